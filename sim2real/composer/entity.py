@@ -53,9 +53,7 @@ class Entity(ABC):
     Subclasses override ``_build``, not the constructor.
 
     Args:
-        *args: Passed on to ``_build``.
         observable_options: Passed on to ``Observables.set_options``.
-        **kwargs: Passed on to ``_build``.
     """
 
     def __init__(self, *args: Any, observable_options: dict[str, Any] | None = None, **kwargs: Any) -> None:
@@ -294,11 +292,7 @@ class Entity(ABC):
 
 
 class ModelWrapperEntity(Entity):
-    """An entity around a model, without any logic.
-
-    Args:
-        mjcf_model: The model, or an ``MjSpec``.
-    """
+    """An entity around a model, without any logic."""
 
     def _build(self, mjcf_model: Model | MjSpec) -> None:
         self._mjcf_model = mjcf_model if isinstance(mjcf_model, Model) else Model(spec=mjcf_model)

@@ -39,11 +39,7 @@ def _declared(owner: type) -> tuple[str, ...]:
 
 
 class Observables:
-    """Named observables of an entity; subclasses declare them with ``@composer.observable``.
-
-    Args:
-        entity: The entity that they observe.
-    """
+    """Named observables of an entity; subclasses declare them with ``@composer.observable``."""
 
     def __init__(self, entity: Any) -> None:
         self._entity = weakref.proxy(entity)
@@ -110,11 +106,7 @@ class Observables:
             value.enabled = False
 
     def add_observable(self, name: str, observable: Observable | Callable[[Any], Any], enabled: bool = True) -> None:
-        """Add an observable, or a function of ``physics`` that returns the value.
-
-        Args:
-            observable: The observable, or the function.
-        """
+        """Add an observable, or a function of ``physics`` that returns the value."""
         if not isinstance(observable, Observable):
             observable = Generic(observable)
         self._observables[name] = observable

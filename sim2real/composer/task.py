@@ -157,20 +157,12 @@ class Task(ABC):
         """Set the state at the start of an episode."""
 
     def before_step(self, physics: AnyPhysics, action: Any, random_state: RandomState) -> None:
-        """Act before a control step; default: the action, shape ``(nu,)``, becomes the control.
-
-        Args:
-            action: What the agent does, as ``action_spec`` says.
-        """
+        """Act before a control step; default: the action, shape ``(nu,)``, becomes the control."""
         del random_state
         physics.set_control(action)
 
     def before_substep(self, physics: AnyPhysics, action: Any, random_state: RandomState) -> None:  # noqa: B027
-        """Act before a step of the physics.
-
-        Args:
-            action: What the agent does, as ``action_spec`` says.
-        """
+        """Act before a step of the physics."""
 
     def after_substep(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a step of the physics."""

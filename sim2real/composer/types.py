@@ -134,19 +134,11 @@ class AnyPhysics(Protocol):
         ...
 
     def set(self, elements: Any, name: str, value: Any) -> AnyPhysics:
-        """Set an attribute of elements.
-
-        Args:
-            elements: An element, or several of one kind.
-        """
+        """Set an attribute of elements."""
         ...
 
     def write(self, elements: Any, name: str, value: Any, index: Any) -> AnyPhysics:
-        """Set a part of an attribute of elements.
-
-        Args:
-            elements: An element, or several of one kind.
-        """
+        """Set a part of an attribute of elements."""
         ...
 
     def fail(self, condition: Any = True) -> None:
@@ -217,6 +209,17 @@ class RandomState(Protocol):
     def permutation(self) -> Draw:
         """A sequence in random order."""
         ...
+
+
+class CarriedRandomState(RandomState, Protocol):
+    """A ``JaxRandomState``: it carries values of variations from draw to draw."""
+
+    def recall(self, owner: Any, initial: Any) -> jax.Array:
+        """Return the value of a variation at its last draw, or its initial value."""
+        ...
+
+    def keep(self, owner: Any, value: Any) -> None:
+        """Keep a value for the next draw of a variation."""
 
 
 Varying: TypeAlias = "ArrayLike | Callable[..., Any] | Sequence[Varying] | Mapping[str, Varying] | None"

@@ -202,22 +202,14 @@ class ComposedWorld(BaseWorld):
         return self.environment.model
 
     def fields(self, params: WorldParams, state: State) -> dict[str, jax.Array]:
-        """Return the fields of the model that differ from the compiled one: parameters, and what hooks set at a start.
-
-        Args:
-            state: What ``init_state`` returned.
-        """
+        """Return the fields of the model that are not as compiled: parameters, and fields that hooks set at a start."""
         physics = self._view()
         self._set(physics, params)
         by_hooks = {name: value for name, value in state.leaves.items() if name not in self._derived}
         return {name: physics.field(name) for name in physics.changed} | by_hooks
 
     def start(self, params: WorldParams, state: State) -> Start:
-        """Return where the physics starts.
-
-        Args:
-            state: What ``init_state`` returned.
-        """
+        """Return where the physics starts."""
         del params
         return Start(state.data.qpos, state.data.qvel, state.data.qacc_warmstart)
 
@@ -232,7 +224,6 @@ class ComposedWorld(BaseWorld):
         """Return what the world sends.
 
         Args:
-            state: What ``init_state`` returned.
             qpos: Positions ``(nq,)`` [m or rad].
             qvel: Velocities ``(nv,)`` [m/s or rad/s].
             qacc: Accelerations ``(nv,)`` of the last physics step [m/s^2 or rad/s^2].

@@ -33,8 +33,6 @@ def reach(
     pseudoinverse and damped least squares methods, 2004.
 
     Args:
-        physics: The physics; its positions are changed.
-        joints: The joints that may move.
         position: Of the site in the world, ``(3,)`` [m].
         quaternion: Of the site in the world, ``(4,)``.
         rotation_weight: Metres that a radian counts as.

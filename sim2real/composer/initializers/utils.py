@@ -15,9 +15,6 @@ if TYPE_CHECKING:
 class JointStaticIsolator:
     """Inside a ``with`` block only some joints move: all others are put back when it ends.
 
-    Args:
-        joints: The joints that may move, or one of them.
-
     Raises:
         UsageError: When the joints belong to different worlds, or there are none.
     """

@@ -25,7 +25,6 @@ def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Any]) -> H:
     """Add an element to a body of this model.
 
     Args:
-        body: The body, or the frame of an attached model.
         attrs: Its attributes in MJCF; they are put under PyMJCF's names.
     """
     if tag == "inertial":
@@ -83,8 +82,6 @@ def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -
     """Add an element that stands in no body; MuJoCo's parser reads its attributes.
 
     Args:
-        kind: What is added, such as ``actuator``.
-        tag: Its tag in MJCF, such as ``motor``.
         attrs: Its attributes in MJCF; they are put under PyMJCF's names.
     """
     model.check_name(kind, attrs.get("name"))
@@ -201,13 +198,7 @@ def _catch_up(element: Handle, said: dict[str, Any], key: str | None) -> None:
 
 
 def reclass(model: Tree[Handle], element: Handle, name: str, value: Any) -> None:
-    """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``.
-
-    Args:
-        element: The element, or the body.
-        name: ``dclass`` or ``childclass``.
-        value: The class, or its name.
-    """
+    """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``."""
     value = getattr(value, "dclass", value)
     element.recorded().note(name, value)
     if name == "childclass":
@@ -246,7 +237,6 @@ def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) ->
 
     Args:
         tag: ``joint``, ``site``, ``geom`` or ``pulley``.
-        attrs: The attributes in MJCF; elements, or their names.
     """
     path = tendon_paths.path_of(model, tendon._native)
     part = tendon_paths.make_part(model, tag, attrs)
@@ -267,7 +257,6 @@ def extend_tuple(model: Tree[H], element: H, tag: str, attrs: dict[str, Any]) ->
     """Add an element to those that a tuple names.
 
     Args:
-        tag: ``element``.
         attrs: ``objname``, an element or a name, with ``objtype``; ``prm``, a number.
     """
     native, target = element._native, attrs.get("objname")

@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 
 class Defaults:
-    """A class of defaults: ``default.geom.rgba = ...``; ``default.add('default', dclass='finger')`` makes another.
-
-    Args:
-        name: The class; ``main`` is the one that holds for everything.
-    """
+    """A class of defaults: ``default.geom.rgba = ...``; ``default.add('default', dclass='finger')`` makes another."""
 
     __slots__ = ("_model", "name")
     tag = "default"
@@ -121,7 +117,6 @@ class DefaultElement(Element):
     themselves.
 
     Args:
-        native: What holds their defaults in the ``MjSpec``.
         tag: The tag under which they were asked for: a class has the same defaults for all actuators.
     """
 

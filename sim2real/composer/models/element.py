@@ -27,11 +27,6 @@ class Element(Handle):
 
     Reading and setting any other attribute reads and sets it in the model's ``MjSpec``, in MJCF's spelling or in
     MuJoCo's own; what was not given reads as None, whatever the defaults are. There is one handle on each element.
-
-    Args:
-        root: The model that the element belongs to.
-        kind: What it is: ``body``, ``geom``, ``joint``, ``actuator`` and so on.
-        native: The element of the ``MjSpec``.
     """
 
     __slots__ = ()

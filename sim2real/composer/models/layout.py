@@ -129,7 +129,6 @@ def index(model: MjModel, field: Field, ids: tuple[int, ...], single: bool) -> A
     """Return what indexes the rows of a field: an int, a slice, or an int array of shape ``(n,)``.
 
     Args:
-        model: The compiled ``mujoco.MjModel``.
         single: Whether one element was bound, rather than a sequence of them.
     """
     if field.size == "nmocap":
@@ -146,9 +145,6 @@ def index(model: MjModel, field: Field, ids: tuple[int, ...], single: bool) -> A
 
 def resolve(model: MjModel, kind: str, names: tuple[str, ...]) -> tuple[int, ...]:
     """Return the numbers of elements in a compiled model.
-
-    Args:
-        model: The compiled ``mujoco.MjModel``.
 
     Raises:
         UsageError: When the model has no element of one of the names.

@@ -24,11 +24,6 @@ class Model(Tree[Element]):
     """The physical parts of one entity, as an ``MjSpec`` that stays editable; PyMJCF calls it ``RootElement``.
 
     Attached models keep specs of their own: ``compile`` copies them all into one.
-
-    Args:
-        model: The name; prefix of all names in it once it is attached.
-        spec: An ``MjSpec`` to wrap; default: an empty one.
-        document: What the spec was parsed from, where that is known.
     """
 
     handle_type = Element
@@ -67,7 +62,6 @@ class Model(Tree[Element]):
 
         Args:
             assets: Contents of files by name: they are looked for there first.
-            resolve_references: As in ``from_xml_string``.
 
         Raises:
             UsageError: When there is no such file.
@@ -83,13 +77,7 @@ class Model(Tree[Element]):
         model_dir: str | os.PathLike[str] = "",
         resolve_references: bool = True,
     ) -> Model:
-        """Return a model from an open MJCF file.
-
-        Args:
-            assets: As in ``from_xml_string``.
-            model_dir: As in ``from_xml_string``.
-            resolve_references: As in ``from_xml_string``.
-        """
+        """Return a model from an open MJCF file."""
         return cls.from_xml_string(file.read(), assets, model_dir=model_dir, resolve_references=resolve_references)
 
     @classmethod

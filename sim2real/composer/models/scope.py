@@ -27,10 +27,6 @@ class Attachment(Generic[T]):
 class Scope:
     """A spec of its own among those of other models: PyMJCF calls it a namescope.
 
-    Args:
-        model: The name; prefix of all names in it once it is attached.
-        spec: An ``MjSpec`` to wrap; default: an empty one.
-
     Attributes:
         parent_model: The model that this one is attached to, or None.
         attachments: Name -> what is attached to this one, in order.

@@ -38,7 +38,6 @@ class Section:
 
     Args:
         path: Where its fields are in the ``MjSpec``; '' for the spec itself.
-        kinds: The kinds of elements that stand in it.
     """
 
     __slots__ = ("_kinds", "_model", "_name", "_path")

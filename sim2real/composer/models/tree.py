@@ -21,13 +21,7 @@ _ADDED_LATER = 1_000_000_000
 
 
 class Handle:
-    """One element of a model: what it is, where it stands and what it is called; its attributes are ``Element``'s.
-
-    Args:
-        root: The model that the element belongs to.
-        kind: What it is: ``body``, ``geom``, ``joint``, ``actuator`` and so on.
-        native: The element of the ``MjSpec``.
-    """
+    """One element of a model: what it is, where it stands and what it is called; its attributes are ``Element``'s."""
 
     __slots__ = ("_native", "kind", "root")
 
@@ -110,11 +104,6 @@ H = TypeVar("H", bound=Handle, covariant=True)
 class Tree(Scope, Generic[H]):
     """What ``Model`` keeps: everything that adds, removes, attaches and compiles works on this.
 
-    Args:
-        model: The name; prefix of all names in it once it is attached.
-        spec: An ``MjSpec`` to wrap; default: an empty one.
-        document: What the spec was parsed from, where that is known.
-
     Attributes:
         references: Native element and attribute -> the element that the attribute names, whatever that is called.
         records: What was given of every element.
@@ -191,11 +180,7 @@ class Tree(Scope, Generic[H]):
         return self._sections["default"].find("default", getattr(name, "dclass", name))
 
     def enlist(self, kind: str, native: Native, tag: str, values: dict[str, Any]) -> H:
-        """Note that an element was added after all others; return its handle.
-
-        Args:
-            values: The attributes that were given to it.
-        """
+        """Note that an element was added after all others; return its handle."""
         self._order[native] = next(self._clock)
         self.records.note(native, tag, values)
         return self.handle(kind, native)

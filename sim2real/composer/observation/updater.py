@@ -45,9 +45,6 @@ class _Channel:
     """One enabled observable: its schedule and the samples that may still be read.
 
     Args:
-        name: The observable's key in the observation.
-        physics: The physics that it samples.
-        random_state: What noise and delays are drawn from.
         steps_per_read: Physics steps from one observation to the next.
         strip: Whether the axis of single samples is left out.
         pad_initial: Whether what was never sampled reads as the first sample, rather than as zeros.

@@ -224,14 +224,7 @@ class Camera:
 
 
 class MovableCamera(Camera):
-    """A free camera that can be put anywhere.
-
-    Args:
-        height: See ``Camera``.
-        width: See ``Camera``.
-        max_geom: See ``Camera``.
-        scene_callback: See ``Camera``.
-    """
+    """A free camera that can be put anywhere."""
 
     def __init__(
         self,

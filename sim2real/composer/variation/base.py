@@ -15,8 +15,7 @@ import numpy as np
 from sim2real.composer.physics.arrays import is_jax, namespace
 
 if TYPE_CHECKING:
-    from sim2real.composer.physics.mjx.random import JaxRandomState
-    from sim2real.composer.types import ArrayLike, Index, RandomState, Varying
+    from sim2real.composer.types import ArrayLike, CarriedRandomState, Index, RandomState, Varying
     from sim2real.types import PyTree
 
 
@@ -86,7 +85,7 @@ class Variation(ABC):
         return UnaryOperation(operator.neg, self)
 
 
-def is_compiled(random_state: RandomState | None) -> TypeGuard[JaxRandomState]:
+def is_compiled(random_state: RandomState | None) -> TypeGuard[CarriedRandomState]:
     """Return whether random numbers are drawn inside a compiled program, which carries values from draw to draw."""
     return hasattr(random_state, "recall")
 
@@ -118,7 +117,7 @@ class Context(NamedTuple):
         return self.current_value if cumulative else self.initial_value
 
 
-class Drawn(Variation):
+class ContextVariation(Variation):
     """A variation whose subclasses compute the value in ``_value``."""
 
     def __call__(
@@ -135,7 +134,7 @@ class Drawn(Variation):
         """Return a value."""
 
 
-class Parametric(Drawn):
+class Parametric(ContextVariation):
     """A variation that is equal to another one of its class with equal parameters."""
 
     def __eq__(self, other: object) -> bool:

@@ -16,14 +16,7 @@ if TYPE_CHECKING:
 
 
 class RgbVariation(Parametric):
-    """Red, green, blue and alpha.
-
-    Args:
-        r: Red, from 0 to 1.
-        g: Green, from 0 to 1.
-        b: Blue, from 0 to 1.
-        alpha: Opacity, from 0 to 1.
-    """
+    """Red, green, blue and alpha."""
 
     def __init__(self, r: Varying, g: Varying, b: Varying, alpha: Varying = 1.0) -> None:
         self._r, self._g, self._b, self._alpha = r, g, b, alpha
@@ -34,14 +27,7 @@ class RgbVariation(Parametric):
 
 
 class HsvVariation(Parametric):
-    """Hue, saturation, value and alpha.
-
-    Args:
-        h: Hue, from 0 to 1.
-        s: Saturation, from 0 to 1.
-        v: Value, from 0 to 1.
-        alpha: Opacity, from 0 to 1.
-    """
+    """Hue, saturation, value and alpha."""
 
     def __init__(self, h: Varying, s: Varying, v: Varying, alpha: Varying = 1.0) -> None:
         self._h, self._s, self._v, self._alpha = h, s, v, alpha

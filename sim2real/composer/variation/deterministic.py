@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from sim2real.composer.physics.arrays import namespace
-from sim2real.composer.variation.base import Context, Drawn, Parametric, evaluate, is_compiled
+from sim2real.composer.variation.base import Context, ContextVariation, Parametric, evaluate, is_compiled
 
 if TYPE_CHECKING:
     from sim2real.composer.types import Varying
@@ -34,7 +34,7 @@ class Constant(Parametric):
         return f"Constant({self._constant!r})"
 
 
-class Sequence(Drawn):
+class Sequence(ContextVariation):
     """One value after the other, and the first one after the last; on MJX: of numbers or arrays of one shape."""
 
     def __init__(self, values: Iterable[Varying]) -> None:

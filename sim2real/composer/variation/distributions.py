@@ -8,7 +8,7 @@ from abc import abstractmethod
 from typing import TYPE_CHECKING
 
 from sim2real.composer.physics.arrays import namespace
-from sim2real.composer.variation.base import Context, Drawn, Parametric, evaluate, is_compiled
+from sim2real.composer.variation.base import Context, ContextVariation, Parametric, evaluate, is_compiled
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ class Bernoulli(Distribution):
         return functools.partial(random_state.binomial, 1)
 
 
-class BiasedRandomWalk(Drawn):
+class BiasedRandomWalk(ContextVariation):
     """A zero-mean Ornstein-Uhlenbeck process, one step a call; it goes on from episode to episode, but not on MJX.
 
     Args:

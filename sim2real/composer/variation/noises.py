@@ -12,11 +12,7 @@ if TYPE_CHECKING:
 
 
 class Additive(Parametric):
-    """Adds a variation to the initial value, or to the current one.
-
-    Args:
-        cumulative: Add to the current value rather than to the initial one.
-    """
+    """Adds a variation to the initial value, or to the current one."""
 
     def __init__(self, variation: Varying, cumulative: bool = False) -> None:
         self._variation, self._cumulative = variation, cumulative
@@ -26,12 +22,7 @@ class Additive(Parametric):
 
 
 class Multiplicative(Parametric):
-    """Multiplies the initial value, or the current one, by a variation.
-
-    Args:
-        variation: The factor.
-        cumulative: Multiply the current value rather than the initial one.
-    """
+    """Multiplies the initial value, or the current one, by a variation."""
 
     def __init__(self, variation: Varying, cumulative: bool = False) -> None:
         self._variation, self._cumulative = variation, cumulative

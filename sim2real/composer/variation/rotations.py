@@ -54,13 +54,7 @@ class QuaternionPreMultiply(Parametric):
 
 
 class QuaternionRotate(Parametric):
-    """A vector ``(3,)`` that is rotated: a given one, else the initial or the current value.
-
-    Args:
-        quat: The rotation, ``(4,)``, scalar first.
-        vec: The vector; None: the initial or the current value.
-        cumulative: Whether the current value is rotated, rather than the initial one.
-    """
+    """A vector ``(3,)`` that is rotated: a given one, else the initial or the current value."""
 
     def __init__(self, quat: Varying, vec: Varying = None, cumulative: bool = False) -> None:
         self._quat, self._vec, self._cumulative = quat, vec, cumulative

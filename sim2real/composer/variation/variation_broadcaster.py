@@ -6,7 +6,7 @@ import weakref
 from collections import deque
 from typing import TYPE_CHECKING
 
-from sim2real.composer.variation.base import Context, Drawn, evaluate
+from sim2real.composer.variation.base import Context, ContextVariation, evaluate
 
 if TYPE_CHECKING:
     from sim2real.composer.types import RandomState, Varying
@@ -35,7 +35,7 @@ class VariationBroadcaster:
         return self._waiting[proxy].popleft()
 
 
-class Proxy(Drawn):
+class Proxy(ContextVariation):
     """Stands for a broadcast variation; made by ``VariationBroadcaster.get_proxy``."""
 
     def __init__(self, broadcaster: VariationBroadcaster) -> None:

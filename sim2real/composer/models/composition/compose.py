@@ -91,9 +91,6 @@ def _compose(model: Tree[Handle], late: frozenset[str]) -> MjSpec:
 
     Names of attached elements are prefixed with ``model/``; each attached model stands in a body of that name.
     Bodies, joints, geoms, actuators and so on are in depth-first order, as PyMJCF writes them.
-
-    Args:
-        late: Kinds of elements that are left out.
     """
     out = _copy(model, late)
     for name, attachment in model.attachments.items():
@@ -125,9 +122,6 @@ def copy_spec(model: Tree[Handle], late: frozenset[str] = frozenset()) -> MjSpec
     """Return a copy of a model's own spec in which every element has a name, and names what it should in this model.
 
     What an element names in another model has a name there that no element of this one has.
-
-    Args:
-        late: Kinds of elements that are left out.
     """
     spec = model._spec
     unnamed = list(_unnamed(model))

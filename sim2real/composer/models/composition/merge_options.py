@@ -281,12 +281,7 @@ def apply(spec: MjSpec, found: Settings) -> None:
 
 
 def set_flag(spec: MjSpec, name: str, value: str) -> None:
-    """Switch a flag: ``enable`` or ``disable``.
-
-    Args:
-        spec: The ``MjSpec``.
-        value: ``enable`` or ``disable``.
-    """
+    """Switch a flag: ``enable`` or ``disable``."""
     field, bit = FLAGS[name]
     bits = getattr(spec.option, field)
     raised = (value == "enable") == (field == "enableflags")

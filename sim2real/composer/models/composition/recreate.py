@@ -64,8 +64,6 @@ def named(model: Tree[Handle], element: str, kind: str, target: Handle | str, to
     """Return the name, in the spec of a world, of what an element of a model names.
 
     Args:
-        model: The model of the element that names another.
-        element: What the element is called, in an error.
         target: What it names: an element, or a text.
 
     Raises:
@@ -135,11 +133,7 @@ def copied(out: MjSpec, kind: str, native: Native, name: str) -> Native:
 
 
 def point_aside(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], done: frozenset[str]) -> None:
-    """Let what stands in bodies, and assets, name elements of other models, now that all models are in one spec.
-
-    Args:
-        done: Kinds of elements that name the right ones already.
-    """
+    """Let what stands in bodies, and assets, name elements of other models, now that all models are in one spec."""
     for model in models:
         for (native, key), target in model.references.items():
             element = model.handle(translate.kind_of(native), native)

@@ -125,13 +125,7 @@ class Records:
         return self._has_defaults or not self.is_blank
 
     def note_default(self, native: Native, kind: str, tag: str, name: str, value: Any) -> None:
-        """Note that an attribute of a class of defaults was set.
-
-        Args:
-            native: What holds the defaults in the spec.
-            kind: Of the elements that they are for.
-            tag: The tag that they were set for.
-        """
+        """Note that an attribute of a class of defaults was set."""
         self._has_defaults = True
         said = self.of_class(native, kind)
         said.tag = tag
@@ -148,12 +142,7 @@ class Records:
             self._document.says_angle = True
 
     def note(self, native: Native, tag: str, values: dict[str, Any]) -> None:
-        """Note that an element was added.
-
-        Args:
-            native: The element of the ``MjSpec``.
-            values: The attributes that were given to it.
-        """
+        """Note that an element was added."""
         self._of[native] = Given(tag, values)
 
     def class_parent(self, name: str) -> str | None:
@@ -219,12 +208,7 @@ class Records:
 
 
 def read(native: Native, kind: str, blank: Native) -> Given:
-    """Return what can be told from an ``MjSpec`` alone: values that differ from the defaults, ``blank``.
-
-    Args:
-        native: The element of the ``MjSpec``.
-        blank: The element that holds its defaults.
-    """
+    """Return what can be told from an ``MjSpec`` alone: values that differ from the defaults, ``blank``."""
     tag = _tag(native, kind)
     found = Given(tag)
     for name in schema.attributes(kind, tag):
@@ -250,12 +234,7 @@ def _tag(native: Native, kind: str) -> str:
 
 
 def show(value: Any, given: Any) -> Any:
-    """Return a native value as PyMJCF shows it: keywords as text, arrays as long as they were given.
-
-    Args:
-        value: The value that the ``MjSpec`` holds.
-        given: The value that was given.
-    """
+    """Return a native value as PyMJCF shows it: keywords as text, arrays as long as they were given."""
     if isinstance(value, np.ndarray) and value.ndim == 1:
         size = len(given.split()) if isinstance(given, str) else np.size(given)
         return value[:size]

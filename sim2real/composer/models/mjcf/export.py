@@ -34,12 +34,7 @@ def export_with_assets(mjcf_model: Model, out_dir: str | os.PathLike[str], out_f
 
 
 def export_with_assets_as_zip(mjcf_model: Model, out_dir: str | os.PathLike[str], model_name: str | None = None) -> str:
-    """Write a model, composed, as MJCF with all its files into an archive; return its path.
-
-    Args:
-        out_dir: The archive's folder, which is made if it is not there.
-        model_name: What the archive, the folder in it and the MJCF file are called; default: as the model.
-    """
+    """Write a model, composed, as MJCF with all its files into an archive; return its path."""
     name = model_name or mjcf_model.model
     Path(out_dir).mkdir(parents=True, exist_ok=True)
     path = str(Path(out_dir) / f"{name}.zip")

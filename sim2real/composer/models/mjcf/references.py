@@ -49,7 +49,6 @@ def refer(element: Handle, key: str, target: Handle | str | None) -> None:
     """Let an attribute name another element, whatever that is called later.
 
     Args:
-        element: The element that names another one.
         key: The attribute, in the spelling of ``MjSpec``.
         target: The other element, or its name; None: no element any more.
     """
@@ -94,11 +93,7 @@ def _native_key(element: Handle, name: str) -> str:
 
 
 def rename(element: Handle, name: str) -> None:
-    """Call an element otherwise; what names it names it still.
-
-    Args:
-        name: Its new name; '' for none.
-    """
+    """Call an element otherwise; what names it names it still."""
     model: Tree[Handle] = element.root
     old = element.name
     if old:
@@ -116,7 +111,6 @@ def hold_below(model: Tree[Handle], prefix: str) -> None:
     """Hold as elements what is named by text with a prefix: elements of a model that will be called otherwise.
 
     Args:
-        model: The model that it is attached to.
         prefix: The prefix of its names, such as ``arm/``.
     """
     for one in _seeing(model):

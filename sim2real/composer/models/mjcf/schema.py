@@ -61,7 +61,6 @@ def attributes(kind: str, tag: str) -> frozenset[str]:
     """Return the attributes of elements with a tag; nothing for a kind that MJCF spells in another way.
 
     Args:
-        kind: The kind of element, such as ``actuator``.
         tag: Its tag, such as ``motor``; the same as the kind where there is only one.
     """
     names: frozenset[str] = frozenset()

@@ -60,11 +60,7 @@ _IN_DEFAULTS = ("geom", "site", "light", "mesh", "material", "tendon")
 
 
 def targets(kind: str, native: Native) -> Iterator[tuple[str, str, str]]:
-    """Yield what an element names: the attribute, such as ``target`` or ``textures[1]``, kind and name of the other.
-
-    Args:
-        native: The element of the ``MjSpec``.
-    """
+    """Yield what an element names: the attribute, such as ``target`` or ``textures[1]``, kind and name of the other."""
     for key, named in FIXED.get(kind, {}).items():
         value = getattr(native, key)
         if isinstance(value, str):
@@ -91,9 +87,6 @@ def by_text(model: Tree[Any], kinds: Collection[str]) -> Iterator[tuple[Native, 
     """Yield what the elements of a model name by text alone: the element, attribute, kind and name of the other.
 
     What a program named by element is left out, and so are the paths of tendons.
-
-    Args:
-        kinds: Kinds of the elements that are looked for; more may be found.
     """
     spec = model._spec
     for kind, attributes in FIXED.items():
@@ -115,7 +108,6 @@ def point(native: Native, key: str, name: str) -> None:
     """Let an attribute name another element: ``target``, or ``textures[1]`` where there are several.
 
     Args:
-        native: The element of the ``MjSpec``.
         key: The attribute, in the spelling of ``MjSpec``.
         name: The other element's name; '' for none.
     """

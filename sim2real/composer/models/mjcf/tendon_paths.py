@@ -59,7 +59,6 @@ def make_part(model: Tree[Any], tag: str, attrs: dict[str, Any]) -> PathPart:
 
     Args:
         tag: ``joint``, ``site``, ``geom`` or ``pulley``.
-        attrs: The attributes in MJCF: elements, or their names.
 
     Raises:
         UsageError: When there is no such part, or an attribute is missing.
@@ -81,7 +80,6 @@ def wrap(tendon: Native, part: PathPart, name: Callable[[str, Handle | str], str
     """Let the path of a tendon of an ``MjSpec`` run on over a part.
 
     Args:
-        tendon: The tendon of the ``MjSpec``.
         name: Kind, and element or text -> the name in that ``MjSpec``.
     """
     names = {key: name(KIND[key], part.values[key]) for key in NAMING[part.tag] if key in part.values}

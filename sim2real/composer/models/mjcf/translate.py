@@ -103,11 +103,7 @@ def native_name(kind: str, key: str) -> str:
 
 
 def read(native: Native, kind: str, key: str) -> Any:
-    """Return an attribute of an element; AttributeError when there is none of that name.
-
-    Args:
-        native: The element of the ``MjSpec``.
-    """
+    """Return an attribute of an element; AttributeError when there is none of that name."""
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return np.array(getattr(native.alt, key))
     value = getattr(native, native_name(kind, key))
@@ -120,11 +116,7 @@ def read(native: Native, kind: str, key: str) -> Any:
 
 
 def is_plain(native: Native, kind: str, key: str, value: Any) -> bool:
-    """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser.
-
-    Args:
-        native: The element of the ``MjSpec``.
-    """
+    """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser."""
     found = _PLAIN.get((kind, key))
     if found is None:
         found = _PLAIN[kind, key] = _is_plain(native, kind, key)
@@ -150,8 +142,6 @@ def reset(native: Native, source: Native, names: tuple[str, ...] | None = None) 
     """Put attributes of an element back to those of another one, its defaults; default: all but its name.
 
     Args:
-        native: The element of the ``MjSpec``.
-        source: The element that holds its defaults.
         names: The attributes, in the spelling of ``MjSpec``; default: all but the name.
     """
     for name in attributes(native) if names is None else names:
@@ -185,7 +175,6 @@ def assign(native: Native, kind: str, key: str, value: Any) -> None:
     """Set an attribute of an element.
 
     Args:
-        native: The element of the ``MjSpec``.
         value: What it is set to: numbers, keywords or text, as in MJCF.
 
     Raises:
@@ -283,9 +272,6 @@ def from_xml(
     """Return the native attributes that MuJoCo's own parser reads from MJCF: plain ones, and those that name elements.
 
     Args:
-        kind: Namespace of the element, such as ``actuator``.
-        tag: Its tag, such as ``position``.
-        attrs: MJCF attribute -> value.
         references: Attributes in ``attrs`` that name other elements.
 
     Raises:
@@ -326,14 +312,7 @@ def _parsed(
 
 
 def key_of(kind: str, tag: str, name: str, references: tuple[str, ...], plain: Mapping[str, str]) -> str | None:
-    """Return the native attribute, such as ``objname`` or ``textures[1]``, that MuJoCo's parser puts a reference in.
-
-    Args:
-        kind: Namespace of the element, such as ``sensor``.
-        name: The attribute in MJCF that names another element.
-        references: All its attributes that do so.
-        plain: Attributes that decide what is named.
-    """
+    """Return the native attribute, such as ``objname`` or ``textures[1]``, that MuJoCo's parser puts a reference in."""
     try:
         _, named = _parsed(kind, tag, tuple(plain.items()), references)
     except ValueError:

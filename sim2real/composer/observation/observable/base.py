@@ -22,7 +22,6 @@ class Aggregator:
     """A reduction of the buffer's first axis.
 
     Args:
-        name: Function of numpy and of ``jax.numpy``.
         preserves_bounds: Whether the result lies within the bounds of the values.
     """
 
@@ -127,11 +126,6 @@ class Generic(Observable):
 
     Args:
         raw_observation_callable: Takes the physics, returns a number or an array.
-        update_interval: See ``Observable``.
-        buffer_size: See ``Observable``.
-        delay: See ``Observable``.
-        aggregator: See ``Observable``.
-        corruptor: See ``Observable``.
     """
 
     def __init__(
@@ -154,13 +148,7 @@ class MujocoFeature(Observable):
     """Rows of an array of mjData, by name.
 
     Args:
-        kind: Name of the array, such as ``geom_xpos``.
         feature_name: Name or names of elements, or a callable that returns them.
-        update_interval: See ``Observable``.
-        buffer_size: See ``Observable``.
-        delay: See ``Observable``.
-        aggregator: See ``Observable``.
-        corruptor: See ``Observable``.
     """
 
     def __init__(
@@ -182,15 +170,7 @@ class MujocoFeature(Observable):
 
 
 class MujocoCamera(Observable):
-    """The image of a camera, by name; uint8 ``(height, width, 3)``, or float32 ``(height, width, 1)`` [m] for depth.
-
-    Args:
-        update_interval: See ``Observable``.
-        buffer_size: See ``Observable``.
-        delay: See ``Observable``.
-        aggregator: See ``Observable``.
-        corruptor: See ``Observable``.
-    """
+    """The image of a camera, by name; uint8 ``(height, width, 3)``, or float32 ``(height, width, 1)`` [m] for depth."""
 
     def __init__(
         self,

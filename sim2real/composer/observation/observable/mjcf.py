@@ -30,12 +30,6 @@ class MJCFFeature(Observable):
 
     Args:
         kind: The attribute, such as ``qpos`` or ``xpos``.
-        mjcf_element: The element or elements.
-        update_interval: See ``Observable``.
-        buffer_size: See ``Observable``.
-        delay: See ``Observable``.
-        aggregator: See ``Observable``.
-        corruptor: See ``Observable``.
 
     Raises:
         UsageError: When something given is no element.
@@ -74,11 +68,6 @@ class MJCFCamera(Observable):
     """An image: uint8 ``(height, width, 3)``, depth float32 ``(.., 1)`` [m] or segmentation int32 ``(.., 2)``.
 
     Args:
-        update_interval: See ``Observable``.
-        buffer_size: See ``Observable``.
-        delay: See ``Observable``.
-        aggregator: See ``Observable``.
-        corruptor: See ``Observable``.
         scene_option: What is drawn: an ``MjvOption``.
 
     Raises:

@@ -56,9 +56,6 @@ class _Memory:
     whoever keeps one, or a slice of one, adds to Python's count of the references to that object. When all counts are
     what they were at the start, nobody does. Weak references cannot tell it, as MuJoCo's own references keep the arrays
     alive. A count that differs for any other reason costs a new memory, never a wrong number.
-
-    Args:
-        model: The model that it copies.
     """
 
     def __init__(self, model: MjModel) -> None:

@@ -35,7 +35,6 @@ class NamedArray(NDArrayOperatorsMixin):
     A name that is not there may leave out the models it is attached below, as long as only one element ends with it.
 
     Args:
-        model: The compiled ``mujoco.MjModel``, which knows the names.
         holder: What has the array as an attribute: the model or the data.
     """
 
@@ -136,12 +135,7 @@ def _column(key: Any) -> Any:
 
 
 class NamedFields:
-    """The arrays of ``model`` or ``data``, each as a ``NamedArray``.
-
-    Args:
-        model: The compiled ``mujoco.MjModel``, which knows the names.
-        struct: ``model`` or ``data``.
-    """
+    """The arrays of ``model`` or ``data``, each as a ``NamedArray``."""
 
     def __init__(self, model: MjModel, struct: str, holder: object) -> None:
         self._model, self._struct, self._holder = model, struct, holder
@@ -160,7 +154,6 @@ class Named:
     """``physics.named``: the arrays of ``named.model`` and ``named.data`` by name.
 
     Args:
-        model: The compiled ``mujoco.MjModel``, which knows the names.
         model_holder: What has the model's arrays as attributes.
     """
 

@@ -35,7 +35,6 @@ class Physics:
     """A model and its state; hooks, observables and tasks read and write it.
 
     Args:
-        model: The compiled ``mujoco.MjModel``.
         legacy_step: After a step, also compute positions and velocities of the new state, as dm_control does.
         data: A ``mujoco.MjData`` as ``mj_resetData`` leaves it; default: a new one.
 
@@ -281,7 +280,6 @@ class Physics:
         """Set an attribute of elements and return the physics; the same call on both engines.
 
         Args:
-            elements: An element, or several of one kind.
             name: The attribute, in MuJoCo's spelling without the kind's prefix.
             value: What it is set to, in the shape in which it is read.
         """
@@ -292,9 +290,7 @@ class Physics:
         """Set a part of an attribute of elements; the same call on both engines.
 
         Args:
-            elements: An element, or several of one kind.
             name: The attribute, in MuJoCo's spelling without the kind's prefix.
-            index: Which part of the attribute, as in ``attribute[index]``.
         """
         getattr(self.bind(elements), name)[index] = value
         return self

@@ -76,11 +76,7 @@ class Overlay(Protocol):
 
 
 class Graphics:
-    """Draws scenes of a model, with a context and a scene for every thread: those of OpenGL belong to threads.
-
-    Args:
-        model: The ``mujoco.MjModel``.
-    """
+    """Draws scenes of a model, with a context and a scene for every thread: those of OpenGL belong to threads."""
 
     def __init__(self, model: MjModel) -> None:
         self._model = model
@@ -106,7 +102,6 @@ class Graphics:
         """Return an image of a scene.
 
         Args:
-            scene: An ``MjvScene`` that is up to date.
             size: Height and width [pixels].
             overlays: Texts to draw over it: ``draw(context, rect)``.
             flags: Flags of ``mjtRndFlag``, by name in small letters, such as ``shadow``, or by number -> value.

@@ -58,7 +58,6 @@ class StepLaw(Protocol):
         """Return controls ``(..., nu)``, applied forces ``(..., nv)`` and the fields for the next step.
 
         Args:
-            xp: ``numpy`` or ``jax.numpy``.
             values: Numbers of each copy, ``(..., n)``.
             control: What the world's ``controls`` gave for this step.
             qpos: Positions ``(..., nq)`` [m or rad].
@@ -97,19 +96,11 @@ class OpenLoop(Protocol):
         """
 
     def fields(self, params: Any, state: Any) -> dict[str, Array]:
-        """Return the fields of the model that differ from the compiled one.
-
-        Args:
-            state: What ``init_state`` returned.
-        """
+        """Return the fields of the model that differ from the compiled one."""
         ...
 
     def start(self, params: Any, state: Any) -> Start:
-        """Return where the physics starts.
-
-        Args:
-            state: What ``init_state`` returned.
-        """
+        """Return where the physics starts."""
         ...
 
     def controls(self, step_state: StepState) -> tuple[StepState, Array]:
@@ -120,7 +111,6 @@ class OpenLoop(Protocol):
         """Return what the world sends.
 
         Args:
-            state: What ``init_state`` returned.
             qpos: Positions ``(nq,)`` [m or rad].
             qvel: Velocities ``(nv,)`` [m/s or rad/s].
             qacc: Accelerations ``(nv,)`` of the last physics step; at the start those without actuators.
@@ -182,9 +172,7 @@ class Rollouts:
         """Roll out every copy.
 
         Args:
-            fields: Name -> values, ``(..., *shape)``.
             controls: Shape ``(..., ticks, substeps, nu)``, or what the law takes.
-            values: What the law takes besides, ``(..., n)`` each.
 
         Returns:
             Positions ``(..., 1 + ticks, nq)``, velocities and accelerations ``(..., 1 + ticks, nv)``: at the start, and

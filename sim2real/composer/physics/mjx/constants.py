@@ -35,10 +35,6 @@ def derived(host: MjModel, model: mjx.Model) -> frozenset[str]:
 
     Without tracing it, which to make an arm's world takes 6 s more.
 
-    Args:
-        host: The compiled ``mujoco.MjModel``.
-        model: The ``mjx.Model``.
-
     Raises:
         UsageError: As ``derive`` does.
     """
@@ -57,10 +53,6 @@ def derived(host: MjModel, model: mjx.Model) -> frozenset[str]:
 
 def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
     """Return the constants of an ``mjx.Model`` whose masses, inertias, lengths or poses were changed: path -> array.
-
-    Args:
-        host: The compiled ``mujoco.MjModel``.
-        model: The ``mjx.Model``.
 
     Raises:
         UsageError: On Warp, where MJX's own JAX does not know the model.

@@ -28,8 +28,6 @@ def origins(function: Callable[..., Any], arguments: tuple[Any, ...], marked: An
     Errs on the side of caution: every result of an operation counts as depending on all that goes into it.
 
     Args:
-        function: A function that JAX can trace.
-        arguments: Its arguments: arrays, or their shapes and dtypes.
         marked: Which of them are marked: a bool for each leaf, in the arguments' tree.
     """
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)

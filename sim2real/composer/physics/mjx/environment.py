@@ -247,8 +247,6 @@ class MjxEnvironment:
         """Return what ``reset`` does without physics: nothing that follows from positions and velocities is computed.
 
         Args:
-            model: See ``reset``.
-            start: See ``reset``.
             data: What episodes start from; default: ``initial``.
         """
         before = self._dry, self.initial
@@ -263,8 +261,6 @@ class MjxEnvironment:
 
         Args:
             state: The copy; only ``data.ctrl``, what hooks keep and ``steps`` are up to date afterwards.
-            action: See ``step``.
-            model: See ``step``.
 
         Returns:
             The copy, and the controls of each physics step ``(substeps, nu)``.
@@ -289,7 +285,6 @@ class MjxEnvironment:
         Args:
             action: As ``action_spec`` says: shape ``(nu,)``, unless the task has actions of its own.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
-            law: See ``reset``.
         """
         physics, random_state = self._physics(state, model, law)
         self._hooks.run("before_step", physics, action, random_state)

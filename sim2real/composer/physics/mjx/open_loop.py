@@ -29,7 +29,6 @@ def check(
 
     Args:
         entered: Maps state and action to the state with which a control step begins.
-        name: The world's name, for errors.
 
     Raises:
         UsageError: With what depends on the state.

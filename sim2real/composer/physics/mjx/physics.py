@@ -48,12 +48,8 @@ class MjxPhysics:
     Setting something replaces the state that this object holds; arrays that were read before keep their values.
 
     Args:
-        host: The compiled ``mujoco.MjModel``.
-        model: The ``mjx.Model``.
-        data: The ``mjx.Data``.
         variables: What tasks keep from hook to hook: name -> array.
         legacy: After a step, also compute positions and velocities of the new state.
-        engine: What steps: the module ``stepping``, which may be under a law, or a ``WarpEngine``.
 
     Attributes:
         np: The module that computes with this engine's arrays: ``jax.numpy``.
@@ -134,7 +130,6 @@ class MjxPhysics:
         """Refuse to set rows of a field where MJX would not see it.
 
         Args:
-            struct: ``model`` or ``data``.
             rows: Which rows of it; default: all.
 
         Raises:
@@ -155,9 +150,6 @@ class MjxPhysics:
 
     def replace(self, struct: str, name: str, value: ArrayLike) -> None:
         """Set a whole field of the model or the state, such as ``qpos``, ``geom_size`` or ``opt.gravity``.
-
-        Args:
-            struct: ``model`` or ``data``.
 
         Raises:
             UsageError: When the field is a constant of compiled programs.
@@ -321,7 +313,6 @@ class MjxPhysics:
         """Set an attribute of elements and return the physics; the same call on both engines.
 
         Args:
-            elements: An element, or several of one kind.
             name: The attribute, in MuJoCo's spelling without the kind's prefix.
             value: What it is set to, in the shape in which it is read.
         """
@@ -332,9 +323,7 @@ class MjxPhysics:
         """Set a part of an attribute of elements; the same call on both engines.
 
         Args:
-            elements: An element, or several of one kind.
             name: The attribute, in MuJoCo's spelling without the kind's prefix.
-            index: Which part of the attribute, as in ``attribute[index]``.
         """
         whole = jnp.asarray(self.get(elements, name))
         return self.set(elements, name, whole.at[index].set(jnp.asarray(value, whole.dtype)))
@@ -365,11 +354,6 @@ class MjxPhysics:
         """Run a function until it no longer calls ``fail``, at most so many times; return whether the last one failed.
 
         Every attempt starts from the same state, with new random numbers.
-
-        Args:
-            attempt: The function: without arguments.
-            random_state: The random numbers that it draws from.
-            attempts: How often it runs at most.
         """
         start, model, outer, dirty = self.tree(random_state), self.mjx_model, self.failed, self.is_dirty
 

@@ -38,7 +38,6 @@ def place(
         physics: The physics; ``physics.fail`` is called where a prop found no place.
         pose: Position ``(3,)`` [m] and quaternion ``(4,)``, or variations.
         attempts: Poses that are tried for each prop.
-        ignored: Entities that may be touched.
 
     Raises:
         UsageError: On Warp, which keeps the contacts of all copies together, unless collisions are ignored.

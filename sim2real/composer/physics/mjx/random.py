@@ -77,29 +77,17 @@ class JaxRandomState:
         return key
 
     def uniform(self, low: ArrayLike = 0.0, high: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        """Return floats in ``[low, high)``.
-
-        Args:
-            size: Shape of what is drawn; default: that of the bounds.
-        """
+        """Return floats in ``[low, high)``."""
         low, high = jnp.asarray(low, float), jnp.asarray(high, float)
         return low + (high - low) * jax.random.uniform(self.next_key(), _shape(size, low, high))
 
     def normal(self, loc: ArrayLike = 0.0, scale: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        """Return normally distributed floats.
-
-        Args:
-            size: Shape of what is drawn; default: that of the parameters.
-        """
+        """Return normally distributed floats."""
         loc, scale = jnp.asarray(loc, float), jnp.asarray(scale, float)
         return loc + scale * jax.random.normal(self.next_key(), _shape(size, loc, scale))
 
     def lognormal(self, mean: ArrayLike = 0.0, sigma: ArrayLike = 1.0, size: Size = None) -> jax.Array:
-        """Return exponentials of normally distributed floats.
-
-        Args:
-            size: Shape of what is drawn; default: that of the parameters.
-        """
+        """Return exponentials of normally distributed floats."""
         return jnp.exp(self.normal(mean, sigma, size))
 
     def exponential(self, scale: ArrayLike = 1.0, size: Size = None) -> jax.Array:
@@ -113,11 +101,7 @@ class JaxRandomState:
         return jax.random.poisson(key, lam, _shape(size, lam))
 
     def binomial(self, n: ArrayLike, p: ArrayLike, size: Size = None) -> jax.Array:
-        """Return binomially distributed integers.
-
-        Args:
-            size: Shape of what is drawn; default: that of the parameters.
-        """
+        """Return binomially distributed integers."""
         return jax.random.binomial(self.next_key(), n, p, _shape(size, n, p)).astype(int)
 
     def randint(self, low: ArrayLike, high: ArrayLike | None = None, size: Size = None) -> jax.Array:
@@ -125,7 +109,6 @@ class JaxRandomState:
 
         Args:
             low: The lower bound; without ``high``, the upper one.
-            size: Shape of what is drawn; default: that of the bounds.
         """
         low, high = (0, low) if high is None else (low, high)
         return jax.random.randint(self.next_key(), _shape(size, low, high), low, high)
@@ -134,8 +117,6 @@ class JaxRandomState:
         """Return items of ``a``, or integers below it, with probabilities ``p``.
 
         Args:
-            a: The items, or how many integers there are to choose from.
-            size: Shape of what is drawn; default: a single item.
             p: Probability of each item; default: all the same.
         """
         values = jnp.arange(a) if np.ndim(a) == 0 else jnp.asarray(a)
@@ -154,22 +135,11 @@ class JaxRandomState:
         return self.normal(size=size)
 
     def beta(self, a: ArrayLike, b: ArrayLike, size: Size = None) -> jax.Array:
-        """Return Beta distributed floats.
-
-        Args:
-            a: The first shape.
-            b: The second shape.
-            size: Shape of what is drawn; default: that of the parameters.
-        """
+        """Return Beta distributed floats."""
         return jax.random.beta(self.next_key(), a, b, _shape(size, a, b))
 
     def gamma(self, shape: ArrayLike, scale: ArrayLike = 1.0, size: Size = None) -> Any:
-        """Return Gamma distributed floats.
-
-        Args:
-            shape: The shape of the distribution.
-            size: Shape of what is drawn; default: that of the parameters.
-        """
+        """Return Gamma distributed floats."""
         return scale * jax.random.gamma(self.next_key(), shape, _shape(size, shape, scale))
 
     def shuffle(self, x: ArrayLike) -> None:

@@ -38,7 +38,6 @@ class Ring:
     Args:
         strip: Leave the buffer's axis out when it holds one sample.
         pad_initial: Pad with the first sample rather than with zeros.
-        call: Calls the observable, given what it is called and its arguments.
 
     Raises:
         UsageError: When a delay or an interval has no bound that a compiled program could reserve space for.
@@ -167,7 +166,6 @@ def make_rings(
         steps: Physics steps that a control step has.
         strip: Whether the axis of single samples is left out, as in the environment.
         pad_initial: Whether what was never sampled reads as the first sample, rather than as zeros.
-        call: Calls a function of the task, with its label, the function and its arguments.
     """
     return [Ring(name, o, steps, strip, pad_initial, call) for name, o in observables.items() if o.enabled]
 

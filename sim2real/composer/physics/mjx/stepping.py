@@ -30,8 +30,6 @@ def advance(model: mjx.Model, data: mjx.Data, legacy: bool, law: Law | None = No
     the same stages, begun elsewhere (``mj_step2; mj_step1``).
 
     Args:
-        model: The ``mjx.Model``.
-        data: The ``mjx.Data``.
         legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
         law: What is set of the model where constraints are made: from the state that a step begins with.
     """
@@ -46,11 +44,7 @@ def advance(model: mjx.Model, data: mjx.Data, legacy: bool, law: Law | None = No
 
 
 class Lawful:
-    """Steps as this module does, under a law.
-
-    Args:
-        law: What is set of the model from the state.
-    """
+    """Steps as this module does, under a law."""
 
     def __init__(self, law: Law) -> None:
         self._law = law
@@ -59,19 +53,12 @@ class Lawful:
         """Return the data a time step later.
 
         Args:
-            model: The ``mjx.Model``.
-            data: The ``mjx.Data``.
             legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
         """
         return advance(model, data, legacy, self._law)
 
     def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
-        """Compute everything that follows from the state; without actuation, as at the start of an episode.
-
-        Args:
-            model: The ``mjx.Model``.
-            data: The ``mjx.Data``.
-        """
+        """Compute everything that follows from the state; without actuation, as at the start of an episode."""
         return forward(self._law(model, data), data, actuation)
 
 
@@ -87,10 +74,6 @@ def forward(model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Dat
     """Compute everything that follows from the state; without actuation, as at the start of an episode.
 
     ``mjx.forward`` leaves accelerometers and force sensors at 0 in models without constraints; this does not.
-
-    Args:
-        model: The ``mjx.Model``.
-        data: The ``mjx.Data``.
     """
     if not actuation:
         flags = model.opt.disableflags | mjx.DisableBit.ACTUATION

@@ -219,9 +219,6 @@ def _numbers(state: Any) -> tuple[bytes, int, list[Any]]:
 def check_variables(before: dict[str, Any], after: dict[str, Any]) -> None:
     """Check that a step leaves the variables of a task as large as it found them.
 
-    Args:
-        before: Name -> value, at the start.
-
     Raises:
         UsageError: With the variable.
     """

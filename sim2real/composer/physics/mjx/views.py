@@ -34,18 +34,10 @@ class Traced(Protocol):
         ...
 
     def check(self, struct: str, name: str, rows: int | slice | np.ndarray) -> None:
-        """Refuse what cannot be set.
-
-        Args:
-            struct: ``model`` or ``data``.
-        """
+        """Refuse what cannot be set."""
 
     def replace(self, struct: str, name: str, value: ArrayLike) -> None:
-        """Set a whole field.
-
-        Args:
-            struct: ``model`` or ``data``.
-        """
+        """Set a whole field."""
 
     def mark_as_dirty(self) -> None:
         """Note that what is computed is out of date."""

@@ -23,7 +23,6 @@ class WarpEngine:
     state: what remains belongs to one copy, so copies can be selected, sliced and merged as on MJX's own JAX.
 
     Args:
-        host: The compiled ``mujoco.MjModel``.
         nconmax: Contacts that there is room for, times the number of copies, which share it; None: MuJoCo Warp's guess.
         njmax: Rows of constraints that there is room for in each copy; None: MuJoCo Warp's guess.
 
@@ -57,20 +56,13 @@ class WarpEngine:
         """Return the data a time step later.
 
         Args:
-            model: The ``mjx.Model``.
-            data: The ``mjx.Data``.
             legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
         """
         step = self._stages.legacy_step if legacy else self._stages.step
         return self._pack(step(model, self._unpack(data)))
 
     def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
-        """Compute everything that follows from the state; without actuation, as at the start of an episode.
-
-        Args:
-            model: The ``mjx.Model``.
-            data: The ``mjx.Data``.
-        """
+        """Compute everything that follows from the state; without actuation, as at the start of an episode."""
         if not actuation:
             flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
             model = with_fields(model, {"opt.disableflags": flags})
@@ -89,8 +81,6 @@ def make_engine(host: MjModel, impl: str, nconmax: int | None, njmax: int | None
     """Return what steps a model with Warp; None with ``impl="jax"``.
 
     Args:
-        host: The compiled ``mujoco.MjModel``.
-        impl: ``jax`` or ``warp``.
         nconmax: See ``WarpEngine``; None with JAX.
         njmax: See ``WarpEngine``; None with JAX.
 

@@ -125,9 +125,6 @@ def _function(name: str, order: Order) -> Callable[[mjx.Model, mjx.Data], mjx.Da
     """Return MJX's function of a model and of data, for ``vmap`` and ``jit``, with another of Warp in its place.
 
     Sizes of contacts in the data are those of one copy; the arrays that hold contacts are empty.
-
-    Args:
-        name: ``step`` or ``forward``.
     """
     room = functools.partial(_with_room, order)
     shim = getattr(generated, f"_{name}_shim").__wrapped__
