@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
-from benches import hidden_robots as hidden
-from benches import randomise
+from benches.hidden import randomise
+from benches.hidden import robots as hidden
 from live_robots import TINY
 from sketches import sketched
 

@@ -1,23 +1,53 @@
-"""What benches share: the form of a row, and programs timed in turn."""
+"""Code that all benches share: the form of a row, shares with their intervals, and programs timed in turn."""
 
 from __future__ import annotations
 
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from sim2real.types import PyTree
+
+Row = dict[str, object]
+"""``name``, ``value``, ``unit``, ``yardstick`` and ``goal`` of one figure."""
+Report = dict[str, object]
+"""``rows``, and the records behind them."""
 
 
-def row(name: str, value: Any, unit: str, yardstick: str = "", goal: str = "") -> dict[str, Any]:
+def row(name: str, value: object, unit: str, yardstick: str = "", goal: str = "") -> Row:
     """Return one row of a bench."""
     return {"name": name, "value": value, "unit": unit, "yardstick": yardstick, "goal": goal}
 
 
+def four_digits(value: float) -> float:
+    """Return a value rounded to four significant digits."""
+    return float(f"{value:.4g}")
+
+
+def share(successes: int, trials: int) -> tuple[float, float, float]:
+    """Return a share and its exact 95 % interval (Clopper and Pearson): value, lower end, upper end."""
+    ends = binomtest(successes, trials).proportion_ci(method="exact")
+    return successes / trials, ends.low, ends.high
+
+
+def mean_absolute(errors: np.ndarray) -> float:
+    """Return the mean absolute error."""
+    return float(np.abs(errors).mean())
+
+
+def rmse(errors: np.ndarray) -> float:
+    """Return the root mean square error."""
+    return float(np.sqrt(np.mean(errors**2)))
+
+
 def medians(
-    programs: Mapping[Any, Callable[[], Any]], repeats: int, clock: Callable[[], float] = time.perf_counter
-) -> dict[Any, float]:
-    """Run programs in turn, once to warm up; return the median of the seconds that each takes."""
-    times: dict[Any, list[float]] = {name: [] for name in programs}
+    programs: Mapping[str, Callable[[], object]], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, float]:
+    """Run programs in turn, once to warm up; return the median time of each [s]."""
+    times: dict[str, list[float]] = {name: [] for name in programs}
     for i in range(repeats + 1):
         for name, program in programs.items():
             begin = clock()
@@ -27,8 +57,10 @@ def medians(
     return {name: statistics.median(t) for name, t in times.items()}
 
 
-def compare(programs: Mapping[str, Callable[[Any], Any]], starts: Any, repeats: int) -> tuple[dict, dict]:
-    """Time programs that are vmapped over ``starts``; return median seconds of a call, and seconds to compile."""
+def compare(
+    programs: Mapping[str, Callable[[PyTree], PyTree]], starts: PyTree, repeats: int
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Time programs that are vmapped over ``starts``; return the median time of a call, and that of compiling [s]."""
     import jax
 
     calls, compile_s = {}, {}

@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 import bench
-from benches import arm, stages
+from benches.runs import arm, stages
 from shared_run import copied
 
 from sim2real import cli

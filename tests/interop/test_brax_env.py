@@ -1,7 +1,4 @@
-"""A robot as a brax environment: actions, starts and ends of episodes under brax's own wrappers.
-
-brax's own PPO trains on it in `tests/scripts/test_benches.py`.
-"""
+"""A robot as a brax environment: actions, starts and ends of episodes under brax's own wrappers, and brax's own PPO."""
 
 import jax
 import jax.numpy as jnp
@@ -77,3 +74,28 @@ def test_past_the_time_limit_there_is_no_reward_to_learn_from(pendulum):
     reward, done = run(jax.random.PRNGKey(0))
     assert np.isnan(reward).tolist() == [False] * 24 + [True]
     assert not done.any()
+
+
+@pytest.mark.full
+def test_braxs_own_ppo_trains_on_it(pendulum, monkeypatch):
+    from brax.training.agents.ppo import train as ppo
+
+    # brax 0.14.2 calls it, and JAX 0.10 has it no more: see docs/guides/interop.md.
+    replicated = lambda tree, devices: jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)  # noqa: E731
+    monkeypatch.setattr(jax, "device_put_replicated", replicated, raising=False)
+    env, curve = brax_env(pendulum), []
+    ppo.train(
+        environment=env,
+        num_timesteps=256,
+        episode_length=env.max_episode_length,
+        num_envs=8,
+        num_eval_envs=8,
+        num_evals=2,
+        unroll_length=4,
+        batch_size=4,
+        num_minibatches=2,
+        normalize_observations=True,
+        progress_fn=lambda steps, metrics: curve.append((steps, float(metrics["eval/episode_return"]))),
+    )
+    assert [steps > 0 for steps, _ in curve] == [False, True]
+    assert np.isfinite([value for _, value in curve]).all()

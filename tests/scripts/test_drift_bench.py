@@ -14,8 +14,8 @@ from sim2real.log.reader import read_log
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches.drift_arms import ReachingArm, ReachingSO101
-from benches.drift_pendulum import Pendulum
+from benches.drift.arms import ReachingArm, ReachingSO101
+from benches.drift.pendulum import Pendulum
 from benches.jobs import robots
 
 KINDS = pytest.mark.parametrize("kind", [ReachingArm, ReachingSO101])

@@ -13,7 +13,8 @@ from sim2real.hardware.plant import load_plant
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches import hidden_robots, hidden_wall
+from benches.hidden import robots as hidden_robots
+from benches.hidden import wall_clock as hidden_wall
 
 STEP_S = hidden_robots.STEP_S
 

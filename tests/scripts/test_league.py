@@ -16,9 +16,14 @@ import pytest
 from sim2real.errors import UsageError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches import cmaes, jobs, league_bam, league_ours, league_sets, recordings
-from benches.league_sets import Fold
-from benches.sysid import Recording
+from benches import jobs
+from benches.identify import recordings
+from benches.identify.sysid import Recording
+from benches.league import bam as league_bam
+from benches.league import cmaes
+from benches.league import ours as league_ours
+from benches.league import sets as league_sets
+from benches.league.sets import Fold
 
 TASK = """
 import os
@@ -102,7 +107,7 @@ def test_blocks_are_held_out_with_states_from_the_past_alone():
 def test_what_pace_predicts_does_not_depend_on_what_it_tried_before():
     """The toolbox sets parameters in one and the same model."""
     pytest.importorskip("mujoco.sysid")
-    from benches import league_mujoco
+    from benches.league import mujoco_joints as league_mujoco
 
     t = 0.01 * np.arange(60)
     known = {"duty_per_rad": 1.0, "mass": 0.49, "length": 0.1, "torque_enable": np.ones(60, bool)}

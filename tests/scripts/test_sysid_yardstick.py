@@ -15,7 +15,7 @@ if not hasattr(toolbox, "optimize"):
     pytest.skip("needs mujoco[sysid]: pip install 'sim2real[bench]'", allow_module_level=True)
 
 sys.path.insert(0, str(REPOSITORY / "scripts"))
-from benches import sysid  # noqa: E402
+from benches.identify import sysid  # noqa: E402
 
 
 def test_commands_are_held_not_interpolated():

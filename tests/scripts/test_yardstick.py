@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches import yardstick
+from benches.processor_time import yardstick
 
 from sim2real.errors import Sim2RealError
 

@@ -26,8 +26,8 @@ from sim2real.stages.deploy.verdict import judged
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches import hidden_robots as hidden
-from benches import randomise
+from benches.hidden import randomise
+from benches.hidden import robots as hidden
 
 pytestmark = [pytest.mark.slow, pytest.mark.full, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
 MORE_S = 0.030

@@ -252,24 +252,6 @@ def disk(fit: Recording, test: list[Recording], delay: bool) -> SysidResult:
     return replace(result, predictions=[_free_run(best, [_Run(r, spec)]) for r in test])
 
 
-def disk_speed(seconds: float) -> float:
-    """Return evaluations per second of the disk's residual alone, 6000 samples, in batches as the optimiser's.
-
-    The recording is synthetic, for the figure does not depend on it: a seeded random command, no motion.
-    """
-    rng = np.random.default_rng(0)
-    command = np.repeat(rng.uniform(-3, 3, DISK_SAMPLES // 20), 20)[:, None]
-    t, still = np.arange(DISK_SAMPLES) * 0.025, np.zeros((DISK_SAMPLES, 1))
-    spec, parameters, transform = _disk_problem(delay=False)
-    residual = _Counted([_Run(Recording(t, command, still, np.zeros((1, 2))), spec)], transform)
-    x = parameters.as_vector()[:, None]
-    residual(x * np.ones((1, 2)), parameters)  # the first call starts threads
-    residual.evaluations, begin = 0, time.perf_counter()
-    while time.perf_counter() - begin < seconds:
-        residual(x * rng.uniform(0.9, 1.1, (len(x), len(x))), parameters)
-    return residual.evaluations / (time.perf_counter() - begin)
-
-
 def _torque(spec: mujoco.MjSpec, value: float) -> None:
     """Set the torque at full duty [N m]: the register's gain, in duty per radian, saturates there."""
     drive, kp = spec.actuator(DRIVE), spec.numeric("kp").data[0]

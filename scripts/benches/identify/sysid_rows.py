@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from benches import sysid
-from benches.recordings import PAST
+from benches.identify import sysid
+from benches.identify.recordings import PAST
 from sim2real.graph.episode import Episode
 
 Row = tuple[str, float, str, str, str]

@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from benches import demo, stages
+from benches.runs import demo
+from benches.runs import stages
 from benches.figures import row
 
 CLOSE_M = 0.02

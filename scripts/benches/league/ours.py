@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from benches import identify, recordings
-from benches.league_sets import DISK_BLOCK, DISK_BLOCKS, Fold
-from benches.sysid import Recording
+from benches.identify import bench as identify
+from benches.identify import recordings
+from benches.identify.sysid import Recording
+from benches.league.sets import DISK_BLOCK, DISK_BLOCKS, Fold
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.fit import fit as fit_model

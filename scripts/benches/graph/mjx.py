@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from benches.figures import compare, row
-from benches.graph_shared import EPISODES, MODEL, unroll_of
+from benches.graph.shared import EPISODES, MODEL, unroll_of
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw

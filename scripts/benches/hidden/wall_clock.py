@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from benches.hidden_robots import SPEED_NOISE, Hidden
+from benches.hidden.robots import SPEED_NOISE, Hidden
 
-PLANT = f"{Path(__file__).with_name('hidden_plant.py')}:HiddenPlant"
+PLANT = f"{Path(__file__).with_name('plant.py')}:HiddenPlant"
 
 
 def put_on_the_bus(robot: Hidden, pipeline: Any) -> None:

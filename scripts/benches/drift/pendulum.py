@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from benches import hidden_robots as hidden
-from benches import randomise
+from benches.hidden import randomise
+from benches.hidden import robots as hidden
 
 FRICTION, PAYLOAD, DELAY_S = 2.0, 1.3, 0.015
 MASS_SHARE = 0.548

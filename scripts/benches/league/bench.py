@@ -23,9 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from benches import figures, jobs, league_bam, league_mujoco, league_ours
-from benches.league_sets import SETS, Fold
-from benches.sysid import Recording
+from benches import figures, jobs
+from benches.identify.sysid import Recording
+from benches.league import bam as league_bam
+from benches.league import mujoco_joints as league_mujoco
+from benches.league import ours as league_ours
+from benches.league.sets import SETS, Fold
 from sim2real.errors import UsageError
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]

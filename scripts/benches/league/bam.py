@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benches.cmaes import minimise
-from benches.sysid import Recording
+from benches.identify.sysid import Recording
+from benches.league.cmaes import minimise
 
 STEP_S, GRAVITY = 0.005, 9.80665
 POPULATION = 32

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from benches import recordings
-from benches.sysid import Recording
-from benches.sysid_rows import recording
+from benches.identify import recordings
+from benches.identify.sysid import Recording
+from benches.identify.sysid_rows import recording
 from sim2real.errors import UsageError
 
 DISK_BLOCK, DISK_BLOCKS, PAST = 5000, 5, 12

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from benches import hidden_robots as hidden
-from benches import hidden_wall
 from benches.figures import row
+from benches.hidden import robots as hidden
+from benches.hidden import wall_clock as hidden_wall
 from benches.jobs import robots
 
 RECORD_S, UPRIGHT = 40.0, 0.8

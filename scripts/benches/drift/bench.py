@@ -17,10 +17,11 @@ from typing import Any
 
 from scipy.stats import binomtest
 
-from benches import jobs, randomise
-from benches.drift_arms import ReachingArm, ReachingSO101
-from benches.drift_pendulum import Pendulum
+from benches import jobs
+from benches.drift.arms import ReachingArm, ReachingSO101
+from benches.drift.pendulum import Pendulum
 from benches.figures import row
+from benches.hidden import randomise
 from sim2real.errors import Sim2RealError
 
 ROBOTS: dict[str, Any] = {"pendulum": Pendulum, "arm": ReachingArm, "so101": ReachingSO101}

@@ -14,8 +14,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benches import yardstick
 from benches.figures import row
+from benches.processor_time import yardstick
 from benches.provenance import ROOT
 from sim2real.errors import Sim2RealError
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benches.figures import compare, row
-from benches.graph_shared import EPISODES, MODEL, unroll_of
+from benches.graph.shared import EPISODES, MODEL, unroll_of
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import StaticDist
 from sim2real.graph.node import BaseNode
@@ -302,7 +302,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     cases = [(device, kind, count, options.repeats, options.unroll) for count in copies for kind in options.cases]
     rows = [r for arguments in cases for r in case(*arguments)]
     if options.mjx:
-        from benches.graph_mjx import mjx_case  # MuJoCo is not needed without it
+        from benches.graph.mjx import mjx_case  # MuJoCo is not needed without it
 
         rows += mjx_case(device, options.mjx, options.repeats, options.links)
     graph_nodes = nodes()

@@ -19,8 +19,8 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
-from benches import hidden_robots as hidden
-from benches.drift_pendulum import DELAY_S, FRICTION
+from benches.drift.pendulum import DELAY_S, FRICTION
+from benches.hidden import robots as hidden
 from sim2real.graph.base import StepState
 from sim2real.hardware.emulation.truth import TruthLog
 from sim2real.hardware.plant import OperatingMode, PlantClock, load_plant

@@ -21,9 +21,9 @@ import mujoco
 import numpy as np
 from mujoco import sysid
 
-from benches import sysid as rigs
-from benches.cmaes import minimise
-from benches.sysid import Recording
+from benches.identify import sysid as rigs
+from benches.identify.sysid import Recording
+from benches.league.cmaes import minimise
 
 Row = tuple[float, float, float, rigs.Put]
 ITERATIONS = 40

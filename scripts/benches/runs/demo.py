@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from benches import stages
+from benches.runs import stages
 from benches.figures import row
 from sim2real.artifacts.recording import Recording
 from sim2real.robots.roles import ROLES

@@ -1,0 +1,1 @@
+"""Robots that change, and the tests that notice it."""

@@ -1,0 +1,1 @@
+"""The graph: compiled, on a simulated clock, on the wall clock."""

@@ -1,0 +1,1 @@
+"""Pendulums drawn at random, whose parameters the stages do not get."""

@@ -1,0 +1,1 @@
+"""Recordings of real motors, fitted and predicted."""

@@ -1,0 +1,1 @@
+"""All recordings, and all tools that fit them."""

@@ -1,0 +1,1 @@
+"""Processor time of the tests and of an identification."""
