@@ -15,6 +15,7 @@ import pytest
 from sim2real import cli, errors
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.run import run_folder
+from sim2real.commands import in_brief
 from sim2real.stages.config import RecordConfig
 
 QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}
@@ -41,6 +42,7 @@ def calls(monkeypatch, tmp_path):
         module.run = run
         return module
 
+    monkeypatch.setattr(in_brief, "conclude", lambda run_dir: None)  # stand-ins leave no page's artifacts
     for stage in run_folder.STAGES:
         monkeypatch.setitem(sys.modules, f"sim2real.stages.{stage}.stage", stand_in(stage))
     return seen

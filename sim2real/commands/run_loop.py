@@ -27,11 +27,14 @@ ALL = ", ".join(STAGES)
 """What is done again where nothing that was recorded is true any more."""
 
 
-def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
+def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> Path | None:
     """Run the four stages in one run folder, from the first one on that is not current there, and around again.
 
     Args:
         flags: Of all stages, and how often to go around.
+
+    Returns:
+        The run folder; None if there is none.
 
     Raises:
         UsageError: When the recording is to be dry, or a goal that is not of this task.
@@ -44,8 +47,7 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
     run_dir = find_run.find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
     plan = None if run_dir is None else Iterations.load(run_dir).plan
     if flags.iterations > 1:
-        _go_around(pipeline, flags, call, run_dir, plan)
-        return
+        return _go_around(pipeline, flags, call, run_dir, plan)
     if plan is not None:
         console.note(f"an iteration of this run was interrupted ({plan.words}): --iterations N goes on with it")
     redo = False
@@ -58,9 +60,10 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: Call) -> None:
         why = f": {done.stale}" if done is not None else ""
         console.note(f"{stage} ({number}/{len(STAGES)}){why}")
         run_dir = call(stage, getattr(flags, stage), run_dir).run_dir
+    return run_dir
 
 
-def _go_around(pipeline: Pipeline, flags: RunFlags, call: Call, run_dir: Path | None, plan: Plan | None) -> None:
+def _go_around(pipeline: Pipeline, flags: RunFlags, call: Call, run_dir: Path | None, plan: Plan | None) -> Path:
     """Run what is not current, or what an interrupted iteration left; then again and again what each verdict asks for.
 
     Args:
@@ -103,11 +106,9 @@ def _go_around(pipeline: Pipeline, flags: RunFlags, call: Call, run_dir: Path | 
             break
     if refused is not None:
         raise refused
-    from sim2real.view.page.page import report  # matplotlib and jinja2 take 0.5 s to import
-
     cells = [[r.number, ", ".join(r.stages), r.real, r.simulation, r.verdict, r.then] for r in rows]
     print(console.table(cells, ["iteration", "ran", "success", "in simulation", "verdict", "then"]))
-    console.wrote(report(run_dir))
+    return run_dir
 
 
 def _iterate(

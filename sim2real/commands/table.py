@@ -92,7 +92,7 @@ def _demo(command: str, arguments: list[str]) -> None:
     )
     pipeline = load_pipeline(DEMO_PIPELINE)
     stages = {stage: getattr(pipeline, stage) for stage in STAGES}
-    everything = flags.RunFlags(parsed.seed, parsed.runs, parsed.resume, parsed.cache, **stages)
+    everything = flags.RunFlags(parsed.seed, parsed.runs, parsed.resume, parsed.cache, parsed.verbose, **stages)
     _run_all(pipeline, everything if parsed.seed is None else _seeded(everything, parsed.seed))
 
 
@@ -256,6 +256,7 @@ COMMANDS: dict[str, Callable[[str, list[str]], None]] = {
 def _run_all(pipeline: Pipeline, flags: Any) -> None:
     """Run the four stages in one run folder, and around again where that was asked for."""
     compilation_cache.enable(flags.cache)
+    from sim2real.commands.in_brief import conclude, in_brief
     from sim2real.commands.run_loop import run_all
 
     def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:
@@ -263,7 +264,7 @@ def _run_all(pipeline: Pipeline, flags: Any) -> None:
         assert done is not None, "RunFlags refuses several processes"
         return done
 
-    run_all(pipeline, flags, call)
+    conclude(run_all(pipeline, flags, call if flags.verbose else in_brief(call)))
 
 
 def _call_stage(stage: str, pipeline: Pipeline, config: Any, root: Path, run_dir: Path | None) -> StageFolder | None:

@@ -23,12 +23,12 @@ def come_to_rest(graph: AsyncGraph, rig: Rig, hold: bool) -> None:
     """
     if rig.torque_withheld or not graph.running:
         return
-    note("coming to rest; Ctrl-C stops at once")
+    note("coming to rest; Ctrl-C stops at once", urgent=True)
     rig.ease()
     while graph.running and not rig.eased:
         graph.run_for(_POLL_S)
     if hold:
-        note("holding: support the robot, then press Enter to take the torque off")
+        note("holding: support the robot, then press Enter to take the torque off", urgent=True)
         while graph.running and not _told():
             graph.run_for(_POLL_S)
 

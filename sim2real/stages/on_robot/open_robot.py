@@ -39,7 +39,7 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
         _require_rig(session.rig)
         if config.dry_run:
             session.rig.withhold_torque()
-        announce(session)
+        announce(session, urgent=config.port != "embedded")
         yield session
 
 
@@ -52,10 +52,10 @@ def _require_rig(rig: object) -> None:
         )
 
 
-def announce(session: Session) -> None:
-    """Say what the motors do by themselves when this computer's side dies, and what stops them then."""
+def announce(session: Session, urgent: bool) -> None:
+    """Print what the motors do when the control process dies, and what stops them then."""
     for line in session.rig.device.without_host():
-        note(f"if this process dies: {line}; the guardian takes the torque off")
+        note(f"if this process dies: {line}; the guardian takes the torque off", urgent)
 
 
 def rig_summary(rig: Rig) -> dict[str, Any]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import re
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,6 +22,51 @@ _LINES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
 
 # Characters that control a terminal: control characters except line feed and tab, and changes of text direction.
 _ACTS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+@dataclass
+class Held:
+    """Output that is held back while a command prints few lines.
+
+    Attributes:
+        terminal: Whether stderr is a terminal.
+        activity: What is being done, as the latest progress display describes it.
+    """
+
+    text: io.StringIO
+    terminal: bool
+    activity: str = ""
+
+
+_held: Held | None = None
+
+
+def hold(held: Held | None) -> None:
+    """Hold notes and progress back from now on; None: print them again."""
+    global _held
+    _held = held
+
+
+class _Silent:
+    """Progress that only names the present activity."""
+
+    def __init__(self, held: Held, total: float | None, desc: str) -> None:
+        self.n: float = 0
+        self.total = total
+        self._held = held
+        held.activity = desc
+
+    def update(self, n: float = 1) -> None:
+        self.n += n
+
+    def refresh(self) -> None:
+        """Do nothing: the holder of the output shows that time passes."""
+
+    def set_description_str(self, desc: str) -> None:
+        self._held.activity = desc
+
+    def set_postfix_str(self, s: str) -> None:
+        """Do nothing: an intermediate result is a detail."""
 
 
 def clean(text: str) -> str:
@@ -91,18 +138,21 @@ def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar
         total: Number of steps; None if unknown.
         shown: False shows nothing: another process does.
     """
+    if _held is not None:
+        yield _Silent(_held, total, desc)
+        return
     if sys.stderr.isatty() or not shown:
         from tqdm import tqdm  # not needed for --help
 
         # Without a total there is nothing to count: the time alone.
         look = None if total else "{desc}: {elapsed}{postfix}"
         bar = tqdm(total=total, desc=desc, file=sys.stderr, leave=False, disable=not shown, bar_format=look)
-        with bar, _ticking(bar.refresh):
+        with bar, ticking(bar.refresh):
             yield bar
         return
     lines = _Lines(total, desc)
     try:
-        with _ticking(lines.refresh):
+        with ticking(lines.refresh):
             yield lines
     except BaseException:
         lines.end("ended")
@@ -111,7 +161,7 @@ def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar
 
 
 @contextmanager
-def _ticking(tick: Callable[[], object]) -> Iterator[None]:
+def ticking(tick: Callable[[], object]) -> Iterator[None]:
     """Call a function every second, in a thread, while the block runs."""
     ended = threading.Event()
 
@@ -170,8 +220,17 @@ class _Lines:
         note(f"{self._desc}: {how} after {time.monotonic() - self._begun_s:.1f} s{said}")
 
 
-def note(text: str) -> None:
-    """Print a message on stderr, without breaking a progress bar."""
+def note(text: str, urgent: bool = False) -> None:
+    """Print a message on stderr, without breaking a progress bar.
+
+    Args:
+        urgent: Whether a person must act on it now: it is printed even where output is held back. Warnings are, too.
+    """
+    if _held is not None:
+        if not urgent and not text.startswith("warning:"):
+            _held.text.write(f"{clean(text)}\n")
+            return
+        sys.stderr.write("\n")  # the line of dots ends
     if "tqdm" in sys.modules:
         from tqdm import tqdm
 

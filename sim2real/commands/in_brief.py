@@ -1,0 +1,52 @@
+"""A run on a few lines: each stage one line of progress and the figures that decide, at the end the result in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sim2real.artifacts.deployment import Deployment
+from sim2real.artifacts.run.run_folder import StageFolder, finished
+from sim2real.stages.terminal import console
+from sim2real.stages.terminal.brief import brief
+
+if TYPE_CHECKING:
+    from sim2real.commands.run_loop import Call
+
+_FIGURES = {
+    "record": ("seconds", "lost replies", "late replies"),
+    "identify": ("verdict", "round trip delay", "identified, 1 s ahead"),
+    "train": ("success in simulation", "what breaks it"),
+    "deploy": ("success, deployment", "measured delay"),
+}
+"""Stage -> how the names of the figures in its manifest begin that are printed."""
+_MOST_ROWS = 4
+
+
+def in_brief(call: Call) -> Call:
+    """Return a caller of stages that prints the figures of each stage instead of everything that it prints."""
+
+    def call_in_brief(stage: str, config: Any, run_dir: Path | None) -> StageFolder:
+        with brief():
+            done = call(stage, config, run_dir)
+        summary = done.manifest["summary"] or {}
+        figures = {n: v for prefix in _FIGURES[stage] for n, v in summary.items() if n.startswith(prefix)}
+        shown = dict(list(figures.items())[:_MOST_ROWS])
+        if shown:
+            print("\n".join(f"  {line}" for line in console.pairs(shown).splitlines()), flush=True)
+        return done
+
+    return call_in_brief
+
+
+def conclude(run_dir: Path | None) -> None:
+    """Write the page of a run, and print the result in words with the page to open."""
+    if run_dir is None:
+        return
+    from sim2real.view.page.page import report  # matplotlib and jinja2 take 0.5 s to import
+
+    page = console.shown(report(run_dir))
+    deployed = finished(run_dir, "deploy")
+    advice = None if deployed is None else Deployment.read(deployed.folder).advice
+    result = "the run is finished" if advice is None else f"{advice.status}: {'; '.join(advice.reasons)}"
+    print(f"{result}. Open {page}", flush=True)

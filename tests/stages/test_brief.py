@@ -1,0 +1,69 @@
+"""A run on few lines: what is held back, what is printed all the same, and what a failure prints."""
+
+import re
+import time
+
+import pytest
+
+from sim2real import cli
+from sim2real.stages.terminal import console
+from sim2real.stages.terminal.brief import brief
+
+
+def test_details_are_held_back_and_warnings_are_not(capsys):
+    with brief():
+        print("a table")
+        console.note("a detail")
+        console.note("warning: late answers")
+        console.note("press Enter", urgent=True)
+        with console.progress(3, "search") as bar:
+            bar.update()
+            bar.set_postfix_str("loss 2")
+            bar.set_description_str("refine")
+    console.note("after")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.fullmatch(r"  \.?\nwarning: late answers\n\npress Enter\n\.? 0 s\nafter\n", err)
+
+
+def test_a_failure_prints_the_details(capsys):
+    def fail():
+        print("a table")
+        console.note("a detail")
+        raise RuntimeError("the motor is gone")
+
+    with pytest.raises(RuntimeError), brief():
+        fail()
+    assert capsys.readouterr().err.endswith("\na table\na detail\n")
+    console.note("printed again")
+    assert capsys.readouterr().err == "printed again\n"
+
+
+def test_no_two_seconds_are_silent(capsys):
+    with brief():
+        time.sleep(2.5)
+    assert capsys.readouterr().err.count(".") >= 2
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys, shared_run_dir):
+    """The stages' artifacts are those of a finished run; each stage prints 100 lines of details."""
+    from sim2real.artifacts.run.run_folder import finished
+    from sim2real.commands import table
+
+    def call_stage(stage, pipeline, config, root, run_dir):
+        for i in range(100):
+            console.note(f"{stage}: detail {i}")
+            print(f"row {i} of {stage}")
+        return finished(shared_run_dir, stage)
+
+    monkeypatch.setattr(table, "_call_stage", call_stage)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["demo", *(["--verbose"] if verbose else [])]) == 0
+    out, err = capsys.readouterr()
+    lines = (out + err).splitlines()
+    assert (len(lines) > 800) if verbose else (len(lines) <= 25)
+    assert re.search(
+        r"^(fine|re-train|re-identify|look at this joint|not judged): .*\. Open .*report\.html$", out, re.M
+    )
+    assert out.splitlines()[-1].endswith("report.html")
