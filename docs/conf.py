@@ -16,7 +16,7 @@ html_title = f"sim2real {release}"
 
 myst_heading_anchors = 3
 
-# A name is documented once, in the module that defines it: hence no __all__, which repeats what is re-exported.
+# A name is documented once, in the module that defines it: hence without __all__, which repeats re-exported names.
 apidoc_modules = [
     {
         "path": "../sim2real",

@@ -1,7 +1,7 @@
 """Draw the pictures of timing.md: `python docs/draw_timing.py` writes docs/timing/*.svg.
 
-What they show is computed by `sim2real.graph.rules` and `schedule`, and stands in each file's description as well: a
-test compares it with what the code computes now.
+`sim2real.graph.rules` and `schedule` compute the content of each picture. The file's description holds the same
+content, and a test compares it with that of the present code.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ BAR, WAIT, MESSAGE, LATE = "#0a66b0", "#b8520a", "#0b7a52", "#8a3f86"
 _BAR, _LANE = 0.30, 1.0
 
 Case = dict[str, Any]
-"""One picture, in milliseconds: ``title``, ``lanes`` and ``messages`` (see ``case``), and what is written into it."""
+"""One picture, in milliseconds: ``title``, ``lanes`` and ``messages`` (see ``case``), and ``notes``."""
 
 
 def case(title: str, nodes: Sequence[BaseNode], timeline: Timeline, names: Mapping[str, str] | None = None) -> Case:
@@ -120,7 +120,7 @@ def _schedule() -> Case:
     slow.connect(fast, delay=0.008)
     timeline = _derive([fast, slow], {"50 Hz": [3] * 6, "30 Hz": [3] * 4}, {("30 Hz", "50 Hz"): [8] * 6})
     picture = case(
-        "Rule 2: step k is scheduled at its slot, rounded by itself", [fast, slow], Timeline(timeline.vertices, {})
+        "Rule 2: step k is scheduled at its slot, rounded separately", [fast, slow], Timeline(timeline.vertices, {})
     )
     for lane, node in enumerate((fast, slow)):
         for k, s in enumerate(picture["lanes"][lane]["slots"]):
@@ -246,12 +246,12 @@ def _window() -> Case:
         {"sender": [2] * 8, reader.name: [2] * 4},
         {(reader.name, "sender"): [1, 4, 1, 14, 1, 1, 1, 1]},
     )
-    picture = case("Rule 7: a step sees the last three messages consumed, oldest first", [sender, reader], timeline)
+    picture = case("Rule 7: a step gets the last three consumed messages, oldest first", [sender, reader], timeline)
     seq_in = timeline.edges[reader.name, "sender"].seq_in[0]
     for k, t in enumerate(picture["lanes"][1]["start"]):
-        seen = np.flatnonzero((seq_in >= 0) & (seq_in <= k))[-3:].tolist()
-        shown = ["-"] * (3 - len(seen)) + [str(m) for m in seen]
-        picture["notes"].append([t + 1, 1, f"sees {', '.join(shown)}"])
+        window = np.flatnonzero((seq_in >= 0) & (seq_in <= k))[-3:].tolist()
+        shown = ["-"] * (3 - len(window)) + [str(m) for m in window]
+        picture["notes"].append([t + 1, 1, f"gets {', '.join(shown)}"])
     return picture
 
 
@@ -346,11 +346,11 @@ def write(folder: Path, kind: str = "svg") -> None:
 
 
 def described(path: Path) -> Case:
-    """Return the picture that an SVG file says it shows."""
-    found = re.search(r"<dc:description>(.*?)</dc:description>", path.read_text(encoding="utf-8"), re.DOTALL)
-    if found is None:
+    """Return the picture of the description of an SVG file."""
+    description = re.search(r"<dc:description>(.*?)</dc:description>", path.read_text(encoding="utf-8"), re.DOTALL)
+    if description is None:
         raise ValueError(f"{path} has no description")
-    return json.loads(unescape(found.group(1)))
+    return json.loads(unescape(description.group(1)))
 
 
 if __name__ == "__main__":

@@ -39,9 +39,9 @@ _SPACE = r"(?:[ ]|\n[ #]*)"
 
 
 def pattern(words: Iterable[str], more: str = "") -> re.Pattern[str]:
-    """Return a pattern that finds words and phrases, also where a line ends inside a phrase."""
+    """Return a pattern that finds words and phrases, also across the end of a line, but not in names of flags."""
     choices = "|".join(word.replace(" ", _SPACE) for word in words)
-    return re.compile(rf"\b({choices})\b{more}", re.IGNORECASE | re.MULTILINE)
+    return re.compile(rf"(?<!-)\b({choices})\b{more}", re.IGNORECASE | re.MULTILINE)
 
 
 WORDS = pattern(DIALECT)

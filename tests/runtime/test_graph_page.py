@@ -23,9 +23,9 @@ def names():
 def test_the_page_says_what_is_so(names):
     nodes = names["nodes"]
     assert (nodes["agent"].phase, nodes["actuator"].phase) == pytest.approx((0.003, 0.007))
-    assert names["found"].steps > 60
-    assert names["found"].overruns == 0
-    assert names["found"].age_s["sensor"].p99 == pytest.approx(0.001)
+    assert names["statistics"].steps > 60
+    assert names["statistics"].overruns == 0
+    assert names["statistics"].age_s["sensor"].p99 == pytest.approx(0.001)
     assert names["Actuator"].sent[0] == "torque on"
     assert names["Actuator"].sent[-1] == "torque off"
     assert len(names["Actuator"].sent) > 5
@@ -34,8 +34,8 @@ def test_the_page_says_what_is_so(names):
 
 def test_a_loss_of_ones_own_finds_the_mass_of_the_recorded_world(names):
     """The recorded episode was made with the world's own mass, and sensors that saw it 5 ms later."""
-    assert float(names["found_mass"].parameters["mass"]) == pytest.approx(0.0509, rel=0.1)
-    assert names["found_mass"].loss < 0.1 * names["found_mass"].start
+    assert float(names["estimate"].parameters["mass"]) == pytest.approx(0.0509, rel=0.1)
+    assert names["estimate"].loss < 0.1 * names["estimate"].start
 
 
 def test_pushing_in_the_direction_of_motion_swings_the_pendulum_up(names):
