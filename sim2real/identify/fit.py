@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.artifacts.identification import Refinement, Search
 from sim2real.graph.episode import Episode
 from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
@@ -57,6 +58,13 @@ class Fit:
     def values(self) -> dict[str, Any]:
         """The estimate by name: a number, or a list of one for each recording."""
         return as_numbers(self.problem.table, self.z)
+
+    @property
+    def record(self) -> Search:
+        """How search and refinement went, for the artifact."""
+        refined = tuple(Refinement(r.before, r.loss, r.steps) for r in self.refined)
+        record = self.search.record if self.search else Search()
+        return replace(record, refined=refined, engine=str(self.problem.engine))
 
     def uncertainty(self) -> Uncertainty:
         """Return how uncertain the estimate is."""

@@ -38,7 +38,7 @@ def test_the_between_variance_solves_the_moment_equation():
     assert found.mean == pytest.approx(mean)
     assert found.standard_error == pytest.approx(information**-0.5)
     reach = stats.t.ppf(0.975, 5) * np.sqrt(tau2 + 1 / information + np.median(s**2))
-    assert (found.low, found.high) == (pytest.approx(mean - reach), pytest.approx(mean + reach))
+    assert (found.low95, found.high95) == (pytest.approx(mean - reach), pytest.approx(mean + reach))
 
 
 def test_recordings_that_agree_have_nothing_between_them():
@@ -53,8 +53,8 @@ def test_recordings_that_disagree_are_told():
     found = aggregate(np.array([1.0, 2.0, 3.0]), np.full(3, 0.1))
     assert not found.agree
     assert found.between == pytest.approx(np.sqrt(1.0 - 0.01))
-    assert found.low < 1.0
-    assert found.high > 3.0
+    assert found.low95 < 1.0
+    assert found.high95 > 3.0
 
 
 @pytest.mark.parametrize(("factor", "agree"), [(0.99, True), (1.01, False)])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from flax import struct
 
+from sim2real.artifacts.identification import Search
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
@@ -201,7 +202,7 @@ def test_progress_adds_up_to_at_most_one(found):
 def test_what_the_search_began_with_is_refined_too(episode, monkeypatch):
     """So that a search that ends in another valley does not decide."""
     far, seen = np.full(2, 2.5), []
-    lost = SearchResult(far, 9.0, np.ones(1), 1, far[None])
+    lost = SearchResult(far, 9.0, far[None], Search())
     ended = Refined(far, 1.0, 2.0, 3, 0.0, True)
     monkeypatch.setattr(fitting, "run_search", lambda *_: lost)
     monkeypatch.setattr(fitting, "_refine", lambda problem, starts, told: seen.append(starts) or ended)

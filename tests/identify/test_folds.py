@@ -223,7 +223,7 @@ def three():
 
 def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
     whole, rows = three
-    assert [r.fold.name for r in rows] == ["recording 1", "recording 2", "recording 3"]
+    assert [r.name for r in rows] == ["recording 1", "recording 2", "recording 3"]
     assert float(rows[2].values["bias"]) == pytest.approx(BIAS, abs=0.003)
     assert rows[2].ahead["y"] > 20 * NOISE
     assert whole.values["bias"] > BIAS + 0.002
@@ -231,8 +231,8 @@ def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
 
 def test_terms_are_chosen_without_what_is_left_out(three):
     _, rows = three
-    assert all("square" not in r.kept for r in rows)
-    assert rows[2].kept == ("bias",)
+    assert all("square" not in r.terms for r in rows)
+    assert rows[2].terms == ("bias",)
     assert float(rows[2].values["square"]) == 0.0
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mujoco import mjx
 
 from sim2real.errors import UsageError
-from sim2real.identify.inertia import THETA, from_log_cholesky, set_inertia, to_log_cholesky
+from sim2real.identify.inertia import THETA, from_log_cholesky, inertia_parameters, set_inertia, to_log_cholesky
 
 ARM = """
 <mujoco>
@@ -158,3 +158,14 @@ def test_equal_moments_can_be_differentiated(accelerations, moments):
         step = 1e-4 * np.eye(10)[i]
         expected = (by_mujoco(theta + step) - by_mujoco(theta - step)) / 2e-4
         np.testing.assert_allclose(slope[..., i], expected, atol=0.02 * np.abs(expected).max() + 0.02, err_msg=THETA[i])
+
+
+def test_inertia_parameters_stand_around_the_nominal_body():
+    mass, com, inertia = 1.3, np.array([0.01, -0.02, 0.1]), np.diag([0.012, 0.010, 0.004])
+    rows = inertia_parameters("hand", mass, com, inertia, 0.7)
+    assert [p.name for p in rows[:2]] == ["hand_alpha", "hand_d1"]
+    m, c, I = from_log_cholesky(np.array([p.nominal for p in rows]))  # noqa: E741
+    np.testing.assert_allclose(float(m), mass, rtol=1e-5)
+    np.testing.assert_allclose(c, com, atol=1e-6)
+    np.testing.assert_allclose(I, inertia, atol=1e-6)
+    assert all(p.high - p.low == pytest.approx(1.4) for p in rows)

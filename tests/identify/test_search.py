@@ -45,10 +45,10 @@ def test_a_bowls_bottom_is_found_and_reported():
     np.testing.assert_allclose(found.z, BOTTOM, atol=0.02)
     assert found.loss == pytest.approx(1.0, abs=1e-3)
     assert found.loss == pytest.approx(float(bowl(found.z[None])[0]))
-    assert len(found.history) < 500  # it ends once it is stuck
-    assert np.all(np.diff(found.history) <= 0)
-    assert found.evaluations == 16 * len(found.history)
-    assert sum(n for n, _ in told) == len(found.history)
+    assert len(found.record.history) < 500  # it ends once it is stuck
+    assert np.all(np.diff(found.record.history) <= 0)
+    assert found.record.evaluations == 16 * len(found.record.history)
+    assert sum(n for n, _ in told) == len(found.record.history)
     assert told[-1][1] == pytest.approx(found.loss)
     np.testing.assert_array_equal(found.finalists, found.z[None])
 
@@ -57,7 +57,7 @@ def test_one_seed_one_result():
     config = replace(CONFIG, strategy="SNES", population=8, generations=3)
     first, again, other = (search(bowl, np.zeros(2), replace(config, seed=s)) for s in (5, 5, 6))
     np.testing.assert_array_equal(first.z, again.z)
-    np.testing.assert_array_equal(first.history, again.history)
+    np.testing.assert_array_equal(first.record.history, again.record.history)
     assert not np.array_equal(first.z, other.z)
 
 
@@ -86,7 +86,7 @@ def test_every_strategy_runs_or_says_why_not(strategy):
     else:
         found = search(bowl, np.zeros(2), config)
         assert np.isfinite(found.z).all()
-        assert found.evaluations == 80
+        assert found.record.evaluations == 80
         start = float(bowl(np.zeros((1, 2)))[0])
         assert found.loss < (start if strategy in STANDARD else start + 1e-3)
         assert found.loss == pytest.approx(float(bowl(found.z[None])[0]), rel=1e-4)
@@ -136,7 +136,7 @@ def test_restarts_find_the_deeper_funnel():
     assert sorted({n for n in populations if n > 1}) == [8, 16, 32]
     one = search(funnels, start, config)
     assert one.loss == pytest.approx(1.0, abs=1e-3)
-    assert several.evaluations > one.evaluations
+    assert several.record.evaluations > one.record.evaluations
 
 
 def test_a_generation_sees_one_batch_and_the_end_sees_all():
@@ -157,7 +157,7 @@ def test_a_generation_sees_one_batch_and_the_end_sees_all():
     assert found.loss == pytest.approx(offsets[segments].mean() + float(bowl(found.z[None])[0]), rel=1e-5)
     batches = [p for p in picks if len(p) == 2]
     assert len([p for p in picks if len(p) == 6]) == 1
-    assert len(batches) >= len(found.history) > 20, "on other segments each time, losses show no standstill"
+    assert len(batches) >= len(found.record.history) > 20, "on other segments each time, losses show no standstill"
     assert all(len(set(p.tolist())) == 2 and set(p.tolist()) <= set(segments.tolist()) for p in batches)
     assert len({tuple(sorted(p.tolist())) for p in batches}) > 5
 
@@ -180,9 +180,9 @@ def test_a_search_goes_on_after_a_lucky_early_candidate(seed):
     asked.clear()
     found = search(losses, np.zeros(6), config, jnp.asarray(candidate), programs=programs)
     jax.effects_barrier()
-    assert set(found.history.tolist()) == {0.5}
-    assert len(found.history) > 20
-    assert len(found.history) > 0.5 * len(plain.history)
+    assert set(found.record.history.tolist()) == {0.5}
+    assert len(found.record.history) > 20
+    assert len(found.record.history) > 0.5 * len(plain.record.history)
     last = [c for c in asked if len(c) == config.population][-1]
     np.testing.assert_allclose(last.mean(axis=0), bottom, atol=0.05)
 
@@ -190,7 +190,7 @@ def test_a_search_goes_on_after_a_lucky_early_candidate(seed):
 def test_a_search_among_equals_ends_soon():
     """Neither median nor best falls: nothing is to be found."""
     flat = lambda c, around, data, pick: 1.0 + 0.0 * c[:, 0]  # noqa: E731
-    assert len(search(flat, np.zeros(2), CONFIG).history) == 20
+    assert len(search(flat, np.zeros(2), CONFIG).record.history) == 20
 
 
 def test_a_batch_of_all_segments_is_none():
@@ -215,9 +215,9 @@ def test_losses_outside_of_programs_are_searched_alike(strategy):
     alone = lambda z: float(bowl(z[None])[0])  # noqa: E731
     one = search(bowl, np.zeros(2), config)
     other = search(on_host, np.zeros(2), config, alone=alone, host=True)
-    np.testing.assert_allclose(other.history, one.history, rtol=2e-3)
+    np.testing.assert_allclose(other.record.history, one.record.history, rtol=2e-3)
     np.testing.assert_allclose(other.z, one.z, atol=5e-3)
-    assert other.evaluations == one.evaluations
+    assert other.record.evaluations == one.record.evaluations
 
 
 def test_outside_of_programs_a_block_begins_afresh_and_a_generation_sees_one_batch():
@@ -231,7 +231,7 @@ def test_outside_of_programs_a_block_begins_afresh_and_a_generation_sees_one_bat
 
     config = replace(CONFIG, generations=20, batch=2)
     found = search(losses, np.zeros(2), config, None, weight, alone=lambda z: float(bowl(z[None])[0]), host=True)
-    assert [i for i, (fresh, _) in enumerate(asked) if fresh] == list(range(0, len(found.history), 10))
+    assert [i for i, (fresh, _) in enumerate(asked) if fresh] == list(range(0, len(found.record.history), 10))
     assert all(len(set(pick)) == 2 and weight[list(pick)].all() for _, pick in asked)
     assert len({pick for _, pick in asked}) > 3
 
@@ -249,9 +249,9 @@ for devices in (1, 2):
     runs = [p for kind, p in programs.items() if kind != "alone" and p.population == 16]
     texts = [compiled.as_text() for p in runs for compiled in p.advance._compiled.values()]
     assert [("num_partitions=2" in t, "f32[8,2]" in t) for t in texts] == [(devices == 2,) * 2], texts[0][:300]
-np.testing.assert_allclose(found[1].history, found[0].history, rtol=1e-3)
+np.testing.assert_allclose(found[1].record.history, found[0].record.history, rtol=1e-3)
 np.testing.assert_allclose(found[1].finalists, found[0].finalists, atol=1e-3)
-assert found[1].evaluations == found[0].evaluations
+assert found[1].record.evaluations == found[0].record.evaluations
 """
 
 

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import Prediction
+from sim2real.artifacts.identification import Determined, Prediction
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty.identifiability import Check
+from sim2real.identify.uncertainty.identifiability import messages_of
 from sim2real.identify.uncertainty.round_trip import RoundTrip
 from sim2real.identify.validation import verdict
 from sim2real.identify.validation.verdict import Position, scores
@@ -43,8 +43,8 @@ def spread(misfit=1.0, **verdicts):
 
 
 def check(*groups):
-    one = np.ones(3)
-    return Check(1.0, one, one, tuple("" if len(g) == 1 else " + ".join(g) for g in groups), groups, 60.0)
+    combinations = tuple("" if len(g) == 1 else " + ".join(g) for g in groups)
+    return Determined(1.0, groups, messages_of(combinations, groups), {})
 
 
 def trip(estimate=0.0166, error=0.0003, apart=False):
@@ -141,7 +141,7 @@ def test_a_bound_comes_with_flags_that_are_accepted(name, side, flags):
     x[i] = TABLE.low[i] if side == "lower" else TABLE.high[i]
     found = judge(rows(0.1, 1.0), spread(**{name: "at a bound"}), x=x)
     assert found.status == "hit a bound"
-    assert found.flags == flags
+    assert found.next == flags
     assert any(r.startswith(f"at a bound: {name} is at its {side} one, ") and flags in r for r in found.reasons)
     low, high = (float(v) for v in flags.split()[2:])
     assert TABLE.with_bounds({name: (low, high)})[name].free
@@ -152,13 +152,13 @@ def test_a_friction_or_a_delay_of_0_is_told_and_accepted(name):
     x = (TABLE.low + TABLE.high) / 2
     x[TABLE.names.index(name)] = 0.0
     found = judge(rows(0.1, 1.0), spread(**{name: "at a bound"}), x=x)
-    assert (found.status, found.flags) == ("accepted", "")
+    assert (found.status, found.next) == ("accepted", "")
     assert f"{name} comes out at 0, less than which there is not: held there, the same fit" in found.reasons
 
 
 def test_what_is_negligible_is_told_with_its_upper_bound_and_accepted():
     found = judge(rows(0.1, 1.0), spread(gain="negligible"))
-    assert (found.status, found.flags) == ("accepted", "")
+    assert (found.status, found.next) == ("accepted", "")
     said = "gain is negligible: at most 0.012 1 (95 %), and without it the model predicts the same"
     assert said in found.reasons
 
@@ -168,13 +168,13 @@ def test_a_bound_of_0_that_a_user_set_above_the_models_is_a_bound():
     x = (table.low + table.high) / 2
     x[table.names.index("offset")] = 0.0
     found = verdict.judge(scores(rows(0.1, 1.0), ONE), table, x, spread(offset="at a bound"), check(), max_delay_s=0.06)
-    assert (found.status, found.flags) == ("hit a bound", "--bounds offset -1 1")
+    assert (found.status, found.next) == ("hit a bound", "--bounds offset -1 1")
 
 
 def test_a_round_trip_at_a_bound_is_told_and_the_shares_of_it_are_not():
     loose = dict.fromkeys(DELAYS, "not identifiable")
     found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(0.12))
-    assert (found.status, found.flags) == ("hit a bound", "--max-delay-s 0.12")
+    assert (found.status, found.next) == ("hit a bound", "--max-delay-s 0.12")
     assert any("the sum of the delays is at its upper one" in r for r in found.reasons)
     found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(0.0))
     assert found.status == "accepted"
@@ -188,12 +188,12 @@ def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
     verdicts = ["accepted"] * own + ["at a bound"]
     made = SimpleNamespace(verdict=tuple(verdicts), misfit=1.0)
     found = verdict.judge(scores(rows(0.1, 1.0), ONE), narrow, x, made, check(), max_delay_s=0.06)
-    assert found.flags == "--bounds sensor_delay 0 0.02"
+    assert found.next == "--bounds sensor_delay 0 0.02"
 
 
 def test_what_nothing_determines_is_not_helped_by_other_bounds():
     found = judge(rows(0.1, 1.0), spread(gain="at a bound"), check(("gain",)), x=TABLE.high)
-    assert (found.status, found.flags) == ("not identifiable", "")
+    assert (found.status, found.next) == ("not identifiable", "")
 
 
 def test_not_identifiable():

@@ -101,5 +101,5 @@ def test_a_search_on_c_is_of_the_segments_it_is_asked_for(problems):
     run_search(first, start)
     shared = run_search(first.recut(spans, SEGMENT_S), start)
     fresh = run_search(Problem(problem.model, problem._recordings, spans, SEGMENT_S, config), start)
-    np.testing.assert_allclose(shared.history, fresh.history, rtol=1e-4)
+    np.testing.assert_allclose(shared.record.history, fresh.record.history, rtol=1e-4)
     np.testing.assert_allclose(shared.z, fresh.z, atol=1e-3)

@@ -18,7 +18,6 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.config import FitConfig
 from sim2real.identify.export.mjcf import Late, late_mjcf
 from sim2real.identify.export.terms import find_terms
-from sim2real.identify.mjcf import identified_mjcf
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.identify.problem.problem import Problem
@@ -89,7 +88,12 @@ class Hinge(LoggedRobot):
         return {**params, "world": world}
 
     def identified_mjcf(self, values):
-        return identified_mjcf(mujoco.MjSpec.from_string(XML), self.identifiable(0.03).parameters, values)
+        spec = mujoco.MjSpec.from_string(XML)
+        model = spec.compile()
+        model.dof_damping[0], model.dof_frictionloss[0] = values["damping"], values["friction"]
+        model.dof_armature[0], model.body_mass[1] = values["armature"], values["mass"]
+        spec.copy_back(model)
+        return spec.to_xml()
 
 
 def steps(ticks):

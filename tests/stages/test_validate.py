@@ -2,10 +2,10 @@
 
 import pytest
 
-from sim2real.identify.validation.verdict import Position, Score
+from sim2real.artifacts.identification import HeldOut
 from sim2real.stages.validate import stage as validate_stage
 
-SCORE = Score(Position("q", "elbow", "rad", 0.001), 8.0, 0.004, {"nominal": 0.05, "hold": 0.0})
+SCORE = HeldOut("elbow", "q", "rad", 8.0, {"identified": 0.004, "nominal": 0.05, "hold": 0.0}, ("hold",))
 
 
 @pytest.mark.parametrize(("moves", "beaten_by"), [(True, ["hold"]), (False, [])])

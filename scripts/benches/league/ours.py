@@ -75,7 +75,7 @@ def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict
         columns = identify.predict(case, {"identified": found.values}, test)
         return [_at(case, columns, r, one) for r, one in enumerate(own)]
 
-    return predict, f"{found.search.evaluations if found.search else 0} candidates, then refined"
+    return predict, f"{found.search.record.evaluations if found.search else 0} candidates, then refined"
 
 
 def _fit_described(name: str, fold: Fold, seed: int) -> tuple[Predict, str]:

@@ -132,8 +132,8 @@ def minimise(
         {n: np.asarray(v) for n, v in values.items()},
         found.loss if better else first,
         first,
-        found.history,
-        found.evaluations + 1,
+        found.record.history,
+        found.record.evaluations + 1,
     )
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from sim2real.artifacts.identification import Search
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.programs import OnCompile, Program
@@ -38,16 +39,14 @@ class SearchResult:
     Attributes:
         z: Shape ``(P,)``: the best candidate.
         loss: Its loss, on all segments.
-        history: Shape ``(generations,)``: the best loss up to each generation, on the segments of that generation.
-        evaluations: Candidates that were simulated.
         finalists: Shape ``(K, P)``: the best of each run, best first.
+        record: Strategy, evaluations, and the best loss up to each generation, on the segments of that generation.
     """
 
     z: np.ndarray
     loss: float
-    history: np.ndarray
-    evaluations: int
     finalists: np.ndarray
+    record: Search
 
 
 def strategies() -> list[str]:
@@ -124,7 +123,8 @@ def search(
         alone = lambda z: float(single(jnp.asarray(z, jnp.float32), data))  # noqa: E731
     finalists, best = _ranked(np.stack(runs), alone)
     history = np.minimum.accumulate(np.concatenate(histories))
-    return SearchResult(finalists[0], best, history, evaluations, finalists)
+    record = Search(strategy=config.strategy, history=history, evaluations=evaluations)
+    return SearchResult(finalists[0], best, finalists, record)
 
 
 def _ranked(finalists: np.ndarray, alone: Callable[[Any], Any]) -> tuple[np.ndarray, float]:

@@ -2,42 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import chdtri, stdtrit
 
+from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.errors import UsageError
 
-
-@dataclass(frozen=True)
-class Aggregate:
-    """What several recordings say together about one quantity; every number in its unit.
-
-    Attributes:
-        mean: Estimate of the mean over recordings.
-        standard_error: Of the mean.
-        between: Standard deviation between recordings, beyond what their own errors explain.
-        low: Lower end of the 95 % interval for what one more such recording will say.
-        high: Upper end.
-        agree: Whether the spread between recordings is no larger than their own errors explain (chi-square, 1 %).
-    """
-
-    mean: float
-    standard_error: float
-    between: float
-    low: float
-    high: float
-    agree: bool
+_DISAGREES = 0.01
+"""Probability by chance, in a chi-square test, below which recordings disagree."""
 
 
-def aggregate(estimates: np.ndarray, errors: np.ndarray) -> Aggregate:
-    """Combine estimates ``(K,)`` with their standard errors ``(K,)`` by a random-effects model (DerSimonian and Laird).
+def aggregate(estimates: np.ndarray, errors: np.ndarray, name: str = "", unit: str = "") -> Quantity:
+    """Combine estimates ``(K,)`` and their standard errors ``(K,)`` by a random-effects model (DerSimonian and Laird).
 
-    The standard error of one recording does not include what differs between recordings: temperature, wear, the
-    model's error on other motions. The interval is for the estimate from one more recording: the prediction interval of
-    Higgins, Thompson and Spiegelhalter (2009), widened by the typical standard error of one recording. It tells how
-    much to randomise in training.
+    The standard error of one recording excludes the differences between recordings: temperature, wear, the errors of
+    the model on other motions. The interval is the prediction interval for one further recording (Higgins, Thompson
+    and Spiegelhalter, 2009), widened by the median standard error of a recording. Training randomises within it.
 
     Raises:
         UsageError: When there are fewer than two recordings.
@@ -45,18 +25,26 @@ def aggregate(estimates: np.ndarray, errors: np.ndarray) -> Aggregate:
     x, s = np.asarray(estimates, np.float64), np.maximum(np.asarray(errors, np.float64), 1e-30)
     if len(x) < 2:
         raise UsageError(f"an aggregate needs two recordings at least, got {len(x)}")
+    # Weight each recording by its own precision, and measure how much more they differ than that explains.
     w = 1.0 / s**2
     fixed = float(np.sum(w * x) / np.sum(w))
     q = float(np.sum(w * (x - fixed) ** 2))
     surplus = float(np.sum(w) - np.sum(w**2) / np.sum(w))
     between = max(0.0, (q - (len(x) - 1)) / surplus)
+    # Weight them again with the variance between recordings added.
     w = 1.0 / (s**2 + between)
     mean, error = float(np.sum(w * x) / np.sum(w)), float(np.sqrt(1.0 / np.sum(w)))
     reach = float(stdtrit(max(len(x) - 2, 1), 0.975)) * np.sqrt(between + error**2 + float(np.median(s**2)))
-    return Aggregate(mean, error, float(np.sqrt(between)), mean - reach, mean + reach, q <= _chi_square_99(len(x) - 1))
-
-
-def _chi_square_99(freedom: int) -> float:
-    from scipy.special import chdtri
-
-    return float(chdtri(freedom, 0.01))
+    agree = q <= float(chdtri(len(x) - 1, _DISAGREES))
+    return Quantity(
+        name,
+        unit,
+        x,
+        np.asarray(errors, np.float64),
+        mean,
+        error,
+        float(np.sqrt(between)),
+        mean - reach,
+        mean + reach,
+        agree,
+    )

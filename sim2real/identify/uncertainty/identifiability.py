@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from fractions import Fraction
 
 import numpy as np
 
+from sim2real.artifacts.identification import Determined
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty.uncertainty import VAGUE, Linearised, linearise, time_shift
@@ -16,39 +16,7 @@ _PART = 0.1
 """A parameter takes part in a direction when its entry is at least this share of the largest."""
 
 
-@dataclass(frozen=True)
-class Check:
-    """What can be identified, judged at one point.
-
-    Attributes:
-        condition: Condition number of the Jacobian, its columns in widths of the bounds.
-        expected_error: Shape ``(P,)``: standard error to expect from the data at hand [the parameter's unit].
-        per_minute: Shape ``(P,)``: the same from one minute of such data.
-        determined: What is determined of each group in ``undetermined``, such as ``K / (R J)``; empty if nothing.
-        undetermined: Groups of parameters that are not determined one by one.
-        duration_s: Length of all segments [s].
-    """
-
-    condition: float
-    expected_error: np.ndarray
-    per_minute: np.ndarray
-    determined: tuple[str, ...]
-    undetermined: tuple[tuple[str, ...], ...]
-    duration_s: float
-
-    @property
-    def messages(self) -> tuple[str, ...]:
-        """What to tell the user about each direction that is not determined."""
-        return tuple(
-            f"only {what} is determined: fix {len(names) - what.count(' and ') - 1} of {', '.join(names)}, or accept "
-            "what is determined"
-            if what
-            else f"nothing in this data determines {', '.join(names)}: excite it, fix it or give it a prior"
-            for what, names in zip(self.determined, self.undetermined, strict=True)
-        )
-
-
-def check(problem: Problem, z: np.ndarray) -> Check:
+def check(problem: Problem, z: np.ndarray) -> Determined:
     """Judge what the problem's segments determine, at ``z (P,)``.
 
     The noise is what the channels say; errors of the model at ``z`` do not count here.
@@ -56,7 +24,7 @@ def check(problem: Problem, z: np.ndarray) -> Check:
     return from_linearised(problem, linearise(problem, z))
 
 
-def from_linearised(problem: Problem, at: Linearised, without: Collection[str] = ()) -> Check:
+def from_linearised(problem: Problem, at: Linearised, without: Collection[str] = ()) -> Determined:
     """Judge a linearised point.
 
     Args:
@@ -80,19 +48,29 @@ def from_linearised(problem: Problem, at: Linearised, without: Collection[str] =
     prior = at.prior * np.outer(table.span, table.span)
     duration_s = problem.segment_s * len(problem.train)
     slope = np.abs(table.slope(at.x)) * table.span
-    error = np.sqrt(np.diag(np.linalg.inv(information + prior))) * slope
     minute = np.sqrt(np.diag(np.linalg.inv(information * 60.0 / duration_s + prior))) * slope
     open_axes = np.where(held[:, None], 0.0, axes)[:, loose]
     # In widths of the bounds, so that a second is no smaller than a logarithm.
     open_axes = open_axes[:, np.abs(open_axes).max(axis=0, initial=0.0) > 1e-9]
     groups = _groups(open_axes)
-    return Check(
-        condition=condition,
-        expected_error=error,
-        per_minute=minute,
-        determined=tuple(_determined(table, open_axes * table.span[:, None], g) for g in groups),
-        undetermined=tuple(tuple(table.names[i] for i in g) for g in groups),
-        duration_s=duration_s,
+    combinations = tuple(_determined(table, open_axes * table.span[:, None], g) for g in groups)
+    undetermined = tuple(tuple(table.names[i] for i in g) for g in groups)
+    expected = dict(zip(table.names, minute.tolist(), strict=True))
+    return Determined(condition, undetermined, messages_of(combinations, undetermined), expected)
+
+
+def messages_of(combinations: Sequence[str], groups: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Return a sentence for each group of parameters that the data does not determine one by one.
+
+    Args:
+        combinations: The combination of each group that the data determines, such as ``K/(R J)``; "" if there is none.
+    """
+    return tuple(
+        f"only {what} is determined: fix {len(names) - what.count(' and ') - 1} of {', '.join(names)}, or accept "
+        "what is determined"
+        if what
+        else f"nothing in this data determines {', '.join(names)}: excite it, fix it or give it a prior"
+        for what, names in zip(combinations, groups, strict=True)
     )
 
 

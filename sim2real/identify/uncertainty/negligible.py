@@ -14,9 +14,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from sim2real.artifacts.identification import Determined
 from sim2real.identify.parameters import Parameter
 from sim2real.identify.problem.problem import Problem
-from sim2real.identify.uncertainty.identifiability import Check, from_linearised
+from sim2real.identify.uncertainty.identifiability import from_linearised
 from sim2real.identify.uncertainty.profile import ONE_SIDED, profile, worse_with
 from sim2real.identify.uncertainty.uncertainty import VAGUE, Linearised, Uncertainty, scaled, time_shift
 
@@ -36,8 +37,8 @@ Found = dict[int, tuple[float, np.ndarray, np.ndarray]]
 
 
 def negligible(
-    problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty, check: Check
-) -> tuple[Uncertainty, Check]:
+    problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty, check: Determined
+) -> tuple[Uncertainty, Determined]:
     """Return the uncertainty with one bound for what may be absent, and the check of what is left.
 
     Others' intervals grow by how far they move when such a parameter is at its bound.
@@ -74,7 +75,7 @@ def indifferent(p: Parameter, bound: float) -> float:
     return min(max(p.nominal, bound), p.high)
 
 
-def _judged(problem: Problem, at: Linearised, spread: Uncertainty, found: Found) -> tuple[Uncertainty, Check]:
+def _judged(problem: Problem, at: Linearised, spread: Uncertainty, found: Found) -> tuple[Uncertainty, Determined]:
     """Return the uncertainty with the bounds that were found, and the check of what is left."""
     table, size = problem.table, len(at.x)
     more, low, high = np.zeros(size), spread.low.copy(), spread.high.copy()
@@ -138,7 +139,7 @@ def _bounded(problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertaint
     return {i: found[i] for i in order[:kept]}
 
 
-def _apart(found: Found, problem: Problem, at: Linearised, check: Check) -> Found:
+def _apart(found: Found, problem: Problem, at: Linearised, check: Determined) -> Found:
     """Return those whose effect is not also that of a parameter which the data leaves open: it may hide them."""
     table = problem.table
     open_names = {n for group in check.undetermined for n in group} - {table.names[i] for i in found}

@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.artifacts.identification import Left
 from sim2real.errors import UsageError
 from sim2real.identify.fit import Fit
 from sim2real.identify.problem.problem import Problem
@@ -50,28 +51,6 @@ class Fold:
                 for s in spans
             ]
         )
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """What was identified without one part, and how far it is off there.
-
-    Attributes:
-        fold: The part.
-        values: The estimate without it, by name.
-        kept: Names of the optional terms that the rest of the data chose.
-        share: Label of a free parameter -> share of what all recordings say about it that this part says, in [0, 1].
-        ahead: Field -> root mean square error up to the horizon of the windows; None where its joint did not move:
-            to say that what rests will rest is easy, and tells nothing of parts in which it moves.
-        free: The same when the part is simulated in one go, from its first samples.
-    """
-
-    fold: Fold
-    values: Mapping[str, Any]
-    kept: tuple[str, ...]
-    share: Mapping[str, float]
-    ahead: Mapping[str, float | None]
-    free: Mapping[str, float | None]
 
 
 def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: int = 2) -> list[Fold]:
@@ -119,7 +98,7 @@ def leave_out(
     choose: bool,
     free_run_s: float = 0.0,
     among: np.ndarray | None = None,
-) -> list[LeftOut]:
+) -> list[Left]:
     """Identify without each part, from the estimate of all, and predict it.
 
     Args:
@@ -138,7 +117,7 @@ def leave_out(
 
 def compare_sets(
     found: Fit, parts: Sequence[Fold], sets: Sequence[np.ndarray], settle_s: float, free_run_s: float
-) -> list[list[LeftOut]]:
+) -> list[list[Left]]:
     """Identify without each part with some sets of terms, and predict it: for each set what ``leave_out`` returns.
 
     The descent of a set begins at the end of the set before, too: with more terms no fit is worse, once it converged.
@@ -215,7 +194,7 @@ def _predicted(
     ends: Sequence[np.ndarray],
     settle_s: float,
     free_run_s: float,
-) -> list[LeftOut]:
+) -> list[Left]:
     """Return how far estimates without each part, ``(P,)`` each, are off on that part."""
     problem, table = found.problem, found.problem.table
     values = [
@@ -231,7 +210,8 @@ def _predicted(
     shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own / np.maximum(own.sum(axis=0), 1e-300)]
     ahead = _ahead(found.windows, parts, stacked, settle_s)
     free = _free(problem, parts, stacked, settle_s, free_run_s) if free_run_s else [{} for _ in parts]
-    return [LeftOut(*row) for row in zip(parts, values, names, shares, ahead, free, strict=True)]
+    rows = zip(parts, names, values, shares, ahead, free, strict=True)
+    return [Left(part.name, *row) for part, *row in rows]
 
 
 def _ahead(

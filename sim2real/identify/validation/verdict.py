@@ -9,10 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from sim2real.artifacts.identification import Prediction
+from sim2real.artifacts.identification import Determined, HeldOut, Judgement, Prediction
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.uncertainty.bounds import is_physical, way_out, way_out_of
-from sim2real.identify.uncertainty.identifiability import Check
 from sim2real.identify.uncertainty.round_trip import RoundTrip
 from sim2real.identify.uncertainty.uncertainty import Uncertainty
 
@@ -46,73 +45,7 @@ class Position:
     sigma: float
 
 
-@dataclass(frozen=True)
-class Score:
-    """How far one position is off on held-out data, at the longest horizon.
-
-    Attributes:
-        position: Which one.
-        horizon_s: The horizon [s].
-        own: Root mean square error of what was identified; infinite where it diverged.
-        others: The same of each baseline.
-    """
-
-    position: Position
-    horizon_s: float
-    own: float
-    others: Mapping[str, float]
-
-    @property
-    def closest(self) -> str | None:
-        """The best baseline; None without any."""
-        return min(self.others, key=lambda m: self.others[m], default=None)
-
-    @property
-    def excess(self) -> float:
-        """The error over that of the best baseline; errors below the noise of the measurement count as the noise."""
-        noise = _NOISE * self.position.sigma
-        best = min(self.others.values(), default=math.inf)
-        return max(self.own, noise) / max(best, noise) if math.isfinite(best) else 0.0
-
-    @property
-    def beaten_by(self) -> list[str]:
-        """The baselines that are as good; ``no delay`` only where it is better."""
-        if self.own <= _NOISE * self.position.sigma:
-            return []
-        return [m for m, e in self.others.items() if self.own > (_ALIKE if m == NO_DELAY else _BETTER) * e]
-
-    @property
-    def needs_delay(self) -> bool:
-        """Whether the same model without delays is worse."""
-        return NO_DELAY not in self.others or self.own < _BETTER * self.others[NO_DELAY]
-
-    def __str__(self) -> str:
-        """Return how far it is off, and what that is beside the best baseline."""
-        p = self.position
-        said = f"{p.name} is off by {self.own:.2g} {p.unit}".rstrip()
-        closest = self.closest
-        if closest is None or not math.isfinite(self.others[closest]):
-            return said
-        best = self.others[closest]
-        return f"{said}, {self.own / best:.2g} times {closest}" if best else f"{said}, where {closest} is exact"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The judgement.
-
-    Attributes:
-        status: The first that applies of: not converged, no improvement, hit a bound, not identifiable, accepted.
-        reasons: Sentences.
-        flags: Flags with which to identify again, where that is the way out.
-    """
-
-    status: Status
-    reasons: tuple[str, ...]
-    flags: str = ""
-
-
-def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[Score]:
+def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[HeldOut]:
     """Return how far each position is off on held-out data at the longest horizon, the worst first.
 
     Args:
@@ -124,28 +57,49 @@ def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> l
     last = {row.model: row.rmse for row in held_out if row.horizon_s == horizon_s}
     if horizon_s is None or "identified" not in last:
         return []
-    found = []
+    rows = []
     for p in positions:
-        errors = {m: e for m, rmse in last.items() if (e := rmse.get(p.column)) is not None}
-        # A prediction that diverged to NaN is infinitely wrong.
-        errors = {m: e if math.isfinite(e) else math.inf for m, e in errors.items()}
+        errors = {model: rmse[p.column] for model, rmse in last.items() if rmse.get(p.column) is not None}
         if "identified" in errors:
-            found.append(Score(p, horizon_s, errors.pop("identified"), errors))
-    return sorted(found, key=lambda s: (not s.beaten_by, -s.excess))
+            rows.append(_scored(p, horizon_s, errors))
+    # The worst first: positions that a baseline beats, then those with the largest error beside the best baseline.
+    return [row for _, row in sorted(rows, key=lambda pair: (not pair[1].beaten_by, -pair[0]))]
+
+
+def _scored(p: Position, horizon_s: float, errors: Mapping[str, float | None]) -> tuple[float, HeldOut]:
+    """Return the error of a position over that of the best baseline, and the row of the position.
+
+    Errors below the noise of the measurement count as the noise.
+    """
+    # A prediction that diverged to NaN is infinitely wrong.
+    finite = {m: e if e is not None and math.isfinite(e) else math.inf for m, e in errors.items()}
+    error, noise = finite.pop("identified"), _NOISE * p.sigma
+    best = min(finite.values(), default=math.inf)
+    excess = max(error, noise) / max(best, noise) if math.isfinite(best) else 0.0
+    # The model without delays counts as better only where it is better by more than chance.
+    limits = {m: (_ALIKE if m == NO_DELAY else _BETTER) * e for m, e in finite.items()}
+    beaten_by = () if error <= noise else tuple(m for m, limit in limits.items() if error > limit)
+    rmse = {m: e if math.isfinite(e) else None for m, e in {"identified": error, **finite}.items()}
+    return excess, HeldOut(p.name, p.column, p.unit, horizon_s, rmse, beaten_by)
+
+
+def errors_of(row: HeldOut) -> dict[str, float]:
+    """Return model -> root mean square error of a position; infinite where the model diverged."""
+    return {model: math.inf if error is None else error for model, error in row.rmse.items()}
 
 
 def judge(
-    found: Sequence[Score],
+    found: Sequence[HeldOut],
     table: ParameterTable,
     x: np.ndarray,
     spread: Uncertainty,
-    check: Check,
+    check: Determined,
     *,
     trip: RoundTrip | None = None,
     max_delay_s: float = 1.0,
     beyond: Sequence[str] = (),
     left: float | None = None,
-) -> Verdict:
+) -> Judgement:
     """Judge an identification.
 
     Args:
@@ -158,7 +112,7 @@ def judge(
     improves, reasons = _on_held_out(found)
     reasons += beyond
     if left is not None:
-        return Verdict("not converged", (_not_converged(left), *reasons))
+        return Judgement("not converged", (_not_converged(left), *reasons))
     known = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
     bounded, least, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
     reasons += bounded
@@ -183,7 +137,7 @@ def judge(
         status = "hit a bound"
     elif loose:
         status = "not identifiable"
-    return Verdict(status, tuple(reasons), flags)
+    return Judgement(status, tuple(reasons), flags)
 
 
 def _not_converged(left: float) -> str:
@@ -209,28 +163,46 @@ def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
     return said
 
 
-def _on_held_out(found: Sequence[Score]) -> tuple[bool, list[str]]:
+def _on_held_out(found: Sequence[HeldOut]) -> tuple[bool, list[str]]:
     """Return whether every position beats every baseline on held-out data, and what to say of it."""
     if not found:
         return True, ["nothing was held out: how well it predicts is not known"]
     ahead = f"{found[0].horizon_s:g} s ahead on held-out data"
     worse = [s for s in found if s.beaten_by]
     if worse:
-        reasons = [f"{ahead} {s.position.name} is no better than: {_errors(s)}" for s in worse[:_MOST]]
+        reasons = [f"{ahead} {s.name} is no better than: {_errors(s)}" for s in worse[:_MOST]]
         return False, reasons + [f"nor are {len(worse) - _MOST} more positions"] * (len(worse) > _MOST)
-    reasons = [f"{ahead} {s}" for s in found[:_MOST]]
+    reasons = [f"{ahead} {_off(s)}" for s in found[:_MOST]]
     if len(found) > _MOST:
         reasons.append(f"{len(found) - _MOST} more positions improve at least as much")
-    if not any(s.needs_delay for s in found):
+    if not any(_needs_delay(s) for s in found):
         reasons.append("without any delay it predicts as well: this data does not need one")
     return True, reasons
 
 
-def _errors(s: Score) -> str:
-    """Return what beats a position, with the errors."""
-    unit = f" {s.position.unit}".rstrip()
-    better = ", ".join(f"{m} ({s.others[m]:.2g}{unit})" for m in s.beaten_by)
-    return f"{better}; its own error is {s.own:.2g}{unit}"
+def _off(row: HeldOut) -> str:
+    """Return how far a position is off, and the ratio to the error of the best baseline."""
+    errors = errors_of(row)
+    sentence = f"{row.name} is off by {errors.pop('identified'):.2g} {row.unit}".rstrip()
+    best = min(errors, key=lambda model: errors[model], default=None)
+    if best is None or not math.isfinite(errors[best]):
+        return sentence
+    if not errors[best]:
+        return f"{sentence}, where {best} is exact"
+    return f"{sentence}, {errors_of(row)['identified'] / errors[best]:.2g} times {best}"
+
+
+def _needs_delay(row: HeldOut) -> bool:
+    """Return whether the same model without delays is worse."""
+    errors = errors_of(row)
+    return NO_DELAY not in errors or errors["identified"] < _BETTER * errors[NO_DELAY]
+
+
+def _errors(row: HeldOut) -> str:
+    """Return the baselines that beat a position, with the errors."""
+    errors, unit = errors_of(row), f" {row.unit}".rstrip()
+    better = ", ".join(f"{m} ({errors[m]:.2g}{unit})" for m in row.beaten_by)
+    return f"{better}; its own error is {errors['identified']:.2g}{unit}"
 
 
 def _at_bounds(

@@ -11,7 +11,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from sim2real.artifacts.identification import ROUND_TRIP
+from sim2real.artifacts.files import number
+from sim2real.artifacts.identification import ROUND_TRIP, Determined
 from sim2real.artifacts.run.manifest import plain
 from sim2real.artifacts.run.run_folder import newest
 from sim2real.errors import Sim2RealError, UsageError
@@ -170,7 +171,7 @@ def judge(
     at = uncertainty.linearise(problem, z)
     check = identifiability.from_linearised(problem, at)
     delays = [c.label for c in problem.table.columns if c.parameter.kind == "delay"]
-    rows, total = _parameters(problem, at, check), _round_trip(problem, at, check)
+    rows, total = _parameters(problem, at, check), _round_trip(problem, at)
     messages = list(check.messages)
     # Only the sum of the delays can be told where initial states are free: then that is all that must be.
     harmless = [g for g in check.undetermined if total and set(g) <= set(delays)]
@@ -298,19 +299,19 @@ def show(found: dict[str, Any]) -> None:
         print(f"- {message}")
 
 
-def _parameters(problem: Problem, at: uncertainty.Linearised, check: identifiability.Check) -> list[dict[str, Any]]:
+def _parameters(problem: Problem, at: uncertainty.Linearised, check: Determined) -> list[dict[str, Any]]:
     """Return the error to expect of each parameter from one minute of such data."""
     loose = {n for group in check.undetermined for n in group}
     rows = []
-    for c, error in zip(problem.table.columns, check.per_minute, strict=True):
+    for c, error in zip(problem.table.columns, check.standard_error_per_minute.values(), strict=True):
         p = c.parameter
-        share = 100 * float(error) / abs(p.nominal) if p.nominal else None
+        share = 100 * number(error) / abs(p.nominal) if p.nominal else None
         rows.append(
             {
                 "name": c.label,
                 "unit": p.unit,
                 "nominal": p.nominal,
-                "standard_error_per_minute": float(error),
+                "standard_error_per_minute": number(error),
                 "percent_of_nominal": share,
                 "determined": "alone" if c.label not in loose else "in a group",
                 "excite": p.excite,
@@ -319,7 +320,7 @@ def _parameters(problem: Problem, at: uncertainty.Linearised, check: identifiabi
     return rows
 
 
-def _round_trip(problem: Problem, at: uncertainty.Linearised, check: identifiability.Check) -> dict[str, Any] | None:
+def _round_trip(problem: Problem, at: uncertainty.Linearised) -> dict[str, Any] | None:
     """Return the error to expect of the sum of the delays, where only that can be told."""
     shift = uncertainty.time_shift(problem.table)
     if not shift.any():
@@ -327,10 +328,11 @@ def _round_trip(problem: Problem, at: uncertainty.Linearised, check: identifiabi
     # With the sensor's delay held, the others move as their sum does.
     rest = np.flatnonzero(~(shift > 0))
     J = at.jacobian.reshape(-1, len(at.x))[:, rest]
+    duration_s = problem.segment_s * len(problem.train)
     behind = [int(np.flatnonzero(rest == i)[0]) for i in np.flatnonzero(shift < 0)]
 
     def error(seconds: float) -> float:
-        information = J.T @ J * seconds / check.duration_s + at.prior[np.ix_(rest, rest)]
+        information = J.T @ J * seconds / duration_s + at.prior[np.ix_(rest, rest)]
         return float(np.sqrt(np.linalg.inv(information)[np.ix_(behind, behind)].sum()))
 
     return {
@@ -339,7 +341,7 @@ def _round_trip(problem: Problem, at: uncertainty.Linearised, check: identifiabi
         "nominal": None,
         "standard_error_per_minute": error(60.0),
         "percent_of_nominal": None,
-        "determined": "alone" if error(check.duration_s) < SURE_S else "no",
+        "determined": "alone" if error(duration_s) < SURE_S else "no",
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,13 +15,10 @@ from sim2real.artifacts.identification import (
     ROUND_TRIP,
     Determined,
     Estimate,
-    HeldOut,
     Identification,
     Judgement,
     Left,
     Matrix,
-    Refinement,
-    Search,
 )
 from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
@@ -31,7 +27,7 @@ from sim2real.identify.uncertainty import identifiability, noise, uncertainty
 from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
 from sim2real.identify.uncertainty.round_trip import RoundTrip, round_trip
 from sim2real.identify.validation.prediction import position_of
-from sim2real.identify.validation.verdict import Position, Score, judge, scores
+from sim2real.identify.validation.verdict import Position, judge, scores
 from sim2real.log.schema import unit_of
 from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.free_run import Lack
@@ -54,7 +50,7 @@ class Findings:
     fit: Fit
     at: uncertainty.Linearised
     spread: uncertainty.Uncertainty
-    check: identifiability.Check
+    check: Determined
     trip: RoundTrip | None
     widening: float
 
@@ -102,15 +98,7 @@ def document(
     """
     fit, spread, check = found.fit, found.spread, found.check
     names = tuple(fit.problem.table.names)
-    minute = dict(zip(names, check.per_minute.tolist(), strict=True))
-    search = Search(
-        strategy=fit.problem.config.strategy if fit.search else None,
-        history=np.asarray(fit.search.history) if fit.search else np.zeros(0),
-        evaluations=fit.search.evaluations if fit.search else 0,
-        refined=tuple(Refinement(r.before, r.loss, r.steps) for r in fit.refined),
-        seconds=seconds,
-        engine=str(fit.problem.engine),
-    )
+    search = replace(fit.record, seconds=seconds)
     if not fit.converged:  # away from a minimum no interval, covariance or condition means anything
         rows = tuple(_without_interval(row) for row in _rows(found, truth))
         return Identification(
@@ -126,7 +114,7 @@ def document(
         correlation=Matrix(names, spread.correlation),
         residual_inflation=spread.inflation,
         misfit=spread.misfit,
-        check=Determined(check.condition, check.undetermined, check.messages, minute),
+        check=check,
         posterior=posterior,
         widening=found.widening,
     )
@@ -165,9 +153,9 @@ def judged(
     horizon_s = max((r.horizon_s for r in document.prediction), default=0.0)
     worth = held_out_parts.sentences(document.left_out, judged_on, horizon_s)
     status = "lacks a term" if lack.flags and verdict.status == "accepted" else verdict.status
-    flags = " ".join(f for f in (verdict.flags, lack.flags) if f)
+    flags = " ".join(f for f in (verdict.next, lack.flags) if f)
     told = Judgement(status, (*worth, *verdict.reasons, *lack.reasons), flags)
-    return replace(document, verdict=told, held_out=tuple(scored(rows)))
+    return replace(document, verdict=told, held_out=tuple(rows))
 
 
 def positions(problem: Problem, units: Mapping[str, str]) -> list[Position]:
@@ -175,21 +163,6 @@ def positions(problem: Problem, units: Mapping[str, str]) -> list[Position]:
     return [
         Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma)
         for c in problem.model.channels
-    ]
-
-
-def scored(scores: Sequence[Score]) -> list[HeldOut]:
-    """Return how far each position is off on held-out data, the worst first."""
-    return [
-        HeldOut(
-            name=s.position.name,
-            column=s.position.column,
-            unit=s.position.unit,
-            horizon_s=s.horizon_s,
-            rmse={m: e if math.isfinite(e) else None for m, e in {"identified": s.own, **s.others}.items()},
-            beaten_by=tuple(s.beaten_by),
-        )
-        for s in scores
     ]
 
 

@@ -121,8 +121,7 @@ def examined(
     least = 2 if choice is None else _LEAST_TO_CHOOSE
     parts = folds_of(found.problem, min(config.folds, segments // 2), names, least)
     among = None if choice is None else choice.kept
-    rows = leave_out(found, parts, config.settle_s, choice is not None, config.free_run_s, among)
-    return tuple(Left(r.fold.name, r.kept, r.values, r.share, r.ahead, r.free) for r in rows)
+    return tuple(leave_out(found, parts, config.settle_s, choice is not None, config.free_run_s, among))
 
 
 def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[Left]) -> Uncertainty:

@@ -314,9 +314,7 @@ def _each(found: Fit) -> tuple[Quantity, ...]:
     for name, unit, parts in estimate.quantities(table):
         values = np.array([sum(np.ravel(own[n])[0] for n in parts) for own, _ in single])
         errors = np.array([sum_of(spread, [table.names.index(n) for n in parts]) for _, spread in single])
-        all_of = aggregate(values, errors)
-        numbers = (all_of.mean, all_of.standard_error, all_of.between, all_of.low, all_of.high)
-        rows.append(Quantity(name, unit, values, errors, *numbers, all_of.agree))
+        rows.append(aggregate(values, errors, name, unit))
     return tuple(rows)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import HeldOut, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.manifest import plain
 from sim2real.artifacts.summary import Rows, Shown
@@ -21,7 +21,7 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span, check_log
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.folds import moving
-from sim2real.identify.validation.verdict import Score, scores
+from sim2real.identify.validation.verdict import errors_of, scores
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.estimation import estimate as identified
@@ -186,13 +186,9 @@ def score(
         columns = prediction.samples(whole, models, fitting.settle_s)
         free = prediction.free_runs(columns, prediction.labels(whole), list(models), fitting.settle_s)
     for s in judged:
-        at = [
-            np.inf if r.rmse is None else r.rmse
-            for r in free
-            if r.field == s.position.column and r.model == "identified"
-        ]
-        own = moves[s.position.column]
-        rows[s.position.name] = _row(s, promised.get(s.position.column) if own else None, float(np.mean(at)), own)
+        at = [np.inf if r.rmse is None else r.rmse for r in free if r.field == s.column and r.model == "identified"]
+        own = moves[s.column]
+        rows[s.name] = _row(s, promised.get(s.column) if own else None, float(np.mean(at)), own)
     if not any(row["moves"] for row in rows.values()):
         raise UsageError("no joint moves in this log: it tells nothing", hint="take a log of motion")
     kept = [r["over_promised"] for r in rows.values() if r["over_promised"] is not None]
@@ -205,7 +201,7 @@ def score(
         "positions": rows,
         "better": not any(row["beaten_by"] for row in rows.values()),
         "promise_kept": all(k <= _KEPT for k in kept) if kept else None,
-        "rmse": float(np.sqrt(np.mean([s.own**2 for s in judged]))),
+        "rmse": float(np.sqrt(np.mean([errors_of(s)["identified"] ** 2 for s in judged]))),
         "free_run_rmse": float(np.sqrt(np.mean([r[_FREE] ** 2 for r in rows.values()]))),
     }
 
@@ -238,15 +234,15 @@ def show(result: dict[str, Any]) -> None:
         note(f"the identification itself was not accepted: {result['identified']}: {'; '.join(result['why'][:1])}")
 
 
-def _row(s: Score, promised: float | None, free_run: float, moves: bool) -> dict[str, Any]:
+def _row(s: HeldOut, promised: float | None, free_run: float, moves: bool) -> dict[str, Any]:
     """Return the row of a position; one that rests is beaten by nobody, for that it rests is no prediction."""
     return {
         "moves": moves,
-        "unit": s.position.unit,
-        "rmse": {"identified": s.own, **s.others},
-        "beaten_by": s.beaten_by if moves else [],
+        "unit": s.unit,
+        "rmse": errors_of(s),
+        "beaten_by": list(s.beaten_by) if moves else [],
         "promised": promised,
-        "over_promised": s.own / promised if promised else None,
+        "over_promised": errors_of(s)["identified"] / promised if promised else None,
         _FREE: free_run,
     }
 
