@@ -18,7 +18,8 @@ from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from sim2real.composer.observation.observable.base import Observable
-    from sim2real.composer.types import AnyPhysics, Array, ArrayLike, Hook, MjSpec, RandomState
+    from sim2real.composer.physics.base import BasePhysics
+    from sim2real.composer.types import Array, ArrayLike, Hook, MjSpec, RandomState
 
 _log = logging.getLogger(__name__)
 
@@ -145,27 +146,27 @@ class Entity(ABC):
     def initialize_episode_mjcf(self, random_state: RandomState) -> None:  # noqa: B027
         """Change the model before it is compiled for an episode."""
 
-    def after_compile(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def after_compile(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Look at the compiled model."""
 
-    def initialize_episode(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def initialize_episode(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Set the state at the start of an episode."""
 
-    def before_step(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def before_step(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act before a control step."""
 
-    def before_substep(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def before_substep(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act before a step of the physics."""
 
-    def after_substep(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def after_substep(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a step of the physics."""
 
-    def after_step(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def after_step(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a control step."""
 
     # -- poses and frames
 
-    def global_vector_to_local_frame(self, physics: AnyPhysics, vec_in_world_frame: ArrayLike) -> Array:
+    def global_vector_to_local_frame(self, physics: BasePhysics, vec_in_world_frame: ArrayLike) -> Array:
         """Return vectors of the world, shape ``(..., 3)`` or ``(..., 2)``, in this entity's axes; same shape.
 
         Raises:
@@ -179,7 +180,7 @@ class Entity(ABC):
         xmat = xp.reshape(xp.asarray(physics.bind(self.root_body).xmat), (3, 3))
         return xp.dot(vector, xmat[:size, :size])
 
-    def global_xmat_to_local_frame(self, physics: AnyPhysics, xmat: ArrayLike) -> Array:
+    def global_xmat_to_local_frame(self, physics: BasePhysics, xmat: ArrayLike) -> Array:
         """Return a rotation of the world, shape ``(3, 3)`` or ``(9,)``, seen from this entity; same shape.
 
         Raises:
@@ -199,14 +200,14 @@ class Entity(ABC):
         joint = get_frame_freejoint(self.mjcf_model)
         return (get_attachment_frame(self.mjcf_model), False) if joint is None else (joint, True)
 
-    def get_pose(self, physics: AnyPhysics) -> tuple[Array, Array]:
+    def get_pose(self, physics: BasePhysics) -> tuple[Array, Array]:
         """Return position ``(3,)`` [m] and quaternion ``(4,)``: of the world with a free joint, else of the parent."""
         holder, free = self._pose_holder()
         bound = physics.bind(holder)
         return (bound.qpos[:3], bound.qpos[3:]) if free else (bound.pos, bound.quat)
 
     def set_pose(
-        self, physics: AnyPhysics, position: ArrayLike | None = None, quaternion: ArrayLike | None = None
+        self, physics: BasePhysics, position: ArrayLike | None = None, quaternion: ArrayLike | None = None
     ) -> None:
         """Set position ``(3,)`` [m] and quaternion ``(4,)``, of the world with a free joint, else of the parent.
 
@@ -231,7 +232,7 @@ class Entity(ABC):
 
     def shift_pose(
         self,
-        physics: AnyPhysics,
+        physics: BasePhysics,
         position: ArrayLike | None = None,
         quaternion: ArrayLike | None = None,
         rotate_velocity: bool = False,
@@ -256,7 +257,7 @@ class Entity(ABC):
                 self.set_velocity(physics, rotate(xp.asarray(self.get_velocity(physics)[0]), turn))
         self.set_pose(physics, new_position, new_quaternion)
 
-    def get_velocity(self, physics: AnyPhysics) -> tuple[Array, Array]:
+    def get_velocity(self, physics: BasePhysics) -> tuple[Array, Array]:
         """Return linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s, local frame].
 
         Raises:
@@ -269,7 +270,7 @@ class Entity(ABC):
         return qvel[:3], qvel[3:]
 
     def set_velocity(
-        self, physics: AnyPhysics, velocity: ArrayLike | None = None, angular_velocity: ArrayLike | None = None
+        self, physics: BasePhysics, velocity: ArrayLike | None = None, angular_velocity: ArrayLike | None = None
     ) -> None:
         """Set linear ``(3,)`` [m/s] and angular velocity ``(3,)`` [rad/s]; warns when there is no free joint.
 
@@ -286,7 +287,7 @@ class Entity(ABC):
         if angular_velocity is not None:
             physics.write(holder, "qvel", angular_velocity, slice(3, 6))
 
-    def configure_joints(self, physics: AnyPhysics, position: ArrayLike) -> None:
+    def configure_joints(self, physics: BasePhysics, position: ArrayLike) -> None:
         """Set the positions of this entity's own joints, frame joints of its children included."""
         physics.set(self.mjcf_model.find_all("joint", exclude_attachments=True), "qpos", position)
 

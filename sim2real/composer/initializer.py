@@ -6,14 +6,15 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import AnyPhysics, RandomState
+    from sim2real.composer.physics.base import BasePhysics
+    from sim2real.composer.types import RandomState
 
 
 class Initializer(ABC):
     """Sets a part of the initial state; called from ``initialize_episode``."""
 
     @abstractmethod
-    def __call__(self, physics: AnyPhysics, random_state: RandomState) -> Any:
+    def __call__(self, physics: BasePhysics, random_state: RandomState) -> Any:
         """Set the state.
 
         Raises:

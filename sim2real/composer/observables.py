@@ -14,7 +14,7 @@ from sim2real.composer.observation.observable.base import Generic, Observable
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sim2real.composer.types import AnyPhysics
+    from sim2real.composer.physics.base import BasePhysics
 
 OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "corruptor", "enabled"})
 """What ``set_options`` can set."""
@@ -112,7 +112,7 @@ class Observables:
         self._observables[name] = observable
         observable.enabled = enabled
 
-    def get_observation(self, physics: AnyPhysics) -> dict[str, Any]:
+    def get_observation(self, physics: BasePhysics) -> dict[str, Any]:
         """Return the present value of every observable, without delays and buffers."""
         return {name: value(physics) for name, value in self._observables.items()}
 

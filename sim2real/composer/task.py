@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from sim2real.composer.observation.observable.base import Observable
-    from sim2real.composer.types import AnyPhysics, Array, RandomState
+    from sim2real.composer.physics.base import BasePhysics
+    from sim2real.composer.types import Array, RandomState
 
 UNLIMITED = 1e10
 """Bound of an action that has none, in dm_control's specs."""
@@ -123,7 +124,7 @@ class Task(ABC):
         """Physics steps in a control step."""
         return _steps(self.control_timestep, self.physics_timestep)
 
-    def action_spec(self, physics: AnyPhysics) -> specs.BoundedArray:
+    def action_spec(self, physics: BasePhysics) -> specs.BoundedArray:
         """Return shape ``(nu,)`` and bounds of an action; its name lists the actuators, separated by tabs."""
         model = physics.model
         limited = np.asarray(model.actuator_ctrllimited, bool)
@@ -150,40 +151,40 @@ class Task(ABC):
     def initialize_episode_mjcf(self, random_state: RandomState) -> None:  # noqa: B027
         """Change the models before they are compiled for an episode."""
 
-    def after_compile(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def after_compile(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Look at the compiled model."""
 
-    def initialize_episode(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def initialize_episode(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Set the state at the start of an episode."""
 
-    def before_step(self, physics: AnyPhysics, action: Any, random_state: RandomState) -> None:
+    def before_step(self, physics: BasePhysics, action: Any, random_state: RandomState) -> None:
         """Act before a control step; default: the action, shape ``(nu,)``, becomes the control."""
         del random_state
         physics.set_control(action)
 
-    def before_substep(self, physics: AnyPhysics, action: Any, random_state: RandomState) -> None:  # noqa: B027
+    def before_substep(self, physics: BasePhysics, action: Any, random_state: RandomState) -> None:  # noqa: B027
         """Act before a step of the physics."""
 
-    def after_substep(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def after_substep(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a step of the physics."""
 
-    def after_step(self, physics: AnyPhysics, random_state: RandomState) -> None:  # noqa: B027
+    def after_step(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Act after a control step."""
 
     @abstractmethod
-    def get_reward(self, physics: AnyPhysics) -> Any:
+    def get_reward(self, physics: BasePhysics) -> Any:
         """Return the reward of the step that was just taken, or its terms by name, whose sum it is."""
 
-    def should_terminate_episode(self, physics: AnyPhysics) -> bool | Array:
+    def should_terminate_episode(self, physics: BasePhysics) -> bool | Array:
         """Return whether the episode ends here; default: what ``get_termination`` says."""
         return self.get_termination(physics)
 
-    def get_termination(self, physics: AnyPhysics) -> bool | Array:
+    def get_termination(self, physics: BasePhysics) -> bool | Array:
         """Return whether the episode ends here; another name for ``should_terminate_episode``."""
         del physics
         return False
 
-    def get_discount(self, physics: AnyPhysics) -> float | Array:
+    def get_discount(self, physics: BasePhysics) -> float | Array:
         """Return the discount of what comes after this step, in [0, 1]."""
         del physics
         return 1.0
@@ -199,7 +200,7 @@ class NullTask(Task):
     def __init__(self, root_entity: Entity | None = None) -> None:
         self._root_entity = Arena() if root_entity is None else root_entity
 
-    def get_reward(self, physics: AnyPhysics) -> float:
+    def get_reward(self, physics: BasePhysics) -> float:
         """Return 0."""
         del physics
         return 0.0

@@ -6,7 +6,6 @@ MuJoCo's classes come from its compiled modules, which say nothing of their attr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from typing import Any, Protocol, TypeAlias
 
 import jax
@@ -75,87 +74,6 @@ Array: TypeAlias = np.ndarray | jax.Array
 """What an engine computes with: numpy's arrays on C, arrays and tracers of JAX on MJX."""
 ArrayLike: TypeAlias = npt.ArrayLike | jax.Array
 """What an array can be made of; texts too, as attributes in MJCF may be."""
-
-
-class AnyPhysics(Protocol):
-    """What hooks are given: the physics of either engine, ``Physics`` or ``MjxPhysics``."""
-
-    variables: dict[str, Any]
-
-    @property
-    def np(self) -> Any:
-        """The module that computes with the engine's arrays."""
-        ...
-
-    @property
-    def model(self) -> Any:
-        """The model; its attributes are those of an ``MjModel``."""
-        ...
-
-    @property
-    def data(self) -> Any:
-        """The state; its attributes are those of an ``MjData``."""
-        ...
-
-    @property
-    def named(self) -> Any:
-        """Model and state by names."""
-        ...
-
-    def time(self) -> float | jax.Array:
-        """Return the simulated time [s]."""
-        ...
-
-    def timestep(self) -> float | jax.Array:
-        """Return the time that a step takes [s]."""
-        ...
-
-    def control(self) -> Array:
-        """Return the controls, shape ``(nu,)``."""
-        ...
-
-    def set_control(self, control: Any) -> None:
-        """Set the controls, shape ``(nu,)``."""
-
-    def position(self) -> Array:
-        """Return qpos, shape ``(nq,)``."""
-        ...
-
-    def velocity(self) -> Array:
-        """Return qvel, shape ``(nv,)``."""
-        ...
-
-    def bind(self, elements: Any) -> Any:
-        """Return the attributes of elements."""
-        ...
-
-    def get(self, elements: Any, name: str) -> Any:
-        """Return an attribute of elements."""
-        ...
-
-    def set(self, elements: Any, name: str, value: Any) -> AnyPhysics:
-        """Set an attribute of elements."""
-        ...
-
-    def write(self, elements: Any, name: str, value: Any, index: Any) -> AnyPhysics:
-        """Set a part of an attribute of elements."""
-        ...
-
-    def fail(self, condition: Any = True) -> None:
-        """Give this initial state up where a condition holds."""
-
-    def forward(self) -> None:
-        """Compute everything that follows from the state."""
-
-    def mark_as_dirty(self) -> None:
-        """Have that computed before it is read."""
-
-    def recompute_constants(self) -> None:
-        """Compute what follows from masses and lengths."""
-
-    def suppress_physics_errors(self) -> AbstractContextManager[None]:
-        """Let warnings raise nothing inside a ``with`` block."""
-        ...
 
 
 Draw: TypeAlias = Callable[..., Any]

@@ -21,7 +21,8 @@ from sim2real.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from sim2real.composer.types import AnyPhysics, RandomState, Steps
+    from sim2real.composer.physics.base import BasePhysics
+    from sim2real.composer.types import RandomState, Steps
 
 DEFAULT_BUFFER_SIZE = 1
 DEFAULT_UPDATE_INTERVAL = 1
@@ -54,7 +55,7 @@ class _Channel:
         self,
         name: str,
         observable: Observable,
-        physics: AnyPhysics,
+        physics: BasePhysics,
         random_state: RandomState,
         steps_per_read: int,
         strip: bool,
@@ -208,7 +209,7 @@ class Updater:
         self._channels: Any = None
         self._flat: list[_Channel] = []
 
-    def reset(self, physics: AnyPhysics, random_state: RandomState) -> None:
+    def reset(self, physics: BasePhysics, random_state: RandomState) -> None:
         """Start an episode: take the first samples."""
         self._now = 0
 

@@ -15,7 +15,8 @@ from sim2real.composer.physics.arrays import namespace
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from sim2real.composer.types import Aggregate, AnyPhysics, Array, Corrupt, RandomState, Steps
+    from sim2real.composer.physics.base import BasePhysics
+    from sim2real.composer.types import Aggregate, Array, Corrupt, RandomState, Steps
 
 
 class Aggregator:
@@ -99,17 +100,17 @@ class Observable(ABC):
         return None
 
     @abstractmethod
-    def _callable(self, physics: AnyPhysics) -> Callable[[], Any]:
+    def _callable(self, physics: BasePhysics) -> Callable[[], Any]:
         """Return a function that samples the raw value."""
 
-    def observation_callable(self, physics: AnyPhysics, random_state: RandomState | None = None) -> Callable[[], Any]:
+    def observation_callable(self, physics: BasePhysics, random_state: RandomState | None = None) -> Callable[[], Any]:
         """Return a function that samples the value and corrupts it."""
         sample, corruptor = self._callable(physics), self.corruptor
         if corruptor is None:
             return sample
         return lambda: corruptor(sample(), random_state=random_state)
 
-    def __call__(self, physics: AnyPhysics, random_state: RandomState | None = None) -> Any:
+    def __call__(self, physics: BasePhysics, random_state: RandomState | None = None) -> Any:
         """Return a sample."""
         return self.observation_callable(physics, random_state)()
 
@@ -140,7 +141,7 @@ class Generic(Observable):
         self._raw_callable = raw_observation_callable
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: AnyPhysics) -> Callable[[], Any]:
+    def _callable(self, physics: BasePhysics) -> Callable[[], Any]:
         return functools.partial(self._raw_callable, physics)
 
 
@@ -164,7 +165,7 @@ class MujocoFeature(Observable):
         self._kind, self._feature_name = kind, feature_name
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: AnyPhysics) -> Callable[[], Any]:
+    def _callable(self, physics: BasePhysics) -> Callable[[], Any]:
         array, name = getattr(physics.named.data, self._kind), self._feature_name
         return lambda: array[name() if callable(name) else name]
 

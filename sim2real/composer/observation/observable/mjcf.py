@@ -14,7 +14,8 @@ from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from sim2real.composer.models.element import Elements
-    from sim2real.composer.types import Aggregate, AnyPhysics, Corrupt, MjvOption, Steps
+    from sim2real.composer.physics.base import BasePhysics
+    from sim2real.composer.types import Aggregate, Corrupt, MjvOption, Steps
 
 
 def _check_elements(elements: Elements) -> None:
@@ -50,7 +51,7 @@ class MJCFFeature(Observable):
         self._kind, self._element, self._index = kind, mjcf_element, index
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: AnyPhysics) -> Callable[[], Any]:
+    def _callable(self, physics: BasePhysics) -> Callable[[], Any]:
         binding, kind, index = physics.bind(self._element), self._kind, self._index
         if index is None:
             return lambda: getattr(binding, kind)

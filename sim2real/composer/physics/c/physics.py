@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
-from sim2real.composer.models import layout
 from sim2real.composer.models.element import as_elements
 from sim2real.composer.models.mjcf.translate import mj
-from sim2real.composer.physics.c.binding import Binding, EmptyBinding, Staleness
-from sim2real.composer.physics.c.named import Named
+from sim2real.composer.physics.base import EmptyBinding
+from sim2real.composer.physics.c.binding import Binding, BoundPhysics, Staleness
 from sim2real.composer.physics.c.rendering import Graphics
 from sim2real.composer.physics.c.views import DataView, ModelView
 from sim2real.composer.physics.engine import Camera, TextOverlay
-from sim2real.errors import UsageError
+from sim2real.composer.physics.named import Named
 
 if TYPE_CHECKING:
     from sim2real.composer.models.element import Element, Elements
@@ -31,20 +30,18 @@ _log = logging.getLogger(__name__)
 _RK4 = int(mj.mjtIntegrator.mjINT_RK4)
 
 
-class Physics:
-    """A model and its state; hooks, observables and tasks read and write it.
+class Physics(BoundPhysics):
+    """A compiled model and its state on MuJoCo's C engine; see ``BasePhysics``.
 
     Args:
         legacy_step: After a step, also compute positions and velocities of the new state, as dm_control does.
         data: A ``mujoco.MjData`` as ``mj_resetData`` leaves it; default: a new one.
 
     Attributes:
-        np: The module that computes with this engine's arrays: numpy.
-        variables: What tasks keep from hook to hook during an episode: name -> array. Emptied by ``reset``.
-        graphics: What draws images of it.
+        graphics: Draws the images.
     """
 
-    np: Any = np
+    np = np
 
     def __init__(self, model: MjModel, legacy_step: bool = True, data: MjData | None = None) -> None:
         self.legacy_step = legacy_step
@@ -96,59 +93,29 @@ class Physics:
 
     # -- state
 
-    def time(self) -> float:
-        """Return the simulated time [s]."""
-        return self.data.ptr.time
-
-    def timestep(self) -> float:
-        """Return the time that a step takes [s]."""
-        return self.model.ptr.opt.timestep
-
-    def control(self) -> np.ndarray:
-        """Return the controls, shape ``(nu,)``."""
-        return self.data.ptr.ctrl
-
     def set_control(self, control: ArrayLike) -> None:
         """Set the controls, shape ``(nu,)`` [the actuators' units]."""
         np.copyto(self.data.ptr.ctrl, control)
 
-    def position(self) -> np.ndarray:
-        """Return a copy of qpos, shape ``(nq,)``."""
-        return self.data.ptr.qpos.copy()
-
-    def velocity(self) -> np.ndarray:
-        """Return a copy of qvel, shape ``(nv,)``."""
-        return self.data.ptr.qvel.copy()
-
-    def activation(self) -> np.ndarray:
-        """Return a copy of act, shape ``(na,)``."""
-        return self.data.ptr.act.copy()
+    def _copied(self, array: np.ndarray) -> np.ndarray:
+        return array.copy()
 
     def get_state(self, sig: int | None = None) -> np.ndarray:
-        """Return positions, velocities and activations, shape ``(nq + nv + na,)``; or what ``mj_getState`` does."""
-        model, data = self.model.ptr, self.data.ptr
+        """Return positions, velocities and activations, shape ``(nq + nv + na,)``; or the result of ``mj_getState``."""
         if sig is None:
-            return np.concatenate([data.qpos, data.qvel, data.act])
-        state = np.empty(mj.mj_stateSize(model, sig))
-        mj.mj_getState(model, data, state, sig)
+            return np.asarray(super().get_state())
+        state = np.empty(mj.mj_stateSize(self.model.ptr, sig))
+        mj.mj_getState(self.model.ptr, self.data.ptr, state, sig)
         return state
 
     state = get_state
 
     def set_state(self, state: ArrayLike, sig: int | None = None) -> None:
-        """Set what ``get_state`` returns.
-
-        Raises:
-            UsageError: When the shape is another.
-        """
-        data, model = self.data.ptr, self.model.ptr
-        if sig is not None:
-            mj.mj_setState(model, data, np.asarray(state, float), sig)
-            return
-        expected = (model.nq + model.nv + model.na,)
-        if np.shape(state) != expected:
-            raise UsageError(f"Input physics state has shape {np.shape(state)}. Expected {expected}.")
-        data.qpos[:], data.qvel[:], data.act[:] = np.split(np.asarray(state), [model.nq, model.nq + model.nv])
+        """Set the result of ``get_state``; UsageError when the shape is another."""
+        if sig is None:
+            super().set_state(state)
+        else:
+            mj.mj_setState(self.model.ptr, self.data.ptr, np.asarray(state, float), sig)
 
     def copy(self, share_model: bool = False) -> Physics:
         """Return an independent copy of the state, and of the model unless it is to be shared."""
@@ -198,10 +165,9 @@ class Physics:
         model, data = self.model.ptr, self.data.ptr
         if keyframe_id is None:
             mj.mj_resetData(model, data)
-        elif 0 <= keyframe_id < model.nkey:
-            mj.mj_resetDataKeyframe(model, data, keyframe_id)
         else:
-            raise UsageError(f"`keyframe_id` must be between 0 and {model.nkey - 1} inclusive, got: {keyframe_id}")
+            self.check_keyframe(keyframe_id)
+            mj.mj_resetDataKeyframe(model, data, keyframe_id)
         self.variables.clear()
         self.after_reset()
 
@@ -249,54 +215,25 @@ class Physics:
         self.staleness.dirty = True
 
     def bind(self, elements: Elements) -> Any:
-        """Return the attributes of an element, or of several of one kind, in this physics.
+        """Return the attributes of an element, or of several of one kind; see ``BasePhysics.bind``.
 
-        Raises:
-            UsageError: When an element is none, is of another kind than the rest, or is not in the compiled model.
+        Bindings are kept: they know the places of the attributes in MuJoCo's arrays.
         """
         key: Any = tuple(elements) if isinstance(elements, list) else elements
         try:
             return self._bindings[key]
-        except (KeyError, TypeError):  # new, or a sequence without a hash
-            found, single = as_elements(elements)
-        key = found[0] if single else found
+        except (KeyError, TypeError):  # a new element, or a sequence without a hash
+            sequence, single = as_elements(elements)
+        key = sequence[0] if single else sequence
         if key not in self._bindings:
-            self._bindings[key] = self._new_binding(found, single)
+            self._bindings[key] = super().bind(key)
         return self._bindings[key]
 
-    def _new_binding(self, found: tuple[Element, ...], single: bool) -> Binding | EmptyBinding:
-        if not found:
-            return EmptyBinding()
-        kind = found[0].kind
-        layout.attributes(kind)
-        ids = layout.resolve(self.model.ptr, kind, tuple(e.full_identifier for e in found))
+    def _new_binding(self, kind: str, ids: tuple[int, ...], single: bool) -> Binding:
         return Binding(weakref.proxy(self), kind, ids, single)
 
-    def get(self, elements: Elements, name: str) -> Any:
-        """Return an attribute of elements; the same call on both engines."""
-        return getattr(self.bind(elements), name)
-
-    def set(self, elements: Elements, name: str, value: Any) -> Physics:
-        """Set an attribute of elements and return the physics; the same call on both engines.
-
-        Args:
-            name: The attribute, in MuJoCo's spelling without the kind's prefix.
-            value: What it is set to, in the shape in which it is read.
-        """
-        setattr(self.bind(elements), name, value)
-        return self
-
-    def write(self, elements: Elements, name: str, value: Any, index: Any) -> Physics:
-        """Set a part of an attribute of elements; the same call on both engines.
-
-        Args:
-            name: The attribute, in MuJoCo's spelling without the kind's prefix.
-        """
-        getattr(self.bind(elements), name)[index] = value
-        return self
-
     def fail(self, condition: ArrayLike = True) -> None:
-        """Give this initial state up where the condition holds; the same call on both engines.
+        """Reject this initial state where the condition holds.
 
         Raises:
             EpisodeInitializationError: When it holds.

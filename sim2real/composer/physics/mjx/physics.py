@@ -12,24 +12,20 @@ import numpy as np
 from mujoco import mjx
 
 from sim2real.composer.models import layout
-from sim2real.composer.models.element import as_elements
 from sim2real.composer.models.mjcf.translate import mj
-from sim2real.composer.physics.c.binding import EmptyBinding
-from sim2real.composer.physics.c.named import Named
 from sim2real.composer.physics.mjx import constants, stepping
 from sim2real.composer.physics.mjx.random import JaxRandomState
-from sim2real.composer.physics.mjx.views import MjxBinding, MjxDataView, MjxModelView, constant
+from sim2real.composer.physics.mjx.views import MjxBinding, MjxDataView, MjxModelView, Traced, constant
 from sim2real.composer.physics.mjx.warp import warp_fields
+from sim2real.composer.physics.named import Named
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from types import ModuleType
 
-    from jax.typing import ArrayLike
-
     from sim2real.composer.models.element import Elements
     from sim2real.composer.physics.mjx.warp.warp import WarpEngine
-    from sim2real.composer.types import MjModel
+    from sim2real.composer.types import ArrayLike, MjModel
 
 _FLUID = ("opt.density", "opt.viscosity", "opt.wind")
 _SWITCHES = {**dict.fromkeys(_FLUID, "opt._impl.has_fluid_params"), "body_gravcomp": "flg_gravcomp"}
@@ -42,7 +38,7 @@ Carried = tuple[mjx.Data, dict[str, jax.Array], dict[str, Any], jax.Array, dict[
 """All that changes: the state, fields of the model, variables of tasks, a key, what variations keep."""
 
 
-class MjxPhysics:
+class MjxPhysics(Traced):
     """The physics that hooks see while a program is traced: the same calls as on the C engine.
 
     Setting something replaces the state that this object holds; arrays that were read before keep their values.
@@ -52,14 +48,13 @@ class MjxPhysics:
         legacy: After a step, also compute positions and velocities of the new state.
 
     Attributes:
-        np: The module that computes with this engine's arrays: ``jax.numpy``.
         changed: Names of the model's fields that were set.
         start: The ``mjx.Data`` that ``reset`` returns to.
         dry: Whether steps compute nothing: for finding out what hooks set and keep.
         failed: Whether no acceptable initial state was found, a boolean array.
     """
 
-    np: Any = jnp
+    np = jnp
 
     def __init__(
         self,
@@ -194,23 +189,11 @@ class MjxPhysics:
 
     def initial(self, elements: Elements, name: str) -> Any:
         """Return an attribute of elements as it was compiled."""
-        field, index = self.bind(elements).place(name)
+        field, index = self.bind(elements).locate(name)
         holder = self._compiled if field.struct == "model" else self.mjx_data
         return getattr(holder, field.name)[index]
 
     # -- the interface of the C engine's physics
-
-    def time(self) -> jax.Array:
-        """Return the simulated time [s]."""
-        return self.mjx_data.time
-
-    def timestep(self) -> jax.Array:
-        """Return the time that a step takes [s]."""
-        return self.mjx_model.opt.timestep
-
-    def control(self) -> jax.Array:
-        """Return the controls, shape ``(nu,)``."""
-        return self.mjx_data.ctrl
 
     def set_control(self, control: ArrayLike) -> None:
         """Set the controls, shape ``(nu,)`` [the actuators' units].
@@ -219,44 +202,16 @@ class MjxPhysics:
             UsageError: When the shape is another.
         """
         old = self.mjx_data.ctrl
-        if jnp.size(control) not in (1, old.size):
+        control = jnp.asarray(control, old.dtype)
+        if control.size not in (1, old.size):
             raise UsageError(
-                f"there are {old.size} controls, and set_control was given an array of shape {jnp.shape(control)}",
+                f"there are {old.size} controls, and set_control was given an array of shape {control.shape}",
                 hint="a task whose actions are something else overrides action_spec and before_step",
             )
-        control = jnp.ravel(jnp.asarray(control, old.dtype))
-        self.mjx_data = self.mjx_data.replace(ctrl=jnp.broadcast_to(control, old.shape))
+        self.mjx_data = self.mjx_data.replace(ctrl=jnp.broadcast_to(jnp.ravel(control), old.shape))
 
-    def position(self) -> jax.Array:
-        """Return qpos, shape ``(nq,)``."""
-        return self.mjx_data.qpos
-
-    def velocity(self) -> jax.Array:
-        """Return qvel, shape ``(nv,)``."""
-        return self.mjx_data.qvel
-
-    def activation(self) -> jax.Array:
-        """Return act, shape ``(na,)``."""
-        return self.mjx_data.act
-
-    def get_state(self) -> jax.Array:
-        """Return positions, velocities and activations, shape ``(nq + nv + na,)``."""
-        data = self.mjx_data
-        return jnp.concatenate([data.qpos, data.qvel, data.act])
-
-    state = get_state
-
-    def set_state(self, state: ArrayLike) -> None:
-        """Set positions, velocities and activations, shape ``(nq + nv + na,)``.
-
-        Raises:
-            UsageError: When the shape is another.
-        """
-        nq, nv, na = self.host.nq, self.host.nv, self.host.na
-        if jnp.shape(state) != (nq + nv + na,):
-            raise UsageError(f"Input physics state has shape {jnp.shape(state)}. Expected {(nq + nv + na,)}.")
-        for name, part in zip(("qpos", "qvel", "act"), jnp.split(jnp.asarray(state), [nq, nq + nv]), strict=True):
-            self.replace("data", name, part)
+    def _copied(self, array: jax.Array) -> jax.Array:
+        return array
 
     def reset(self, keyframe_id: int | None = None) -> None:
         """Return to the initial state, or to a keyframe; variables are forgotten.
@@ -266,10 +221,7 @@ class MjxPhysics:
         """
         self.mjx_data = self.start
         if keyframe_id is not None:
-            if not 0 <= keyframe_id < self.host.nkey:
-                raise UsageError(
-                    f"`keyframe_id` must be between 0 and {self.host.nkey - 1} inclusive, got: {keyframe_id}"
-                )
+            self.check_keyframe(keyframe_id)
             names = {"qpos": "qpos", "qvel": "qvel", "act": "act", "ctrl": "ctrl", "time": "time"}
             for name, key in {**names, "mocap_pos": "mpos", "mocap_quat": "mquat"}.items():
                 self.replace("data", name, getattr(self.host, f"key_{key}")[keyframe_id])
@@ -292,45 +244,12 @@ class MjxPhysics:
         """MJX raises none."""
         return contextlib.nullcontext()
 
-    def bind(self, elements: Elements) -> Any:
-        """Return the attributes of an element, or of several of one kind.
+    def _new_binding(self, kind: str, ids: tuple[int, ...], single: bool) -> MjxBinding:
+        return MjxBinding(self, kind, ids, single)
 
-        Raises:
-            UsageError: When an element is none, is of another kind than the rest, or is not in the compiled model.
-        """
-        found, single = as_elements(elements)
-        if not found:
-            return EmptyBinding()
-        layout.attributes(found[0].kind)
-        ids = layout.resolve(self.host, found[0].kind, tuple(e.full_identifier for e in found))
-        return MjxBinding(self, found[0].kind, ids, single)
-
-    def get(self, elements: Elements, name: str) -> Any:
-        """Return an attribute of elements; the same call on both engines."""
-        return getattr(self.bind(elements), name)
-
-    def set(self, elements: Elements, name: str, value: Any) -> MjxPhysics:
-        """Set an attribute of elements and return the physics; the same call on both engines.
-
-        Args:
-            name: The attribute, in MuJoCo's spelling without the kind's prefix.
-            value: What it is set to, in the shape in which it is read.
-        """
-        setattr(self.bind(elements), name, value)
-        return self
-
-    def write(self, elements: Elements, name: str, value: Any, index: Any) -> MjxPhysics:
-        """Set a part of an attribute of elements; the same call on both engines.
-
-        Args:
-            name: The attribute, in MuJoCo's spelling without the kind's prefix.
-        """
-        whole = jnp.asarray(self.get(elements, name))
-        return self.set(elements, name, whole.at[index].set(jnp.asarray(value, whole.dtype)))
-
-    def fail(self, condition: bool | jax.Array = True) -> None:
+    def fail(self, condition: ArrayLike = True) -> None:
         """Note that no acceptable initial state was found where the condition holds; another attempt follows."""
-        self.failed = self.failed | condition
+        self.failed = self.failed | jnp.asarray(condition)
 
     # -- state as a tree
 

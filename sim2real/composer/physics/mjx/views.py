@@ -2,45 +2,45 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from abc import abstractmethod
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.composer.models import layout
-from sim2real.composer.physics.c.binding import columns
+from sim2real.composer.physics.base import BaseBinding, BaseModelView, BasePhysics
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from jax.typing import ArrayLike
     from mujoco import mjx
 
-    from sim2real.composer.types import MjModel
+    from sim2real.composer.types import ArrayLike, Index, MjModel
+    from sim2real.types import PyTree
 
 _MATRICES = ("xmat", "ximat", "geom_xmat", "site_xmat", "cam_xmat")
 """MJX keeps them as ``(n, 3, 3)``, MuJoCo as ``(n, 9)``."""
 
 
-class Traced(Protocol):
-    """What is shown here: an ``MjxPhysics``, whose state and model are replaced when something is set."""
+class Traced(BasePhysics):
+    """An ``MjxPhysics`` for its views: setting an attribute replaces its state or its model."""
 
     host: MjModel
     mjx_model: mjx.Model
     mjx_data: mjx.Data
 
-    def read(self, field: layout.Field) -> Any:
+    @abstractmethod
+    def read(self, field: layout.Field) -> PyTree:
         """Return a whole field."""
-        ...
 
-    def check(self, struct: str, name: str, rows: int | slice | np.ndarray) -> None:
-        """Refuse what cannot be set."""
+    @abstractmethod
+    def check(self, struct: str, name: str, rows: Index) -> None:
+        """Refuse to set rows of a field of the ``model`` or the ``data`` where MJX would ignore it."""
 
+    @abstractmethod
     def replace(self, struct: str, name: str, value: ArrayLike) -> None:
-        """Set a whole field."""
-
-    def mark_as_dirty(self) -> None:
-        """Note that what is computed is out of date."""
+        """Set a whole field of the ``model`` or the ``data``."""
 
 
 def constant(name: str) -> UsageError:
@@ -60,13 +60,13 @@ class ConstantView(np.ndarray):
         """Let arrays that are computed from this one be plain."""
         self.name = ""
 
-    def __getitem__(self, key: Any) -> Any:
+    def __getitem__(self, key: Index) -> PyTree:
         part = super().__getitem__(key)
         if isinstance(part, ConstantView):
             part.name = self.name
         return part
 
-    def __setitem__(self, key: Any, value: Any) -> None:
+    def __setitem__(self, key: Index, value: object) -> None:
         if self.name:
             raise constant(self.name)
         super().__setitem__(key, value)
@@ -75,18 +75,18 @@ class ConstantView(np.ndarray):
 class Struct:
     """A part of the compiled ``MjModel``, such as ``stat``: it can only be read."""
 
-    def __init__(self, native: Any, name: str) -> None:
+    def __init__(self, native: object, name: str) -> None:
         object.__setattr__(self, "_native", native)
         object.__setattr__(self, "_name", name)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> PyTree:
         return shown(getattr(self._native, name), f"{self._name}.{name}")
 
     def __setattr__(self, name: str, value: ArrayLike) -> None:
         raise constant(f"{self._name}.{name}")
 
 
-def shown(value: Any, name: str) -> Any:
+def shown(value: PyTree, name: str) -> PyTree:
     """Return a value of the compiled model as hooks may see it."""
     if isinstance(value, np.ndarray):
         view = value.view(ConstantView)
@@ -102,7 +102,7 @@ class OptionView:
     def __init__(self, physics: Traced) -> None:
         object.__setattr__(self, "_physics", physics)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> PyTree:
         value = getattr(self._physics.mjx_model.opt, name, None)
         return value if isinstance(value, jax.Array) else shown(getattr(self._physics.host.opt, name), f"opt.{name}")
 
@@ -110,27 +110,15 @@ class OptionView:
         self._physics.replace("model", f"opt.{name}", value)
 
 
-class MjxModelView:
-    """``physics.model``: what differs from copy to copy comes from MJX, the rest from ``ptr``, the ``MjModel``."""
+class MjxModelView(BaseModelView):
+    """``physics.model``: fields that differ from copy to copy come from MJX, all others from the ``MjModel``."""
 
     def __init__(self, physics: Traced) -> None:
+        super().__init__(physics.host)
         object.__setattr__(self, "_physics", physics)
         object.__setattr__(self, "opt", OptionView(physics))
 
-    @property
-    def ptr(self) -> MjModel:
-        """The compiled ``mujoco.MjModel``; its arrays are read-only."""
-        return self._physics.host
-
-    def name2id(self, name: str, kind: str) -> int:
-        """Return the number of an element; UsageError when there is none of that name."""
-        return layout.resolve(self.ptr, kind, (name,))[0]
-
-    def id2name(self, number: int, kind: str) -> str:
-        """Return the name of an element, '' when it has none."""
-        return layout.names_of(self.ptr, kind)[number]
-
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> PyTree:
         if name.startswith("__"):
             raise AttributeError(name)
         model = self._physics.mjx_model
@@ -147,7 +135,7 @@ class MjxDataView:
     def __init__(self, physics: Traced) -> None:
         object.__setattr__(self, "_physics", physics)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> PyTree:
         if name.startswith("__"):
             raise AttributeError(name)
         data = self._physics.mjx_data
@@ -160,54 +148,25 @@ class MjxDataView:
         self._physics.replace("data", name, value)
 
 
-class MjxBinding:
-    """Bound elements on MJX: attributes are JAX arrays; setting one replaces the physics's state or model.
+class MjxBinding(BaseBinding):
+    """Bound elements on MJX: attributes are JAX arrays; setting one replaces the physics's state or model."""
 
-    Args:
-        single: Whether one element is bound, rather than a sequence of them.
-    """
+    __slots__ = ()
+    _physics: Traced
 
-    __slots__ = ("_fields", "_ids", "_kind", "_physics", "_single", "element_id")
-
-    def __init__(self, physics: Traced, kind: str, ids: tuple[int, ...], single: bool) -> None:
-        numbers = ids[0] if single else np.array(ids, int)
-        values = (layout.attributes(kind), ids, kind, physics, single, numbers)
-        for name, value in zip(self.__slots__, values, strict=True):
-            object.__setattr__(self, name, value)
-
-    def place(self, name: str) -> tuple[layout.Field, Any]:
-        """Return the field that holds an attribute and the index of the bound rows in it."""
-        field = self._fields.get(name)
-        if field is None:
-            known = ", ".join(sorted(self._fields))
-            raise AttributeError(f"bound element <{self._kind}> does not have attribute {name!r}. Available: {known}")
-        return field, layout.index(self._physics.host, field, self._ids, self._single)
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        field, index = self.place(name)
+    def read(self, name: str) -> PyTree:
+        """Return an attribute of all bound elements."""
+        field, index = self.locate(name)
         return self._physics.read(field)[index]
 
-    def __setattr__(self, name: str, value: ArrayLike) -> None:
-        field, index = self.place(name)
+    def write(self, name: str, value: ArrayLike) -> None:
+        """Set an attribute of all bound elements."""
+        field, index = self.locate(name)
         array = jnp.asarray(self._physics.read(field))
         self._physics.check(field.struct, field.name, index)
         self._physics.replace(field.struct, field.name, array.at[index].set(jnp.asarray(value, array.dtype)))
         if field.triggers:
             self._physics.mark_as_dirty()
-
-    def __getitem__(self, key: Any) -> Any:
-        name, axes = key if isinstance(key, tuple) else (key, None)
-        value = getattr(self, name)
-        return value if axes is None else value[..., columns(axes)]
-
-    def __setitem__(self, key: Any, value: Any) -> None:
-        name, axes = key if isinstance(key, tuple) else (key, None)
-        if axes is not None:
-            whole = jnp.asarray(getattr(self, name))
-            value = whole.at[..., columns(axes)].set(jnp.asarray(value, whole.dtype))
-        setattr(self, name, value)
 
 
 def freeze(model: MjModel) -> None:
