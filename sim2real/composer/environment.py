@@ -156,11 +156,7 @@ class Environment(dm_env.Environment):
         self._hooks.add(hook_name, hook_callable)
 
     def reset(self) -> dm_env.TimeStep:
-        """Start an episode.
-
-        Raises:
-            EpisodeInitializationError: When the last attempt failed too.
-        """
+        """Start an episode; EpisodeInitializationError when the last attempt failed too."""
         self._reset_next_step = True
         for attempt in range(1, self._max_reset_attempts + 1):
             try:

@@ -15,8 +15,4 @@ class Initializer(ABC):
 
     @abstractmethod
     def __call__(self, physics: BasePhysics, random_state: RandomState) -> Any:
-        """Set the state.
-
-        Raises:
-            EpisodeInitializationError: When no acceptable state was found.
-        """
+        """Set the state; EpisodeInitializationError when no acceptable state was found."""

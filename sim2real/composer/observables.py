@@ -61,11 +61,7 @@ class Observables:
         return OrderedDict((prefix + name, value) for name, value in self._observables.items())
 
     def get_observable(self, name: str, name_fully_qualified: bool = False) -> Observable:
-        """Return an observable.
-
-        Raises:
-            KeyError: When there is none of that name.
-        """
+        """Return an observable; KeyError when there is none of that name."""
         if name_fully_qualified:
             name = name.removeprefix(self._entity.mjcf_model.full_identifier)
         try:

@@ -109,11 +109,7 @@ class Task(ABC):
         self.root_entity.mjcf_model.option.timestep = value
 
     def set_timesteps(self, control_timestep: float, physics_timestep: float) -> None:
-        """Set both time steps [s].
-
-        Raises:
-            UsageError: When a control step is no whole number of physics steps.
-        """
+        """Set both time steps [s]; UsageError when a control step is no whole number of physics steps."""
         self._check_root_entity("set_timesteps")
         _steps(control_timestep, physics_timestep)
         self.root_entity.mjcf_model.option.timestep = physics_timestep

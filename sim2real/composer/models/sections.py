@@ -182,11 +182,7 @@ class DocumentsOnly:
         self._name = name
 
     def add(self, tag: str, **attrs: Any) -> Any:
-        """Refuse.
-
-        Raises:
-            UsageError: Always.
-        """
+        """Refuse; UsageError always."""
         raise UsageError(f"a <{tag}> cannot be added to <{self._name}> by a program", hint=schema.FROM_DOCUMENTS)
 
 

@@ -92,11 +92,7 @@ class BasePhysics(ABC):
             setattr(self.data, name, part)
 
     def check_keyframe(self, keyframe_id: int) -> None:
-        """Check that a keyframe exists.
-
-        Raises:
-            UsageError: When there is no such keyframe.
-        """
+        """Check that a keyframe exists; UsageError when there is no such keyframe."""
         count = self.model.ptr.nkey
         if not 0 <= keyframe_id < count:
             raise UsageError(f"`keyframe_id` must be between 0 and {count - 1} inclusive, got: {keyframe_id}")

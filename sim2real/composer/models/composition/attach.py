@@ -76,11 +76,7 @@ _TURNING = (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_BALL)
 
 
 def detach(model: Tree[Handle]) -> None:
-    """Take a model off the one that it is attached to.
-
-    Raises:
-        UsageError: When it is not attached.
-    """
+    """Take a model off the one that it is attached to; UsageError when it is not attached."""
     parent = model.parent_model
     if parent is None:
         raise UsageError(f"Cannot detach model {model.model!r}: it is not attached")

@@ -134,11 +134,7 @@ class Physics(BoundPhysics):
     # -- dynamics
 
     def step(self, nstep: int = 1) -> None:
-        """Advance by a number of time steps.
-
-        Raises:
-            PhysicsError: When MuJoCo warns.
-        """
+        """Advance by a number of time steps; PhysicsError when MuJoCo warns."""
         model, data = self.model.ptr, self.data.ptr
         self._warned = self._warnings.tobytes()
         if not self.legacy_step:
@@ -233,11 +229,7 @@ class Physics(BoundPhysics):
         return Binding(weakref.proxy(self), kind, ids, single)
 
     def fail(self, condition: ArrayLike = True) -> None:
-        """Reject this initial state where the condition holds.
-
-        Raises:
-            EpisodeInitializationError: When it holds.
-        """
+        """Reject this initial state where the condition holds; EpisodeInitializationError when it holds."""
         if np.any(condition):
             raise EpisodeInitializationError
 

@@ -20,11 +20,7 @@ _PASSIVE = (mj.mjtDisableBit.mjDSBL_SPRING, mj.mjtDisableBit.mjDSBL_DAMPER)
 
 
 def check_model(model: MjModel) -> None:
-    """Refuse a compiled model that MJX does not simulate as MuJoCo does.
-
-    Raises:
-        UsageError: With the option or the elements.
-    """
+    """Refuse a compiled model that MJX does not simulate as MuJoCo does; UsageError with the option or the elements."""
     if int(model.opt.noslip_iterations) > 0:
         raise UsageError(
             f"MJX has no no-slip solver: option noslip_iterations is {model.opt.noslip_iterations}",

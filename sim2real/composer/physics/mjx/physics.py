@@ -196,11 +196,7 @@ class MjxPhysics(Traced):
     # -- the interface of the C engine's physics
 
     def set_control(self, control: ArrayLike) -> None:
-        """Set the controls, shape ``(nu,)`` [the actuators' units].
-
-        Raises:
-            UsageError: When the shape is another.
-        """
+        """Set the controls, shape ``(nu,)`` [the actuators' units]; UsageError when the shape is another."""
         old = self.mjx_data.ctrl
         control = jnp.asarray(control, old.dtype)
         if control.size not in (1, old.size):

@@ -143,11 +143,7 @@ class JaxRandomState:
         return scale * jax.random.gamma(self.next_key(), shape, _shape(size, shape, scale))
 
     def shuffle(self, x: ArrayLike) -> None:
-        """Refuse to work in place.
-
-        Raises:
-            UsageError: Always.
-        """
+        """Refuse to work in place; UsageError always."""
         raise UsageError("random_state.shuffle works in place", hint="use x = random_state.permutation(x)")
 
     def __getattr__(self, name: str) -> Any:

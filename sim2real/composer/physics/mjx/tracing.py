@@ -217,11 +217,7 @@ def _numbers(state: Any) -> tuple[bytes, int, list[Any]]:
 
 
 def check_variables(before: dict[str, Any], after: dict[str, Any]) -> None:
-    """Check that a step leaves the variables of a task as large as it found them.
-
-    Raises:
-        UsageError: With the variable.
-    """
+    """Check that a step leaves the variables of a task as large as it found them; UsageError with the variable."""
     for name, value in before.items():
         old, new = (
             [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree_util.tree_leaves(v)] for v in (value, after[name])

@@ -112,11 +112,7 @@ def _short() -> int:
 
 
 def find_device() -> Any:
-    """Return the device that JAX computes on.
-
-    Raises:
-        UsageError: When Warp is not installed, or cannot use that device.
-    """
+    """Return the device that JAX computes on; UsageError when Warp is not installed, or cannot use that device."""
     from mujoco.mjx import warp as mjx_warp
 
     if not mjx_warp.WARP_INSTALLED or mjx_warp.mujoco_warp is None:

@@ -15,11 +15,7 @@ def varies(path: str) -> bool:
 
 
 def check_field(path: str) -> None:
-    """Refuse a field of the model that cannot differ from copy to copy.
-
-    Raises:
-        UsageError: With the field.
-    """
+    """Refuse a field of the model that cannot differ from copy to copy; UsageError with the field."""
     if not varies(path):
         raise UsageError(
             f"MJX-Warp cannot change {path!r}: it is the same in all copies",
