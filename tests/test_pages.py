@@ -1,5 +1,6 @@
 """Files, modules and links that the pages name exist; tables that people extend stay well formed."""
 
+import ast
 import importlib
 import re
 from pathlib import Path
@@ -135,3 +136,36 @@ def test_rows_of_choices_are_complete():
 )
 def test_wrong_rows_of_choices_are_seen(line, wrong):
     assert len(malformed(rows(f"| a |\n|---|\n{line}", "| a |"))) == wrong
+
+
+PRINTED = {
+    "guides/any_robot.md": ["proposed from ", "was measured and ", " commanded, by their names"],
+    "guides/check.md": ["accept what is determined", "nothing in this data determines ", "record instead:", "round_trip_delay"],
+    "guides/deploy.md": ["the policy was trained with ", "sim2real latency; to deploy all the same: --force", "look at this joint"],
+    "guides/identify.md": [
+        "accepted", "no improvement on held-out data", "hit a bound", "not identifiable", "lacks a term", "not converged",
+        "interrupted", "negligible", "not reached", "disagree", "residuals of the fit", "nothing in this data determines ",
+        "no delay", "hold", "engine:", "next:",
+    ],
+    "guides/latency.md": [
+        ", from the sample to its message", " on the bus, question and answer", " wakes and computes",
+        ", from the motion", "sum of the medians, without what is in ()",
+    ],
+    "guides/safety.md": ["the control process is gone"],
+    "reference/runs.md": ["died", "dry run"],
+}  # fmt: skip
+"""Texts of the console that pages quote: each is part of a string in the code."""
+
+
+def strings() -> str:
+    """Return all strings of the package's code, one after the other; docstrings count too."""
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "sim2real").rglob("*.py"))
+    values = (n.value for tree in trees for n in ast.walk(tree) if isinstance(n, ast.Constant))
+    return "\n".join(value for value in values if isinstance(value, str))
+
+
+def test_quoted_texts_of_the_console_are_those_of_the_code():
+    printed = strings()
+    pages = {page: " ".join((ROOT / "docs" / page).read_text().split()) for page in PRINTED}
+    assert [(page, text) for page, texts in PRINTED.items() for text in texts if text.strip() not in pages[page]] == []
+    assert [(page, text) for page, texts in PRINTED.items() for text in texts if text not in printed] == []
