@@ -140,20 +140,45 @@ def test_wrong_rows_of_choices_are_seen(line, wrong):
 
 PRINTED = {
     "guides/any_robot.md": ["proposed from ", "was measured and ", " commanded, by their names"],
-    "guides/check.md": ["accept what is determined", "nothing in this data determines ", "record instead:", "round_trip_delay"],
-    "guides/deploy.md": ["the policy was trained with ", "sim2real latency; to deploy all the same: --force", "look at this joint"],
+    "guides/check.md": [
+        "accept what is determined",
+        "nothing in this data determines ",
+        "record instead:",
+        "round_trip_delay",
+    ],
+    "guides/deploy.md": [
+        "the policy was trained with ",
+        "sim2real latency; to deploy all the same: --force",
+        "look at this joint",
+    ],
     "guides/identify.md": [
-        "accepted", "no improvement on held-out data", "hit a bound", "not identifiable", "lacks a term", "not converged",
-        "interrupted", "negligible", "not reached", "disagree", "residuals of the fit", "nothing in this data determines ",
-        "no delay", "hold", "engine:", "next:",
+        "accepted",
+        "no improvement on held-out data",
+        "hit a bound",
+        "not identifiable",
+        "lacks a term",
+        "not converged",
+        "interrupted",
+        "negligible",
+        "not reached",
+        "disagree",
+        "residuals of the fit",
+        "nothing in this data determines ",
+        "no delay",
+        "hold",
+        "engine:",
+        "next:",
     ],
     "guides/latency.md": [
-        ", from the sample to its message", " on the bus, question and answer", " wakes and computes",
-        ", from the motion", "sum of the medians, without what is in ()",
+        ", from the sample to its message",
+        " on the bus, question and answer",
+        " wakes and computes",
+        ", from the motion",
+        "sum of the medians, without what is in ()",
     ],
     "guides/safety.md": ["the control process is gone"],
     "reference/runs.md": ["died", "dry run"],
-}  # fmt: skip
+}
 """Texts of the console that pages quote: each is part of a string in the code."""
 
 
