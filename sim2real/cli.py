@@ -8,33 +8,19 @@ import sys
 from collections.abc import Sequence
 
 from sim2real.commands import exit_code
-from sim2real.commands.table import COMMANDS, DEMO_PIPELINE, EXIT_CODES
+from sim2real.commands.command_kinds import DEMO_PIPELINE, EXIT_CODES
+from sim2real.commands.table import COMMANDS
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 from sim2real.runtime import compilation_cache
 from sim2real.stages.terminal.interruption import SignalHandling
 
+_LIST = "\n".join(f"  {name:9} {command.help}" for name, command in COMMANDS.items())
 HELP = f"""\
 From a robot's log to a policy that works on that robot
 
 usage: sim2real COMMAND [PIPELINE] [FLAGS]
 
-  record    record the robot under an excitation
-  identify  identify dynamics, delays and initial states from the log
-  train     train a policy on the identified model with the robot's timing
-  deploy    run the policy on the robot and compare with the simulation
-  run       all four, one after the other; --resume RUN goes on where it ended
-  demo      run on the embedded {DEMO_PIPELINE}, with its defaults
-  view      open a run in the Rerun viewer, or save it as a recording
-  report    write a run's report as one HTML page
-  info      about the installation, a pipeline, a log or a run
-  check     judge what a recording, or a planned one, can tell about the parameters
-  validate  score what was identified on a later log
-  compare   parameters with intervals, errors and success of several runs side by side
-  latency   where the milliseconds go between motion and motion: host, bus and device
-  import    turn files of other recorders into logs, and say what is what in them
-  new       write the files of a pipeline for a robot of which there is a model
-  export    write what was identified for MuJoCo, mjlab, Isaac Lab, or as JSON; or a policy for a bare machine
-  log       recover what is readable of a damaged log into a new one
+{_LIST}
 
 examples
   sim2real demo --seed 1
@@ -65,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run_command(arguments: list[str], signals: SignalHandling) -> int:
-    """Run a command; say what went wrong, and return the exit code that stands for it."""
+    """Run a command; print its error, if any, and return its exit code."""
     try:
         _dispatch(arguments)
         sys.stdout.flush()

@@ -15,7 +15,7 @@ import pytest
 from sim2real import cli, errors
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.run import run_folder
-from sim2real.commands import in_brief
+from sim2real.commands.loop import in_brief
 from sim2real.stages.config import RecordConfig
 
 QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}

@@ -93,7 +93,7 @@ def run(
         The run, with what each stage left.
     """
     from sim2real.commands.flags import RunFlags
-    from sim2real.commands.run_loop import run_all
+    from sim2real.commands.loop.run_loop import run_all
 
     pipeline, root = pipeline_of(robot), folder_of(runs, "runs")
     given = {"record": record, "identify": identify, "train": train, "deploy": deploy}

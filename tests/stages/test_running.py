@@ -12,8 +12,8 @@ from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.run_folder import STAGES, Source, open_stage
-from sim2real.commands import run_loop
 from sim2real.commands.flags import RunFlags
+from sim2real.commands.loop import run_loop
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.view.page.iterations import iterations_sections
@@ -106,7 +106,7 @@ def test_a_fine_robot_ends_the_loop(world, capsys):
         ["1", "record, identify, train, deploy", "0.6000"],
         ["2", "train.2, deploy.2", "1.000"],
     ]
-    assert "stop: nothing is left to do" in capsys.readouterr().out
+    assert "stop: the policy works on the robot" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -169,7 +169,7 @@ def restored(
     """
     import sim2real
     from sim2real.artifacts.identification import ROUND_TRIP
-    from sim2real.commands.retry import MOST, for_longer, lacking, repeated
+    from sim2real.commands.loop.retry import MAX_RETRIES, run_with_retries, why_insufficient, with_more_steps
     from sim2real.stages.deploy.next_command import logs_to_identify, terms_to_identify
 
     if said["verdict"] != "re-identify":
@@ -182,15 +182,15 @@ def restored(
         again = identify(pipeline, own, now.number, options, terms) if own else None
     except Sim2RealError:
         again = None
-    if again is None or lacking(again):
+    if again is None or why_insufficient(again):
         own = [logs[0].with_name(f"{change}_session.mcap")]
         now.record(own[0], options.record_s, 1000)
         again = identify(pipeline, own, now.number, options, terms)
-    config, bundle = repeated(
+    config, bundle = run_with_retries(
         lambda config: sim2real.train(pipeline, again, config),
         randomise.train_config(pipeline, "all", now.number, options),
-        lambda config, bundle: for_longer(config, bundle.history),
-        MOST["train"],
+        lambda config, bundle: with_more_steps(config, bundle.history),
+        MAX_RETRIES["train"],
     )[-1]
     success = now.success(bundle, options)
     print(f"robot {now.number}, {change}: {success} after one iteration from {len(own)} logs", flush=True)
@@ -208,10 +208,12 @@ def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Nam
     """Return what logs say about a robot; with wider bounds where an estimate lies at one, as a run does it."""
     import sim2real
     from sim2real.artifacts.recording import Recording
-    from sim2real.commands.retry import MOST, repeated, with_wider_bounds
+    from sim2real.commands.loop.retry import MAX_RETRIES, run_with_retries, with_wider_bounds
 
     few = {"folds": options.folds, "generations": options.generations}
     config = replace(pipeline.identify, seed=number, terms=terms, **few)
     recordings = [Recording.load(log) for log in logs]
-    tried = repeated(lambda c: sim2real.identify(pipeline, recordings, c), config, with_wider_bounds, MOST["identify"])
+    tried = run_with_retries(
+        lambda c: sim2real.identify(pipeline, recordings, c), config, with_wider_bounds, MAX_RETRIES["identify"]
+    )
     return tried[-1][1]

@@ -32,8 +32,6 @@ from sim2real.artifacts.run.manifest import (
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
 
 STAGES = ("record", "identify", "train", "deploy")
-TESTS = ("latency", "explain")
-"""What has a folder in a run as stages have, but no other stage takes up."""
 DRY = "dry run"
 """Status of a stage that ended well but moved nothing: later stages do not use it."""
 INTERRUPTED = 130
@@ -157,7 +155,7 @@ def open_stage(
     """Run a stage in a folder of its own, with a manifest from the first moment to the last.
 
     Args:
-        stage: One of ``STAGES``, or of ``TESTS``.
+        stage: Name of the stage, which is also the name of its folder.
         config: The resolved configuration, a dataclass.
         inputs: Name -> file or folder that the stage reads; hashed before it starts.
         run_dir: Run folder to add to; None makes a new one.
@@ -167,7 +165,7 @@ def open_stage(
         code.
 
     Raises:
-        UsageError: When there is no such stage, or the pipeline's name cannot be that of a folder.
+        UsageError: When the stage's or the pipeline's name cannot be that of a folder.
         Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
     """
     _check_names(pipeline, stage)
@@ -218,9 +216,9 @@ def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str,
 
 
 def _check_names(pipeline: str, stage: str) -> None:
-    """Refuse unknown stages, and names of pipelines, which may come from files, that lead out of the folder of runs."""
-    if stage not in (known := (*STAGES, *TESTS)):
-        raise UsageError(f"unknown stage {stage!r}. Available: {', '.join(known)}")
+    """Refuse names that are no folder in the folder of runs; a pipeline's name may come from a file."""
+    if not stage.isidentifier():
+        raise UsageError(f"{stage!r} is no name for a stage", hint="letters, digits and '_'; a letter first")
     if not _NAME.fullmatch(pipeline):
         raise UsageError(
             f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"

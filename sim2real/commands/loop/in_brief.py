@@ -1,4 +1,4 @@
-"""A run on a few lines: each stage one line of progress and the figures that decide, at the end the result in words."""
+"""A run on a few lines: one line of progress and the main figures of each stage, then the verdict."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim2real.stages.terminal import console
 from sim2real.stages.terminal.brief import brief
 
 if TYPE_CHECKING:
-    from sim2real.commands.run_loop import Call
+    from sim2real.commands.loop.run_loop import CallStage
 
 _FIGURES = {
     "record": ("seconds", "lost replies", "late replies"),
@@ -19,19 +19,19 @@ _FIGURES = {
     "train": ("success in simulation", "what breaks it"),
     "deploy": ("success, deployment", "measured delay"),
 }
-"""Stage -> how the names of the figures in its manifest begin that are printed."""
-_MOST_ROWS = 4
+"""Stage -> the figures of its manifest that are printed, by the beginnings of their names."""
+_MAX_FIGURES = 4
 
 
-def in_brief(call: Call) -> Call:
-    """Return a caller of stages that prints the figures of each stage instead of everything that it prints."""
+def in_brief(call: CallStage) -> CallStage:
+    """Return a caller of stages that prints the main figures of each stage instead of its full output."""
 
     def call_in_brief(stage: str, config: Any, run_dir: Path | None) -> StageFolder:
         with brief():
             done = call(stage, config, run_dir)
         summary = done.manifest["summary"] or {}
         figures = {n: v for prefix in _FIGURES[stage] for n, v in summary.items() if n.startswith(prefix)}
-        shown = dict(list(figures.items())[:_MOST_ROWS])
+        shown = dict(list(figures.items())[:_MAX_FIGURES])
         if shown:
             print("\n".join(f"  {line}" for line in console.pairs(shown).splitlines()), flush=True)
         return done
@@ -40,7 +40,7 @@ def in_brief(call: Call) -> Call:
 
 
 def conclude(run_dir: Path | None) -> None:
-    """Write the page of a run, and print the result in words with the page to open."""
+    """Write the page of a run; print the verdict and the name of the page."""
     if run_dir is None:
         return
     from sim2real.view.page.page import report  # matplotlib and jinja2 take 0.5 s to import
