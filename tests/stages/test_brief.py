@@ -49,7 +49,7 @@ def test_no_two_seconds_are_silent(capsys):
 def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys, shared_run_dir):
     """The stages' artifacts are those of a finished run; each stage prints 100 lines of details."""
     from sim2real.artifacts.run.run_folder import finished
-    from sim2real.commands import table
+    from sim2real.commands import run_commands
 
     def call_stage(stage, pipeline, config, root, run_dir):
         for i in range(100):
@@ -57,7 +57,7 @@ def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys
             print(f"row {i} of {stage}")
         return finished(shared_run_dir, stage)
 
-    monkeypatch.setattr(table, "_call_stage", call_stage)
+    monkeypatch.setattr(run_commands, "run_stage", call_stage)
     monkeypatch.chdir(tmp_path)
     assert cli.main(["demo", *(["--verbose"] if verbose else [])]) == 0
     out, err = capsys.readouterr()

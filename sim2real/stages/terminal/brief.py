@@ -18,7 +18,7 @@ def brief() -> Iterator[None]:
     A terminal shows the seconds that have passed and the present activity; a log file gets a dot each second, so that
     neither is silent.
     """
-    held = console.Held(io.StringIO(), sys.stderr.isatty())
+    held = console.HeldOutput(io.StringIO(), sys.stderr.isatty())
     begun_s = time.monotonic()
 
     def tick() -> None:

@@ -25,7 +25,7 @@ _ACTS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066
 
 
 @dataclass
-class Held:
+class HeldOutput:
     """Output that is held back while a command prints few lines.
 
     Attributes:
@@ -38,10 +38,10 @@ class Held:
     activity: str = ""
 
 
-_held: Held | None = None
+_held: HeldOutput | None = None
 
 
-def hold(held: Held | None) -> None:
+def hold(held: HeldOutput | None) -> None:
     """Hold notes and progress back from now on; None: print them again."""
     global _held
     _held = held
@@ -50,7 +50,7 @@ def hold(held: Held | None) -> None:
 class _Silent:
     """Progress that only names the present activity."""
 
-    def __init__(self, held: Held, total: float | None, desc: str) -> None:
+    def __init__(self, held: HeldOutput, total: float | None, desc: str) -> None:
         self.n: float = 0
         self.total = total
         self._held = held
