@@ -1,6 +1,54 @@
-"""Identification: parameters, residuals, search, uncertainty."""
+"""Identification: the way from a log to a verdict, in ten calls.
 
-from typing import TYPE_CHECKING, Any
+``sim2real.identify(robot, recording)`` does this and more, such as refits without parts of the log. The steps::
+
+    import numpy as np
+
+    import sim2real
+    from sim2real.identify.config import FitConfig
+    from sim2real.identify.fit import fit
+    from sim2real.identify.problem.segments import Span
+    from sim2real.identify.uncertainty import identifiability, uncertainty
+    from sim2real.identify.validation import prediction, verdict
+
+    LENGTH_S, SETTLE_S, HORIZON_S = 1.3, 0.3, 1.0
+
+    # Open the robot and the log, and make the graph whose parameters are identified.
+    robot = sim2real.load_pipeline("pendulum").load()  # 1
+    episode = sim2real.Recording.load("datasets/pendulum/chirp.mcap").episode  # 2
+    config = FitConfig()
+    model = robot.identifiable(config.max_delay_s)  # 3
+
+    # Cut the log into segments of LENGTH_S: the first three quarters are fitted, the rest is held out.
+    begins_s = np.arange(0.3, episode.duration_s - LENGTH_S - 0.2, LENGTH_S)
+    spans = [Span(0, float(begin_s), begin_s < 0.75 * episode.duration_s) for begin_s in begins_s]
+
+    # Search, then refine: the estimate is where the simulated segments differ least from the measured ones.
+    estimate = fit(model, [episode], spans, LENGTH_S, config)  # 4
+
+    # Linearise the residuals at the estimate: intervals follow from the derivatives, and which parameters the log
+    # determines.
+    at = uncertainty.linearise(estimate.problem, estimate.z)  # 5
+    spread = uncertainty.from_linearised(estimate.problem, at)  # 6
+    determined = identifiability.from_linearised(estimate.problem, at)  # 7
+
+    # Predict the held-out segments: SETTLE_S of each give its initial state, HORIZON_S are compared.
+    models = {"identified": estimate.values, "nominal": {p.name: p.nominal for p in model.parameters}}
+    columns = prediction.samples(estimate.windows, models, SETTLE_S)  # 8
+    errors = prediction.errors(estimate.windows, columns, list(models), SETTLE_S, [HORIZON_S])
+
+    # Judge: the estimate must predict every position better than every baseline, within its bounds.
+    scores = verdict.scores(errors, verdict.positions(model, robot.units))  # 9
+    left = None if estimate.converged else estimate.left
+    judgement = verdict.judge(scores, estimate.problem.table, at.x, spread, determined, left=left)  # 10
+    for line in (judgement.status, *judgement.reasons):
+        print(line)
+
+Packages: ``problem`` (segments, residuals, programs), ``search`` (evolution strategy, least squares), ``uncertainty``
+(intervals, posterior), ``validation`` (held-out parts, verdict), ``delays`` (links), ``drift``, ``export``.
+"""
+
+from typing import TYPE_CHECKING
 
 from sim2real import callable_package
 
@@ -12,7 +60,7 @@ __all__ = ["minimise"]
 callable_package(__name__)
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a public function on first use."""
     if name in __all__:
         from sim2real.identify.search import minimum

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,9 +25,11 @@ _OFF_BOUNDS = 3.0
 """A search begins within the middle 90 % of the bounds."""
 _CONVERGED = 0.5
 """A fit without refinement has converged where less is left of the next Gauss-Newton step, in standard errors."""
-Told = Callable[[str, float, float, np.ndarray], None]
-"""Called with the phase (``search`` or ``refine``; ``compiling`` in between), the share of it done since the last call,
-and the best loss and point so far."""
+OnProgress = Callable[[str, float, float, np.ndarray], None]
+"""Called with the phase (``search``, ``refine`` or ``compiling``), the share of it done since the last call, and the
+best loss and point so far."""
+Value: TypeAlias = float | list[float]
+"""The value of a parameter: a number, or a list with one number a recording."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Fit:
     converged: bool
 
     @property
-    def values(self) -> dict[str, Any]:
+    def values(self) -> dict[str, Value]:
         """The estimate by name: a number, or a list of one for each recording."""
         return as_numbers(self.problem.table, self.z)
 
@@ -71,7 +73,7 @@ class Fit:
         return uncertainty(self.problem, self.z)
 
 
-def as_numbers(table: ParameterTable, z: np.ndarray, kept: np.ndarray | None = None) -> dict[str, Any]:
+def as_numbers(table: ParameterTable, z: np.ndarray, kept: np.ndarray | None = None) -> dict[str, Value]:
     """Return values by name as Python numbers, lists where each recording has its own.
 
     Args:
@@ -89,7 +91,7 @@ def fit(
     config: FitConfig,
     table: ParameterTable | None = None,
     long_spans: Sequence[Span] = (),
-    told: Told | None = None,
+    report: OnProgress | None = None,
     begins: Callable[[Problem], None] | None = None,
 ) -> Fit:
     """Identify a model.
@@ -107,15 +109,15 @@ def fit(
     starts, found = problem.table.starts(), None
     z, loss = starts[0], float("nan")
     if config.generations:
-        found = run_search(problem, starts[0], told)
+        found = run_search(problem, starts[0], report)
         starts = np.stack([*found.finalists[: config.refine], starts[0]])
         z, loss = found.z, found.loss
     refined = []
     if config.refine:
-        refined.append(_refine(problem, starts, told))
+        refined.append(_refine(problem, starts, report))
     if config.refine and config.long_s and long_spans:
         problem = problem.recut(long_spans, config.long_s)
-        refined.append(_refine(problem, refined[-1].z[None], told))
+        refined.append(_refine(problem, refined[-1].z[None], report))
     if refined:
         z, loss, left, converged = refined[-1].z, refined[-1].loss, refined[-1].left, refined[-1].converged
     else:
@@ -125,7 +127,7 @@ def fit(
     return Fit(problem, z, loss, found, tuple(refined), windows, left, converged)
 
 
-def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Any]:
+def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Value]:
     """Estimate fewer parameters, by refinement alone; the others are held at what a model without them has.
 
     Args:
@@ -143,7 +145,7 @@ def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Any
     return as_numbers(table, refine(problem, starts, problem.part(kept=kept), coarse=True).z, kept)
 
 
-def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) -> SearchResult:
+def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = None) -> SearchResult:
     """Search as the problem's configuration says.
 
     Args:
@@ -154,10 +156,10 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
     start = np.clip(start, -_OFF_BOUNDS, _OFF_BOUNDS)
 
     def advance(generations: int, best: float, z: np.ndarray) -> None:
-        if told:
-            told("search", generations / total, best, z)
+        if report:
+            report("search", generations / total, best, z)
 
-    compiling, data, config = _compiling(told, "search", start), problem.data, problem.config
+    compiling, data, config = _compiling(report, "search", start), problem.data, problem.config
     free = config.initial_state == "free"
     # How a search shares the delays' sum between both sides of the world means nothing: see ``centred``.
     middle = lambda z: centred(problem.table, z) if free else z  # noqa: E731
@@ -175,29 +177,29 @@ def run_search(problem: Problem, start: np.ndarray, told: Told | None = None) ->
     )
     finalists = np.array([middle(z) for z in found.finalists])
     found = replace(found, z=finalists[0], finalists=finalists)
-    if told:  # the loss of the best candidate by itself: before, initial states were those of its generation's middle
-        told("search", 0.0, found.loss, found.z)
+    if report:  # the loss of the best candidate by itself: before, initial states were those of its generation's middle
+        report("search", 0.0, found.loss, found.z)
     return found
 
 
-def _refine(problem: Problem, starts: np.ndarray, told: Told | None) -> Refined:
+def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> Refined:
     left, share = 1.0, 0.5 / (problem.config.refine_steps * (1 + len(starts)))
 
     def advance(best: float, z: np.ndarray) -> None:
         nonlocal left
         step = min(share, left / 2.0)  # how many evaluations there will be is not known
         left -= step
-        if told:
-            told("refine", step, best, z)
+        if report:
+            report("refine", step, best, z)
 
-    return refine(problem, starts, on_step=advance, on_compile=_compiling(told, "refine", starts[0]))
+    return refine(problem, starts, on_step=advance, on_compile=_compiling(report, "refine", starts[0]))
 
 
-def _compiling(told: Told | None, then: str, z: np.ndarray) -> OnCompile:
+def _compiling(report: OnProgress | None, then: str, z: np.ndarray) -> OnCompile:
     """Return what reports that programs are compiled, before the phase ``then`` goes on."""
 
-    def report(started: bool) -> None:
-        if told:
-            told("compiling" if started else then, 0.0, float("inf"), z)
+    def on_compile(started: bool) -> None:
+        if report:
+            report("compiling" if started else then, 0.0, float("inf"), z)
 
-    return report
+    return on_compile

@@ -168,7 +168,7 @@ def found(episode):
     """The lag, searched for briefly and refined."""
     told = []
     return SimpleNamespace(
-        fit=fit(Model(), [episode], SPANS, LENGTH_S, CONFIG, told=lambda *what: told.append(what)), told=told
+        fit=fit(Model(), [episode], SPANS, LENGTH_S, CONFIG, report=lambda *what: told.append(what)), told=told
     )
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.stages.estimation import estimate as identified
+from sim2real.stages.identify.show import show
 
 
 @pytest.mark.parametrize(
@@ -12,5 +12,5 @@ from sim2real.stages.estimation import estimate as identified
 def test_how_far_an_estimate_is_off_where_nothing_is_true_too(estimate, truth, off, capsys):
     """An empty hand holds 0 kg."""
     p = Estimate("payload", "kg", "dynamics", "", 0.0, estimate, "accepted", truth=truth)
-    identified.show(Identification("arm", (), Judgement("accepted", ()), (p,)))
+    show(Identification("arm", (), Judgement("accepted", ()), (p,)))
     assert off in capsys.readouterr().out

@@ -14,7 +14,7 @@ from sim2real.identify.uncertainty.uncertainty import Uncertainty
 from sim2real.identify.validation.verdict import Position
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.estimation.held_out_parts import further, promises, sentences, widened, widest
-from sim2real.stages.identify import stage as identify_stage
+from sim2real.stages.identify import fitting
 from sim2real.stages.identify.interrupted import Best
 
 ANGLE = Position("th", "tilt", "rad", 0.001)
@@ -146,11 +146,12 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
         tables.append((config.generations, table))
         return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
 
-    monkeypatch.setattr(identify_stage, "fitted_to", fit)
+    monkeypatch.setattr(fitting, "fitted_to", fit)
     selection = SimpleNamespace(names=lambda _: ("cogging",))
-    monkeypatch.setattr(identify_stage.held_out_parts, "chosen", lambda *_: selection)
+    monkeypatch.setattr(fitting.held_out_parts, "chosen", lambda *_: selection)
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
-    identify_stage._with_terms(None, [], [], config, table, ["log"], Best())
+    inputs = SimpleNamespace(config=config, table=table, model=None, episodes=[], fitted=1, windows=[], names=["log"])
+    fitting.fit_model(inputs, Best())
     fewer = tables[1][1]
     assert fewer.terms == ("cogging",)
     assert [(generations, own) for generations, own in tables] == [(config.generations, table), (0, fewer)]

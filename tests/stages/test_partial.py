@@ -12,6 +12,7 @@ import pytest
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.run_folder import attempts
 from sim2real.errors import Sim2RealError
+from sim2real.stages.identify import fitting
 from sim2real.stages.identify import stage as identify_stage
 from sim2real.stages.identify.interrupted import Best
 from sim2real.stages.pipeline.open_parameters import open_identification
@@ -37,7 +38,7 @@ def interrupted(pipeline, root, monkeypatch, ending, told=True):
                 tell("search", 0.25, loss, own.encode(values))
         raise ending
 
-    monkeypatch.setattr(identify_stage, "fitted_to", fit)
+    monkeypatch.setattr(fitting, "fitted_to", fit)
     config = replace(pipeline.identify, log=(str(LOG),))
     with pytest.raises(type(ending)):
         identify_stage.run(pipeline, config, root, None)
@@ -84,7 +85,7 @@ def test_a_kill_while_a_fit_is_judged_loses_the_judgement_alone(tmp_path):
     quick = ["--generations", "10", "--refine", "1"]
     with subprocess.Popen([*own, *quick], stderr=subprocess.PIPE, text=True, cwd=ROOT) as running:
         for line in running.stderr:
-            if "identify: left-out parts: started" in line:
+            if "identify: held-out parts: started" in line:
                 running.kill()
                 break
     (path,) = tmp_path.rglob("partial.json")

@@ -1,36 +1,61 @@
-"""Each recording identified by itself, from the estimate of all: how much a robot differs from one to the next."""
+"""Each recording identified alone, from the estimate of all: how much a robot differs between recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from sim2real.identify.fit import Fit, as_numbers
+from sim2real.artifacts.estimation.quantity import Quantity
+from sim2real.artifacts.identification import ROUND_TRIP
+from sim2real.identify.fit import Fit, Value, as_numbers
+from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.search.refine import refine
-from sim2real.identify.uncertainty.uncertainty import Uncertainty, from_linearised, linearise
+from sim2real.identify.uncertainty.aggregate import aggregate
+from sim2real.identify.uncertainty.uncertainty import Uncertainty, from_linearised, linearise, sum_of
 from sim2real.identify.validation.optional_terms import statistics
 
 
-def identify_each(found: Fit) -> list[tuple[Mapping[str, Any], Uncertainty]]:
-    """Return what each recording says by itself, with its uncertainty, in order.
+def compare_recordings(estimate: Fit) -> tuple[Quantity, ...]:
+    """Identify each recording alone, and combine the estimates of each quantity."""
+    alone, table = identify_each(estimate), estimate.problem.table
+    rows = []
+    for name, unit, parts in _quantities(table):
+        values = np.array([sum(np.ravel(estimates[n])[0] for n in parts) for estimates, _ in alone])
+        errors = np.array([sum_of(spread, [table.names.index(n) for n in parts]) for _, spread in alone])
+        rows.append(aggregate(values, errors, name, unit))
+    return tuple(rows)
 
-    A descent from where the others led stays in their optimum: what differs is the robot, not which optimum was found.
+
+def identify_each(estimate: Fit) -> list[tuple[Mapping[str, Value], Uncertainty]]:
+    """Return the estimates of each recording alone, by name, with their uncertainty.
+
+    Each descent begins near the estimate of all recordings and stays in its optimum. So recordings differ by changes of
+    the robot, and not by the optimum that a search reached.
     """
-    problem, table = found.problem, found.problem.table
-    of = problem.recording[problem.train]
-    rows = [of == r for r in np.unique(of)]
-    at = linearise(problem, found.z)
-    stats = statistics(problem, at, np.array(rows))
-    every, single = np.ones(len(table.terms), bool), []
-    for k, own in enumerate(rows):
-        data = problem.part(problem.train[~own])
-        starts = (table.at_scale(at.x + stats.only(k).step(table, every)), found.z)
+    problem, table = estimate.problem, estimate.problem.table
+    recording = problem.recording[problem.train]
+    masks = [recording == r for r in np.unique(recording)]
+    at = linearise(problem, estimate.z)
+    stats = statistics(problem, at, np.array(masks))
+    all_terms, alone = np.ones(len(table.terms), bool), []
+    for k, mask in enumerate(masks):
+        data = problem.part(problem.train[~mask])
+        # Begin at the better of two points: the linear prediction for this recording, and the estimate of all.
+        starts = (table.at_scale(at.x + stats.only(k).step(table, all_terms)), estimate.z)
         start = min(starts, key=lambda z, data=data: np.nan_to_num(problem.loss(z, data), nan=np.inf))
         z = refine(problem, start[None], data, settle=False).z
-        there = linearise(problem, z)
-        alone = replace(there, residuals=there.residuals[own], jacobian=there.jacobian[own], raw=there.raw[own])
-        single.append((as_numbers(table, z), from_linearised(problem, alone)))
-    return single
+        # Compute the uncertainty from the residuals of this recording.
+        end = linearise(problem, z)
+        part = replace(end, residuals=end.residuals[mask], jacobian=end.jacobian[mask], raw=end.raw[mask])
+        alone.append((as_numbers(table, z), from_linearised(problem, part)))
+    return alone
+
+
+def _quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
+    """Return the quantities to compare: name, unit, and the parameters of which each is the sum."""
+    free = [p for p in parameters if p.free and not p.per_recording]
+    delays = [p.name for p in free if p.kind == "delay"]
+    rows = [(p.name, p.unit, [p.name]) for p in free if p.kind != "delay" or len(delays) == 1]
+    return rows + ([(ROUND_TRIP, "s", delays)] if len(delays) > 1 else [])

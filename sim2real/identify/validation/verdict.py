@@ -10,10 +10,13 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.identification import Determined, HeldOut, Judgement, Prediction
+from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.uncertainty.bounds import is_physical, way_out, way_out_of
 from sim2real.identify.uncertainty.round_trip import RoundTrip
 from sim2real.identify.uncertainty.uncertainty import Uncertainty
+from sim2real.identify.validation.prediction import position_of
+from sim2real.log.schema import unit_of
 
 Status = Literal["accepted", "not converged", "no improvement on held-out data", "not identifiable", "hit a bound"]
 _BETTER = 0.95
@@ -43,6 +46,15 @@ class Position:
     name: str
     unit: str
     sigma: float
+
+
+def positions(model: IdentifiableModel, units: Mapping[str, str]) -> list[Position]:
+    """Return the measured positions of a model, which are judged one by one.
+
+    Args:
+        units: Field -> unit.
+    """
+    return [Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma) for c in model.channels]
 
 
 def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[HeldOut]:

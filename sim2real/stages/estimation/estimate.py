@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.estimation.links import Link
 from sim2real.artifacts.estimation.posterior import Posterior
-from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import (
     ROUND_TRIP,
     Determined,
@@ -21,17 +18,12 @@ from sim2real.artifacts.identification import (
     Matrix,
 )
 from sim2real.identify.fit import Fit
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty import identifiability, noise, uncertainty
 from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
 from sim2real.identify.uncertainty.round_trip import RoundTrip, round_trip
-from sim2real.identify.validation.prediction import position_of
-from sim2real.identify.validation.verdict import Position, judge, scores
-from sim2real.log.schema import unit_of
+from sim2real.identify.validation.verdict import judge, positions, scores
 from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.free_run import Lack
-from sim2real.stages.terminal.console import note, table
 
 
 @dataclass(frozen=True)
@@ -135,7 +127,7 @@ def judged(
         max_delay_s: For which delays the model is made [s].
         outside: Where held-out data goes beyond what was fitted: sentences.
     """
-    judged_on = positions(found.fit.problem, units)
+    judged_on = positions(found.fit.problem.model, units)
     rows = scores(document.prediction, judged_on)
     table = found.fit.problem.table
     fit = found.fit
@@ -156,92 +148,6 @@ def judged(
     flags = " ".join(f for f in (verdict.next, lack.flags) if f)
     told = Judgement(status, (*worth, *verdict.reasons, *lack.reasons), flags)
     return replace(document, verdict=told, held_out=tuple(rows))
-
-
-def positions(problem: Problem, units: Mapping[str, str]) -> list[Position]:
-    """Return the measured positions, which the verdict judges one by one."""
-    return [
-        Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma)
-        for c in problem.model.channels
-    ]
-
-
-def quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
-    """Return the quantities in which recordings are compared: name, unit, and the parameters that it is the sum of."""
-    free = [p for p in parameters if p.free and not p.per_recording]
-    delays = [p.name for p in free if p.kind == "delay"]
-    rows = [(p.name, p.unit, [p.name]) for p in free if p.kind != "delay" or len(delays) == 1]
-    return rows + ([(ROUND_TRIP, "s", delays)] if len(delays) > 1 else [])
-
-
-def show(found: Identification) -> None:
-    """Print the parameters, and what stands in the way of trusting them."""
-    rows = []
-    for p in found.parameters:
-        interval = "" if p.low95 is None else f"[{p.low95:.4g}, {number(p.high95):.4g}]"
-        rows.append([p.name, p.estimate, interval, p.unit, p.nominal, p.truth, _off(p), p.verdict])
-    print(table(rows, ["parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict"]))
-    if found.aggregate:
-        each = [
-            [a.name, a.mean, f"[{a.low95:.4g}, {a.high95:.4g}]", a.unit, a.between, a.agree] for a in found.aggregate
-        ]
-        print(table(each, ["over recordings", "mean", "95 % of the next", "unit", "spread", "agree"]))
-    if found.posterior is not None and found.posterior.others:
-        others = [[o.about, f"{100 * o.weight:.0f} %"] for o in found.posterior.others]
-        print(table(others, ["explains the recordings as well", "share of the draws"]))
-    if found.held_out:
-        models = list(dict.fromkeys(m for row in found.held_out for m in row.rmse))
-        errors = [[row.name, *(row.rmse.get(m) for m in models), row.unit] for row in found.held_out]
-        print(table(errors, [f"off {found.held_out[0].horizon_s:g} s ahead, held out", *models, "unit"]))
-    if found.links:
-        print(link_table(found.links))
-    note(f"verdict: {found.verdict.status}")
-    for reason in found.verdict.reasons:
-        note(f"  {reason}")
-    if found.verdict.next:
-        note(f"next: {found.verdict.next}")
-
-
-def _off(p: Estimate) -> str:
-    """Return how far an estimate is from the truth; of a truth of 0 in its unit."""
-    if p.truth is None:
-        return ""
-    return f"{100 * (p.estimate / p.truth - 1):+.1f} %" if p.truth else f"{p.estimate:+.2g} {p.unit}"
-
-
-def link_table(links: Sequence[Link]) -> str:
-    """Return what was found of links, as a table with a 95 % interval a number."""
-    rows = [
-        [name, factor * number(r.value), f"[{factor * number(r.low95):.4g}, {factor * number(r.high95):.4g}]", unit]
-        for link in links
-        for name, r, factor, unit in link.rows()
-    ]
-    return table(rows, ["link", "estimate", "95 % interval", "unit"])
-
-
-def summary(found: Identification) -> dict[str, Any]:
-    """Return the few lines that the console shows at the end; of several positions the worst."""
-    total = next((p for p in found.parameters if p.name == ROUND_TRIP), None)
-    first = found.logs[0].path
-    lines: dict[str, Any] = {"log": first if len(found.logs) == 1 else f"{len(found.logs)} logs, the first {first}"}
-    if total:
-        lines["round trip delay"] = f"{1e3 * total.estimate:.1f} ms"
-    if found.held_out:
-        worst = found.held_out[0]
-        count, unit = len(found.held_out), f" {worst.unit}".rstrip()
-        which = worst.name + (f", the worst of {count}" if count > 1 else "")
-        lines["position"] = f"{which}, on held-out data"
-        for model, error in worst.rmse.items():
-            if error is not None:
-                lines[f"{model}, {worst.horizon_s:g} s ahead"] = f"{error:.4f}{unit}"
-        for model in ("identified", "hold"):
-            free = [number(r.rmse) for r in found.free_run if r.field == worst.column and r.model == model]
-            if free:
-                lines[f"{model}, free run"] = f"{np.mean(free):.4f}{unit}"
-    seconds = number(found.search.seconds)
-    lines["verdict"] = found.verdict.status
-    lines["search"] = f"{found.search.evaluations} candidates in {seconds:.0f} s"
-    return lines
 
 
 def _rows(found: Findings, truth: Mapping[str, float]) -> list[Estimate]:

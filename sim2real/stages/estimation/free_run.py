@@ -12,7 +12,7 @@ import numpy as np
 from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import FreeRun, Identification
 from sim2real.graph.episode import Episode
-from sim2real.identify.fit import Fit, Told, fit
+from sim2real.identify.fit import Fit, OnProgress, fit
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
@@ -73,7 +73,7 @@ def fitted_to(
     windows: Sequence[Span],
     config: IdentifyConfig,
     table: ParameterTable,
-    told: Told | None = None,
+    report: OnProgress | None = None,
     begins: Callable[[Problem], None] | None = None,
 ) -> Fit:
     """Return the fit of a model to logs.
@@ -82,7 +82,9 @@ def fitted_to(
         windows: Segments to search on, and others to predict.
     """
     longer = [s for s in spans(episodes, fitted, config, config.long_s) if s.fitted] if config.long_s else []
-    return fit(model, list(episodes), windows, config.settle_s + config.horizon_s, config, table, longer, told, begins)
+    return fit(
+        model, list(episodes), windows, config.settle_s + config.horizon_s, config, table, longer, report, begins
+    )
 
 
 def far_off(document: Identification, positions: Sequence[Position]) -> list[tuple[Position, float, float]]:

@@ -21,9 +21,10 @@ from sim2real.identify.problem.segments import Span
 from sim2real.identify.search.refine import refine
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.folds import MOVES
+from sim2real.identify.validation.verdict import positions
 from sim2real.robots.contract import RecordedRobot
 from sim2real.robots.worlds import in_world
-from sim2real.stages.estimation import estimate, held_out_parts
+from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -66,7 +67,7 @@ def tested(pipeline: Pipeline, found: Identification, episodes: Sequence[Episode
     errors = prediction.errors(problem, columns, list(models), config.settle_s, [ahead_s])
     promised, still = (_held_out(found, model, ahead_s) for model in ("identified", "hold"))
     rows = []
-    for position in estimate.positions(problem, robot.units):
+    for position in positions(problem.model, robot.units):
         rmse = {e.model: e.rmse.get(position.column) for e in errors if e.held_out}
         rmse = {m: e if e is not None and math.isfinite(e) else None for m, e in rmse.items()}
         own, moved, now = promised.get(position.column), still.get(position.column), rmse.get("hold")

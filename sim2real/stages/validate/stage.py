@@ -21,10 +21,9 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span, check_log
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.folds import moving
-from sim2real.identify.validation.verdict import errors_of, scores
+from sim2real.identify.validation.verdict import errors_of, positions, scores
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.robots.contract import RecordedRobot
-from sim2real.stages.estimation import estimate as identified
 from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.fitted_logs import require_new
 from sim2real.stages.estimation.segment_split import reach
@@ -180,7 +179,7 @@ def score(
         windows = _problem(model, episodes, fitting, min(horizon_s, shortest_s - fitting.settle_s))
         columns = prediction.samples(windows, models, fitting.settle_s)
         errors = prediction.errors(windows, columns, list(models), fitting.settle_s, [horizon_s])
-        judged = scores(errors, identified.positions(windows, robot.units))
+        judged = scores(errors, positions(model, robot.units))
         moves = dict(zip(prediction.labels(windows), moving(windows, np.arange(windows.segments)), strict=True))
         whole = _problem(model, episodes, fitting, min(config.free_run_s, shortest_s) - fitting.settle_s, once=True)
         columns = prediction.samples(whole, models, fitting.settle_s)

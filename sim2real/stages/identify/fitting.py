@@ -1,0 +1,92 @@
+"""The fit of an identification: all optional terms, then the selected ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim2real.identify.fit import Fit, OnProgress
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.validation.optional_terms import Selection
+from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation.free_run import fitted_to
+from sim2real.stages.identify.inputs import Inputs
+from sim2real.stages.identify.interrupted import Best
+from sim2real.stages.terminal.console import note, progress
+from sim2real.stages.terminal.interruption import patiently
+
+_PERCENT_OF_SEARCH, _PERCENT_OF_REFINEMENT = 70, 30
+"""Shares of a progress bar."""
+
+
+@dataclass(frozen=True)
+class Fits:
+    """The fits of an identification.
+
+    Attributes:
+        widest: The fit with all optional terms.
+        estimate: The fit with the selected terms.
+        selection: How the terms were selected; None without a selection.
+    """
+
+    widest: Fit
+    estimate: Fit
+    selection: Selection | None
+
+    @property
+    def terms(self) -> tuple[str, ...] | None:
+        """Names of the optional terms of the estimate; None if the model has none."""
+        return self.estimate.problem.table.terms if self.widest.problem.table.terms else None
+
+
+def fit_model(inputs: Inputs, best: Best) -> Fits:
+    """Fit the model, and select its optional terms if the configuration says ``auto``.
+
+    Args:
+        best: Updated with the best values so far.
+    """
+    config, table = inputs.config, inputs.table
+    data = (inputs.model, inputs.episodes, inputs.fitted, inputs.windows)
+    # Fit the model with all terms that the configuration allows.
+    best.restart(table.for_recordings(len(inputs.episodes)))
+    with _progress("identify", best) as report:
+        widest = patiently(lambda: fitted_to(*data, config, table, report, _show_engine))
+    if config.terms != "auto":
+        return Fits(widest, widest, None)
+    # Select the terms without which held-out parts are predicted worse.
+    with progress(None, "identify: sets of terms"):
+        selection = patiently(lambda: held_out_parts.chosen(widest, config, inputs.names))
+    terms: Sequence[str] = selection.names(widest.problem.table)
+    # Refine the model with the selected terms. A value fixed by a flag stays fixed, in whichever term the parameter is;
+    # the parameters of all other terms have their values without the term.
+    narrow = table.with_terms(terms).with_fixed(config.fix)
+    shared = [p.name for p in narrow if p.free and not p.per_recording]
+    narrow = narrow.with_nominal({name: float(np.squeeze(widest.values[name])) for name in shared})
+    best.restart(narrow.for_recordings(len(inputs.episodes)))
+    with _progress(f"identify with {', '.join(terms) or 'no term'}", best) as report:
+        estimate = patiently(lambda: fitted_to(*data, replace(config, generations=0), narrow, report))
+    return Fits(widest, estimate, selection)
+
+
+def _show_engine(problem: Problem) -> None:
+    note(f"engine: {problem.engine}")
+
+
+@contextmanager
+def _progress(title: str, best: Best) -> Iterator[OnProgress]:
+    """Show a bar for search and refinement, and keep the best values."""
+    with progress(100, title) as bar:
+
+        def advance(stage: str, share: float, loss: float, z: np.ndarray) -> None:
+            if stage in best.done:
+                best.advance(stage, share, loss, z)
+            bar.set_description_str(f"{title}: {stage}")
+            percent = _PERCENT_OF_SEARCH * best.done["search"] + _PERCENT_OF_REFINEMENT * best.done["refine"]
+            bar.update(round(percent) - bar.n)
+            bar.set_postfix_str(f"loss {loss:.4f}" if np.isfinite(loss) else "")
+
+        yield advance
+        bar.update(100 - bar.n)

@@ -1,0 +1,125 @@
+"""From a fit to an identification: intervals, predictions, free runs and the verdict."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from sim2real.artifacts.identification import FreeRun, Identification
+from sim2real.identify.delays.links import links
+from sim2real.identify.fit import Fit, Value, as_numbers, refit
+from sim2real.identify.problem.segments import beyond
+from sim2real.identify.uncertainty import ensemble
+from sim2real.identify.uncertainty.per_recording import compare_recordings
+from sim2real.identify.validation import prediction
+from sim2real.identify.validation.verdict import NO_DELAY, positions
+from sim2real.robots.worlds import in_world
+from sim2real.stages.estimation import estimate, held_out_parts
+from sim2real.stages.estimation.free_run import Lack, fitted_to, free_runs, lacking, with_one_more
+from sim2real.stages.identify.fitting import Fits
+from sim2real.stages.identify.inputs import Inputs, table_of
+from sim2real.stages.identify.true_values import true_values
+from sim2real.stages.terminal.console import progress
+from sim2real.stages.terminal.interruption import patiently
+
+_NO_DELAY_S = 1e-4
+"""Estimates of delays below this count as no delay [s]."""
+_HORIZONS = (0.1, 0.25, 0.5, 1.0)
+"""Shares of the horizon at which prediction errors are listed."""
+
+
+def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
+    """Return the estimates with intervals, predictions, free runs and a verdict; the caller adds logs and timing.
+
+    Args:
+        started_s: When the fit began [s on ``time.monotonic``].
+    """
+    config = inputs.config
+    with progress(None, "identify: held-out parts") as bar:
+        # Refit without each part of the recordings. The errors of a fit that did not converge bound no later error.
+        examine = config.folds and fits.estimate.converged
+        parts = (
+            patiently(lambda: held_out_parts.examined(fits.widest, config, inputs.names, fits.selection))
+            if examine
+            else ()
+        )
+        # Compute intervals; they widen where estimates without one part differ.
+        bar.set_description_str("identify: intervals")
+        findings = patiently(lambda: estimate.Findings.of(fits.estimate, parts))
+        fit = findings.fit
+        truth = true_values(inputs.logs[0], inputs.robot.roles) if config.reveal else {}
+        # Collect the models that explain the recordings as well, for training to draw from.
+        bar.set_description_str("identify: posterior")
+        posterior = patiently(
+            lambda: ensemble.posterior(fit, findings.at, findings.spread, fits.widest, fits.selection)
+        )
+        document = estimate.document(inputs.pipeline.name, findings, posterior, truth, time.monotonic() - started_s)
+        # Predict held-out data, beside baselines.
+        bar.set_description_str("identify: predictions and baselines")
+        document = patiently(lambda: _predicted(document, inputs, fit))
+        bar.set_description_str("identify: each recording, distribution of delays")
+        several = config.each and inputs.fitted > 1
+        aggregate = patiently(lambda: compare_recordings(fit)) if several else ()
+        links_ = patiently(lambda: links(fit.problem, fit.z)) if config.links else ()
+        document = replace(document, left_out=parts, terms=fits.terms, links=links_, aggregate=aggregate)
+        # Try one further term where free runs are far off.
+        bar.set_description_str("identify: free runs")
+        lack = patiently(lambda: _lack(document, inputs, fit))
+    outside = beyond(inputs.model, inputs.episodes, inputs.windows, config.settle_s + config.horizon_s)
+    return estimate.judged(document, findings, inputs.units, config.max_delay_s, outside, lack)
+
+
+def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identification:
+    """Return the document with the columns of all segments and of the free runs, and their errors."""
+    config, problem = inputs.config, fit.windows
+    nominal = {p.name: p.nominal for p in inputs.model.parameters}
+    models: dict[str, Mapping[str, Value]] = {"identified": fit.values, **_without_delays(fit), "nominal": nominal}
+    samples = prediction.samples(problem, models, config.settle_s)
+    horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
+    runs, columns = free_runs(fit, inputs.episodes, inputs.fitted, config, models)
+    return replace(
+        document,
+        samples=samples,
+        free=columns,
+        settle_s=config.settle_s,
+        prediction=tuple(prediction.errors(problem, samples, list(models), config.settle_s, horizons)),
+        free_run=tuple(runs),
+        segments=problem.segments,
+        held_out_from_s=float(np.delete(problem.begins_s, problem.train).min(initial=np.inf)),
+        sigma=dict(zip(prediction.labels(problem), (s for _, s, _ in problem.fields), strict=True)),
+    )
+
+
+def _without_delays(fit: Fit) -> dict[str, Mapping[str, Value]]:
+    """Return the baseline: the same model fitted without delays, if it has some."""
+    table = fit.problem.table
+    kept = np.array([c.parameter.kind != "delay" for c in table.columns])
+    if kept.all():
+        return {}
+    delays = [p for p in table if p.free and p.kind == "delay"]
+    largest_s = max(float(np.max(np.abs(np.subtract(fit.values[p.name], p.without)))) for p in delays)
+    # A fit without delays is its own baseline: a second fit of a quadruped took 120 s and changed no estimate.
+    if largest_s < _NO_DELAY_S:
+        return {NO_DELAY: as_numbers(table, fit.z, kept)}
+    return {NO_DELAY: refit(fit.problem, kept, fit.z)}
+
+
+def _lack(document: Identification, inputs: Inputs, fit: Fit) -> Lack:
+    """Return what free runs lack, after a fit with one further term if the robot offers one."""
+    config = inputs.config
+    wider = with_one_more(in_world(inputs.pipeline.load(), config.world), document.terms, config)
+    if not fit.converged or wider is None:
+        return lacking(document, positions(inputs.model, inputs.robot.units), None)
+    robot, more_terms = wider
+
+    def attempt() -> list[FreeRun]:
+        model, episodes = robot.identifiable(config.max_delay_s), inputs.episodes
+        # Search from the start, as the printed command does: a fit without the term has distorted other parameters.
+        table = table_of(model, more_terms)
+        refitted = fitted_to(model, episodes, inputs.fitted, inputs.windows, more_terms, table)
+        return free_runs(refitted, episodes, inputs.fitted, more_terms, {"identified": refitted.values})[0]
+
+    return lacking(document, positions(inputs.model, inputs.robot.units), attempt)
