@@ -1,11 +1,19 @@
 """Files, modules and links that the pages name exist; tables that people extend stay well formed."""
 
 import ast
+import contextlib
+import functools
 import importlib
+import io
+import itertools
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+
+from sim2real import cli
+from sim2real.commands.table import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -197,3 +205,36 @@ def test_quoted_texts_of_the_console_are_those_of_the_code():
     pages = {page: " ".join((ROOT / "docs" / page).read_text().split()) for page in PRINTED}
     assert [(page, text) for page, texts in PRINTED.items() for text in texts if text.strip() not in pages[page]] == []
     assert [(page, text) for page, texts in PRINTED.items() for text in texts if text not in printed] == []
+
+
+PIPELINES = {"pendulum", "arm", "so101", "disk", "xl330"}
+COMMAND = re.compile(r"^(?: *\w*\$ |    )(?:\w+=\S+ )?(sim2real [a-z].*)$", re.MULTILINE)
+
+
+@functools.cache
+def help_of(command: str, *arguments: str) -> str:
+    """Return the help of a command with these arguments before ``--help``."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert cli.main([command, *arguments, "--help"]) == 0
+    return out.getvalue()
+
+
+def unknown_flags(line: str) -> list[str]:
+    """Return the flags in a command line that the help of its command does not list."""
+    words = shlex.split(line.split("&&")[0], comments=True)
+    flags = [word for word in words if word.startswith("--")]
+    names = [*itertools.takewhile(lambda word: not word.startswith("-"), words[1:])]
+    kinds = [name for name in names[1:2] if name in PIPELINES | {"identified", "policy", "recover"}]
+    text = help_of(names[0], *kinds, *(["--mjcf", "robot.xml"] if "--mjcf" in flags else []))
+    return [flag for flag in flags if flag not in ("--help", "--mjcf") and not re.search(rf"{flag}(?![\w-])", text)]
+
+
+def test_commands_on_pages_have_flags_that_exist():
+    lines = {line: page.name for page in PAGES for line in COMMAND.findall(page.read_text().replace("\\\n", " "))}
+    commands = {line: page for line, page in lines.items() if line.split()[1] in COMMANDS}
+    assert len(commands) > 70
+    assert {(page, line): wrong for line, page in commands.items() if (wrong := unknown_flags(line))} == {}
+
+
+def test_a_flag_that_does_not_exist_is_seen():
+    assert unknown_flags("sim2real train pendulum --seed 1 --sead 2  # --none") == ["--sead"]
