@@ -12,6 +12,7 @@ import pytest
 
 from sim2real import cli
 from sim2real.errors import UsageError
+from sim2real.stages.check import determination, sources
 from sim2real.stages.check import stage as check_stage
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.config import RecordConfig
@@ -136,7 +137,7 @@ def test_what_is_planned_is_simulated_from_where_the_robot_hangs():
     assert th[0] == pytest.approx(np.pi, abs=1e-3)
     assert np.ptp(th) > 0.05
     np.testing.assert_allclose(np.abs(episode.outputs["actuator"]["action"]).max(), 1.0, atol=0.35)
-    assert check_stage.coverage(episode, model, {})["joints"][0]["moving"] > 0.1
+    assert determination.coverage(episode, model, {})["joints"][0]["moving"] > 0.1
 
 
 def test_without_recording_and_plan_there_is_nothing_to_judge(tmp_path):
@@ -144,7 +145,7 @@ def test_without_recording_and_plan_there_is_nothing_to_judge(tmp_path):
     model = pipeline.load().identifiable(0.06)
     for config in (CheckConfig(runs=tmp_path), CheckConfig(plan=True)):
         with pytest.raises(UsageError) as caught:
-            check_stage.find_source(pipeline, config, model, model.parameters, pipeline.identify)
+            sources.find_source(pipeline, config, model, model.parameters, pipeline.identify)
         assert "--log FILE" in (caught.value.hint or "")
 
 
@@ -155,10 +156,10 @@ def test_a_plan_and_a_log_exclude_each_other():
 
 def test_segments_lie_side_by_side_and_are_not_too_many(judged):
     pipeline = load_pipeline("pendulum")
-    episode = check_stage.open_recording(LOG, pipeline).episode
-    spans, length_s = check_stage.cut([episode], pipeline.identify)
+    episode = sources.open_recording(LOG, pipeline).episode
+    spans, length_s = determination.cut_segments([episode], pipeline.identify)
     assert len(spans) == judged[1]["segments"]
     assert np.diff([s.begin_s for s in spans]) == pytest.approx(length_s)
-    many, _ = check_stage.cut([episode] * 20, pipeline.identify)
+    many, _ = determination.cut_segments([episode] * 20, pipeline.identify)
     assert len(many) == 120
     assert {s.recording for s in many} == set(range(20))

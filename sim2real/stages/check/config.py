@@ -1,4 +1,4 @@
-"""How a recording is judged; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
+"""Flags of check. Imports no JAX, so that ``--help`` stays instant."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from sim2real.stages.record.config import RecordConfig
 
 @dataclass(frozen=True)
 class CheckConfig:
-    """Judge what a recording, or a planned one, can tell about the parameters, before anything is searched."""
+    """Predict which parameters a recording, or a planned one, can determine, before a search."""
 
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
     """MCAP log to judge, one flag a log; default: the newest recording, and without one the planned excitation."""
     plan: bool = False
-    """Judge the planned excitation even where there is a recording."""
+    """Judge the planned excitation even if there is a recording."""
     bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
     """Bounds of a parameter instead of the pipeline's: NAME LOW HIGH, one flag a parameter."""
     fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
-    """Value of a parameter that is not to be identified: NAME VALUE, one flag a parameter."""
+    """Value at which a parameter is fixed: NAME VALUE, one flag a parameter."""
     world: str | None = None
     """World of an installed package whose parameters are judged; default: the robot's own."""
     json: bool = False
@@ -34,6 +34,6 @@ class CheckConfig:
     """The excitation that is planned."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked before a log is read."""
+        """Check the fields."""
         if self.plan and self.log:
             raise UsageError("plan and log exclude each other: a plan is judged without a log")

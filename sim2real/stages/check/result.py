@@ -1,35 +1,34 @@
-"""What check finds: what recordings, or a planned one, can tell about the parameters."""
+"""The result of check."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from sim2real.artifacts.summary import Rows, Shown
+from sim2real.types import Json
 
 
 @dataclass(frozen=True, repr=False)
 class Checked(Shown):
-    """What recordings, or a planned one, can tell.
+    """Which parameters recordings, or a planned one, determine.
 
     Attributes:
-        pipeline: The robot.
-        source: ``log``, or the planned excitation.
-        recordings: How each was sampled, what its joints did, and what drove them.
-        segments: How many segments were simulated.
-        segment_s: Their length [s].
+        source: ``log``, or ``planned excitation``.
+        recordings: Sampling, joints and commands of each recording.
+        segments: Number of simulated segments.
+        segment_s: Length of a segment [s].
         condition: Condition number of the Jacobian.
-        determined: Whether everything is determined, up to the time shift between delays.
-        undetermined: Groups of parameters of which at most combinations are determined.
-        only_sum_of_delays: Whether only the sum of the delays can be told.
-        messages: The same in words.
+        determined: Whether every parameter is determined; of the delays the sum suffices.
+        undetermined: Groups of parameters; only combinations of the parameters in a group are determined.
+        only_sum_of_delays: Whether only the sum of the delays is determined.
+        messages: Sentences about the undetermined groups.
         parameters: A row for each parameter.
-        recommendation: What to do next, in words.
+        recommendation: Sentences about the next step.
     """
 
     pipeline: str
     source: str
-    recordings: list[dict[str, Any]]
+    recordings: list[dict[str, Json]]
     segments: int
     segment_s: float
     condition: float
@@ -37,13 +36,13 @@ class Checked(Shown):
     undetermined: list[list[str]]
     only_sum_of_delays: bool
     messages: list[str]
-    parameters: list[dict[str, Any]]
+    parameters: list[dict[str, Json]]
     recommendation: list[str]
 
-    def about(self) -> dict[str, Any]:
-        """Return what to say about it: name -> value."""
-        found = {"pipeline": self.pipeline, "source": self.source, "determined": "yes" if self.determined else "no"}
-        return found | {"why": "; ".join(self.messages), "next": "; ".join(self.recommendation)}
+    def about(self) -> dict[str, Json]:
+        """Return name -> value of the main figures."""
+        figures = {"pipeline": self.pipeline, "source": self.source, "determined": "yes" if self.determined else "no"}
+        return figures | {"why": "; ".join(self.messages), "next": "; ".join(self.recommendation)}
 
     def rows(self) -> Rows:
         """Return a row for each parameter."""
