@@ -1,4 +1,4 @@
-"""The contract of a device: motors that can be measured and commanded, whatever they are connected by.
+"""The contract of a device: motors that can be measured and commanded, over any connection.
 
 `sim2real.hardware.safety.rig.Rig` puts the safety gate in front of any device; `sim2real.hardware.testing` tests one.
 """
@@ -20,11 +20,10 @@ class Transaction:
     """The times of one instruction with its answer and its retries.
 
     Args:
-        t_sent_ns: When the instruction that was answered was sent, CLOCK_MONOTONIC [ns].
-        lock_wait_ns: How long it waited for another thread's use of the bus [ns].
+        t_sent_ns: Time at which the answered instruction was sent, CLOCK_MONOTONIC [ns].
+        lock_wait_ns: Wait for another thread's use of the bus [ns].
         transfer_ns: Time from getting the bus to having the answer, retries included [ns].
-        retries: Number of times that the instruction was sent again.
-        late_ns: How much longer the answer took than its bytes need on the wire [ns].
+        late_ns: Delay of the answer beyond the time of its bytes on the wire [ns].
     """
 
     t_sent_ns: int
@@ -39,10 +38,10 @@ class Reading:
     """A measurement of n motors, in the order of the device's `motors`.
 
     Args:
-        position_rad: Shape (n,) [rad]; where zero is, the device's settings say.
+        position_rad: Shape (n,) [rad], from the zero of the device's settings.
         velocity_rad_s: Shape (n,) [rad/s].
         load: Shape (n,), in the unit that the device's `measures` names; NaN if it does not name `load`.
-        transaction: When it was asked for, and how late the answer came.
+        transaction: The times of the instruction and its answer.
     """
 
     position_rad: np.ndarray
@@ -53,15 +52,13 @@ class Reading:
 
 @dataclass(frozen=True)
 class Counters:
-    """What went over a device's bus since it was opened.
+    """Counts of the transactions of a device since it was opened.
 
     Args:
         transactions: Instructions that were answered, or needed no answer.
-        lost_replies: Answers that were missing.
-        retries: Instructions that were sent again.
-        late_replies: Answers that came too late, or so late that the time of their sample is uncertain.
-        late_s: How much longer each answer took than its bytes need on the wire, shape (N,) [s].
-        withheld: Instructions that were not sent, as they could have moved a motor (dry runs).
+        late_replies: Answers after the timeout, or so late that the time of their sample is uncertain.
+        late_s: Delay of each answer beyond the time of its bytes on the wire, shape (N,) [s].
+        withheld: Instructions that a dry run did not send, as they could have moved a motor.
     """
 
     transactions: int = 0
@@ -74,11 +71,11 @@ class Counters:
 
 @dataclass(frozen=True)
 class CommandKind:
-    """What the numbers of a command are.
+    """The quantity of a command.
 
     Args:
-        name: What they are called in messages, in the plural.
-        stale: What is safe to send when no new command comes: zeros, or the last command once more.
+        name: Its name in messages, in the plural.
+        stale: The safe replacement of a stale command: zeros, or the last command again.
     """
 
     name: str
@@ -92,7 +89,7 @@ POSITION: Final = CommandKind("positions", "rad", "hold")
 
 
 class Alone(Enum):
-    """What a motor does by itself when it hears nothing from its host any more."""
+    """Reaction of a motor to the silence of its host."""
 
     TORQUE_OFF = "takes its torque off"
     STOPS = "stops"
@@ -101,12 +98,12 @@ class Alone(Enum):
 
 @dataclass(frozen=True)
 class WithoutHost:
-    """What motors do by themselves when their host dies; `str` says it in a sentence.
+    """Reaction of motors to the death of their host; `str` returns it as a sentence.
 
     Args:
-        after_s: Time after the last instruction at which they notice [s]; inf: never.
-        source: How that is known.
-        why: A few words on why they never notice, or "".
+        after_s: Time from the last instruction to the reaction [s]; inf: never.
+        source: Where that is documented, or who measured it.
+        why: The reason why there is no reaction, or "".
     """
 
     model: str
@@ -118,7 +115,7 @@ class WithoutHost:
 
     @property
     def words(self) -> str:
-        """What they do, in words without their names."""
+        """The reaction as a phrase, without the names of the motors."""
         if self.does is Alone.TORQUE_OFF:
             return f"takes its torque off after {self.after_s:g} s"
         if self.does is Alone.STOPS:
@@ -138,8 +135,8 @@ class Device(ABC):
     commands have shape (n,), float64, in the order of `motors`. Every method may be called from any thread while the
     device is open, `make_safe` from a signal handler too.
 
-    Whatever raises HardwareLost does so when the device does not answer within its limits; SafetyStop means that a
-    motor has stopped itself, or that something has taken the torque off.
+    Methods raise HardwareLost when the device does not answer within its limits, and SafetyStop when a motor has
+    stopped itself or the torque was taken off from outside.
     """
 
     def __enter__(self) -> Self:
@@ -151,7 +148,7 @@ class Device(ABC):
         """Take the torque off and close the device."""
         self.close()
 
-    # -- what it says about itself, before it is opened too
+    # -- properties, also before it is opened
 
     @property
     @abstractmethod
@@ -161,7 +158,7 @@ class Device(ABC):
     @property
     @abstractmethod
     def commanded(self) -> CommandKind:
-        """What the numbers of a command are."""
+        """The quantity of a command."""
 
     @property
     @abstractmethod
@@ -170,7 +167,7 @@ class Device(ABC):
 
     @property
     def measures(self) -> Mapping[str, str]:
-        """Quantity -> unit of what a reading holds; ``position`` [rad] and ``velocity`` [rad/s] always."""
+        """Quantity -> unit of a reading; ``position`` [rad] and ``velocity`` [rad/s] always."""
         return {"position": "rad", "velocity": "rad/s", "load": "1"}
 
     # -- from open to close
@@ -187,21 +184,21 @@ class Device(ABC):
 
     @abstractmethod
     def without_host(self) -> tuple[WithoutHost, ...]:
-        """Return what the motors do by themselves when this process dies, each motor in one entry."""
+        """Return the reaction of the motors to the death of this process, each motor in one entry."""
 
     @abstractmethod
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest command that the motors follow, each of shape (n,).
 
-        A gate that lets more through is refused, as a motor may ignore such a command without a word. Infinite: there
-        is no such limit, or `command` itself refuses what is beyond it.
+        A gate with wider limits is refused, as a motor may ignore such a command without an error. Infinite: there is
+        no such limit, or `command` raises.
         """
 
     @abstractmethod
     def withhold_torque(self) -> None:
-        """Move nothing from now until the device is closed, for a dry run: all goes on as it would, with torque off.
+        """Keep the torque off until the device is closed, for a dry run.
 
-        What could move a motor is not sent, and counted; something that takes as long is sent in its place.
+        An instruction that could move a motor is counted, and replaced by one that takes as long and moves nothing.
 
         Raises:
             UsageError: Torque is on.
@@ -210,18 +207,18 @@ class Device(ABC):
     @property
     @abstractmethod
     def torque_withheld(self) -> bool:
-        """Whether nothing can move a motor; see `withhold_torque`."""
+        """Whether this is a dry run; see `withhold_torque`."""
 
     @abstractmethod
     def enable(self) -> None:
         """Write the settings that motors lose without power, and switch the torque on; the motors stay at rest.
 
-        From before torque goes on, something outside this process watches that it lives: if it dies, or is silent for
-        longer than `silence_s`, the torque is taken off.
+        Before torque goes on, a watcher outside of this process starts: it takes the torque off when this process dies,
+        or is silent for longer than `silence_s`.
 
         Raises:
             SafetyStop: `make_safe` was called before, or the torque has been taken off from outside.
-            HardwareLost: A motor does not answer, or nothing would watch.
+            HardwareLost: A motor does not answer, or the watcher does not start.
         """
 
     @abstractmethod
@@ -239,7 +236,7 @@ class Device(ABC):
 
     @abstractmethod
     def command(self, values: np.ndarray) -> Transaction:
-        """Send a command; in a dry run, send something that moves nothing and takes as long.
+        """Send a command; in a dry run, an instruction that takes as long and moves nothing.
 
         Args:
             values: Shape (n,) [the unit of `commanded`].
@@ -255,21 +252,18 @@ class Device(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Look for motors that have stopped or lost their settings and do not say so in their answers.
+        """Raise SafetyStop for a motor that has stopped or lost its settings and does not report it in its answers.
 
-        Called twice a second, before a measurement, which it delays; nothing to do if all answers tell.
-
-        Raises:
-            SafetyStop: There is one.
+        Called twice a second before a measurement, which it delays; empty if all answers carry such errors.
         """
 
     def require_watching(self) -> None:  # noqa: B027
-        """Raise SafetyStop if another process that watches this one has taken over; nothing to do where none does."""
+        """Raise SafetyStop if the process that watches this one has taken over; empty without such a process."""
 
     @property
     @abstractmethod
     def counters(self) -> Counters:
-        """What went over the bus so far; all zero before `open`."""
+        """Counts of the transactions since `open`; all zero before."""
 
     # -- the ways out
 
@@ -285,8 +279,8 @@ class Device(ABC):
     def make_safe(self) -> None:
         """Take the torque off at once, without a lock and without waiting for answers. Never raises.
 
-        For signal handlers and watchdog threads: the code that was interrupted may hold any lock. The torque cannot
-        be switched on again before the device is opened anew.
+        For signal handlers and watchdog threads: the interrupted code may hold any lock. The torque can be switched on
+        again only after `close` and `open`.
         """
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""What installed packages bring beside what comes with sim2real: names only, nothing is imported."""
+"""Devices and worlds of sim2real and of installed packages, by name; listing them imports no module."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ DEVICES: Final = "sim2real.devices"
 """The entry point group of devices, see `sim2real.hardware.registry`."""
 WORLDS: Final = "sim2real.worlds"
 """The entry point group of worlds, see `sim2real.robots.worlds`."""
-OWN: Final[Mapping[str, Mapping[str, str]]] = {
+BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     DEVICES: {
         "dynamixel": "sim2real.hardware.dynamixel.device:servos",
         "feetech": "sim2real.hardware.feetech.device:servos",
     },
     WORLDS: {},
 }
-"""Group -> name -> ``module:callable`` of what comes with sim2real."""
+"""Group -> name -> ``module:callable`` of the devices and worlds of sim2real."""
 
 
 def available(group: str = DEVICES) -> dict[str, Any]:
-    """Return name -> source of a group: those of installed packages before those that come with sim2real."""
-    return {**OWN[group], **{entry.name: entry for entry in metadata.entry_points(group=group)}}
+    """Return name -> source of a group; an installed package replaces the built-in entry of the same name."""
+    return {**BUILT_IN[group], **{entry.name: entry for entry in metadata.entry_points(group=group)}}

@@ -1,4 +1,4 @@
-"""How joints are mounted on their motors: between what an encoder reads and a command does, and the joint's side."""
+"""Mountings of joints on their motors: conversion between the encoder's side and the joint's side."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim2real.errors import UsageError
 from sim2real.hardware.device import Device, Reading
 
 _POWER_OF_GEAR: Final = {"rad": 1, "rad/s": 1, "N m": -1, "V": 0, "A": 0, "1": 0}
-"""Unit -> power of the gear by which the motor's value is the larger one: it turns faster, with less torque."""
+"""Unit -> power of the gear in the ratio of the motor's value to the joint's: it turns faster, with less torque."""
 
 
 T = TypeVar("T", "float", "np.ndarray")
@@ -21,11 +21,10 @@ T = TypeVar("T", "float", "np.ndarray")
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint, and what is between it and the encoder of its motor.
+    """A joint, and its mounting on the encoder of its motor.
 
     Attributes:
-        name: Its name.
-        zero_rad: What the encoder reads, as the device tells it, where the joint's angle is 0 [rad].
+        zero_rad: The encoder's angle, as the device reports it, at the joint's angle 0 [rad].
         direction: 1 where both turn the same way, -1 where they turn against each other.
         gear: Turns of the encoder for one of the joint.
     """
@@ -47,7 +46,7 @@ class Joint:
         if not (math.isfinite(self.gear) and self.gear > 0):
             raise UsageError(
                 f"joint {self.name!r}: gear = {self.gear!r} is not a number above 0",
-                hint="direction = -1 says that encoder and joint turn against each other",
+                hint="direction = -1 means that encoder and joint turn against each other",
             )
         if not math.isfinite(self.zero_rad):
             raise UsageError(f"joint {self.name!r}: zero_rad = {self.zero_rad!r} is not a finite angle")
@@ -62,7 +61,7 @@ class Joint:
         return self.direction * (encoder_rad - self.zero_rad) / self.gear
 
     def encoder(self, angle_rad: T) -> T:
-        """Return what the encoder reads [rad] at an angle of the joint, of any shape."""
+        """Return the encoder's angle [rad] at an angle of the joint, of any shape."""
         return self.zero_rad + self.direction * self.gear * angle_rad
 
     def speed(self, encoder_rad_s: T) -> T:
@@ -71,48 +70,49 @@ class Joint:
 
 
 class Mounting:
-    """The mountings of all joints of a device: what is said and measured at the joints, and at the motors.
+    """The mountings of all joints of a device: converts commands and readings between joints and motors.
 
-    An angle of a joint is that of `Joint.angle`. A command is an angle, a speed, a torque, or what drives the motor, by
-    its unit: `V`, `A` or `1` change their sign alone. Gears are taken to lose nothing.
+    The unit of a command determines its conversion: angle, speed, torque, or drive of the motor (`V`, `A` or `1`),
+    whose sign alone changes. Gears count as lossless.
 
     Args:
         joints: One per motor, in the device's order; none: each turns with its encoder.
         device: The device; it need not be open.
 
     Raises:
-        UsageError: There is another number of joints than of motors, or nobody knows what a gear or a direction does to
-            the unit of the device's commands or loads.
+        UsageError: There is another number of joints than of motors, or the unit of the device's commands or loads has
+            no conversion.
     """
 
     def __init__(self, joints: Sequence[Joint], device: Device) -> None:
-        own = tuple(joints) or tuple(Joint(name) for name in device.motors)
-        if len(own) != len(device.motors):
-            names = ", ".join(joint.name for joint in own)
-            raise UsageError(f"there are {len(own)} joints ({names}) for {len(device.motors)} motors")
+        mounted = tuple(joints) or tuple(Joint(name) for name in device.motors)
+        if len(mounted) != len(device.motors):
+            names = ", ".join(joint.name for joint in mounted)
+            raise UsageError(f"there are {len(mounted)} joints ({names}) for {len(device.motors)} motors")
         kind = device.commanded
-        rows = np.array([(joint.zero_rad, joint.direction, joint.gear) for joint in own], np.float64)
+        rows = np.array([(joint.zero_rad, joint.direction, joint.gear) for joint in mounted], np.float64)
         self._zero, direction, gear = rows.reshape(-1, 3).T
         self._turns = direction * gear
-        plain = all(joint.is_plain for joint in own)
+        # Plain joints need no conversion, so their units may be any.
+        plain = all(joint.is_plain for joint in mounted)
         self._factor, self._load = (
-            np.ones(len(own)) if plain else direction * gear ** _power(unit, what)
+            np.ones(len(mounted)) if plain else direction * gear ** _power(unit, what)
             for unit, what in ((kind.unit, kind.name), (device.measures.get("load", "1"), "loads"))
         )
-        self._offset = self._zero if kind.unit == "rad" else np.zeros(len(own))
+        self._offset = self._zero if kind.unit == "rad" else np.zeros(len(mounted))
 
     def to_motors(self, command: np.ndarray) -> np.ndarray:
         """Return the device's command for one of the joints, ``(n,)``."""
         return self._offset + self._factor * command
 
     def to_joints(self, command: np.ndarray) -> np.ndarray:
-        """Return the joints' command that the device's stands for, ``(n,)``."""
+        """Return the joints' command for one of the device, ``(n,)``."""
         return (command - self._offset) / self._factor
 
     def limits(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest command of the joints between the device's, each ``(n,)``."""
         ends = self.to_joints(low), self.to_joints(high)
-        return np.minimum(*ends), np.maximum(*ends)  # turned round where joint and motor turn against each other
+        return np.minimum(*ends), np.maximum(*ends)  # a direction of -1 swaps them
 
     def reading(self, reading: Reading) -> Reading:
         """Return angles, speeds and loads of the joints for those of the motors."""

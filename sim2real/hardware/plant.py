@@ -20,7 +20,7 @@ STATE_PERIOD_S: Final = 0.005
 
 
 class OperatingMode(IntEnum):
-    """What a motor is driven by; the numbers are those of DYNAMIXEL's register, with OFF for torque off."""
+    """Mode of a motor; the numbers are those of DYNAMIXEL's register, with OFF for torque off."""
 
     OFF = 0
     VELOCITY = 1
@@ -39,13 +39,11 @@ class Plant(Protocol):
     servo_ids: tuple[int, ...]
 
     def advance(self, t_s: float) -> None:
-        """Integrate up to a time, in fixed steps of at most 1 ms, with the last commands.
+        """Integrate up to a time [s], in fixed steps of at most 1 ms, with the last commands.
 
         It is called with k * plant_step_s, k = 1, 2, ... The plant's own step must divide `plant_step_s`; to avoid
         drift, make `round((t_s - now) / step)` steps.
 
-        Args:
-            t_s: The time [s].
         """
         ...
 
@@ -53,7 +51,6 @@ class Plant(Protocol):
         """Command a servo from the plant's present time on.
 
         Args:
-            servo_id: One of `servo_ids`.
             mode: One of `OperatingMode`: PWM, position, velocity, or off.
             goal: PWM: fraction of the supply voltage in [-1, 1]; position: [rad]; velocity: [rad/s]; torque off: 0.
         """
@@ -74,7 +71,7 @@ class Plant(Protocol):
 
 @runtime_checkable
 class ConfigurablePlant(Plant, Protocol):
-    """A plant that is told the settings of its servos' position controllers."""
+    """A plant that takes the settings of its servos' position controllers."""
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
         """Set a servo's position controller from the plant's present time on.
@@ -82,7 +79,6 @@ class ConfigurablePlant(Plant, Protocol):
         Called for every servo at time 0 with the power-up values, and later whenever a write or a reboot changes them.
 
         Args:
-            servo_id: One of `servo_ids`.
             p_gain: Position P Gain [counts].
             d_gain: Position D Gain [counts].
             profile_velocity_rad_s: Speed at which the setpoint moves to the goal [rad/s]; inf: the setpoint is the
@@ -94,7 +90,7 @@ class ConfigurablePlant(Plant, Protocol):
 class PlantClock:
     """Steps a plant on a fixed time grid, applies commands at grid points, and keeps a history of measurements.
 
-    The plant is never stepped past the time asked for, so that no command can arrive for a time that has passed.
+    The plant is never stepped past the requested time, so that no command can arrive for a time that has passed.
 
     Args:
         plant: The mechanism; must be at time 0.
@@ -127,25 +123,16 @@ class PlantClock:
             self._remember()
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Tell the plant a servo's controller settings, if it is a `ConfigurablePlant`.
-
-        Args:
-            p_gain: Position P Gain [counts].
-            d_gain: Position D Gain [counts].
-            profile_velocity_rad_s: Speed at which the setpoint moves to the goal [rad/s]; inf: the setpoint is the
-                goal.
-        """
+        """Pass the settings of a servo's controller to a `ConfigurablePlant`; arguments as there."""
         if isinstance(self._plant, ConfigurablePlant):
             self._plant.configure(servo_id, p_gain, d_gain, profile_velocity_rad_s)
 
     def schedule(self, t_ns: int, t_host_ns: int, servo_id: int, mode: int, goal: float) -> None:
-        """Schedule a command at the grid point nearest to a time; commands at one point apply in the order given.
+        """Schedule a command at the grid point nearest to a time; commands at one point apply in their order here.
 
         Args:
-            t_ns: When it takes effect [ns].
-            t_host_ns: When the emulator received it, for the truth log [ns]; 0: it does not come from the host.
-            mode: As in `Plant.command`.
-            goal: As in `Plant.command`.
+            t_ns: Time of its effect [ns].
+            t_host_ns: Time at which the emulator received it, for the truth log [ns]; 0: a command of the servo itself.
         """
         index = max(round((t_ns - self._start_ns) / self._step_ns), self._index)
         self._sequence += 1
@@ -157,18 +144,17 @@ class PlantClock:
         heapq.heapify(self._effects)
 
     def sample(self, servo_id: int, t_ns: int) -> tuple[float, float, float]:
-        """Return position, velocity and load at a time up to the one advanced to.
+        """Return position, velocity and load at a time [ns] that `advance` has reached.
 
         Interpolated linearly between grid points; after the newest one the position is extrapolated by the velocity.
-
-        Args:
-            t_ns: The time [ns].
         """
+        # Find the grid point before, within the history.
         place = max(0.0, (t_ns - self._start_ns) / self._step_ns)
         before = min(int(place), self._index)
         before = max(before, self._index - self._depth + 2)
         position_rad, velocity_rad_s, load = self._history[before % self._depth][servo_id]
         share = max(0.0, place - before)
+        # Interpolate to the next grid point, or extrapolate where there is none yet.
         if before == self._index:
             return position_rad + velocity_rad_s * share * self._step_ns * 1e-9, velocity_rad_s, load
         after = self._history[(before + 1) % self._depth][servo_id]
@@ -197,7 +183,6 @@ def load_plant(spec: str, arguments: Mapping[str, Any] | None = None) -> Plant:
 
     Args:
         spec: `package.module:Name` or `path/to/file.py:Name`; calling `Name` must return the plant.
-        arguments: Keyword arguments of that call.
 
     Raises:
         UsageError: The module, the file or the name does not exist.
@@ -206,11 +191,10 @@ def load_plant(spec: str, arguments: Mapping[str, Any] | None = None) -> Plant:
 
 
 def load_named(spec: str, what: str) -> Callable[..., Any]:
-    """Return what a command line names as `package.module:Name` or `path/to/file.py:Name`.
+    """Return the callable that a command line names as `package.module:Name` or `path/to/file.py:Name`.
 
     Args:
-        spec: Module or file, and name.
-        what: What it is, for errors.
+        what: The noun for it in errors, e.g. ``plant``.
 
     Raises:
         UsageError: The module, the file or the name does not exist, or it cannot be called.
@@ -220,11 +204,11 @@ def load_named(spec: str, what: str) -> Callable[..., Any]:
         hint = f"e.g. my_robot/{what}.py:{what.title()}"
         raise UsageError(f"{what} {spec!r} is not of the form MODULE_OR_FILE:NAME", hint=hint)
     module = _load_module(place, what)
-    found: Callable[..., Any] | None = getattr(module, name, None)
-    if not callable(found):
+    target: Callable[..., Any] | None = getattr(module, name, None)
+    if not callable(target):
         available = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
         raise UsageError(f"{place} has no callable {name!r}. Available: {available}")
-    return found
+    return target
 
 
 def _load_module(place: str, what: str) -> ModuleType:

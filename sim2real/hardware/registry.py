@@ -1,4 +1,4 @@
-"""Devices by name: those that come with sim2real, and those of installed packages."""
+"""Devices by name: those of sim2real, and those of installed packages."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from sim2real.hardware.plant import load_named
 
 
 class DeviceFactory(Protocol):
-    """What a device's name stands for: makes the device, not opened yet."""
+    """Makes the device of a name, not opened yet."""
 
     def __call__(self, port: str, ids: Sequence[Any], drive: Any, *, baud_rate: int, silence_s: float) -> Device:
         """Return the device.
 
         Args:
-            port: What it is connected to, e.g. a serial port's device file.
+            port: Its connection, e.g. a serial port's device file.
             ids: The motors' numbers, in the order of the joints.
-            drive: How the motors are driven: settings that the robot and the device agree on.
+            drive: Settings of the motors, of a type that the robot and the device agree on.
             baud_rate: Bits per second.
             silence_s: Longest time without an instruction while torque is on [s].
         """
@@ -28,31 +28,27 @@ class DeviceFactory(Protocol):
 
 
 def load_device(name: str) -> DeviceFactory:
-    """Return what makes the device of a name.
-
-    Raises:
-        UsageError: There is no such device, or what its entry point names cannot be imported or called.
-    """
+    """Return the factory of a device; raise UsageError if there is none of this name, or it cannot be imported."""
     return cast(DeviceFactory, load_entry("device", name, DEVICES, "hardware.registry.DeviceFactory"))
 
 
 def load_entry(what: str, name: str, group: str, contract: str) -> Callable[..., Any]:
-    """Return what makes something that goes by a name.
+    """Return the callable of an entry point.
 
     Args:
-        what: What it is, in a word.
-        contract: What says how it is called, for the hint: a name in sim2real.
+        what: The noun for it in errors, e.g. ``device``.
+        contract: The protocol that it must satisfy, for the hint: a name in sim2real.
 
     Raises:
-        UsageError: There is no such name, or what its entry point names cannot be imported or called.
+        UsageError: There is no entry of this name, or it cannot be imported or called.
     """
-    found = available(group)
-    if name not in found:
+    entries = available(group)
+    if name not in entries:
         raise UsageError(
-            f"unknown {what} {name!r}. Available: {', '.join(sorted(found)) or 'none'}",
+            f"unknown {what} {name!r}. Available: {', '.join(sorted(entries)) or 'none'}",
             hint=f"install a package with the entry point group '{group}'",
         )
-    source = found[name]
+    source = entries[name]
     if isinstance(source, str):
         return load_named(source, what)
     try:

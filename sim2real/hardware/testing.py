@@ -1,4 +1,4 @@
-"""A conformance suite for devices: what every device does, on its emulator, in a few seconds.
+"""A conformance suite for devices: runs the contract of a device on its emulator, in a few seconds.
 
 Fill in `make_device` in a test module of your own; pytest runs the rest:
 
@@ -54,7 +54,7 @@ while True:
 
 
 class DeviceConformance(ABC):
-    """What the rig relies on in a device, on its emulator; a subclass says which device and emulator.
+    """The parts of the contract on which the rig relies; a subclass names the device and its emulator.
 
     Attributes:
         emulation: The class of the emulator's settings.
@@ -76,7 +76,7 @@ class DeviceConformance(ABC):
 
     @pytest.fixture
     def start(self, tmp_path: Path) -> Iterator[Started]:
-        """Start an emulator with some settings, and return it with its device, not opened yet."""
+        """Yield a function that starts an emulator with settings, and returns it with its device, not opened yet."""
         robots, devices = [], []
 
         def begin(**settings: Any) -> tuple[EmbeddedRobot, Device]:
@@ -101,7 +101,7 @@ class DeviceConformance(ABC):
         return readings
 
     def require_off(self, robot: EmbeddedRobot, device: Device) -> None:
-        """Check on the emulator that every motor was driven, and that the last each was told is "torque off"."""
+        """Check on the emulator that every motor was driven, and that its last command is "torque off"."""
         robot.stop()
         rows = robot.truth().of(Kind.EFFECT)
         last = {int(row["servo_id"]): int(row["values"][0]) for row in rows}
@@ -109,7 +109,7 @@ class DeviceConformance(ABC):
         assert set(last.values()) == {OperatingMode.OFF}, f"the motors end in the modes {last}"
 
     def test_a_closed_device_touches_nothing(self) -> None:
-        """It says what it is, and that nothing has happened, before its port is opened; its ways out do nothing."""
+        """Before its port is opened, its properties are readable and its counters are zero; `close` has no effect."""
         device = self.make_device("/dev/no-such-port")
         assert device.motors
         assert device.commanded.stale in ("zero", "hold")
@@ -121,8 +121,8 @@ class DeviceConformance(ABC):
         with pytest.raises(HardwareLost):
             device.open()
 
-    def test_it_opens_without_torque_and_says_what_it_does_alone(self, start: Started) -> None:
-        """Opening drives no motor; each is accounted for when the host dies; limits and rest have one entry each."""
+    def test_it_opens_without_torque_and_reports_its_reaction_without_a_host(self, start: Started) -> None:
+        """Opening drives no motor; `without_host` lists each motor once; `reach` has one entry for each."""
         robot, device = start()
         with device:
             alone = device.without_host()
@@ -134,8 +134,8 @@ class DeviceConformance(ABC):
         modes = robot.truth().of(Kind.EFFECT)["values"][:, 0]
         assert set(modes.tolist()) <= {OperatingMode.OFF}
 
-    def test_a_reading_says_when_it_was_asked_for(self, start: Started) -> None:
-        """The stamp lies within the call, and is when the emulator got the instruction; the counters count it."""
+    def test_a_reading_has_the_time_of_its_instruction(self, start: Started) -> None:
+        """The stamp lies within the call, and equals the emulator's time of the instruction; the counters count it."""
         robot, device = start(sensing_latency_s=0.004)
         with device:
             before, begin_ns = device.counters, time.monotonic_ns()
@@ -157,8 +157,8 @@ class DeviceConformance(ABC):
         taken = np.median(samples["t_host_ns"] - samples["t_ns"]) * 1e-9
         assert 0.002 < taken < 0.005
 
-    def test_torque_goes_on_at_rest_and_off_again(self, start: Started) -> None:
-        """Right after `enable` the motors stay where they are; `disable` ends it, and it can begin anew."""
+    def test_torque_goes_on_at_rest_and_off(self, start: Started) -> None:
+        """Right after `enable` the motors stay at their positions; `enable` works again after `disable`."""
         robot, device = start()
         with device:
             still, readings = device.measure().position_rad, []
@@ -174,7 +174,7 @@ class DeviceConformance(ABC):
 
     @pytest.mark.parametrize("fault", [{"reply_loss": 0.15}, {"corrupt": 0.15}, {"late": 0.15, "late_s": 0.012}])
     def test_faults_are_survived_and_counted(self, start: Started, fault: Mapping[str, float]) -> None:
-        """Answers that are lost, corrupted or late cost retries, and never a wrong reading."""
+        """Lost, corrupted or late answers cause retries, and never a wrong reading."""
         _, device = start(seed=3, **fault)
         with device:
             readings = [device.measure() for _ in range(60)]
@@ -187,7 +187,7 @@ class DeviceConformance(ABC):
             assert max(r.transaction.retries for r in readings) >= 1
 
     def test_silence_is_hardware_lost(self, start: Started) -> None:
-        """A device that no longer answers says so, to every call; its ways out still end, and raise nothing."""
+        """A device that no longer answers raises HardwareLost; `make_safe` and `close` still return normally."""
         _, device = start(silent_after_s=0.6)
         with device:
             device.enable()
@@ -197,7 +197,7 @@ class DeviceConformance(ABC):
 
     @pytest.mark.parametrize("way", ["close", "exception", "make_safe", "another thread", "rig"])
     def test_every_way_out_takes_the_torque_off(self, start: Started, way: str) -> None:
-        """Also while another thread is in the middle of an instruction; `make_safe` holds until it is opened anew."""
+        """Also while another thread is in the middle of an instruction; `make_safe` holds until the next `open`."""
         robot, device = start()
         if way in ("rig", "exception"):
             with pytest.raises(ZeroDivisionError):
@@ -217,7 +217,7 @@ class DeviceConformance(ABC):
         self.require_off(robot, device)
 
     def test_a_host_that_is_killed_leaves_no_torque(self, start: Started) -> None:
-        """Something outside the process takes it off: nothing in it can any more."""
+        """The watcher outside of the process takes it off."""
         robot, device = start()
         suite = f"{sys.modules[type(self).__module__].__file__}:{type(self).__name__}"
         code = _HOST.format(suite=suite, port=robot.port)
@@ -234,7 +234,7 @@ class DeviceConformance(ABC):
         assert (rows["t_ns"][-1] - killed_ns) * 1e-9 < self.patience_s
 
     def test_a_dry_run_moves_nothing(self, start: Started) -> None:
-        """All goes on as it would, but no motor is driven; it is for good, and for before torque."""
+        """All calls work, but no motor is driven; the dry run lasts until the device is closed."""
         robot, device = start()
         with device:
             device.withhold_torque()
@@ -249,7 +249,7 @@ class DeviceConformance(ABC):
         assert robot.truth().of(Kind.EFFECT).size == 0
 
     def test_torque_that_is_on_cannot_be_withheld(self, start: Started) -> None:
-        """A dry run is decided before anything moves."""
+        """A dry run begins before torque is on."""
         _, device = start()
         with device:
             device.enable()
@@ -283,4 +283,4 @@ class DeviceConformance(ABC):
         time.sleep(0.05)
         device.close()
         busy.join(5.0)
-        assert not busy.is_alive(), "a loop that went on was not told that the torque is off"
+        assert not busy.is_alive(), "the loop did not end although the torque is off"

@@ -183,7 +183,7 @@ def test_a_gate_is_refused_for_the_joints_that_a_plain_one_would_be_refused_for(
     """What the motors take is turned round with them: the low end is the joint's."""
     joints = as_joints(rows)
     for low, high in ((-0.9, 1.0), (-1.0, 1.1)):
-        with pytest.raises(UsageError, match=r"exceeds what the motors take, \[-0\.9.* to \[1\.0"):
+        with pytest.raises(UsageError, match=r"exceeds the reach of the motors, \[-0\.9.* to \[1\.0"):
             Rig(Bench(kind, rows, reach=(-0.9 - 1e-9, 1.0 + 1e-9)), gate_of(kind, limit=(low - 0.01, high)), joints)
     Rig(Bench(kind, rows, reach=(-0.9 - 1e-9, 1.0 + 1e-9)), gate_of(kind, limit=(-0.9, 1.0)), joints).close()
 

@@ -126,7 +126,7 @@ def test_a_joint_that_is_pushed_both_ways_and_stands_still_is_stopped():
 def test_a_joint_that_is_pushed_otherwise_than_before_is_suspect_once():
     (said,) = judge(pushes((0.3, 1.0), (0.8, 2.0), (0.3, 1.0), (0.8, 1.0))).suspects
     assert said.startswith("joint 'tilt' has read -0.25 rad for 1.")
-    assert said.endswith("though what pushes it changed by 40% of its torque")
+    assert said.endswith("though its push changed by 40% of its torque")
     (said,) = judge(pushes((0.5, 5.0))).suspects
     assert said == "joint 'tilt' has read -0.25 rad for 2.00 s, though it is pushed with 40% of its torque"
 
@@ -187,7 +187,7 @@ def test_an_encoder_that_freezes_at_a_turning_point_is_seen(turn, hz, drive):
     if drive == "volts":
         assert "though it was pushed both ways" in said
     else:  # from an extreme it is pushed one way alone, as a joint that lies on something: it may be right
-        assert "though what pushes it changed by" in judge.suspects[0]
+        assert "though its push changed by" in judge.suspects[0]
 
 
 @pytest.fixture

@@ -12,10 +12,9 @@ import pytest
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel.bus import BusConfig, BusLink, ServoBus
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
-from sim2real.hardware.dynamixel.link import BusLink
 from sim2real.hardware.dynamixel.protocol import PROTOCOL
 from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
@@ -267,7 +266,7 @@ def test_a_joint_outside_of_what_servos_take_keeps_its_torque_off(open_arm, star
 
 def test_limits_beyond_the_servos_own_are_refused(open_arm, start_robot):
     robot = start_robot("Joints")
-    with pytest.raises(UsageError, match=r"(?s)limit 3.2 exceeds what the motors take, .*-3.142.* to .*3.141"):
+    with pytest.raises(UsageError, match=r"(?s)limit 3.2 exceeds the reach of the motors, .*-3.142.* to .*3.141"):
         open_arm(robot=robot, limit=3.2)
     with ServoBus(BusConfig(robot.port)) as bus:
         bus.handshake({2: None})

@@ -1,1 +1,1 @@
-"""What all half-duplex buses of servos share: port, packets, registers, transactions."""
+"""Shared code of all half-duplex buses of servos: port, packets, registers, transactions."""

@@ -1,9 +1,7 @@
 """Transactions on a half-duplex bus of servos, one at a time: port, lock, retries, late answers, withheld torque.
 
-Written by hand, as the makers' packages cannot time their reads. They poll for an answer, for which PyPI's
-feetech-servo-sdk 1.0.0 takes 0.61 ms of processor time a read, and this module 0.05; they notice a missing one after 34
-ms, fixed, by the wall clock; they keep neither when an instruction was sent nor the error bytes of a synchronised read;
-and as they do not drop late answers, the one to an earlier instruction passes for that to the next.
+The makers' packages are not used because they do not time their reads. They poll for an answer, report a missing one
+after a fixed 34 ms, drop the error bytes of a synchronised read, and confuse a late answer with the next one.
 """
 
 from __future__ import annotations
@@ -30,10 +28,10 @@ from sim2real.hardware.safety.guardian import Guardian
 
 _LOCK_TIMEOUT_S: Final = 0.5
 _FORCED_ATTEMPTS: Final = 5
-_LEAST_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
+_MIN_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
 _PADS: Final = 4
 _SCANNED: Final = 20
-_CONFIRMING_BYTES: Final = 14  # no other read is as long: what confirms cannot be a late answer to something else
+_CONFIRMING_BYTES: Final = 14  # no other read is as long, so a late answer to another read cannot confirm
 
 
 class ServoLink(ABC):
@@ -72,47 +70,40 @@ class ServoLink(ABC):
 
     @abstractmethod
     def require_fine(self, answer: Answer, what: str) -> None:
-        """Raise the error that an answer reports: SafetyStop if the servo has stopped itself.
-
-        Args:
-            what: Description of the instruction, for errors.
-        """
+        """Raise the error that an answer to the instruction ``what`` reports: SafetyStop if the servo has stopped."""
 
     @property
     def counters(self) -> Counters:
-        """What went over the bus so far."""
+        """Counts of the transactions since the port was opened."""
         late_s = np.array(self._late_us, np.float64) * 1e-6
         return Counters(self._transactions, self._lost, self._retries, self._late, late_s, self._withheld)
 
     def read(self, servo_id: int, register: Register, despite_error: bool = False) -> int:
-        """Return a register's value in counts; of a goal that was withheld, that goal.
+        """Return a register's value in counts; a goal that was withheld replaces the register's own value.
 
         Args:
-            despite_error: Whether to return it although the servo reports an error.
+            despite_error: Whether an error in the answer is ignored.
         """
         what = f"read of {register.name}"
-        found = self.read_each((servo_id,), register.address, register.size, what, despite_error)[0][0]
-        return self._withheld_goals.get((servo_id, register), register.decode(found))
+        data = self.read_each((servo_id,), register.address, register.size, what, despite_error)[0][0]
+        return self._withheld_goals.get((servo_id, register), register.decode(data))
 
     def read_each(
         self, servo_ids: Sequence[int], address: int, length: int, what: str, despite_error: bool = False
     ) -> tuple[list[bytes], Transaction]:
-        """Read the same bytes of several servos' memory with one instruction.
+        """Read the same bytes of several servos' memory with one instruction; return those of each servo.
 
         Args:
             what: Description of the instruction, for errors.
-            despite_error: Whether to return them although a servo reports an error.
-
-        Returns:
-            The bytes of each servo; and the transaction.
+            despite_error: Whether errors in the answers are ignored.
         """
         # After a missing answer, more bytes are requested: if it still comes, it is recognised by its length. Taken for
         # the answer to the repeated instruction, its sample would get a time stamp that is 8 ms too late.
         spare = max(0, min(_PADS - 1, self.table.size - address - length))
 
         def instruction() -> tuple[bytes, int]:
-            asked = length + self._pad % (spare + 1)
-            return self.form.read(servo_ids, address, asked), asked
+            padded = length + self._pad % (spare + 1)
+            return self.form.read(servo_ids, address, padded), padded
 
         answers, transaction = self._exchange(instruction, servo_ids, what, despite_error)
         return [answer.data[:length] for answer in answers], transaction
@@ -120,14 +111,11 @@ class ServoLink(ABC):
     def read_counts(
         self, servo_ids: Sequence[int], registers: Sequence[Register], what: str
     ) -> tuple[np.ndarray, Transaction]:
-        """Read registers that are near each other, of several servos, with one instruction.
+        """Read neighbouring registers of several servos with one instruction, ``(servos, registers)`` [counts].
 
         Args:
-            registers: The registers, in the order of their addresses.
+            registers: In the order of their addresses.
             what: Description of the instruction, for errors.
-
-        Returns:
-            Their values, shape ``(servos, registers)`` [counts]; and the transaction.
         """
         begin = registers[0].address
         blocks, transaction = self.read_each(servo_ids, begin, registers[-1].end - begin, what)
@@ -135,10 +123,7 @@ class ServoLink(ABC):
         return np.array(counts), transaction
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
-        """Write a register, and wait for the servo to confirm that the instruction came.
-
-        Some servos do not say whether they took the value: `set` reads it back.
-        """
+        """Write a register, and wait for the answer; some servos confirm a value that they refuse, see `set`."""
         if self._withholds(register, (value,)):
             return self._withhold(register, {servo_id: value})
         packet = self.form.write(servo_id, register, value)
@@ -153,38 +138,35 @@ class ServoLink(ABC):
 
     def require(self, servo_id: int, register: Register, value: int) -> None:
         """Raise HardwareLost if a register does not hold the value that was written."""
-        found = self.read(servo_id, register)
-        if found != value:
+        current = self.read(servo_id, register)
+        if current != value:
             raise HardwareLost(
-                f"servo {servo_id} does not keep its settings: {register.name} is {found} after {value} was written",
+                f"servo {servo_id} does not keep its settings: {register.name} is {current} after {value} was written",
                 hint="is its supply stable, its firmware another one?",
             )
 
     def write_each(self, register: Register, values: Mapping[int, int]) -> Transaction:
-        """Write a register of several servos, each a value in counts by id, in one instruction that none confirms."""
+        """Write a register of several servos, id -> value in counts, with one instruction that no servo answers."""
         if self._withholds(register, values.values()):
             return self._withhold(register, values)
         packet = self.form.write_each(register, values)
         return self._exchange(lambda: (packet, 0), (), f"write of {register.name}")[1]
 
     def ping(self, servo_id: int) -> bytes:
-        """Return the data of a servo's answer to a ping, whatever error it reports; raise HardwareLost without one."""
+        """Return the data of a servo's answer to a ping, also with an error; raise HardwareLost without an answer."""
         packet, who, length = self._ping(servo_id)
         return self._exchange(lambda: (packet, length), who, "ping", despite_error=True)[0][0].data
 
     def scan(self) -> list[int]:
-        """Return the ids below 20 that answer a single ping; to ask all takes 2 s."""
+        """Return the ids below 20 that answer a ping of their own; a scan of all ids would take 2 s."""
         with self.hold():
             return [i for i in range(_SCANNED) if self._attempt(*self._ping(i)) is not None]
 
     def force(self, servo_id: int, register: Register, value: int) -> bool:
-        """Write a register despite a held lock, missing answers or errors, until it reads back. Never raises.
-
-        Returns:
-            Whether the servo holds the value.
-        """
+        """Write a register despite lock, missing answers and errors; return whether it reads back. Never raises."""
         write = self.form.write(servo_id, register, value)
         query = self.form.read((servo_id,), register.address, _CONFIRMING_BYTES)
+        # Go on without the lock after the timeout: taking the torque off matters more than an intact packet.
         held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
         try:
             for _ in range(_FORCED_ATTEMPTS):
@@ -199,13 +181,13 @@ class ServoLink(ABC):
         return False
 
     def answering(self, packet: bytes, wait_s: float) -> list[int]:
-        """Send an instruction once; return the id of each answer that comes in a while, in their order."""
-        found = []
+        """Send an instruction once; return the ids of the answers that come within ``wait_s``, in their order."""
+        ids = []
         with self.hold():
             self._send(packet)
             while (answer := self._next_answer(self._sent_ns + round(1e9 * wait_s))) is not None:
-                found.append(answer.servo_id)
-        return found
+                ids.append(answer.servo_id)
+        return ids
 
     def close(self) -> None:
         """Close the port; later instructions raise HardwareLost. Never raises itself."""
@@ -228,27 +210,25 @@ class ServoLink(ABC):
         what: str,
         despite_error: bool = False,
     ) -> tuple[list[Answer], Transaction]:
-        """Repeat an instruction until it is answered, or the bus counts as lost.
+        """Repeat an instruction until all servos have answered, or the bus counts as lost.
 
         Args:
-            instruction: Returns its bytes, and how many bytes of data each answer must have.
-            servo_ids: Who answers it, in this order.
+            instruction: Returns its bytes, and the number of data bytes of each answer.
+            servo_ids: The servos that answer, in this order.
             what: Description of the instruction, for errors.
-            despite_error: Whether errors in the answers do not matter.
-
-        Returns:
-            The answers, and the transaction.
+            despite_error: Whether errors in the answers are ignored.
 
         Raises:
             HardwareLost: There was no answer within the configured limits.
             SafetyStop: A servo has stopped itself; the guardian has taken over, or has died.
         """
-        asked_ns = time.monotonic_ns()
+        requested_ns = time.monotonic_ns()
         losses = 0
-        to_whom = f"{what}{of_servos(servo_ids)}"
+        request = f"{what}{of_servos(servo_ids)}"
         with self.hold():
             began_ns = time.monotonic_ns()
             while True:
+                # Show the guardian that this process lives, as often as the bus is used.
                 if self.guardian is not None:
                     self.guardian.beat()
                 packet, length = instruction()
@@ -256,17 +236,19 @@ class ServoLink(ABC):
                     answers = self._attempt(packet, servo_ids, length)
                 except OSError as failure:
                     self._require_watching()
-                    raise HardwareLost(f"{self.config.port} failed during {to_whom}: {failure}") from failure
+                    raise HardwareLost(f"{self.config.port} failed during {request}: {failure}") from failure
                 now_ns = time.monotonic_ns()
                 if answers is not None:
                     late_ns = self._count_answer(now_ns, self._wire_ns(packet, servo_ids, length))
                     break
+                # An answer is missing: ask for more bytes next time, and give up after the longest silence.
                 losses += 1
                 self._lost += 1
                 self._pad = (self._pad + 1) % _PADS
-                self._judge(losses, (now_ns - began_ns) * 1e-9, to_whom)
+                self._require_heard(losses, (now_ns - began_ns) * 1e-9, request)
                 self._retries += 1
-            transaction = Transaction(self._sent_ns, began_ns - asked_ns, now_ns - began_ns, losses, late_ns)
+            transaction = Transaction(self._sent_ns, began_ns - requested_ns, now_ns - began_ns, losses, late_ns)
+        # Outside of the lock, as the error's cause is read from the servo.
         for answer in answers:
             if answer.error and not despite_error:
                 self.require_fine(answer, what)
@@ -276,12 +258,12 @@ class ServoLink(ABC):
         return self.form.build(servo_id, Instruction.PING), (servo_id,), self.ping_bytes
 
     def _wire_ns(self, packet: bytes, servo_ids: Sequence[int], length: int) -> int:
-        """Return how long an instruction and its answers need on the wire [ns]."""
+        """Return the time of an instruction and its answers on the wire [ns]."""
         count = len(packet) + len(servo_ids) * (self.form.answer_bytes + length)
         return round(1e10 * count / self.config.baud_rate)
 
     def _attempt(self, packet: bytes, servo_ids: Sequence[int], length: int) -> list[Answer] | None:
-        """Send an instruction once; return the answers of the servos, or None if one is missing."""
+        """Send an instruction; return the answers of the servos, or None if one is missing."""
         self._send(packet)
         end_ns = self._sent_ns + round(1e9 * self.config.reply_timeout_s) + self._wire_ns(packet, servo_ids, length)
         answers = []
@@ -293,7 +275,7 @@ class ServoLink(ABC):
         return answers
 
     def _send(self, packet: bytes) -> None:
-        """Send an instruction; forget late answers that came before, and the beginning of one that was cut."""
+        """Drop late answers to earlier instructions, also incomplete ones, and send an instruction."""
         self._parser.clear()
         self._waiting.clear()
         try:
@@ -304,9 +286,9 @@ class ServoLink(ABC):
         os.write(self.fd, packet)
 
     def _receive(self, servo_id: int, length: int, end_ns: int) -> Answer | None:
-        """Wait for a servo's answer with `length` bytes of data, or a refusal without any.
+        """Return a servo's answer with `length` bytes of data, or its refusal without data.
 
-        Others are late answers to earlier instructions, and are dropped.
+        All other answers are late ones to earlier instructions, and are dropped.
         """
         while (answer := self._next_answer(end_ns)) is not None:
             refused = not answer.data and answer.error & self.form.refusals
@@ -328,18 +310,18 @@ class ServoLink(ABC):
             data = os.read(self.fd, 4096)
             if not data:
                 raise OSError("the port is ready to be read, but has no data: was it unplugged?")
-            self._waiting += [found for found, _ in self._parser.feed(data)]
+            self._waiting += [packet for packet, _ in self._parser.feed(data)]
 
     def _count_answer(self, now_ns: int, wire_ns: int) -> int:
-        """Count an answer that has arrived; return how much longer it took than its bytes need on the wire [ns]."""
+        """Count an answer; return its delay beyond the time of its bytes on the wire [ns]."""
         self._transactions += 1
         late_ns = max(0, now_ns - self._sent_ns - wire_ns)
         self._late_us.append(min(late_ns // 1000, 1 << 30))
         self._late += late_ns > 1e9 * self.config.late_after_s
         return late_ns
 
-    def _judge(self, losses: int, silent_s: float, what: str) -> None:
-        if losses >= _LEAST_LOSSES and silent_s > self.config.max_silence_s:
+    def _require_heard(self, losses: int, silent_s: float, what: str) -> None:
+        if losses >= _MIN_LOSSES and silent_s > self.config.max_silence_s:
             self._require_watching()
             raise HardwareLost(
                 f"no answer to {what} on {self.config.port}: {losses} missed in a row, {1e3 * silent_s:.0f} ms",
@@ -348,17 +330,17 @@ class ServoLink(ABC):
             )
 
     def _require_watching(self) -> None:
-        """Raise SafetyStop if the guardian has taken over: it reads answers off the port that are missed here."""
+        """Raise SafetyStop if the guardian has taken over: it reads answers that are then missing here."""
         if self.guardian is not None:
             self.guardian.require_watching()
 
     def _withholds(self, register: Register, values: Iterable[int]) -> bool:
-        """Whether a write could move a motor, and nothing may."""
+        """Whether a write could move a motor in a dry run."""
         moves = register in self.table.goals or (register == self.table.torque and any(values))
         return self.torque_withheld and moves
 
     def _withhold(self, register: Register, values: Mapping[int, int]) -> Transaction:
-        """Keep a write to oneself, and read the register in its place: the bus is as busy, and its loss is noticed."""
+        """Read the register in place of a write, so that the bus is as busy and its loss is noticed."""
         self._withheld += 1
         if register in self.table.goals:
             self._withheld_goals |= {(servo_id, register): value for servo_id, value in values.items()}

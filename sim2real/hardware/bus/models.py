@@ -1,4 +1,4 @@
-"""Servo models of all families, and what each does by itself when the computer that controls it dies."""
+"""Servo models of all families, and the reaction of each to the death of the computer that controls it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class ServoModel:
 
     Args:
         name: The model's name, as printed on the servo.
-        stops_alone: Whether it stops by itself when its bus watchdog trips; None: it has no watchdog.
-        source: How that is known.
+        stops_alone: Whether it stops when its own bus watchdog trips; None: it has no watchdog.
+        source: Where that is documented, or who measured it.
     """
 
     name: str
@@ -24,11 +24,7 @@ class ServoModel:
     source: str
 
     def without_host(self, watchdog_s: float, motors: tuple[str, ...] = ()) -> WithoutHost:
-        """Return what the servo does by itself when its host dies.
-
-        Args:
-            watchdog_s: The time that its bus watchdog is set to [s]; 0: off.
-        """
+        """Return the servo's reaction to the death of its host; a ``watchdog_s`` of 0 switches its bus watchdog off."""
         if self.stops_alone is None or not watchdog_s:
             why = "it has no bus watchdog" if self.stops_alone is None else "its bus watchdog is off"
             return WithoutHost(self.name, motors, Alone.GOES_ON, math.inf, self.source, why)
@@ -37,7 +33,7 @@ class ServoModel:
 
 
 def table(models: Iterable[ServoModel]) -> str:
-    """Return the Markdown table of docs/guides/safety.md: the models, and what they do by themselves."""
+    """Return the Markdown table of models and their reactions in docs/guides/safety.md."""
     rows = [
         (m.name, m.without_host(0.1).words.replace("after 0.1 s", "after `servo_watchdog_s`"), m.source) for m in models
     ]

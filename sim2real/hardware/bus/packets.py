@@ -1,4 +1,4 @@
-"""Packets on a half-duplex bus of servos: what all families have in common, and what a family must define."""
+"""Packets on a half-duplex bus of servos: the shared part, and the abstract part that each family defines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BROADCAST_ID: Final = 0xFE
 
 
 class Instruction(IntEnum):
-    """Instruction byte of a packet; the numbers are those of DYNAMIXEL, which other families have taken over."""
+    """Instruction byte of a packet; the numbers are DYNAMIXEL's, which other families copied."""
 
     PING = 0x01
     READ = 0x02
@@ -30,13 +30,12 @@ class Instruction(IntEnum):
 
 @dataclass(frozen=True)
 class Packet:
-    """A packet that was received.
+    """A received packet.
 
     Args:
         servo_id: Receiver, or the sender of a status packet.
-        code: Instruction byte, not necessarily one of `Instruction`; some families have the error byte of a status
-            packet in its place.
-        parameters: Bytes between code and checksum, as they were meant.
+        code: Instruction byte, also one outside of `Instruction`; in status packets of some families the error byte.
+        parameters: Bytes between code and checksum, without stuffing.
         intact: Whether the checksum matches; if not, the other fields may be wrong.
     """
 
@@ -47,13 +46,7 @@ class Packet:
 
 
 class Answer(NamedTuple):
-    """What a servo says in a status packet.
-
-    Attributes:
-        servo_id: The servo.
-        error: Error byte, 0: none.
-        data: What was read.
-    """
+    """Content of a status packet: the servo, its error byte (0: no error), and the data that were read."""
 
     servo_id: int
     error: int
@@ -61,15 +54,15 @@ class Answer(NamedTuple):
 
 
 class PacketFormat(ABC):
-    """How the servos of a family write packets.
+    """The packet format of a family of servos.
 
     Attributes:
         header: The first bytes of every packet.
-        prefix_bytes: Bytes up to and with the one or two that say how many follow.
-        answer_bytes: Bytes of a status packet without data.
-        address_bytes: Bytes of an address, and of a number of bytes.
-        refusals: Bits of the error byte that mean that an instruction was refused; such an answer has no data.
-        off_errors: Error bytes with which a servo may say that its torque is off.
+        prefix_bytes: Number of bytes up to the end of the length field.
+        answer_bytes: Number of bytes of a status packet without data.
+        address_bytes: Number of bytes of an address, and of a length in an instruction.
+        refusals: Bits of the error byte of a refused instruction; such an answer has no data.
+        off_errors: Possible error bytes of an answer that confirms that torque is off.
     """
 
     header: ClassVar[bytes]
@@ -84,12 +77,7 @@ class PacketFormat(ABC):
         """Return the bytes of a packet with a body, which is its code and its parameters."""
 
     def build(self, servo_id: int, code: int, parameters: bytes = b"") -> bytes:
-        """Return the bytes of a packet, as sent on the wire.
-
-        Args:
-            servo_id: The receiver; of a status packet, the sender.
-            code: As in `Packet`.
-        """
+        """Return the bytes of a packet on the wire; arguments as in `Packet`."""
         return self.frame(servo_id, bytes((code,)) + parameters)
 
     def build_status(self, servo_id: int, error: int, parameters: bytes = b"") -> bytes:
@@ -98,15 +86,15 @@ class PacketFormat(ABC):
 
     @abstractmethod
     def following(self, prefix: bytearray) -> int | None:
-        """Return how many bytes follow a packet's first `prefix_bytes`; None: no packet begins like this."""
+        """Return the number of bytes after a packet's first `prefix_bytes`; None if the prefix is invalid."""
 
     @abstractmethod
     def parse(self, packet: bytes) -> Packet:
-        """Return what the bytes of a whole packet mean."""
+        """Return the content of a whole packet."""
 
     @abstractmethod
     def answer(self, packet: Packet) -> Answer | None:
-        """Return what a status packet says; None for any other packet."""
+        """Return the content of a status packet; None for any other packet."""
 
     def read(self, servo_ids: Sequence[int], address: int, length: int) -> bytes:
         """Return the instruction that reads the same bytes of one or several servos."""
@@ -120,13 +108,13 @@ class PacketFormat(ABC):
         return self.build(servo_id, Instruction.WRITE, self._word(register.address) + register.encode(value))
 
     def write_each(self, register: Register, values: Mapping[int, int]) -> bytes:
-        """Return the instruction that writes a register of several servos, by id, which they do not answer."""
+        """Return the instruction that writes a register of several servos, id -> value; no servo answers it."""
         items = b"".join(bytes((i,)) + register.encode(value) for i, value in values.items())
         place = self._word(register.address) + self._word(register.size)
         return self.build(BROADCAST_ID, Instruction.SYNC_WRITE, place + items)
 
     def torque_queries(self, torque: Register, servo_ids: Sequence[int]) -> list[tuple[bytes, list[bytes]]]:
-        """Return for each servo the instruction that asks for its torque, and the answers that mean "off"."""
+        """Return for each servo the instruction that reads its torque register, and the answers that mean "off"."""
         return [
             (
                 self.read((i,), torque.address, torque.size),
@@ -155,17 +143,13 @@ class Parser:
         self._buffer.clear()
 
     def feed(self, chunk: bytes) -> list[tuple[Packet, int]]:
-        """Process the next bytes.
-
-        Returns:
-            The packets that they complete; each with the number of bytes of `chunk` up to and with its last byte.
-        """
+        """Return the packets that a chunk completes, each with the number of bytes of the chunk up to its end."""
         held_bytes = len(self._buffer)
         self._buffer += chunk
         taken_bytes = 0
         packets = []
-        while (found := self._next()) is not None:
-            packet, used_bytes = found
+        while (item := self._next()) is not None:
+            packet, used_bytes = item
             taken_bytes += used_bytes
             if packet is not None:
                 packets.append((packet, max(0, taken_bytes - held_bytes)))
@@ -174,11 +158,13 @@ class Parser:
     def _next(self) -> tuple[Packet | None, int] | None:
         """Remove a packet or leading garbage; return it (or None) and its size in bytes, None if more are needed."""
         buffer, form = self._buffer, self._form
+        # Find the header, and drop the garbage before it.
         start = buffer.find(form.header)
         if start != 0:
             # The last bytes may be the beginning of a header.
             garbage_bytes = start if start > 0 else max(0, len(buffer) - len(form.header) + 1)
             return self._drop(garbage_bytes) if garbage_bytes else None
+        # Wait for the length field, then for the whole packet.
         if len(buffer) < form.prefix_bytes:
             return None
         following = form.following(buffer)
@@ -197,7 +183,7 @@ class Parser:
 
 
 def of_servos(servo_ids: Sequence[int]) -> str:
-    """Return whom an instruction is for, in words."""
+    """Return the receivers of an instruction as a phrase for messages."""
     if not servo_ids:
         return ""
     return f" of servo {servo_ids[0]}" if len(servo_ids) == 1 else f" of servos {tuple(servo_ids)}"

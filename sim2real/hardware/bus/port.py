@@ -19,11 +19,11 @@ class LinkConfig:
     Args:
         port: Device file, e.g. /dev/ttyUSB0.
         baud_rate: Bits per second.
-        reply_timeout_s: How long to wait for an answer, beyond the time that its bytes need on the wire [s]. With a USB
-            adapter whose latency timer is 16 ms this must be longer than 16 ms; better set the timer to 1 ms.
+        reply_timeout_s: Longest wait for an answer, beyond the time of its bytes on the wire [s]. It must exceed the
+            latency timer of a USB adapter: 16 ms by default, better set it to 1 ms.
         max_silence_s: Time without any answer after which the bus counts as lost [s].
-        late_after_s: An answer that takes this much longer than its bytes need is late: the time at which its sample
-            was taken is then uncertain [s].
+        late_after_s: Delay of an answer, beyond the time of its bytes on the wire, from which it counts as late: the
+            time of its sample is then uncertain [s].
         silence_s: Longest time without an instruction while torque is on, after which the guardian takes it off, and
             the servos' own watchdogs trip if they have any [s]; 0: unlimited, only the death of this process counts.
         guardian: Whether to start a guardian; False only to test what the servos do without one.

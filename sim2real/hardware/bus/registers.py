@@ -1,4 +1,4 @@
-"""The registers of a servo's memory, whatever family it is of: where they are, and how their bytes mean a number."""
+"""The registers of a servo's memory, for all families: their addresses, and the encoding of their numbers."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Register:
         minimum: Smallest value that may be written [counts].
         maximum: Largest value that may be written [counts].
         default: Value after power-up [counts].
-        sign: Bit that means "negative", the others being a magnitude; `TWOS_COMPLEMENT`; None: it is never negative.
-        eeprom: Whether its value outlives a loss of power.
+        sign: Number of the sign bit beside a magnitude; or `TWOS_COMPLEMENT`; None: never negative.
+        eeprom: Whether its value survives a loss of power.
     """
 
     name: str
@@ -60,15 +60,13 @@ eeprom = partial(Register, writable=True, eeprom=True)
 
 @dataclass(frozen=True)
 class MemoryTable:
-    """What the driver of any servo must know of its memory.
+    """The memory of a servo, with the registers that drivers of all families use.
 
     Args:
-        named: Whatever a module of registers defines; what is no register does not count.
+        named: The values of a module of registers; values of other types are ignored.
         torque: The register that holds 0 while torque is off.
         goals: The registers that can move the motor while torque is on.
-        model_number: The register that says which model it is.
-        servo_id: The register that holds its id.
-        return_delay: The register that says how long it waits before it answers, in units of 2 us.
+        return_delay: The register of the time between instruction and answer, in units of 2 us.
     """
 
     named: Iterable[object]

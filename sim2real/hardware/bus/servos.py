@@ -1,4 +1,4 @@
-"""Servos on one bus, whatever family they are of: what watches them, and every way in which their torque goes off."""
+"""Servos of any family on one bus: the guardian that watches them, and every way in which their torque goes off."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class GuardedServos(Generic[L]):
     process that is started before torque goes on.
 
     Attributes:
-        models: Id -> model of the servos that were found, whose torque `close` takes off.
-        armed: Whether torque is on, as far as is known.
-        halted: Whether torque stays off, as `make_safe` or `close` was called.
+        models: Id -> model of the servos that answered; `close` takes their torque off.
+        armed: Whether torque was switched on.
+        halted: Whether torque stays off because `make_safe` or `close` was called.
     """
 
     link_type: type[L]
-    """What makes the link of a configuration."""
+    """Makes the link from a configuration."""
 
     def __init__(self, config: LinkConfig, ids: Sequence[int] = ()) -> None:
         self.config = config
@@ -88,12 +88,12 @@ class GuardedServos(Generic[L]):
 
     @property
     def counters(self) -> Counters:
-        """What went over the bus so far."""
+        """Counts of the transactions since `open`."""
         return Counters() if self._link is None else self._link.counters
 
     @property
     def torque_withheld(self) -> bool:
-        """Whether nothing can move a motor; see `withhold_torque`."""
+        """Whether this is a dry run; see `withhold_torque`."""
         return self._link is not None and self._link.torque_withheld
 
     def require_watching(self) -> None:
@@ -117,16 +117,17 @@ class GuardedServos(Generic[L]):
         self._off_packet = form.write_each(torque, dict.fromkeys(self.ids, 0)) if self.ids else b""
 
     def find(self, servo_id: int, whose: str = "") -> bytes:
-        """Return what a servo answers to a ping.
+        """Return the data of a servo's answer to a ping.
 
         Args:
-            whose: What it moves, for errors.
+            whose: The joint of the servo, for errors.
 
         Raises:
             HardwareLost: It does not answer, the message has the ids that do; or two servos have this id.
         """
+        # Ping once for the data.
         try:
-            found = self.link.ping(servo_id)
+            data = self.link.ping(servo_id)
         except HardwareLost as error:
             raise HardwareLost(
                 f"servo {servo_id}{whose} does not answer on {self.config.port} at {self.config.baud_rate} baud. "
@@ -134,28 +135,28 @@ class GuardedServos(Generic[L]):
                 hint="check power, cable, id and baud rate; set a USB adapter's latency timer to 1 ms; two servos of "
                 "one id garble each other's answers: connect one at a time",
             ) from error
-        # A late answer to an earlier ping does not come again and again, that of a second servo does.
+        # Ping several times for a second servo of the same id: a late answer to an earlier ping does not repeat.
         ping, wait_s = self.link.form.build(servo_id, Instruction.PING), 2.0 * self.config.reply_timeout_s
         if all(self.link.answering(ping, wait_s).count(servo_id) > 1 for _ in range(_SHARED_PINGS)):
             raise HardwareLost(
                 f"two servos on {self.config.port} have the id {servo_id}{whose}: both answer, and both would obey",
                 hint="connect one of them at a time, and give each an id of its own",
             )
-        return found
+        return data
 
     def without_host(self) -> tuple[WithoutHost, ...]:
-        """Return for each model of servo found what it does by itself when this process dies."""
+        """Return the reaction of each model on this bus to the death of this process."""
         kinds: dict[ServoModel, list[str]] = {}
         for servo_id, model in self.models.items():
             kinds.setdefault(model, []).append(f"servo {servo_id}")
         return tuple(m.without_host(self.silence_s, tuple(motors)) for m, motors in kinds.items())
 
     def withhold_torque(self) -> None:
-        """Let nothing pass from now on that could move a motor, for a dry run: neither "torque on" nor any goal.
+        """Send neither "torque on" nor any goal from now until the bus is opened again, for a dry run.
 
-        There is no way back but to open the bus again. Everything else goes on as it would: watchdog and guardian are
-        armed, goals are checked, and a goal that was withheld is what its register seems to hold. In the place of an
-        instruction that is withheld its register is read, which takes the bus about as long.
+        Everything else happens as usual: watchdog and guardian are armed, goals are checked, and `ServoLink.read`
+        returns a withheld goal. Each withheld instruction is replaced by a read of its register, which takes the bus
+        about as long.
 
         Raises:
             UsageError: Torque is on.
@@ -210,7 +211,7 @@ class GuardedServos(Generic[L]):
                 os.write(link.fd, self._off_packet)
 
     def stop_if_halted(self) -> None:
-        """Take the torque off once more: what switches it on may have passed `make_safe` on its way."""
+        """Take the torque off after `make_safe`, as an instruction that switches it on may have followed."""
         if self.halted:
             self.make_safe()
 
@@ -224,14 +225,16 @@ class GuardedServos(Generic[L]):
             return
         self.halted, self.armed = True, False
         guardian = link.guardian
+        # Let a guardian that takes the torque off finish, as both use the same line.
         if guardian is not None:
             guardian.settle()
-        left = [servo_id for servo_id in self.models if not self.release(servo_id)]
-        if left:
-            _LOGGER.error("servos %s did not confirm that their torque is off", left)
+        # Release every servo; the guardian goes on with those that do not confirm.
+        unconfirmed = [servo_id for servo_id in self.models if not self.release(servo_id)]
+        if unconfirmed:
+            _LOGGER.error("servos %s did not confirm that their torque is off", unconfirmed)
         link.close()
         if guardian is not None:
-            guardian.end(confirmed=not left)
+            guardian.end(confirmed=not unconfirmed)
         atexit.unregister(self.close)
 
     def release(self, servo_id: int) -> bool:

@@ -1,1 +1,1 @@
-"""DYNAMIXEL X servos: the device, its bus, and the servos that the emulator emulates."""
+"""DYNAMIXEL X servos: tables of registers and models, the bus, the device, and their emulation."""

@@ -12,11 +12,7 @@ from sim2real.hardware.dynamixel.drive import Drive
 
 
 class DynamixelServos(ServoBus, Device):
-    """DYNAMIXEL X servos on one port, commanded in the unit of their drive.
-
-    Raises:
-        UsageError: The drive is made for another number of servos.
-    """
+    """DYNAMIXEL X servos on one port, commanded in the unit of their drive."""
 
     def __init__(self, config: BusConfig, ids: Sequence[int], drive: Drive) -> None:
         drive.check(len(ids))
@@ -25,7 +21,7 @@ class DynamixelServos(ServoBus, Device):
 
     @property
     def commanded(self) -> CommandKind:
-        """What the drive's commands are."""
+        """The quantity of the drive's commands."""
         return self.drive.kind
 
     def open(self) -> None:
@@ -44,7 +40,7 @@ class DynamixelServos(ServoBus, Device):
         return self.drive.reach(self)
 
     def enable(self) -> None:
-        """Write the settings, which a servo that was rebooted has lost, and switch the torque on, at rest."""
+        """Write the settings, which a servo loses at a reboot, and switch the torque on, at rest."""
         self.drive.prepare(self)
         self.torque(True)
 
@@ -70,10 +66,5 @@ class DynamixelServos(ServoBus, Device):
 
 
 def servos(port: str, ids: Sequence[int], drive: Drive, *, baud_rate: int, silence_s: float) -> DynamixelServos:
-    """Return servos on a port, not opened yet; what the name ``dynamixel`` stands for.
-
-    Args:
-        baud_rate: Bits per second.
-        silence_s: Longest time without an instruction while torque is on [s].
-    """
+    """Return servos on a port, not opened yet: the device of the name ``dynamixel``; see ``DeviceFactory``."""
     return DynamixelServos(BusConfig(port, baud_rate, silence_s=silence_s), ids, drive)

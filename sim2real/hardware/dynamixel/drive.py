@@ -1,4 +1,4 @@
-"""The ways to drive servos, by voltage or by joint angle: how commands become goals on the bus, and back."""
+"""Drives of servos, by voltage or by joint angle: conversion of commands to goals on the bus, and of readings back."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Drive(ABC):
     """A way to drive servos. Commands are float64 arrays of shape (n,), in the order of the bus's ids.
 
     Attributes:
-        mode: The operating mode that the servos must be in.
-        kind: What the numbers of a command are.
+        mode: The servos' operating mode.
+        kind: The quantity of a command.
     """
 
     mode: ClassVar[OperatingMode]

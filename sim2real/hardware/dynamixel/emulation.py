@@ -1,4 +1,4 @@
-"""DYNAMIXEL servos on an emulated bus: what is their own in it."""
+"""DYNAMIXEL servos on an emulated bus: the part that other families do not share."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ class EmulatedBus(InstructedBus[EmulatedServo, "EmulatorConfig"]):
             super().execute(request)
 
     def _misunderstand(self, servo: EmulatedServo, request: Request) -> None:
-        """Say what is wrong with an instruction."""
+        """Answer an instruction with its error."""
         self._answer(servo, request, StatusError.INSTRUCTION if request.packet.intact else StatusError.CRC)
 
     def _misread(self, servo: EmulatedServo, request: Request) -> None:
-        """Say that a READ has another length than it should."""
+        """Answer a READ of a wrong length with an error."""
         self._confirm(servo, request, StatusError.DATA_LENGTH)
 
     def _bulk_read(self, request: Request, targets: list[EmulatedServo]) -> None:

@@ -1,4 +1,4 @@
-"""DYNAMIXEL X models, and what each does by itself when the computer that controls it dies."""
+"""The table of DYNAMIXEL X models, with the reaction of each to the death of the computer that controls it."""
 
 from __future__ import annotations
 
@@ -24,5 +24,5 @@ MODELS: Final[Mapping[int, ServoModel]] = {
 
 
 def model(number: int) -> ServoModel:
-    """Return the model with a number; an unknown one is assumed not to stop by itself."""
+    """Return the model of a number; an unknown one counts as one that goes on without its host."""
     return MODELS.get(number, ServoModel(f"model {number}", False, "unknown model: the worst is assumed"))

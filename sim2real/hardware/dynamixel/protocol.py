@@ -75,12 +75,12 @@ class Protocol2(PacketFormat):
         return self.build(servo_id, Instruction.STATUS, bytes((error,)) + parameters)
 
     def following(self, prefix: bytearray) -> int | None:
-        """Return the length that a packet says it has, if it is possible."""
+        """Return the content of the length field; None if it is invalid."""
         length = int.from_bytes(prefix[5:7], "little")
         return length if 3 <= length <= MAX_PACKET_LENGTH else None
 
     def parse(self, packet: bytes) -> Packet:
-        """Return what a packet means, without stuffing."""
+        """Return the content of a packet, without stuffing."""
         intact = crc16(packet[:-2]) == int.from_bytes(packet[-2:], "little")
         body = packet[self.prefix_bytes : -2].replace(_STUFFED[1], _STUFFED[0])
         return Packet(packet[4], body[0], body[1:], intact)

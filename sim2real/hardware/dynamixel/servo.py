@@ -19,11 +19,9 @@ _MOTION: Final = (reg.TORQUE_ENABLE, *reg.TABLE.goals)
 
 
 class EmulatedServo(ServoFirmware):
-    """Registers and firmware of one DYNAMIXEL X servo, without time, bus and physics.
+    """Registers and firmware of one DYNAMIXEL X servo; see `ServoFirmware`.
 
     Args:
-        return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
-        encoder_counts: Resolution of the encoder [counts per revolution].
         watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
     """
 
@@ -61,11 +59,8 @@ class EmulatedServo(ServoFirmware):
         return ALERT_BIT if self.get(reg.HARDWARE_ERROR_STATUS) else 0
 
     def command(self) -> tuple[int, float]:
-        """Return what the motor is commanded to do, according to the registers.
-
-        Returns:
-            (mode, goal): PWM and a fraction in [-1, 1], POSITION [rad], VELOCITY [rad/s], or OFF and 0.
-        """
+        """Return mode and goal: PWM and a fraction in [-1, 1], POSITION [rad], VELOCITY [rad/s], or OFF and 0."""
+        # Torque off and a tripped watchdog come before the operating mode.
         if not self.get(reg.TORQUE_ENABLE):
             return OperatingMode.OFF, 0.0
         mode = self.get(reg.OPERATING_MODE)
@@ -89,10 +84,10 @@ class EmulatedServo(ServoFirmware):
 
         Args:
             position_rad: Angle from the encoder's zero [rad].
-            velocity_rad_s: Speed [rad/s].
             load: Fraction of the largest load, in [-1, 1].
             tick_ms: Time since power-up [ms]; wraps at 32768 like the servo's own counter.
         """
+        # Round the angle to the encoder's resolution, then to counts of the register.
         step_rad = 2.0 * math.pi / self._encoder_counts
         count = reg.count_from_rad(round(position_rad / step_rad) * step_rad)
         velocity_count = reg.count_from_rad_s(velocity_rad_s)
@@ -105,23 +100,21 @@ class EmulatedServo(ServoFirmware):
         self.put(reg.REALTIME_TICK, tick_ms % 32768)
 
     def read(self, address: int, length: int) -> tuple[StatusError, bytes]:
-        """Return the error and the bytes that a READ is answered with."""
+        """Return the error and the bytes of the answer to a READ."""
         if length == 0 or address + length > reg.TABLE.size:
             return StatusError.ACCESS, b""
         return StatusError.NONE, bytes(self._memory[address : address + length])
 
     def write(self, address: int, data: bytes) -> tuple[StatusError, bool]:
-        """Write registers: all of them, or, if there is an error, none.
-
-        Returns:
-            The error, and whether torque or a goal was written, so that `command` may have changed.
-        """
+        """Write all registers, or none if there is an error; return it, and whether `command` may have changed."""
+        # Check every register before the first is written.
         pairs: list[tuple[Register, int]] = []
         error = self._split(address, data, pairs)
         for register, value in pairs:
             error = error or self._refusal(register, value)
         if error:
             return error, False
+        # When torque goes on, the goals are set to rest.
         torque_was_on = self.get(reg.TORQUE_ENABLE)
         for register, value in pairs:
             self.put(register, value)
@@ -139,14 +132,14 @@ class EmulatedServo(ServoFirmware):
         return self.write(*stored)
 
     def watchdog_deadline_ns(self) -> int | None:
-        """Return when the bus watchdog trips if no instruction comes before; None if it is not armed."""
+        """Return the time at which the bus watchdog trips without an instruction; None if it is off."""
         value = self.get(reg.BUS_WATCHDOG)
         if value <= 0 or not self.get(reg.TORQUE_ENABLE):
             return None
         return self.heard_ns + round(value * reg.WATCHDOG_UNIT_S * 1e9)
 
     def trip_watchdog(self) -> None:
-        """Trip the bus watchdog: goals cannot be written until it is set to 0, and the motor stops on some models."""
+        """Trip the bus watchdog: it refuses goals until it is set to 0, and the motor stops on some models."""
         if self.watchdog_stops:
             self._rest_goals()
         self.put(reg.BUS_WATCHDOG, reg.WATCHDOG_TRIPPED)
@@ -176,7 +169,7 @@ class EmulatedServo(ServoFirmware):
         return StatusError.NONE
 
     def _refusal(self, register: Register, value: int) -> StatusError:
-        """Return why the firmware refuses a value, or NONE."""
+        """Return the firmware's reason to refuse a value, or NONE."""
         if not register.writable or (register.eeprom and self.get(reg.TORQUE_ENABLE)):
             return StatusError.ACCESS
         if register in _FIXED and value != self.get(register):

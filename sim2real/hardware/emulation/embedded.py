@@ -24,9 +24,9 @@ _STOP_TIMEOUT_S: Final = 3.0
 
 
 class EmbeddedRobot:
-    """Emulated servos on `port`, from construction until `stop` or the end of this process, however it ends.
+    """Emulated servos on `port`, from construction until `stop` or any end of this process.
 
-    The stages get the port alone. The emulator logs true states and latencies to the truth file; `truth` and `reveal`
+    The stages get only the port. The emulator logs true states and latencies to the truth file; `truth` and `reveal`
     read it.
 
     Args:
@@ -50,7 +50,7 @@ class EmbeddedRobot:
         self.truth_path = Path(truth_path) if truth_path is not None else folder / "truth.bin"
         self.truth_path.parent.mkdir(parents=True, exist_ok=True)
         self._messages_path = folder / "messages.txt"
-        # -P: files in the working directory, which is the user's, must not be imported as modules.
+        # The settings become flags. -P: files in the user's working directory must not be imported as modules.
         command = [
             sys.executable,
             "-P",
@@ -70,6 +70,7 @@ class EmbeddedRobot:
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=messages, start_new_session=True
             )
+        # The emulator prints the port when it is ready.
         ready = self._wait_until_ready()
         self.port: str = ready["port"]
         self.pid: int = ready["pid"]
@@ -106,7 +107,7 @@ class EmbeddedRobot:
         self._folder.cleanup()
 
     def truth(self) -> Truth:
-        """Read what the truth file has so far; while the robot runs, the last 0.25 s may be missing."""
+        """Read the truth file; while the robot runs, the last 0.25 s may be missing."""
         return read_truth(self.truth_path)
 
     def reveal(self) -> dict[str, Any]:
@@ -123,5 +124,5 @@ class EmbeddedRobot:
         raise HardwareLost(message)
 
     def _messages(self) -> str:
-        """Return what the process has written to stderr."""
-        return self._messages_path.read_text(errors="replace").strip() or "it said nothing"
+        """Return the process's messages on stderr."""
+        return self._messages_path.read_text(errors="replace").strip() or "without a message"

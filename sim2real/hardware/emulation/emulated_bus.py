@@ -1,4 +1,4 @@
-"""The core of emulated half-duplex buses, computed in planned time: what does not depend on a protocol.
+"""The core of emulated half-duplex buses, computed in planned time, independent of the protocol.
 
 The times of all events are computed from the times at which the host's bytes arrive, and do not depend on how late the
 emulator's process runs: an instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud;
@@ -22,17 +22,16 @@ from sim2real.hardware.plant import OperatingMode, Plant, PlantClock
 _STALE_PACKET_NS: Final = 5_000_000  # after a longer pause, an incomplete packet is dropped
 
 Sample = tuple[int, tuple[float, float, float]]
-"""When values were sampled [ns], and position [rad], velocity [rad/s] and load."""
+"""Time of the sample [ns], and position [rad], velocity [rad/s] and load."""
 
 
 @dataclass
 class Request:
-    """An instruction that was received.
+    """A received instruction.
 
     Attributes:
-        packet: The instruction.
-        t_ns: When it was complete on the wire.
-        t_host_ns: When its last bytes had reached the emulator.
+        t_ns: Time at which it was complete on the wire.
+        t_host_ns: Time at which its last bytes had reached the emulator.
         actuation_ns: Delay until its commands take effect, the same for all servos; None until it is drawn.
     """
 
@@ -58,8 +57,7 @@ class Firmware(Protocol):
     """Registers and firmware of one servo, without time, bus and physics.
 
     Attributes:
-        servo_id: Its id on the bus.
-        heard_ns: When it last heard an instruction.
+        heard_ns: Time of the last instruction that it received.
         watchdog_stops: Whether a tripped watchdog stops the motor.
     """
 
@@ -87,7 +85,7 @@ class Firmware(Protocol):
         ...
 
     def watchdog_deadline_ns(self) -> int | None:
-        """Return when its watchdog trips if no instruction comes before; None if it has none, or it is not armed."""
+        """Return the time at which its watchdog trips without an instruction; None if it has none, or it is off."""
         ...
 
     def trip_watchdog(self) -> None:
@@ -106,10 +104,9 @@ class PlannedBus(ABC):
     `actuate`, `configure` and `reply`.
 
     Args:
-        send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
+        send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
         start_ns: Time 0 of the plant.
         now_ns: Clock by which lateness is measured.
-        parser: Finds instructions in the host's bytes.
         servos: Id -> servo, ordered by id.
     """
 
@@ -158,9 +155,11 @@ class PlannedBus(ABC):
         """Process bytes that the host has sent; `run_until(now_ns)` must be called next."""
         if self._silent(now_ns):
             return
+        # After a pause, the rest of an incomplete packet does not come any more.
         if now_ns - self._last_bytes_ns > _STALE_PACKET_NS:
             self._parser.clear()
         self._last_bytes_ns = now_ns
+        # Each instruction is executed when its last byte has passed the wire.
         begin_ns = max(now_ns, self._wire_free_ns)
         self._wire_free_ns = begin_ns + round(len(chunk) * self._byte_ns)
         for packet, end in self._parser.feed(chunk):
@@ -183,6 +182,7 @@ class PlannedBus(ABC):
         """Process all events up to `t_ns` in order, and advance the plant to that time."""
         while (due_ns := self.next_due_ns()) is not None and due_ns <= t_ns:
             self._clock.advance(due_ns)
+            # Watchdogs first: an instruction that comes at the same time is too late.
             for servo in self._firmware.values():
                 deadline_ns = servo.watchdog_deadline_ns()
                 if deadline_ns is not None and deadline_ns <= due_ns:
@@ -193,7 +193,7 @@ class PlannedBus(ABC):
         self._clock.advance(t_ns)
 
     def begin_faults(self, t_ns: int) -> None:
-        """Count the times of faults from now on, ``t_ns``."""
+        """Count the times of faults from ``t_ns``."""
         self._fault_ns = t_ns
 
     def unplugged(self, t_ns: int) -> bool:
@@ -205,18 +205,18 @@ class PlannedBus(ABC):
         return probability > 0.0 and self.random.random() < probability
 
     def ill(self, probability: float, t_ns: int) -> bool:
-        """Return whether an answer to what came at a time [ns] is late, or wild, with this probability."""
+        """Return whether the answer to an instruction at a time [ns] is late, or wild, with this probability."""
         return self._passed(self._config.ill_after_s, t_ns) and self.happens(probability)
 
     def configure(self, servo: Firmware) -> None:
-        """Tell the plant a servo's controller settings if they have changed."""
+        """Pass a servo's controller settings to the plant if they have changed."""
         controller = servo.controller()
         if self._controllers.get(servo.servo_id) != controller:
             self._controllers[servo.servo_id] = controller
             self._clock.configure(servo.servo_id, *controller)
 
     def actuate(self, servo: Firmware, request: Request) -> None:
-        """Let what the servo's registers command now take effect one actuation latency after the request."""
+        """Schedule the command of the servo's registers one actuation latency after the request."""
         config = self._config
         if request.actuation_ns is None:
             request.actuation_ns = self._delay_ns(config.actuation_latency_s, config.actuation_jitter_s)
@@ -231,10 +231,10 @@ class PlannedBus(ABC):
         config = self._config
         sampled_ns = t_ns - self._delay_ns(config.sensing_latency_s, config.sensing_jitter_s)
         values = self._clock.sample(servo.servo_id, sampled_ns)
-        shown = values
+        reported = values
         if self._passed(config.frozen_after_s, t_ns):
-            shown = self._frozen.setdefault(servo.servo_id, (values[0], 0.0, values[2]))
-        servo.refresh(*shown, tick_ms=(t_ns - self._start_ns) // 1_000_000)
+            reported = self._frozen.setdefault(servo.servo_id, (values[0], 0.0, values[2]))
+        servo.refresh(*reported, tick_ms=(t_ns - self._start_ns) // 1_000_000)
         return sampled_ns, values
 
     def reply(
@@ -243,12 +243,12 @@ class PlannedBus(ABC):
         """Schedule an answer: sent after the return delay when the wire is free, delivered at its last byte.
 
         Args:
-            servo_id: The servo that answers.
-            return_delay_s: How long the servo waits before it answers [s].
-            sample: What it has measured, if it answers with present values.
+            return_delay_s: Time between instruction and answer [s].
+            sample: The measurement, if the answer has present values.
         """
         begin_ns = max(request.t_ns, self._wire_free_ns) + round(return_delay_s * 1e9)
         self._wire_free_ns = begin_ns + round(len(answer) * self._byte_ns)
+        # A late answer delays the later ones, as in a USB adapter.
         late_ns = round(self._config.late_s * 1e9) if self.ill(self._config.late, request.t_ns) else 0
         self._delivered_ns = max(self._delivered_ns, self._wire_free_ns + late_ns)
         self._at(self._delivered_ns, self._deliver, self._delivered_ns, servo_id, answer, request, sample)
@@ -270,6 +270,7 @@ class PlannedBus(ABC):
     def _deliver(self, planned_ns: int, servo_id: int, answer: bytes, request: Request, sample: Sample | None) -> None:
         kind = Kind.REPLY if sample is None else Kind.SAMPLE
         t_ns, values = sample or (request.t_ns, ())
+        # Faults of the wire: a corrupted byte, or no answer at all.
         if self.random.random() < self._config.corrupt:
             position = self.random.randrange(len(answer))
             answer = answer[:position] + bytes((answer[position] ^ 0x10,)) + answer[position + 1 :]
@@ -299,27 +300,18 @@ class PlannedBus(ABC):
 
 @dataclass(frozen=True)
 class BusEmulation(Emulation):
-    """Settings that know which bus they are for; see `Emulation` for what they are."""
+    """Settings of a certain bus; see `Emulation` for their meaning."""
 
     bus_type: ClassVar[Callable[..., PlannedBus]]
-    """What makes the bus: called with plant, settings, truth, ``send`` and ``start_ns``."""
+    """Makes the bus from plant, settings, truth, ``send`` and ``start_ns``."""
 
     def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
-        """Return the emulated bus with these settings.
-
-        Args:
-            send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
-            start_ns: Time 0 of the plant, CLOCK_MONOTONIC [ns].
-        """
+        """Return the emulated bus with these settings; arguments as in `PlannedBus`."""
         return type(self).bus_type(plant, self, truth, send, start_ns)
 
 
 def truth_header(plant: Plant, config: Emulation, start_ns: int) -> dict[str, Any]:
-    """Return the header of a truth file.
-
-    Args:
-        start_ns: Time 0 of the plant [ns].
-    """
+    """Return the header of a truth file; ``start_ns`` is time 0 of the plant."""
     return {
         "start_ns": start_ns,
         "config": asdict(config),

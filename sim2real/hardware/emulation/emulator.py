@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _IDLE_NS: Final = 2_000_000  # longest time without stepping the plant: catching up with more would delay answers
 _PR_SET_TIMERSLACK: Final = 29
 _TIMER_SLACK_NS: Final = 1_000
-_REAL_TIME_PRIORITY: Final = 2  # a servo does not wait for the computer that commands it, whose threads have 1
+_REAL_TIME_PRIORITY: Final = 2  # above the threads of the controlling process, which have 1: a servo does not wait
 _TYPES: Final = {"int": int, "float": float, "bool": {"True": True, "False": False}.__getitem__}
 
 
@@ -59,7 +59,7 @@ class _Pty:
             self.fd = -1
 
     def send(self, answer: bytes) -> bool:
-        """Send bytes to the host; return False if nobody reads: the buffer is full, or the port is gone."""
+        """Send bytes to the host; return False if the buffer is full or the port is gone."""
         if self.fd < 0:
             return False
         try:
@@ -76,7 +76,7 @@ class _Pty:
 
 
 class _StopFlag:
-    """A flag that SIGTERM and SIGINT set, and when SIGUSR1 came, after which faults begin."""
+    """A flag that SIGTERM and SIGINT set, and the time of SIGUSR1, from which times of faults count."""
 
     def __init__(self) -> None:
         self.is_set = False
@@ -98,12 +98,14 @@ def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_
     """Run the bus until `stop` is set; with `parent_fd`, also until the other end of that pipe is closed."""
     inputs = [pty.fd] if parent_fd is None else [pty.fd, parent_fd]
     while not stop.is_set:
+        # Sleep until bytes arrive or the next event is due.
         now_ns = time.monotonic_ns()
         wake_ns = now_ns + _IDLE_NS
         due_ns = bus.next_due_ns()
         if due_ns is not None:
             wake_ns = min(wake_ns, due_ns)
         ready = select.select(inputs, [], [], max(0, wake_ns - now_ns) * 1e-9)[0]
+        # Faults that a signal or the settings start.
         now_ns = time.monotonic_ns()
         if stop.faulty_ns is not None:
             bus.begin_faults(stop.faulty_ns)
@@ -111,6 +113,7 @@ def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_
         if pty.fd >= 0 and bus.unplugged(now_ns):
             inputs.remove(pty.fd)
             pty.unplug()
+        # Pass the bytes on, then compute all events up to now.
         if pty.fd in ready:
             bus.feed(pty.receive(), now_ns)
         if parent_fd in ready and not os.read(parent_fd, 1024):
@@ -120,7 +123,7 @@ def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_
 
 
 def _keep_time() -> None:
-    """Make this process as punctual as the operating system allows."""
+    """Reduce the lateness of this process as far as the operating system allows."""
     # Sleeps end within about 1 us of the requested time, instead of 50 us.
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, _TIMER_SLACK_NS, 0, 0, 0)
@@ -133,21 +136,26 @@ def _keep_time() -> None:
 
 
 def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
-    """Return the parser of the command line, with a flag for each setting of the emulation that it names."""
+    """Return the parser of the command line, with a flag for each setting of the named emulation."""
+    # The flag --emulation determines the other flags.
     parser = argparse.ArgumentParser(
         prog="python -m sim2real.hardware.emulation.emulator", description=__doc__, add_help=False
     )
     place = "MODULE_OR_FILE:NAME"
-    parser.add_argument("--emulation", required=True, metavar=place, help="the settings, which say what bus it is")
+    parser.add_argument(
+        "--emulation", required=True, metavar=place, help="the class of the settings, which makes the bus"
+    )
     named = parser.parse_known_args(arguments)[0]
     settings = load_named(named.emulation, "emulation")
     if not (isinstance(settings, type) and issubclass(settings, BusEmulation)):
         raise UsageError(f"emulation {named.emulation!r} is no class of settings of an emulated bus")
     parser.set_defaults(settings=settings)
     parser.add_argument("-h", "--help", action="help")
-    parser.add_argument("--plant", required=True, metavar=place, help="what is called to get the plant")
-    parser.add_argument("--plant-args", default="{}", metavar="JSON", help="keyword arguments of that call")
-    parser.add_argument("--truth", type=Path, required=True, metavar="FILE", help="where the truth is logged")
+    parser.add_argument("--plant", required=True, metavar=place, help="the callable that returns the plant")
+    parser.add_argument("--plant-args", default="{}", metavar="JSON", help="keyword arguments of --plant")
+    parser.add_argument(
+        "--truth", type=Path, required=True, metavar="FILE", help="the log of true states and latencies"
+    )
     parser.add_argument(
         "--until-stdin-closes", action="store_true", help="also stop when stdin ends, as when the parent dies"
     )

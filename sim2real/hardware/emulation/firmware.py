@@ -1,4 +1,4 @@
-"""The firmware of one emulated servo: what does not depend on its family."""
+"""The firmware of one emulated servo, as far as all families share it."""
 
 from __future__ import annotations
 
@@ -15,9 +15,6 @@ class ServoFirmware(Firmware, ABC):
     Args:
         return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
         encoder_counts: Resolution of the encoder [counts per revolution].
-
-    Attributes:
-        table: Its memory.
     """
 
     table: ClassVar[MemoryTable]
@@ -47,7 +44,7 @@ class ServoFirmware(Firmware, ABC):
 
     @property
     def return_delay_s(self) -> float:
-        """How long it waits before it answers [s]."""
+        """Time between an instruction and its answer [s]."""
         return self.get(self.table.return_delay) * RETURN_DELAY_UNIT_S
 
     @property
@@ -63,7 +60,7 @@ class ServoFirmware(Firmware, ABC):
     @property
     @abstractmethod
     def alert(self) -> int:
-        """Bits that are set in the error byte of every answer: those of an error that is present."""
+        """Bits of the present error, which are set in the error byte of every answer."""
 
     @property
     def identity(self) -> bytes:
@@ -72,7 +69,7 @@ class ServoFirmware(Firmware, ABC):
 
     @abstractmethod
     def read(self, address: int, length: int) -> tuple[int, bytes]:
-        """Return the error and the bytes that a READ is answered with."""
+        """Return the error and the bytes of the answer to a READ."""
 
     @abstractmethod
     def write(self, address: int, data: bytes) -> tuple[int, bool]:
@@ -83,21 +80,21 @@ class ServoFirmware(Firmware, ABC):
         self._registered = (address, data)
 
     def action(self) -> tuple[int, bool]:
-        """Carry out the stored write, if there is one; return what `write` does."""
+        """Carry out the stored write, if there is one; return as `write`."""
         if self._registered is None:
             return 0, False
         stored, self._registered = self._registered, None
         return self.write(*stored)
 
     def reboot(self) -> None:
-        """Begin again as after a loss of power: torque off, and whatever is not in the EEPROM at its default."""
+        """Restart as after a loss of power: torque off, and all registers outside the EEPROM at their defaults."""
         self._registered = None
         for register in self.table.registers.values():
             if not register.eeprom:
                 self.put(register, register.default)
 
     def watchdog_deadline_ns(self) -> int | None:
-        """Return when its watchdog trips if no instruction comes before; None if it has none, or it is not armed."""
+        """Return the time at which its watchdog trips without an instruction; None if it has none, or it is off."""
         return None
 
     def trip_watchdog(self) -> None:

@@ -1,4 +1,4 @@
-"""Servos on an emulated bus: what each instruction does, whatever family they are of."""
+"""Servos on an emulated bus: the effect of each instruction, for all families."""
 
 from __future__ import annotations
 
@@ -22,14 +22,13 @@ class InstructedBus(PlannedBus, Generic[S, E]):
     """Emulated servos of one family on a bus, driving a plant; see `PlannedBus`.
 
     Args:
-        send: Called with an answer's bytes when the host is to get them; returns False if it cannot take them.
+        send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
         start_ns: Time 0 of the plant.
         now_ns: Clock by which lateness is measured.
 
     Attributes:
-        form: How packets are written.
         present: The first and the last register of present values.
-        wild_counts: Lowest and highest position that no motor can reach.
+        wild_counts: Range of positions out of the motors' reach.
     """
 
     form: ClassVar[PacketFormat]
@@ -66,6 +65,7 @@ class InstructedBus(PlannedBus, Generic[S, E]):
     def execute(self, request: Request) -> None:
         """Carry out an instruction that is complete on the wire, and reply to it."""
         packet = request.packet
+        # Every servo that receives the instruction resets its watchdog.
         broadcast = packet.servo_id == BROADCAST_ID
         targets = [s for i, s in self.servos.items() if broadcast or i == packet.servo_id]
         if packet.intact:
@@ -78,10 +78,10 @@ class InstructedBus(PlannedBus, Generic[S, E]):
             self._misunderstand(targets[0], request)
 
     def _misunderstand(self, servo: S, request: Request) -> None:
-        """React to an instruction with a wrong checksum, or an unknown one: here in silence."""
+        """React to an instruction with a wrong checksum, or an unknown one: here without an answer."""
 
     def _misread(self, servo: S, request: Request) -> None:
-        """React to a READ that does not say what to read: here in silence."""
+        """React to a READ of a wrong length: here without an answer."""
 
     def _ping(self, request: Request, targets: list[S]) -> None:
         """Answer a ping."""
@@ -89,7 +89,7 @@ class InstructedBus(PlannedBus, Generic[S, E]):
             self._answer(servo, request, 0, servo.identity)
 
     def _answer(self, servo: S, request: Request, error: int, data: bytes = b"", sample: Sample | None = None) -> None:
-        """Let a servo answer, with what it has measured if it answers with present values."""
+        """Let a servo answer, with its measurement if the answer has present values."""
         status = self._status(servo, error | servo.alert, data)
         self.reply(servo.servo_id, request, status, servo.return_delay_s, sample)
 
@@ -103,7 +103,7 @@ class InstructedBus(PlannedBus, Generic[S, E]):
             self._answer(servo, request, error)
 
     def _answer_read(self, servo: S, request: Request, position: int) -> None:
-        """Let a servo answer an instruction that says at a position in its parameters what to read."""
+        """Let a servo answer a read whose address and length begin at a position in the parameters."""
         address = self.form.word(request.packet.parameters, position)
         length = self.form.word(request.packet.parameters, position + self.form.address_bytes)
         sample = self.measure(servo, request.t_ns)
@@ -169,6 +169,6 @@ class InstructedBus(PlannedBus, Generic[S, E]):
         return error
 
     def _place(self, request: Request) -> tuple[int, bytes]:
-        """Return the address that an instruction writes to, and the data."""
+        """Return the address and the data of an instruction that writes."""
         parameters = request.packet.parameters
         return self.form.word(parameters, 0), parameters[self.form.address_bytes :]

@@ -1,4 +1,4 @@
-"""A plant behind mountings: what emulated servos see of joints with a zero, a direction and a gear of their own."""
+"""A plant behind mountings: emulated servos on joints with a zero, a direction and a gear."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from sim2real.hardware.plant import ConfigurablePlant, OperatingMode, load_plant
 class MountedPlant:
     """A plant whose servos drive its joints through their mountings; see `sim2real.hardware.plant.Plant`.
 
-    The plant inside knows its joints alone: it is told angles and speeds of theirs, and voltages that push them. Its
-    true states stay those of the joints.
+    The plant inside works on the joints' side: it gets their angles, speeds and voltages, and has their true states.
 
     Args:
         plant: The plant inside, as `load_plant` takes it.
         joints: Fields of `Joint`, one row per servo, in the order of the plant's `servo_ids`.
-        zero_rad: What an encoder reads, from count 0, where the device says 0 [rad]; the plant inside says so for a
+        zero_rad: The encoder's angle from count 0 where the device reports 0 [rad]; in the plant inside, that of a
             joint at 0.
 
     Raises:
@@ -44,12 +43,7 @@ class MountedPlant:
         self._plant.advance(t_s)
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
-        """Command a servo; see `Plant.command`.
-
-        Args:
-            mode: One of `OperatingMode`.
-            goal: Of the servo, not of its joint.
-        """
+        """Command a servo; see `Plant.command`. The goal is the servo's, not its joint's."""
         joint = self._joints[servo_id]
         if mode in (OperatingMode.POSITION, OperatingMode.EXTENDED_POSITION):
             goal = joint.angle(goal - self._zero_rad) + self._zero_rad
@@ -60,13 +54,7 @@ class MountedPlant:
         self._plant.command(servo_id, mode, goal)
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Set a servo's position controller, where the plant inside has one; see `ConfigurablePlant`.
-
-        Args:
-            p_gain: Position P Gain [counts].
-            d_gain: Position D Gain [counts].
-            profile_velocity_rad_s: Largest speed of the servo's setpoint [rad/s]; inf: no limit.
-        """
+        """Set a servo's position controller if the plant inside has one; see `ConfigurablePlant`."""
         if isinstance(self._plant, ConfigurablePlant):
             speed = profile_velocity_rad_s / self._joints[servo_id].gear
             self._plant.configure(servo_id, p_gain, d_gain, speed)

@@ -24,15 +24,15 @@ class Emulation:
         encoder_counts: Resolution of the encoder [counts per revolution].
         plant_step_s: Period of the grid on which the plant is stepped and commands take effect [s]; at most 1 ms.
         seed: Seed of jitter, loss and corruption.
-        silent_after_s: Time from which nothing is received or answered, as with an unplugged cable [s]; None: never.
+        silent_after_s: Time from which no byte is received or answered, as with an unplugged cable [s]; None: never.
         overload_after_s: Time at which the servos report an overload and switch their torque off [s]; None: never.
         late: Probability that an answer is delayed, as by a USB adapter; later answers wait for it.
         late_s: That delay [s].
-        wild: Probability that a read returns a position that no motor can reach, with a correct checksum.
+        wild: Probability that a read returns a position out of the motors' reach, with a correct checksum.
         frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
         unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
         ill_after_s: Time from which answers are late or wild [s].
-        on_signal: Whether those times, but for the overload's, count from when the process gets SIGUSR1.
+        on_signal: Whether these times, except the overload's, count from SIGUSR1 to the process.
     """
 
     baud_rate: int = 1_000_000

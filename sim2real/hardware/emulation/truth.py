@@ -1,4 +1,4 @@
-"""The emulator's log of true states and true latencies, against which other results are measured.
+"""The emulator's log of true states and true latencies, the reference for other results.
 
 The file is one line of JSON (the header), followed by rows of fixed size, flushed every 0.25 s, so that a file that was
 cut off can be read. All times are CLOCK_MONOTONIC nanoseconds, which all processes of a machine share.
@@ -27,20 +27,20 @@ _MIN_VALUES: Final = 3  # a sample's position, velocity and load
 
 
 class Kind(IntEnum):
-    """The kind of a row, which says what its times and values mean.
+    """The kind of a row, which determines the meaning of its times and values.
 
-    In every row `t_host_ns` is when the emulator received the instruction's last bytes from the host.
+    In every row `t_host_ns` is the time at which the emulator received the instruction's last bytes from the host.
 
     Attributes:
-        SAMPLE: An answered read of present values. `t_ns`: when they were sampled; `t_done_ns`: when the host got the
-            answer; `late_ns`: how much later than planned. Values: position [rad], velocity [rad/s] and load, before
+        SAMPLE: An answered read of present values. `t_ns`: time of the sample; `t_done_ns`: time at which the host got
+            the answer; `late_ns`: lateness against the plan. Values: position [rad], velocity [rad/s] and load, before
             quantisation.
-        EFFECT: A command took effect. `t_ns`: when, a point of the plant's grid; `late_ns`: how much later than
-            planned, possibly negative. Values: mode and goal. `t_host_ns` is 0 for a command of the servo itself.
+        EFFECT: A command took effect. `t_ns`: its time, a point of the plant's grid; `late_ns`: lateness against the
+            plan, possibly negative. Values: mode and goal. `t_host_ns` is 0 for a command of the servo itself.
         STATE: The plant's true state at `t_ns`. Values: in the order of the header's `state_names`.
         WATCHDOG: The bus watchdog tripped at `t_ns`.
         LOSS: An answer was lost; times as for SAMPLE.
-        REPLY: Any other answer. `t_ns`: when the instruction was complete on the wire; otherwise as for SAMPLE.
+        REPLY: Any other answer. `t_ns`: time at which the instruction was complete on the wire; else as for SAMPLE.
     """
 
     SAMPLE = 1
@@ -67,7 +67,7 @@ def _dtype(values: int) -> np.dtype:
 
 
 class TruthLog:
-    """Appends rows to a truth file, from a thread of its own: a disk that is busy must not hold up a servo's answers.
+    """Appends rows to a truth file in a separate thread, so that a busy disk does not hold up a servo's answers.
 
     Args:
         path: The file; an existing one is replaced.
@@ -97,21 +97,12 @@ class TruthLog:
         late_ns: int,
         values: Sequence[float] = (),
     ) -> None:
-        """Buffer one row; `Kind` says what times and values mean.
-
-        Args:
-            servo_id: The servo; 0 for the whole plant.
-            t_host_ns: See `Kind` [ns].
-            t_ns: See `Kind` [ns].
-            t_done_ns: See `Kind` [ns].
-            late_ns: See `Kind` [ns].
-            values: See `Kind`.
-        """
+        """Buffer one row; see `Kind` for times and values. The ``servo_id`` of the whole plant is 0."""
         padded = (*values, *self._padding[len(values) :])
         self._rows.append(self._struct.pack(kind, servo_id, t_host_ns, t_ns, t_done_ns, late_ns, *padded))
 
     def flush_if_due(self, now_ns: int) -> None:
-        """Pass the buffered rows on, to the operating system in the end, if the last time was at least 0.25 s ago."""
+        """Pass the buffered rows to the writer if the last time was at least 0.25 s ago."""
         if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
             self._flushed_ns = now_ns
             self._flush()
@@ -129,7 +120,7 @@ class TruthLog:
         self._rows = []
 
     def _write_batches(self) -> None:
-        """Write what comes; if that fails, the log ends there, and the emulated robot goes on."""
+        """Write all batches; if that fails, the log ends there, and the emulated robot goes on."""
         with contextlib.suppress(OSError):
             while (rows := self._batches.get()) is not None:
                 self._file.write(b"".join(rows))
@@ -152,10 +143,10 @@ class Truth:
 
     def of(self, kind: Kind, servo_id: int | None = None) -> np.ndarray:
         """Return the rows of one kind, optionally of one servo only, in the order in which they were written."""
-        chosen = self.rows["kind"] == kind
+        selected = self.rows["kind"] == kind
         if servo_id is not None:
-            chosen &= self.rows["servo_id"] == servo_id
-        return self.rows[chosen]
+            selected &= self.rows["servo_id"] == servo_id
+        return self.rows[selected]
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -168,13 +159,11 @@ class Truth:
         return rows["t_ns"], {name: rows["values"][:, i] for i, name in enumerate(self.header["state_names"])}
 
     def mean_latencies(self) -> dict[str, float]:
-        """Return the session's mean latencies [s]; NaN if nothing was read or written.
+        """Return the session's mean latencies [s]; NaN without samples, or without effects.
 
-        Returns:
-            `sensing_s`: age of a sample when its answer reaches the host.
-            `actuation_s`: time from the arrival of a goal's bytes to its effect.
-            `sample_before_request_s`: time from the sample to the arrival of the read's bytes; negative if sampled
-            later.
+        `sensing_s`: age of a sample when its answer reaches the host. `actuation_s`: time from the arrival of a goal's
+        bytes to its effect. `sample_before_request_s`: time from the sample to the arrival of the read's bytes;
+        negative if sampled later.
         """
         samples = self.of(Kind.SAMPLE)
         effects = self.of(Kind.EFFECT)
@@ -186,7 +175,7 @@ class Truth:
         }
 
     def lateness_s(self) -> np.ndarray:
-        """Return how much later than planned each answer was sent, shape (N,) [s]: the emulator's real-time error."""
+        """Return the lateness of each answer against the plan, shape (N,) [s]: the emulator's real-time error."""
         answers = np.isin(self.rows["kind"], (Kind.SAMPLE, Kind.REPLY))
         return self.rows["late_ns"][answers] * 1e-9
 
@@ -196,11 +185,7 @@ def _mean_s(durations_ns: np.ndarray) -> float:
 
 
 def read_truth(path: Path | str) -> Truth:
-    """Read a truth file, complete or cut off; an incomplete last row is left out.
-
-    Raises:
-        Sim2RealError: The file does not exist or has no header.
-    """
+    """Read a truth file without an incomplete last row; raise Sim2RealError if it does not exist or has no header."""
     path = Path(path)
     if not path.is_file():
         raise Sim2RealError(f"there is no truth file {path}")

@@ -1,7 +1,7 @@
 """A plant made from a robot's own MJCF model: an emulated robot for when there is no hardware yet.
 
-Its parameters differ from the model's by given factors, so that there is something to identify. It cannot check the
-model's structure: what is wrong in the MJCF is wrong in its twin too.
+Its parameters differ from the model's by factors, so that an identification has a task. It cannot check the model's
+structure: an error of the MJCF is also in its twin.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class TwinPlant:
     Args:
         mjcf: The model, with one position actuator per joint.
         joints: Name of each joint, in the order of the servos -> its name in the model.
-        p_gain: Position P Gain to which the actuators' ``kp`` corresponds [counts].
+        p_gain: Position P Gain that corresponds to the actuators' ``kp`` [counts].
         factors: Factors on the model's parameters: ``gain``, ``damping``, ``armature``, ``friction``; default: 1.
         step_s: MuJoCo's time step [s].
         gears: Turns of each servo for one of its joint; default: 1. The model's numbers are the joints', the counts of
@@ -54,13 +54,15 @@ class TwinPlant:
         self.joints = tuple(joints)
         self._gears = tuple(gears) or (1.0,) * len(self.joints)
         elements = [joints[name] for name in self.joints]
+        # Check names before the model is changed.
         f = dict.fromkeys(_FACTORS, 1.0) | dict(factors or {})
         if unknown := set(f) - set(_FACTORS):
             raise UsageError(f"a twin has no factor {sorted(unknown)[0]!r}. Available: {', '.join(_FACTORS)}")
         model = self.model = MjModel.from_xml_string(mjcf)
         names = [model.joint(i).name for i in range(model.njnt)]
-        if lacking := [j for j in elements if j not in names]:
-            raise UsageError(f"the twin's model has no joint {lacking[0]!r}. Available: {', '.join(names)}")
+        if missing := [j for j in elements if j not in names]:
+            raise UsageError(f"the twin's model has no joint {missing[0]!r}. Available: {', '.join(names)}")
+        # Scale the model's parameters.
         model.opt.timestep = step_s
         model.actuator_gainprm[:, 0] *= f["gain"]
         model.actuator_biasprm[:, 1] *= f["gain"]
@@ -72,8 +74,9 @@ class TwinPlant:
         model.dof_solref[:] = (4 * step_s, 1.0)
         model.dof_solimp[:, :3] = (0.999, 0.999, 0.001)
         self.data = MjData(model)
+        # Find each servo's joint and actuator in the model.
         self._p_gain, self._kp = p_gain, model.actuator_gainprm[:, 0].copy()
-        self._most = model.actuator_forcerange.copy()
+        self._force_range = model.actuator_forcerange.copy()
         self._qpos = [int(model.joint(j).qposadr[0]) for j in elements]
         self._dofs = [int(model.joint(j).dofadr[0]) for j in elements]
         driven = model.actuator_trnid[:, 0].tolist()
@@ -88,9 +91,11 @@ class TwinPlant:
         for _ in range(round((t_s - data.time) / step_s)):
             for i, goal in enumerate(self._goals):
                 angle, motor = float(data.qpos[self._qpos[i]]), self._motors[i]
+                # Torque off: a goal at the present angle makes the actuator's force 0.
                 if goal is None:
                     data.ctrl[motor] = angle
                     continue
+                # Move the setpoint along its profile, and round the error to counts as the firmware does.
                 reach = self._profiles[i] * step_s
                 self._references[i] += min(max(goal - self._references[i], -reach), reach)
                 count_rad = _RAD_PER_COUNT / self._gears[i]
@@ -128,7 +133,7 @@ class TwinPlant:
     def measure(self, servo_id: int) -> tuple[float, float, float]:
         """Return angle from the encoder's count 0 [rad], velocity [rad/s], and load, a fraction of the stall torque."""
         i = self.servo_ids.index(servo_id)
-        load = float(self.data.actuator_force[self._motors[i]]) / float(self._most[self._motors[i], 1])
+        load = float(self.data.actuator_force[self._motors[i]]) / float(self._force_range[self._motors[i], 1])
         angle, speed = self.data.qpos[self._qpos[i]], self.data.qvel[self._dofs[i]]
         return float(angle) + _CENTRE_RAD, float(speed), load
 

@@ -1,1 +1,1 @@
-"""Feetech STS servos (STS3215, the SO-101's): driver, emulator, and LeRobot's calibration file."""
+"""Feetech STS servos (STS3215, the SO-101's): tables of registers and models, device, emulation, calibration file."""

@@ -1,10 +1,10 @@
-"""LeRobot's calibration file: which servo moves which joint, where its zero is, and how far it may go.
+"""LeRobot's calibration file: the servo, the zero and the range of each joint.
 
     {"shoulder_pan": {"id": 1, "drive_mode": 0, "homing_offset": -1365, "range_min": 746, "range_max": 3477}, ...}
 
-`homing_offset` is kept in the servo, which subtracts it from what its encoder shows; the range is in counts after
-that. LeRobot's angles in degrees are zero in the middle of the range (`motors_bus.py`, MotorNormMode.DEGREES), and so
-are ours. Its `drive_mode` 1 mirrors the joint. LeRobot takes a turn for 4095 counts, we for 4096: 0.02 % of an angle.
+The servo stores `homing_offset`, and subtracts it from its encoder's count; the range is in counts after that.
+LeRobot's angles in degrees are zero in the middle of the range (`motors_bus.py`, MotorNormMode.DEGREES), as here.
+Its `drive_mode` 1 mirrors the joint. A turn has 4095 counts for LeRobot, 4096 here: 0.02 % of an angle.
 """
 
 from __future__ import annotations
@@ -33,13 +33,11 @@ class CalibratedJoint:
     """A joint that a servo moves: angle = direction * gear * (count - zero_count) * (2 pi / 4096).
 
     Args:
-        zero_count: What the servo reads at the joint's zero [counts].
+        zero_count: The servo's count at the joint's zero [counts].
         direction: 1, or -1 if the joint's angle falls as the count rises.
-        low_count: Lowest count that the joint may have.
-        high_count: Highest count that the joint may have.
+        low_count: Lowest count of the joint's range.
         gear: Turns of the joint per turn of the servo [1].
-        homing_offset: What the servo must subtract from its encoder's count, so that the other counts mean what they
-            say; None: whatever it is set to.
+        homing_offset: Offset in the servo for which the other counts hold, checked at `open`; None: not checked.
     """
 
     name: str
@@ -64,7 +62,7 @@ class CalibratedJoint:
 
     @property
     def rad_per_count(self) -> float:
-        """By how much the angle rises with the count [rad]."""
+        """Change of the angle with the count [rad]."""
         return self.direction * self.gear * reg.RAD_PER_COUNT
 
     @property
@@ -86,28 +84,25 @@ def read_calibration(path: Path | str, travel_rad: Mapping[str, float] | None = 
     """Read LeRobot's calibration of an arm: `~/.cache/huggingface/lerobot/calibration/robots/so101_follower/*.json`.
 
     The zero of a joint is the middle of its range, so a wrong range moves the zero. A joint that passes from count 4095
-    to count 0 while its range is recorded gets the range 0 to 4095, whatever its travel is.
+    to count 0 while its range is recorded gets the range 0 to 4095, for any travel.
 
     Args:
-        travel_rad: Joint -> angle from stop to stop [rad]; a joint that is not in it may have any range, as one that
-            turns freely.
-
-    Returns:
-        The joints, in the order of the file.
+        travel_rad: Joint -> angle from stop to stop [rad]; other joints may have any range, as one that turns freely.
 
     Raises:
-        UsageError: There is no such file, or it is none, or a range is far from the joint's travel; says what is wrong
-            with which motor.
+        UsageError: There is no such file, it is not a calibration, or a range is far from the joint's travel.
     """
+    # Read the file.
     path = Path(path)
     try:
-        motors = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_once)
+        motors = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_unique)
     except OSError as error:
         raise UsageError(f"calibration file {path} cannot be read: {error.strerror}", hint=_HINT) from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"calibration file {path} is not valid JSON: {error}", hint=_HINT) from error
     if not isinstance(motors, dict) or not motors:
         raise UsageError(f"calibration file {path} holds no motors by name", hint=_HINT)
+    # Make the joints, in the order of the file, and check that they fit together.
     joints = tuple(_joint(path, name, entry) for name, entry in motors.items())
     by_id: dict[int, str] = {}
     for joint in joints:
@@ -121,7 +116,7 @@ def read_calibration(path: Path | str, travel_rad: Mapping[str, float] | None = 
 
 
 def _check_range(path: Path, joint: CalibratedJoint, travel_rad: float | None) -> None:
-    """Refuse a range that is far from the joint's travel; None: the joint may have any."""
+    """Refuse a range that is far from the joint's travel; None: any range is accepted."""
     if travel_rad is None:
         return
     counts = joint.high_count - joint.low_count
@@ -152,11 +147,11 @@ _WHOLE_TURN: Final = 0.97
 _HINT: Final = "lerobot-calibrate writes one"
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object as a dict; raise ValueError if it has a name twice, of which one would be lost."""
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object as a dict; raise ValueError if it has a name twice, as one of them would be lost."""
     names = [name for name, _ in pairs]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"{twice[0]!r} is there twice")
+    if duplicates := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"{duplicates[0]!r} is there twice")
     return dict(pairs)
 
 

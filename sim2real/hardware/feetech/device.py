@@ -4,40 +4,62 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
-from sim2real.hardware.bus.models import ServoModel
+from sim2real.hardware.bus.link import ServoLink
+from sim2real.hardware.bus.packets import Answer
+from sim2real.hardware.bus.port import LinkConfig
 from sim2real.hardware.bus.servos import GuardedServos
 from sim2real.hardware.device import POSITION, CommandKind, Device, Reading, Transaction
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import CalibratedJoint
 from sim2real.hardware.feetech.drive import StsDrive
-from sim2real.hardware.feetech.link import StsConfig, StsLink
+from sim2real.hardware.feetech.models import MODELS
+from sim2real.hardware.feetech.protocol import PROTOCOL, describe_alarms
 
-_SOURCE: Final = "Feetech, STS Series Servo Memory Table: no register for it; not measured by us"
-MODELS: Final = {777: ServoModel("STS3215", None, _SOURCE), 2825: ServoModel("STS3250", None, _SOURCE)}
-"""Model number -> model, of servos with this memory table (LeRobot's tables.py)."""
 _STATE: Final = (reg.PRESENT_POSITION, reg.PRESENT_SPEED, reg.PRESENT_LOAD)
 _SETTINGS: Final = (reg.TORQUE_ENABLE, reg.ACCELERATION, reg.GOAL_SPEED, reg.TORQUE_LIMIT)
 _BEYOND_RAD: Final = 0.1
-"""How far outside its range a joint may be when torque goes on [rad]; it is pulled back to the end of the range."""
+"""Largest distance of a joint from its range when torque goes on [rad]; it is pulled back to the end of the range."""
+
+
+@dataclass(frozen=True)
+class StsConfig(LinkConfig):
+    """Port and time limits of a bus of Feetech servos; see `LinkConfig`. They have no watchdogs."""
+
+    family = "Feetech"
+    baud_rates = reg.BAUD_RATES
+
+
+class StsLink(ServoLink):
+    """Owner of the port of Feetech servos; see `ServoLink`."""
+
+    form = PROTOCOL
+    table = reg.TABLE
+
+    def require_fine(self, answer: Answer, what: str) -> None:
+        """Raise SafetyStop, as the error byte holds alarms."""
+        del what
+        raise SafetyStop(
+            f"servo {answer.servo_id} reports an alarm: {describe_alarms(answer.error)}",
+            hint="remove the cause, then switch its power off and on; does the supply's voltage fit the servo?",
+        )
 
 
 class StsServos(GuardedServos[StsLink], Device):
     """STS servos on one port, each moving one joint, commanded in joint angles [rad].
 
-    No register is made permanent: settings are written while the servos' lock is on, so they last until the power goes,
-    and are written again by `enable`. A servo does not say that it refuses a value, so every setting is read back.
-
-    These servos have no watchdog: if this process dies they hold, or go on to, the last goal. The guardian takes their
-    torque off, a process of its own that is started before torque goes on.
+    Settings are written while the servos' lock is on: they last until the power goes, and `enable` writes them again.
+    A servo does not report that it refuses a value, so every setting is read back. These servos have no watchdog: if
+    this process dies, they go on to the last goal until the guardian takes their torque off.
 
     Args:
-        joints: The joints, each with the servo that moves it; `read_calibration` makes them of LeRobot's file.
-        drive: How the servos follow a position; its joints do not matter here.
+        joints: The joints, each with the servo that moves it; `read_calibration` reads them from LeRobot's file.
+        drive: Gains and limits of the servos; its `joints` are ignored.
 
     Raises:
         UsageError: There are no joints, or two with one servo.
@@ -75,7 +97,7 @@ class StsServos(GuardedServos[StsLink], Device):
             raise
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest angles that the joints may be sent to [rad], each ``(n,)``."""
+        """Return the lowest and the highest angles of the joints [rad], each ``(n,)``."""
         low, high = np.array([joint.range_rad for joint in self.joints]).T
         return low, high
 
@@ -88,7 +110,7 @@ class StsServos(GuardedServos[StsLink], Device):
             for joint in self.joints:
                 self._write_settings(joint.servo_id)
                 goals.append(self._rest_count(joint, link.read(joint.servo_id, reg.PRESENT_POSITION)))
-                # Before torque goes on; some firmware may switch it on by itself at this moment, where it stands.
+                # The goal comes before torque: some firmware switches it on at this write, and holds the position.
                 link.set(joint.servo_id, reg.GOAL_POSITION, goals[-1])
                 link.write(joint.servo_id, reg.TORQUE_ENABLE, 1)
             self._rest = (np.array(goals) - self._zero) * self._scale
@@ -119,7 +141,8 @@ class StsServos(GuardedServos[StsLink], Device):
             SafetyStop: An angle is not finite or outside the joint's range, a servo reports an alarm, or torque is off.
         """
         if self.halted:  # a goal could switch the torque on again
-            raise SafetyStop("nothing is sent: the servos have been made safe", hint="open them again")
+            raise SafetyStop("no command is sent: the servos have been made safe", hint="open them again")
+        # Refuse every angle before any is sent.
         goals = {}
         for joint, angle in zip(self.joints, values.tolist(), strict=True):
             count = joint.count(angle) if math.isfinite(angle) else -1
@@ -127,6 +150,7 @@ class StsServos(GuardedServos[StsLink], Device):
                 low, high = joint.range_rad
                 raise SafetyStop(f"joint {joint.name!r}: {angle:.6g} rad is outside [{low:.6g}, {high:.6g}]")
             goals[joint.servo_id] = count
+        # One servo confirms its goal; several share one instruction without answers.
         link = self.link
         try:
             if len(goals) == 1:
@@ -138,21 +162,21 @@ class StsServos(GuardedServos[StsLink], Device):
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
         """Return the duty that the P gain computes from the position error, ignoring the profile."""
         gear = np.abs(self._scale) / reg.RAD_PER_COUNT
-        most = self._drive.torque
-        return np.clip((command - position_rad) / gear * self._drive.p_gain * reg.P_GAIN_UNIT_PER_RAD, -most, most)
+        limit = self._drive.torque
+        return np.clip((command - position_rad) / gear * self._drive.p_gain * reg.P_GAIN_UNIT_PER_RAD, -limit, limit)
 
     def check(self) -> None:
-        """Raise SafetyStop if a servo has lost its settings, or its torque is not as it was left."""
+        """Raise SafetyStop if a servo has lost its settings, or its torque is off."""
         if not self.armed or self.torque_withheld:
             return
         counts, _ = self.link.read_counts(self.ids, _SETTINGS, "read of the settings")
         for servo_id, row in zip(self.ids, counts.tolist(), strict=True):
             expected = {reg.TORQUE_ENABLE: 1, **self._drive.registers(self._phases[servo_id])}
-            for register, found in zip(_SETTINGS, row, strict=True):
+            for register, current in zip(_SETTINGS, row, strict=True):
                 value = expected[register]
-                if found != value and self.armed:  # once more: another thread may have taken the torque off
+                if current != value and self.armed:  # `armed` may have changed: another thread took the torque off
                     raise SafetyStop(
-                        f"servo {servo_id} has lost its settings: {register.name} is {found}, not {value}",
+                        f"servo {servo_id} has lost its settings: {register.name} is {current}, not {value}",
                         hint="did its supply fail for a moment?",
                     )
 
@@ -168,13 +192,13 @@ class StsServos(GuardedServos[StsLink], Device):
         self.find(servo_id, f" (joint {joint.name!r})")
         number = link.read(servo_id, reg.MODEL_NUMBER, despite_error=True)
         if number not in MODELS:
-            known = ", ".join(f"{model.name} ({n})" for n, model in MODELS.items())
-            raise HardwareLost(f"servo {servo_id} is model {number}, which is not known. Available: {known}")
+            names = ", ".join(f"{model.name} ({n})" for n, model in MODELS.items())
+            raise HardwareLost(f"servo {servo_id} is model {number}, which is not supported. Available: {names}")
         self.models[servo_id] = MODELS[number]
         offset = link.read(servo_id, reg.HOMING_OFFSET, despite_error=True)
         if joint.homing_offset not in (None, offset):
             raise HardwareLost(
-                f"servo {servo_id} (joint {joint.name!r}) has homing offset {offset}, its calibration says "
+                f"servo {servo_id} (joint {joint.name!r}) has homing offset {offset}, its calibration has "
                 f"{joint.homing_offset}",
                 hint="this is another arm's calibration, or the servo was changed: run lerobot-calibrate",
             )
@@ -206,7 +230,7 @@ class StsServos(GuardedServos[StsLink], Device):
             link.set(servo_id, register, value)
 
     def _rest_count(self, joint: CalibratedJoint, count: int) -> int:
-        """Return the goal at which a joint stays where it is; raise SafetyStop if it is far outside its range."""
+        """Return the goal that holds a joint at its position; raise SafetyStop if that is far outside its range."""
         goal = min(max(count, joint.low_count), joint.high_count)
         if abs(goal - count) * abs(joint.rad_per_count) > _BEYOND_RAD:
             low, high = joint.range_rad
@@ -222,14 +246,7 @@ class StsServos(GuardedServos[StsLink], Device):
 
 
 def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, silence_s: float) -> StsServos:
-    """Return servos on a port, not opened yet; what the name ``feetech`` stands for.
-
-    Args:
-        ids: The servos' ids, in the order of commands and measurements.
-        drive: How they follow a position, and the joints that they move.
-        baud_rate: Bits per second.
-        silence_s: Longest time without an instruction while torque is on [s].
-    """
+    """Return servos on a port, not opened yet: the device of the name ``feetech``; see ``DeviceFactory``."""
     joints = {joint.servo_id: joint for joint in drive.joints}
-    chosen = [joints.get(i) or CalibratedJoint(f"servo {i}", i) for i in ids]
-    return StsServos(StsConfig(port, baud_rate, silence_s=silence_s), chosen, drive)
+    selected = [joints.get(i) or CalibratedJoint(f"servo {i}", i) for i in ids]
+    return StsServos(StsConfig(port, baud_rate, silence_s=silence_s), selected, drive)

@@ -1,4 +1,4 @@
-"""How Feetech servos follow a position, and the registers that say so."""
+"""Gains and limits with which Feetech servos follow a position, and their registers."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from sim2real.hardware.feetech.calibration import CalibratedJoint
 
 @dataclass(frozen=True)
 class StsDrive:
-    """How the servos follow a position.
+    """Gains and limits with which the servos follow a position.
 
     Args:
         p_gain: P gain; LeRobot uses 16.
         speed_rad_s: Speed at which a servo's setpoint moves to its goal; inf: the setpoint is the goal.
-        acceleration_rad_s2: How fast that speed may change, rounded to a multiple of 0.15 rad/s^2; inf: at once.
-        torque: Largest fraction of the torque that a servo may use, in [0, 1].
-        joints: What the servos move, e.g. of `read_calibration`; a servo that moves none of them is a joint by itself,
-            with its zero at 2048 counts.
+        acceleration_rad_s2: Acceleration of the setpoint, rounded to a multiple of 0.15 rad/s^2; inf: no limit.
+        torque: Largest fraction of a servo's torque, in (0, 1].
+        joints: The joints, e.g. from `read_calibration`; a servo without one gets a joint with its zero at 2048 counts.
     """
 
     p_gain: int = 16
@@ -45,16 +44,16 @@ class StsDrive:
 
     def registers(self, phase: int) -> dict[Register, int]:
         """Return the registers' values [counts] for a servo whose register Phase holds `phase`."""
-        most = reg.ACCELERATION.maximum
+        limit = reg.ACCELERATION.maximum
         acceleration = self.acceleration_rad_s2 / (reg.ACCELERATION_UNIT * reg.RAD_PER_COUNT)
-        # Goal Speed 0 means "stop" to some servos, so the least is 1, and the most for those is as fast as they turn.
+        # Goal Speed 0 means "stop" for some servos: the smallest value is 1, and the largest their top speed.
         fastest = 0 if phase & reg.PHASE_ZERO_IS_FASTEST else reg.FASTEST_COUNTS_PER_S
         speed = self.speed_rad_s / reg.speed_unit_rad_s(phase)
         return {
             reg.P_GAIN: self.p_gain,
             reg.D_GAIN: self.d_gain,
             reg.I_GAIN: self.i_gain,
-            reg.ACCELERATION: 0 if acceleration > most else max(1, round(acceleration)),
+            reg.ACCELERATION: 0 if acceleration > limit else max(1, round(acceleration)),
             reg.GOAL_SPEED: fastest if speed > reg.GOAL_SPEED.maximum else max(1, round(speed)),
             reg.TORQUE_LIMIT: round(self.torque * reg.LOAD_FULL_SCALE),
         }

@@ -1,4 +1,4 @@
-"""Feetech servos on an emulated bus: what is their own in it."""
+"""Feetech servos on an emulated bus: the part that other families do not share."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from sim2real.hardware.plant import Plant
 class StsBus(InstructedBus[StsServo, "StsEmulation"]):
     """Emulated STS3215 servos on a bus, driving a plant; see `InstructedBus`.
 
-    An instruction with a wrong checksum is not answered, as their protocol has no way to say so; nor is a ping of all
-    servos if there are several, whose answers would collide.
+    They do not answer an instruction with a wrong checksum, for which the protocol has no error; nor several servos a
+    broadcast ping, as their answers would collide.
     """
 
     form = PROTOCOL
@@ -38,7 +38,7 @@ class StsBus(InstructedBus[StsServo, "StsEmulation"]):
         return servo
 
     def configure(self, servo: Firmware) -> None:
-        """Tell the plant a servo's controller settings if they have changed."""
+        """Pass a servo's controller settings to the plant if they have changed."""
         super().configure(servo)
         self._profiles.accelerate(servo.servo_id, self.servos[servo.servo_id].acceleration_rad_s2())
 
@@ -60,10 +60,10 @@ class StsEmulation(BusEmulation):
 
     Args:
         alarms: The alarms that they report from `overload_after_s` on; bits of the error byte.
-        wrong_id: Probability that an answer says that it is another servo's.
+        wrong_id: Probability that an answer has the id of another servo.
         cut: Probability that an answer ends after its fourth byte.
         goal_wakes: Whether writing a goal switches the torque on, the worse case for a driver.
-        homing_offset: What every servo subtracts from its encoder's count [counts].
+        homing_offset: Offset that every servo subtracts from its encoder's count [counts].
     """
 
     bus_type = StsBus

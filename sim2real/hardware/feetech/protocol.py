@@ -2,8 +2,8 @@
 
     FF FF | id | length | instruction (status packet: error byte) | parameters | checksum
 
-Length counts what follows it; the checksum is the inverted low byte of the sum of everything from the id on. Nothing is
-stuffed: a header may occur inside a packet.
+The length counts the bytes after it; the checksum is the inverted low byte of the sum of all bytes from the id on.
+There is no stuffing: a header may occur inside a packet.
 
 Sources: Feetech, "Servo SCS Communication Protocol" (its examples are in the tests); scservo_sdk of PyPI's
 feetech-servo-sdk 1.0.0, for the meaning of the error byte's bits.
@@ -53,15 +53,15 @@ class StsProtocol(PacketFormat):
         return HEADER + summed + bytes((checksum(summed),))
 
     def following(self, prefix: bytearray) -> int | None:
-        """Return the length that a packet says it has, if it is possible, and the id is one."""
+        """Return the content of the length field; None if it or the id is invalid."""
         return prefix[3] if prefix[2] <= BROADCAST_ID and prefix[3] >= 2 else None
 
     def parse(self, packet: bytes) -> Packet:
-        """Return what a packet means."""
+        """Return the content of a packet."""
         return Packet(packet[2], packet[4], packet[5:-1], checksum(packet[2:-1]) == packet[-1])
 
     def answer(self, packet: Packet) -> Answer:
-        """Return error and data of a status packet, which nothing distinguishes from an instruction."""
+        """Return error and data of a status packet, which has the same form as an instruction."""
         return Answer(packet.servo_id, packet.code, packet.parameters)
 
 

@@ -1,7 +1,7 @@
 """The memory table of Feetech's STS servos with magnetic encoders, and the units of its registers.
 
 Addresses, sizes, ranges and defaults are those of Feetech's "STS Series Servo Memory Table" (doc.feetech.cn), model
-number and sign bits those of LeRobot's `motors/feetech/tables.py`. What is from elsewhere, or assumed, says so.
+number and sign bits those of LeRobot's `motors/feetech/tables.py`. Comments name other sources, and assumptions.
 Numbers are little endian. A signed one is a magnitude and a sign bit, not a two's complement.
 """
 
@@ -21,13 +21,13 @@ CURRENT_UNIT_A: Final = 0.0065
 P_GAIN_UNIT_PER_RAD: Final = 0.166
 """Duty per radian of position error and count of P gain: measured by Rhoban with an oscilloscope (BAM, STS3215)."""
 FASTEST_COUNTS_PER_S: Final = 3400
-"""Speed of the setpoint at power-up, as Rhoban found it (BAM): about what the motor reaches without load."""
+"""Speed of the setpoint at power-up, measured by Rhoban (BAM): about the motor's speed without load."""
 BAUD_RATES: Final = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
 """Bits per second, by the value of the register Baud Rate."""
 
 # Bits of the register Phase.
 PHASE_COUNTS_PER_S: Final = 0x04  # speeds are in counts/s; if not set, in units of 0.732 rpm, which are 50 counts/s
-PHASE_ZERO_IS_FASTEST: Final = 0x08  # Goal Speed 0 means as fast as it can; if not set, stop
+PHASE_ZERO_IS_FASTEST: Final = 0x08  # Goal Speed 0 means top speed; if not set, stop
 PHASE_FULL_ANGLE: Final = 0x10  # positions count turns; if not set, they wrap from 4095 to 0
 
 

@@ -18,17 +18,15 @@ _MOTION: Final = (reg.TORQUE_ENABLE, *reg.TABLE.goals, reg.OPERATING_MODE)
 class StsServo(ServoFirmware):
     """Registers and firmware of one STS3215, without time, bus and physics.
 
-    A value that does not fit is dropped without a word, as its status packets have no way to say so; so are writes to
-    registers that cannot be written. EEPROM registers may be written at any time; what was written while Lock is 1 is
-    forgotten at the next restart. Goals beyond the position limits are cut to them.
+    A value out of range is dropped without an error, as its status packets carry none; so is a write to a read-only
+    register. EEPROM registers accept writes at any time; a value that was written while Lock is 1 is lost at the next
+    restart. Goals beyond the position limits are cut to them.
 
-    Assumed, as the worse for a driver, and not measured by us: a goal that is written switches the torque on
-    (`goal_wakes`), and after an alarm the motor is off while the torque register still says "on". Not emulated: the
-    torque that is left after an overload (Protective Torque), the step mode, other ids and baud rates.
+    Two assumptions, not measured by us, are the worse case for a driver: writing a goal switches the torque on
+    (`goal_wakes`), and after an alarm the motor is off while the torque register still holds 1. Not emulated: the
+    remaining torque after an overload (Protective Torque), the step mode, other ids and baud rates.
 
     Args:
-        return_delay_us: Return Delay Time at power-up, rounded to the register's unit of 2 us [us].
-        encoder_counts: Resolution of the encoder [counts per revolution].
         goal_wakes: Whether writing a goal switches the torque on.
         alarms: The alarms that `overload` sets; bits of the error byte.
     """
@@ -60,7 +58,7 @@ class StsServo(ServoFirmware):
         return self.get(reg.STATUS)
 
     def command(self) -> tuple[int, float]:
-        """Return what the motor is commanded to do, according to the registers; see `ServoFirmware.command`."""
+        """Return mode and goal of the motor; see `Firmware.command`."""
         if not self.get(reg.TORQUE_ENABLE) or self.alert & self.get(reg.UNLOADING):
             return OperatingMode.OFF, 0.0
         mode = self.get(reg.OPERATING_MODE)
@@ -81,7 +79,7 @@ class StsServo(ServoFirmware):
         return self.get(reg.P_GAIN), self.get(reg.D_GAIN), speed_rad_s
 
     def acceleration_rad_s2(self) -> float:
-        """Return how fast the setpoint's speed may change [rad/s^2]."""
+        """Return the acceleration of the setpoint [rad/s^2]."""
         count = self.get(reg.ACCELERATION)
         return count * reg.ACCELERATION_UNIT * reg.RAD_PER_COUNT if count else math.inf
 
@@ -90,36 +88,38 @@ class StsServo(ServoFirmware):
 
         Args:
             position_rad: Angle from the encoder's zero [rad].
-            velocity_rad_s: Speed [rad/s].
             load: Fraction of the largest load, in [-1, 1].
-            tick_ms: Not used: it shows no time.
+            tick_ms: Not used: it has no register of time.
         """
         del tick_ms
+        # Round the angle to the encoder's resolution, then to counts of the register.
         step_rad = 2.0 * math.pi / self._encoder_counts
         count = round(round(position_rad / step_rad) * step_rad / reg.RAD_PER_COUNT) - self.get(reg.HOMING_OFFSET)
         phase = self.get(reg.PHASE)
-        shown = count if phase & reg.PHASE_FULL_ANGLE else count % reg.COUNTS_PER_REVOLUTION
+        wrapped = count if phase & reg.PHASE_FULL_ANGLE else count % reg.COUNTS_PER_REVOLUTION
         load = max(-1.0, min(1.0, load))
-        self.put(reg.PRESENT_POSITION, shown)
+        self.put(reg.PRESENT_POSITION, wrapped)
         self.put(reg.PRESENT_SPEED, round(velocity_rad_s / reg.speed_unit_rad_s(phase)))
         self.put(reg.PRESENT_LOAD, round(load * reg.LOAD_FULL_SCALE))
         self.put(reg.PRESENT_CURRENT, round(load * STALL_CURRENT_A / reg.CURRENT_UNIT_A))
         self.put(reg.MOVING, abs(velocity_rad_s / reg.RAD_PER_COUNT) > _MOVING_COUNTS_PER_S)
 
     def read(self, address: int, length: int) -> tuple[int, bytes]:
-        """Return no error, and the bytes that a READ is answered with; beyond the table, zeros."""
+        """Return no error, and the bytes of the answer to a READ; beyond the table, zeros."""
         return 0, bytes(self._memory[address : address + length]).ljust(length, b"\0")
 
     def write(self, address: int, data: bytes) -> tuple[int, bool]:
         """Write registers; return no error, and whether `command` may have changed."""
         torque_was_on, moved = self.get(reg.TORQUE_ENABLE), False
         for register in reg.TABLE.registers.values():
+            # Take the registers that lie wholly within the data.
             begin = register.address - address
             if not 0 <= begin <= len(data) - register.size:
                 continue
             value = register.decode(data[begin : begin + register.size])
             if not register.writable or register in _FIXED or not register.minimum <= value <= register.maximum:
                 continue
+            # Without the lock, EEPROM registers also survive a restart.
             self.put(register, value)
             moved |= register in _MOTION
             if register.eeprom and not self.get(reg.LOCK):
@@ -140,7 +140,7 @@ class StsServo(ServoFirmware):
         return super().action()
 
     def reboot(self) -> None:
-        """Begin again as after a loss of power, torque off: EEPROM registers as saved, all others at their defaults."""
+        """Restart as after a loss of power, torque off: EEPROM registers as saved, all others at their defaults."""
         self._memory[:] = self._saved
         super().reboot()
         self.put(reg.TORQUE_LIMIT, self.get(reg.MAX_TORQUE))

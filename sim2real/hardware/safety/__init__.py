@@ -1,1 +1,1 @@
-"""What keeps a robot safe: gate, guardian, plausibility of measurements, and the rig that joins them."""
+"""Safety of a robot: gate, guardian, plausibility of measurements, and the rig that joins them."""

@@ -31,7 +31,7 @@ class GateLimits:
     freeze_rad_s: float = 2.0
     """A joint that moved this fast and then reads the same for 0.05 s stops the robot: its encoder froze [rad/s]."""
     envelope_rad: tuple[float, float] | None = None
-    """Joint angles outside of which the robot is stopped, lowest and highest; default: not checked [rad]."""
+    """Range of joint angles, lowest and highest; outside of it the robot is stopped; default: not checked [rad]."""
     max_sample_age_s: float = 0.25
     """Age of the newest measurement above which the robot is stopped instead of commanded [s]."""
     stop_s: float = 0.5
@@ -57,16 +57,15 @@ class GateLimits:
         if self.envelope_rad is not None and not self.envelope_rad[0] < self.envelope_rad[1]:
             raise UsageError(f"gate.envelope_rad must be the lowest and the highest angle, got {self.envelope_rad}")
 
-    def gate(self, limit: GateLimit, **own: Any) -> GateConfig:
-        """Return a gate with these limits.
+    def gate(self, limit: GateLimit, **settings: Any) -> GateConfig:
+        """Return the gate of a robot with these limits.
 
         Args:
             limit: Largest magnitude of a command, or (low, high) [the command's unit].
-            **own: What else the robot says of it; see ``GateConfig``.
+            **settings: The robot's own fields of ``GateConfig``.
         """
-        from sim2real.hardware.safety.gate import (
-            GateConfig,  # numpy takes 0.1 s to import, which --help need not wait for
-        )
+        # Imported here because numpy takes 0.1 s, for which --help would wait.
+        from sim2real.hardware.safety.gate import GateConfig
 
-        there = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("limit", "servo_watchdog_s")}
-        return GateConfig(limit, **there, **own)
+        limits = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("limit", "servo_watchdog_s")}
+        return GateConfig(limit, **limits, **settings)

@@ -23,18 +23,17 @@ class GateConfig:
         max_speed_rad_s: Speed above which the robot is stopped, whether measured or computed from successive positions;
             one value or one per joint [rad/s]; None: not checked.
         node: Name of the actuator's node, for errors.
-        stale: What replaces a stale command: ``zero``, or ``hold``, the last command that was sent (for positions).
+        stale: Replacement of a stale command: ``zero``, or ``hold``, the last command that was sent (for positions).
         joints: The joints' names, for errors.
         stuck_effort: Fraction of a joint's torque: a joint that is driven with more than this in both directions must
             move, or the robot is stopped; one value or one per joint; above 1: not checked. See
             `sim2real.hardware.safety.plausibility`.
-        stuck_s: How long it must be driven in each direction without a break [s].
+        stuck_s: Duration of that drive in each direction without a break [s].
         freeze_rad_s: A joint that is pushed, moved this fast between two readings, and then reads the same to the count
-            for ``freeze_s``, stops the robot: its encoder has frozen, or it hit something [rad/s].
-        freeze_s: See there [s].
+            for ``freeze_s``, stops the robot: its encoder has frozen, or it hit an obstacle [rad/s].
         envelope_rad: Measured positions beyond which the robot is stopped, (low, high), each one value or one per joint
             [rad]; None: not checked.
-        max_sample_age_s: Age of the newest measurement above which nothing is commanded any more [s].
+        max_sample_age_s: Age of the newest measurement above which the robot is stopped [s].
         stop_s: Longest time in which a soft stop brings the robot to rest [s].
     """
 
@@ -55,6 +54,7 @@ class GateConfig:
 
     def __post_init__(self) -> None:
         """Check that all limits are in their ranges and fit each other."""
+        # A gate that lets no command through, or not the one at rest, would stop the robot at once.
         low, high = self.range
         if low.ndim > 1 or (low.ndim and high.ndim and low.shape != high.shape):
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} has another number of lows than of highs")
@@ -64,6 +64,7 @@ class GateConfig:
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain 0, the command at rest")
         if self.envelope_rad is not None and not np.all(np.less(*map(np.asarray, self.envelope_rad))):
             raise UsageError(f"gate of {self.node!r}: envelope_rad = {self.envelope_rad} holds no position")
+        # All other limits are positive, each one value or one per joint.
         positive = ("command_timeout_s", "max_speed_rad_s", "stuck_effort", "stuck_s", "max_sample_age_s", "stop_s")
         for name in ("slew_per_s", "freeze_rad_s", "freeze_s", *positive):
             value = getattr(self, name)
@@ -83,15 +84,13 @@ class GateConfig:
 
 @dataclass
 class GateCounts:
-    """How often the gate was passed, and how often each of its limits changed a command.
+    """Counts of the calls of the gate, and of those in which each limit changed a command.
 
     Args:
         passed: Calls that returned a command.
-        clamped: Calls with a value outside the limit.
-        slewed: Calls with a change that was too fast.
-        stale: Calls with a command that was too old.
         cut: For each actuator, calls in which a limit changed its command.
         low: For each actuator, the lowest command that was returned.
+        total: For each actuator, the sum of the commands that were returned.
     """
 
     passed: int = 0
@@ -104,7 +103,7 @@ class GateCounts:
     total: list[float] = field(default_factory=list)
 
     def add(self, allowed: np.ndarray, cut: np.ndarray) -> None:
-        """Count a command that was returned ``(n,)``, and for which actuators a limit had changed it."""
+        """Count a returned command ``(n,)``, and the actuators ``(n,)`` for which a limit changed it."""
         before = (self.low, self.high, self.total, self.cut) if self.passed else (allowed, allowed, 0.0, 0)
         self.low, self.high = np.minimum(before[0], allowed).tolist(), np.maximum(before[1], allowed).tolist()
         self.total, self.cut = np.add(before[2], allowed).tolist(), np.add(before[3], cut).tolist()
@@ -139,11 +138,7 @@ class SafetyGate:
 
     @property
     def fallback(self) -> np.ndarray:
-        """What would replace a stale command now, float64 of shape (n,).
-
-        Raises:
-            UsageError: There was neither a `start` nor a command yet.
-        """
+        """The replacement of a stale command, float64 of shape (n,); UsageError without a `start` or a command."""
         if self._last is None:
             raise UsageError(f"gate of {self.config.node!r} has nothing to hold", hint="call reset(start) first")
         return np.zeros_like(self._last) if self.config.stale == "zero" else self._last.copy()
@@ -153,8 +148,7 @@ class SafetyGate:
     ) -> np.ndarray:
         """Return the command that may be sent.
 
-        A stale command is replaced by zero or by the last command, as configured; the slew limit does not apply to
-        that.
+        A stale command is replaced by `fallback`, to which the slew limit does not apply.
 
         Args:
             command: Shape (n,): the policy's command.
@@ -169,6 +163,7 @@ class SafetyGate:
             SafetyStop: A value is not finite, or a speed is above its limit.
             UsageError: The number of commands differs from that of the limits, or there is no last command to hold.
         """
+        # Refuse commands and speeds that must stop the robot.
         if self._stop is not None:
             raise self._stop
         wanted = np.array(command, dtype=np.float64, ndmin=1)
@@ -178,6 +173,7 @@ class SafetyGate:
             self._last = np.zeros_like(wanted)
         fallback = self.fallback
         self._require_shape(wanted)
+        # Replace a stale command, or limit a fresh one; the comparison also catches an age of NaN.
         if not age_s <= self.config.command_timeout_s:
             self.counts.stale += 1
             allowed, cut = fallback, np.zeros(wanted.shape, bool)

@@ -1,4 +1,4 @@
-"""The guardian as seen from the control process: starts it, sends it signs of life, and reads its messages."""
+"""The control process's side of the guardian: starts it, sends it signs of life, and reads its messages."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from sim2real.hardware.safety import guardian_process as process
 
 _START_TIMEOUT_S: Final = 10.0
 _SETTLE_TIMEOUT_S: Final = 1.0
-_BEATS: Final = 10  # signs of life per allowed silence
+_BEATS: Final = 10  # number of signs of life in the longest silence
 _INTERVAL_S: Final = 0.01  # between signs of life if silence is not limited
 # Send buffer for about 50 unread signs of life (on Linux 770 bytes each, of twice this size); when it is full, the
 # guardian hangs.
 _UNHEARD_BYTES: Final = 20_000
-# Longest time without an answer to a sign of life. A guardian that is stopped is noticed at the next one; this is for
-# what the kernel does not report, such as a debugger: so long a busy machine lets no process wait that is due.
+# Longest time without an answer to a sign of life, for a guardian that a debugger stops: the kernel does not report it.
+# A busy machine lets no process of this priority wait for so long.
 _HEARD_S: Final = 0.5
-_DEAD: Final = "the guardian has died or was stopped: nothing would take the torque off if this process died too"
+_DEAD: Final = "the guardian has died or was stopped: the torque would stay on if this process died too"
 
 
 class Guardian:
@@ -36,14 +36,14 @@ class Guardian:
     It shares the open port and its lock, so that no other process gets the port before the torque is off. In normal
     operation it only receives signs of life from `beat`, which cost 10 us each, and answers them: a guardian that died
     or was stopped is noticed at the next one. If this process dies while the guardian is stopped, the kernel lets it
-    continue (Linux), and it takes the torque off. It reports on stderr what it did.
+    continue (Linux), and it takes the torque off. It reports its actions on stderr.
 
     Args:
         off: The packet that takes the torque of all servos off.
-        servos: For each servo, the packet that asks whether its torque is on, and the answers that mean "off".
+        servos: For each servo, the packet that reads its torque register, and the answers that mean "off".
         silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
             counts.
-        answer_s: How long a servo's answer may take [s].
+        answer_s: Longest wait for a servo's answer [s].
 
     Raises:
         HardwareLost: It does not start.
@@ -63,12 +63,13 @@ class Guardian:
         self._unheard_s: float | None = None  # when the first sign of life was sent that was not answered yet
         self._armed = False
         self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
-        self._said = b""
+        self._messages = b""
+        # The signs of life go over a socket with a small buffer, which is full when the guardian hangs.
         self._link, other = socket.socketpair()
         self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNHEARD_BYTES)
         longest_s = silence_s + self._interval_s if silence_s else 0.0  # signs of life are one interval apart
         numbers = [str(port_fd), str(other.fileno()), repr(longest_s), repr(answer_s)]
-        # -I -S: neither the user's site packages nor the working directory may affect what runs here.
+        # Start it. -I -S: neither the user's site packages nor the working directory may affect what runs here.
         command = [sys.executable, "-I", "-S", str(Path(process.__file__)), *numbers, off.hex()]
         command += [f"{query.hex()}:{','.join(a.hex() for a in answers)}" for query, answers in servos]
         try:
@@ -87,11 +88,12 @@ class Guardian:
             ) from error
         finally:
             other.close()
+        # Torque may go on only once it watches.
         if not self._hears(process.READY, _START_TIMEOUT_S):
             self._process.kill()
             self.end(confirmed=True)
             raise HardwareLost("the guardian does not start", hint="torque stays off without it")
-        self._said = b""
+        self._messages = b""
         self._link.setblocking(False)
 
     @property
@@ -117,7 +119,7 @@ class Guardian:
         """Let it no longer watch for silence, as torque is off. Never raises; if it has died, the next `arm` raises."""
         with self._lock, suppress(SafetyStop):  # locked, as a sign of life sent after this message would arm it again
             self._armed = False
-            self._say(process.REST)
+            self._send(process.REST)
 
     def beat(self) -> None:
         """Send a sign of life if one is due; called before every instruction on the bus.
@@ -127,13 +129,14 @@ class Guardian:
         """
         with self._lock:
             now_s = time.monotonic()
-            if not self._armed or (not self._said and now_s - self._beat_s < self._interval_s):
+            if not self._armed or (not self._messages and now_s - self._beat_s < self._interval_s):
                 return
             self._beat_s = now_s
+            # Any message means that it has taken over; without one, show it that this process lives.
             self._listen()
-            if not self._said:
+            if not self._messages:
                 self._require_running(now_s)
-                self._say(process.BEAT)
+                self._send(process.BEAT)
                 self._unheard_s = now_s if self._unheard_s is None else self._unheard_s
                 return
         raise SafetyStop(
@@ -142,9 +145,9 @@ class Guardian:
         )
 
     def require_watching(self) -> None:
-        """Raise SafetyStop, as `beat` does, but whether or not a sign of life is due: asked when the bus seems lost.
+        """Raise SafetyStop as `beat` does, also when no sign of life is due: called when the bus seems lost.
 
-        A guardian that takes over asks the servos itself, and their answers are missed here.
+        A guardian that takes over reads the servos' answers, which are then missing here.
         """
         self._beat_s = 0.0
         self.beat()
@@ -153,18 +156,18 @@ class Guardian:
         """Wait until it has finished taking the torque off, if it is doing so. Never raises.
 
         Returns:
-            Whether it is still watching: it has neither taken over nor died, and was not stopped.
+            Whether it still watches: it has neither taken over nor died, and was not stopped.
         """
         try:
             with self._lock:
                 self._listen()
-                if not self._said:
+                if not self._messages:
                     self._require_running(time.monotonic())
         except SafetyStop:
             return False
-        if self._said and process.SAFE not in self._said:
+        if self._messages and process.SAFE not in self._messages:
             self._hears(process.SAFE, _SETTLE_TIMEOUT_S)
-        return not self._said
+        return not self._messages
 
     def end(self, confirmed: bool) -> None:
         """End the guardian. Never raises.
@@ -174,7 +177,7 @@ class Guardian:
         """
         if confirmed:
             with suppress(SafetyStop):
-                self._say(process.LEAVE)
+                self._send(process.LEAVE)
         self._link.close()
         if not confirmed:
             return
@@ -184,7 +187,7 @@ class Guardian:
             self._process.kill()
             self._process.wait()
 
-    def _say(self, message: bytes) -> None:
+    def _send(self, message: bytes) -> None:
         try:
             self._link.send(message)
         except OSError as error:  # it has died, or does not read
@@ -194,7 +197,7 @@ class Guardian:
         """Raise SafetyStop if the guardian was stopped, or has not answered for long."""
         stopped = self._unheard_s is not None and now_s - self._unheard_s > _HEARD_S
         if not stopped and hasattr(os, "waitid"):
-            with suppress(ChildProcessError):  # it has ended, and its socket is closed: `_say` notices
+            with suppress(ChildProcessError):  # it has ended, and its socket is closed: `_send` raises
                 flags = os.WSTOPPED | os.WNOHANG | os.WNOWAIT
                 stopped = os.waitid(os.P_PID, self._process.pid, flags) is not None
         if stopped:
@@ -204,24 +207,24 @@ class Guardian:
         """Read the guardian's messages; raise SafetyStop if it has died."""
         while True:
             try:
-                said = self._link.recv(256, socket.MSG_DONTWAIT)
+                received = self._link.recv(256, socket.MSG_DONTWAIT)
             except BlockingIOError:
                 return
             except OSError:
-                said = b""
-            if not said:
+                received = b""
+            if not received:
                 raise SafetyStop(_DEAD, hint="start again")
-            if process.HEARD in said:
+            if process.HEARD in received:
                 self._unheard_s = None
-            self._said += said.replace(process.HEARD, b"")
+            self._messages += received.replace(process.HEARD, b"")
 
     def _hears(self, message: bytes, timeout_s: float) -> bool:
-        """Wait for a message, for a report of failure, or for the guardian's death; return whether the message came."""
+        """Wait for a message; return False after the timeout, a report of failure, or the guardian's death."""
         end_s = time.monotonic() + timeout_s
         with suppress(SafetyStop):
-            while message not in self._said and process.FAILED not in self._said:
+            while message not in self._messages and process.FAILED not in self._messages:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0.0 or not select.select([self._link], [], [], left_s)[0]:
                     break
                 self._listen()
-        return message in self._said
+        return message in self._messages

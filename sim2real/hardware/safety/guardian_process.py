@@ -2,9 +2,9 @@
 
     python -I -S guardian_process.py PORT_FD LINK_FD SILENCE_S ANSWER_S OFF QUERY:ANSWER[,ANSWER] ...
 
-It has the port open from before torque goes on, and writes to it only when the control process no longer does. It
-imports little, so that it starts within 20 ms, and knows no protocol: `sim2real.hardware.safety.guardian` passes the
-packets as hexadecimal arguments.
+It has the port open before torque goes on, and writes to it only when the control process no longer does. It imports
+few modules, so that it starts within 20 ms. The packets, which depend on the protocol, are hexadecimal arguments from
+`sim2real.hardware.safety.guardian`.
 """
 
 import os
@@ -22,19 +22,13 @@ _PRIORITY = 3  # above the threads that it watches, which have 1: should one nev
 
 
 class Guard:
-    """Decides when to take the torque off, and does it.
-
-    Args:
-        answer_s: How long a servo's answer may take [s].
-        off: The packet that takes the torque of all servos off.
-        servos: For each servo, the packet that asks whether its torque is on, and the answers that mean "off".
-    """
+    """Decides when to take the torque off, and does it; arguments as in `sim2real.hardware.safety.guardian`."""
 
     def __init__(self, port_fd: int, answer_s: float, off: bytes, servos: list[tuple[bytes, list[bytes]]]) -> None:
         self._fd, self._answer_s, self._off, self._servos = port_fd, answer_s, off, servos
 
     def watch(self, link: int, silence_s: float) -> None:
-        """Wait until the control process says goodbye; act when it dies, or is silent for too long with torque on.
+        """Wait until the control process ends it; act when it dies, or is silent for too long with torque on.
 
         Args:
             silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
@@ -45,13 +39,13 @@ class Guard:
             watched = armed and not tripped and silence_s > 0.0
             wait_s = max(0.0, heard_s + silence_s - time.monotonic()) if watched else None
             if select.select([link], [], [], wait_s)[0]:  # messages first: this process may be late itself
-                said = _hear(link)
-                if said.endswith(LEAVE):
+                messages = _receive_messages(link)
+                if messages.endswith(LEAVE):
                     return
-                if not said:
+                if not messages:
                     self.make_safe("the control process is gone")
                     return
-                armed, heard_s = said.endswith(BEAT), time.monotonic()
+                armed, heard_s = messages.endswith(BEAT), time.monotonic()
                 if armed:
                     _write(link, HEARD)
             elif watched and time.monotonic() - heard_s >= silence_s:
@@ -67,10 +61,10 @@ class Guard:
         failure = self._take_torque_off()
         took_ms = 1e3 * (time.monotonic() - begin_s)
         if failure:
-            said = f"torque off could NOT be confirmed, {failure}; cut the servos' power"
+            result = f"torque off could NOT be confirmed, {failure}; cut the servos' power"
         else:
-            said = f"torque is off, confirmed after {took_ms:.0f} ms"
-        _write(2, f"sim2real guardian: {reason}: {said}\n".encode())
+            result = f"torque is off, confirmed after {took_ms:.0f} ms"
+        _write(2, f"sim2real guardian: {reason}: {result}\n".encode())
         return not failure
 
     def _take_torque_off(self) -> str:
@@ -80,15 +74,16 @@ class Guard:
         the control process, if it resumes, may read an answer in place of this one.
         """
         end = time.monotonic() + GIVE_UP_S
-        left = self._servos
+        unconfirmed = self._servos
         try:
             self._drain()
-            while left and time.monotonic() < end:
+            while unconfirmed and time.monotonic() < end:
                 self._send(self._off)
-                left = [(query, answers) for query, answers in left if not self._confirms(query, answers)]
+                unconfirmed = [servo for servo in unconfirmed if not self._confirms(*servo)]
         except OSError as error:
             return f"the port failed: {error}"
-        return f"{len(left)} of {len(self._servos)} servos did not answer for {GIVE_UP_S:g} s" if left else ""
+        count = len(unconfirmed)
+        return f"{count} of {len(self._servos)} servos did not answer for {GIVE_UP_S:g} s" if count else ""
 
     def _drain(self) -> None:
         """Wait until no more bytes arrive: on a half-duplex line, sending now would collide with an answer."""
@@ -123,7 +118,7 @@ class Guard:
         return data
 
 
-def _hear(link: int) -> bytes:
+def _receive_messages(link: int) -> bytes:
     """Return the control process' messages; empty if it has died."""
     try:
         return os.read(link, 4096)
@@ -145,7 +140,7 @@ def continue_when_host_dies() -> None:
         import ctypes
 
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
-    except (ImportError, OSError, AttributeError):  # on other systems nothing continues it
+    except (ImportError, OSError, AttributeError):  # other systems do not continue it
         pass
 
 

@@ -8,8 +8,8 @@ from sim2real.errors import SafetyStop
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.leaps import STAMP_S, reach_rad
 
-_KEPT = 0.5
-"""The share of its speed that a joint surely keeps from one reading to the next."""
+_MIN_SPEED_RATIO = 0.5
+"""The smallest share of its speed that a joint keeps from one reading to the next."""
 _HARD = 10.0
 """A push in one direction, which a weight would explain, is suspicious after this many times ``stuck_s``."""
 
@@ -21,15 +21,15 @@ class Plausibility:
     uncertainty of times and readings, the robot is stopped.
 
     **Freeze.** A joint that surely moved faster than ``freeze_rad_s`` from one reading to the next, and then reads the
-    same to the count for ``freeze_s`` though it is pushed, stops the robot: no motor stops dead. "Surely": between two
-    samples more time may have passed than between their stamps, since the first may have been an older one and the
-    second may have been taken as late as its answer came. An encoder that freezes just after a reading moves by next to
-    nothing until the following one: half the speed from the reading before counts there, too.
+    same to the count for ``freeze_s`` though it is pushed, stops the robot: a motor needs time to stop. "Surely": more
+    time may have passed between two samples than between their stamps, as the first may be older, and the second as
+    late as its answer. An encoder that freezes just after a reading hardly moves until the following one, so half the
+    speed from the reading before counts there, too.
 
     **Envelope.** A position outside of ``envelope_rad`` stops the robot.
 
     **Standstill.** A joint stands still if its reading does not change by a single count. That is normal at rest, while
-    holding, with friction, and at a stop. "Push" is the torque that the command asks for:
+    holding, with friction, and at a stop. "Push" is the torque of the command:
 
     - A joint that stands still although it was pushed in both directions, each with more than ``stuck_effort`` of its
       torque for ``stuck_s`` without a break, is not plausible: the robot is stopped.
@@ -40,7 +40,7 @@ class Plausibility:
     Suspicious joints do not stop the robot; they are listed in ``suspects``.
 
     Attributes:
-        suspects: Descriptions of what was suspicious since ``reset``.
+        suspects: Descriptions of the suspicious joints since ``reset``.
     """
 
     def __init__(self, config: GateConfig) -> None:
@@ -62,7 +62,7 @@ class Plausibility:
 
         Args:
             position_rad: Shape (n,): the joints' positions [rad].
-            t_s: When they were measured [s].
+            t_s: Time of the measurement [s].
             unsure_s: Uncertainty of that time [s].
             effort: Shape (n,): fraction of its torque that each joint is pushed with, in [-1, 1].
 
@@ -74,14 +74,17 @@ class Plausibility:
         if self._t_s is None or len(position_rad) != len(self._position):
             self._begin(position_rad, t_s, unsure_s, effort)
             return
+        # Jumps: no joint is faster than its limit.
         elapsed_s = max(0.0, t_s - self._t_s)
         self._require_reachable(position_rad, elapsed_s + unsure_s + self._unsure_s)
         self._t_s, self._unsure_s = t_s, unsure_s
+        # Keep for each joint the least speed that explains its last motion; two samples of one time have none.
         moved = position_rad != self._position
-        if elapsed_s > 0.0:  # two samples of one time say nothing of a speed
+        if elapsed_s > 0.0:
             speed = np.abs(position_rad - self._position) / (elapsed_s + STAMP_S + unsure_s)
-            self._speed[moved] = np.maximum(speed, _KEPT * self._before)[moved]
+            self._speed[moved] = np.maximum(speed, _MIN_SPEED_RATIO * self._before)[moved]
             self._before = speed
+        # Freeze and standstill: both count from the last motion.
         self._position = position_rad.copy()
         self._since_s[moved], self._start[moved] = t_s + unsure_s, effort[moved]
         self._require_no_freeze(t_s, effort)
@@ -94,8 +97,8 @@ class Plausibility:
         # Of each joint [rad/s]: before it stood still, and between the last two samples.
         self._speed, self._before = np.zeros(n), np.zeros(n)
         self._since_s, self._start = np.full(n, t_s), effort.copy()
-        # How long each joint has been pushed, now and at most since it moved. Rows: pushed up, pushed down, push
-        # differs from that at the start of the standstill, pushed hard up, pushed hard down.
+        # Duration of the push of each joint, now and at most since it moved. Rows: up, down, different from that at the
+        # start of the standstill, hard up, hard down.
         self._held_s, self._longest_s = np.zeros((5, n)), np.zeros((5, n))
         fastest = np.inf if self._config.max_speed_rad_s is None else self._config.max_speed_rad_s
         self._fastest = np.broadcast_to(np.asarray(fastest, np.float64), n)
@@ -111,7 +114,7 @@ class Plausibility:
             raise SafetyStop(
                 f"{self._config.joint(worst)} is at {position_rad[worst]:.4g} rad, outside of its envelope, "
                 f"{low[worst]:.4g} to {high[worst]:.4g} rad",
-                hint="bring it back by hand; envelope_rad sets what is allowed",
+                hint="bring it back by hand; envelope_rad sets the limits",
             )
 
     def _require_reachable(self, position_rad: np.ndarray, elapsed_s: float) -> None:
@@ -123,7 +126,7 @@ class Plausibility:
             raise SafetyStop(
                 f"{self._config.joint(worst)} reads {position_rad[worst]:.6g} rad, {leap[worst]:.6g} rad from the last "
                 f"reading: at its fastest, {limit[worst]:.4g} rad/s, it can have moved by {most[worst]:.3g} rad",
-                hint="look at the encoder and the cable; max_speed_rad_s sets what is possible",
+                hint="look at the encoder and the cable; max_speed_rad_s sets the limit",
             )
 
     def _require_no_freeze(self, t_s: float, effort: np.ndarray) -> None:
@@ -139,6 +142,7 @@ class Plausibility:
 
     def _require_motion(self, effort: np.ndarray, elapsed_s: float) -> None:
         limit, more = self._stuck, 2.0 * self._stuck
+        # Add the elapsed time to the rows whose push goes on, and clear the others.
         other = np.abs(effort - self._start) >= more
         pushed = [effort >= limit, effort <= -limit, other, effort >= more, effort <= -more]
         self._held_s = (self._held_s + elapsed_s) * pushed
@@ -147,6 +151,7 @@ class Plausibility:
         long = self._longest_s >= self._enough_s
         if not long.any():
             return
+        # A push in both directions stops the robot; the others are listed once.
         was_long = before >= self._enough_s
         for i in np.flatnonzero(long[0] & long[1]):
             raise SafetyStop(
@@ -154,7 +159,7 @@ class Plausibility:
                 hint="is it blocked, its encoder stuck, its supply off? stuck_effort sets the limit",
             )
         for i in np.flatnonzero(long[2:].any(axis=0) & ~was_long[2:].any(axis=0)):
-            how = "what pushes it changed by" if long[2, i] else "it is pushed with"
+            how = "its push changed by" if long[2, i] else "it is pushed with"
             self.suspects.append(f"{self._standing(int(i))}, though {how} {more[i]:.0%} of its torque")
 
     def _standing(self, index: int) -> str:

@@ -1,4 +1,4 @@
-"""A rig: a device behind the safety gate, and everything that makes its motors stop."""
+"""A rig: a device behind the safety gate, and all ways in which its motors are stopped."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ _CHECK_PERIOD_S: Final = 0.5
 _STILL_RAD_S: Final = 0.05
 """A joint this slow is at rest."""
 _FADE: Final = 0.4
-"""Share of a soft stop in which commands fade; the rest is for what they leave to come to rest."""
+"""Share of a soft stop in which commands fade to zero; in the rest the robot comes to rest."""
 
 
 @dataclass(frozen=True)
 class BusUse:
-    """How long transactions of one kind took, in their order.
+    """Times of the transactions of one kind, in their order.
 
     Attributes:
         transfer_us: From getting the bus to having the answer, retries included [us].
-        wait_us: How long each waited before for another's use of the bus [us].
+        wait_us: Wait for another thread's use of the bus [us].
     """
 
     transfer_us: array[int] = field(default_factory=lambda: array("q"))
     wait_us: array[int] = field(default_factory=lambda: array("q"))
 
     def add(self, transaction: Transaction) -> None:
-        """Note a transaction."""
+        """Append the times of a transaction."""
         self.transfer_us.append(transaction.transfer_ns // 1000)
         self.wait_us.append(transaction.lock_wait_ns // 1000)
 
@@ -46,22 +46,21 @@ class BusUse:
 class Rig:
     """A device behind a safety gate, commanded in the device's unit; it is opened with the rig, with torque off.
 
-    Whatever is commanded, limited, checked and returned here is on the joints' side: an angle is the joint's, and a
-    positive voltage or load pushes towards larger angles of the joint. The device alone has the motors' side.
+    Commands, limits and readings here are on the joints' side: an angle is the joint's, and a positive voltage or load
+    pushes towards larger angles of the joint. Only the device has the motors' side.
 
-    Three things stop its motors: every way out of this context (torque off); what watches the device from outside this
-    process, when this one dies or hangs; and a watchdog here when commands stop coming while measurements, which show
-    that this process lives, go on. That one sends what the gate makes of a stale command: zero, or the last one once
-    more.
+    Three mechanisms stop its motors. Every exit of this context takes the torque off. The device's watcher outside of
+    this process does so when this process dies or hangs. A watchdog thread here sends the gate's replacement of a stale
+    command when commands stop while measurements go on: zero, or the last command.
 
     Args:
         device: The device, not opened yet.
         gate: Limits of the commands, in the device's unit.
-        joints: How each motor's joint is mounted; none: as the device measures and commands it.
+        joints: The mounting of each motor's joint; none: angles and commands are the device's.
 
     Attributes:
         measuring: The bus's use by `measure` since `start`.
-        commanding: The bus's use by `command` since then.
+        commanding: The bus's use by `command` since `start`.
 
     Raises:
         UsageError: Gate, joints and device do not fit together.
@@ -106,12 +105,10 @@ class Rig:
         return self.device.torque_withheld
 
     def withhold_torque(self) -> None:
-        """Move nothing from now on, for a dry run: all goes on as it would, but no torque and no goal is ever sent.
-
-        Commands pass the gate, and `command` returns what would have been sent.
+        """Send neither torque nor goals from now on, for a dry run; `command` returns the output of the gate.
 
         Raises:
-            UsageError: Torque is on, or the device does not say that it withholds it.
+            UsageError: Torque is on, or the device does not confirm that it withholds it.
         """
         self.device.withhold_torque()
         if not self.device.torque_withheld:
@@ -119,16 +116,18 @@ class Rig:
 
     @property
     def suspects(self) -> list[str]:
-        """What was odd about the measurements since `start`, but not sure enough to stop."""
+        """Suspicious joints since `start`, which did not stop the robot; see `Plausibility`."""
         return self._plausibility.suspects
 
     def start(self) -> None:
-        """Switch the torque on, at rest, and start watching the age of commands."""
+        """Switch the torque on, at rest, and start the watchdog of stale commands."""
+        # A new event for the new watchdog: an old one that still runs must end at the old event.
         self._done.set()
-        self._done = threading.Event()  # a watcher that has not noticed yet that it is over must not go on
+        self._done = threading.Event()
         self._commanded_s = self._speed_rad_s = self._failure = self._sampled_s = self._eased_s = None
         self.measuring, self.commanding = BusUse(), BusUse()
         self._require_reach()
+        # The slew limit starts from the command that the motors follow at rest.
         self.device.enable()
         self.gate.reset(self._mounting.to_joints(self.device.rest()))
         self._plausibility.reset()
@@ -142,7 +141,7 @@ class Rig:
         self.device.disable()
 
     def stop_quietly(self) -> None:
-        """Switch the torque off on a way out that has an error of its own to report; never raises."""
+        """Switch the torque off while another error is reported; never raises."""
         self._done.set()
         self._sent = None
         self.device.make_safe()
@@ -156,33 +155,35 @@ class Rig:
         """Read positions, velocities and loads of all joints.
 
         Raises:
-            SafetyStop: A motor has stopped itself, or what it measures cannot be true.
+            SafetyStop: A motor has stopped itself, or a measurement is not plausible.
             HardwareLost: The device is silent.
         """
         self._check()
         self._supervise()
+        # Take the last command before the reading, as its effort acted while the sample was taken.
         sent = self._sent
         measured = self.device.measure()
-        reading, asked = self._mounting.reading(measured), measured.transaction
-        self.measuring.add(asked)
+        reading, transaction = self._mounting.reading(measured), measured.transaction
+        self.measuring.add(transaction)
         effort = np.zeros(len(measured.position_rad))
         if sent is not None and not self.torque_withheld:
-            # Of the motors, whose direction does not matter to what is plausible.
+            # On the motors' side: the checks do not depend on the direction.
             effort = self.device.effort(self._mounting.to_motors(sent), measured.position_rad)
-        self._plausibility.check(reading.position_rad, 1e-9 * asked.t_sent_ns, 1e-9 * asked.late_ns, effort)
-        self._speed_rad_s, self._sampled_s = reading.velocity_rad_s, 1e-9 * asked.t_sent_ns
+        sampled_s = 1e-9 * transaction.t_sent_ns
+        self._plausibility.check(reading.position_rad, sampled_s, 1e-9 * transaction.late_ns, effort)
+        self._speed_rad_s, self._sampled_s = reading.velocity_rad_s, sampled_s
         return reading
 
     def command(self, command: np.ndarray, age_s: float, now_s: float) -> np.ndarray:
-        """Send a command through the gate and return what was sent.
+        """Send a command through the gate and return the gate's output.
 
         Args:
             command: Shape ``(n,)``, of the joints [the device's unit].
-            age_s: How long ago it was decided [s].
+            age_s: Time since the policy computed it [s].
             now_s: A monotonic time, for the slew limit [s].
 
         Raises:
-            SafetyStop: The gate refused, or a motor has stopped itself.
+            SafetyStop: The gate stopped the robot, or a motor has stopped itself.
             HardwareLost: The device is silent.
         """
         self._check()
@@ -194,29 +195,25 @@ class Rig:
         return allowed
 
     def require_fresh(self) -> None:
-        """Refuse to go on without a recent measurement.
-
-        Raises:
-            SafetyStop: The newest is older than ``max_sample_age_s``, or, of a process that was stopped meanwhile, the
-                guardian has taken the torque off: that is the reason then.
-        """
-        now_s, most_s = time.monotonic(), self.gate.config.max_sample_age_s
-        age_s = 0.0 if self._sampled_s is None else now_s - self._sampled_s  # before the first, all is at rest
-        if age_s > most_s:
+        """Raise SafetyStop if the newest measurement is older than ``max_sample_age_s``."""
+        now_s, max_age_s = time.monotonic(), self.gate.config.max_sample_age_s
+        age_s = 0.0 if self._sampled_s is None else now_s - self._sampled_s  # before the first, the robot is at rest
+        if age_s > max_age_s:
+            # A process that was stopped for a while reports the guardian's action as the reason.
             self.device.require_watching()
             raise SafetyStop(
                 f"node {self.gate.config.node!r} stopped: the newest measurement is {age_s:.3g} s old, "
-                f"{most_s:g} s are allowed",
-                hint="what holds up the sensor? max_sample_age_s sets the limit",
+                f"{max_age_s:g} s are allowed",
+                hint="does another process hold up the sensor? max_sample_age_s sets the limit",
             )
 
     def ease(self) -> None:
-        """Begin a soft stop: from now on commands fade to zero within ``stop_s``, and goals stay where they are."""
+        """Begin a soft stop: from now on voltages fade to zero within ``stop_s``, and goals keep their values."""
         self._eased_s = time.monotonic()
 
     @property
     def eased(self) -> bool:
-        """Whether a soft stop is over: all is still, or ``stop_s`` has passed."""
+        """Whether a soft stop is over: all joints are still, or ``stop_s`` has passed."""
         if self._eased_s is None:
             return False
         passed_s = time.monotonic() - self._eased_s
@@ -233,21 +230,19 @@ class Rig:
         return np.asarray(command) * max(0.0, left)
 
     def wait_until_still(self, timeout_s: float, speed_rad_s: float = _STILL_RAD_S, for_s: float = 0.5) -> Reading:
-        """Wait, with torque off, until nothing moves any more.
+        """Wait, with torque off, until all joints are still; raise HardwareLost if they move after ``timeout_s``.
 
         Args:
             timeout_s: Longest time to wait [s].
             speed_rad_s: A motor this slow or slower counts as still [rad/s].
-            for_s: How long all must be still without a break [s].
-
-        Raises:
-            HardwareLost: It still moves after ``timeout_s``.
+            for_s: Time for which all must be still without a break [s].
         """
         end = time.monotonic() + timeout_s
         still_since: float | None = None
         while True:
             reading = self.measure()
             now = time.monotonic()
+            # Restart the time of stillness at every motion.
             if np.max(np.abs(reading.velocity_rad_s)) > speed_rad_s:
                 still_since = None
             else:
@@ -266,27 +261,27 @@ class Rig:
             raise self._failure
 
     def _supervise(self) -> None:
-        """Have the device look every now and then for motors that have stopped without saying so."""
+        """Let the device check twice a second for motors that stopped without an error in their answers."""
         now_s = time.monotonic()
         if now_s - self._checked_s > _CHECK_PERIOD_S:
             self.device.check()  # before the state is read, not after: a measurement should not wait
             self._checked_s = now_s
 
     def _require_reach(self) -> None:
-        """Refuse gate limits beyond what the motors follow, or for another number of motors."""
+        """Refuse gate limits beyond the reach of the motors, or for another number of motors."""
         gate, (low, high) = self.gate.config, self._mounting.limits(*self.device.reach())
         for limits in gate.range:
             if limits.ndim and limits.shape != low.shape:
                 raise UsageError(f"gate of {gate.node!r}: limits for {limits.size} motors, but there are {low.size}")
         if np.any(gate.range[0] < low) or np.any(gate.range[1] > high):
             raise UsageError(
-                f"gate of {gate.node!r}: limit {gate.limit} exceeds what the motors take, "
+                f"gate of {gate.node!r}: limit {gate.limit} exceeds the reach of the motors, "
                 f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} {self.device.commanded.unit}",
                 hint="narrow the limit, or set the joints' zeros and the motors' own limits",
             )
 
     def _watch(self, done: threading.Event) -> None:
-        """Send what is safe while no command has come yet, and when the last one is too old: its loop may hang."""
+        """Send the gate's fallback before the first command, and when the last one is too old: its loop may hang."""
         keep_time()
         timeout_s = self.gate.config.command_timeout_s
         period_s = min(timeout_s, self.device.silence_s or timeout_s) / 5
@@ -294,7 +289,8 @@ class Rig:
             with self._lock:
                 if done.is_set():
                     return
-                waiting = self._commanded_s is None  # the graph starts up: keeps the motors' own watchdog quiet
+                # Before the first command the graph starts up, and the motors' own watchdog must not trip.
+                waiting = self._commanded_s is None
                 late = not waiting and time.monotonic() - (self._commanded_s or 0.0) > timeout_s
                 if waiting or late:
                     try:

@@ -140,7 +140,7 @@ def test_what_they_do_without_a_host_is_said(serve, connect):
         (
             (reg.HOMING_OFFSET, -7),
             Joint("pan", 1, homing_offset=5),
-            "homing offset -7, its calibration says 5",
+            "homing offset -7, its calibration has 5",
         ),
         (
             (reg.MAX_POSITION, 3000),
