@@ -77,3 +77,9 @@ def test_names_that_name_no_thing_are_seen(house):
 def test_the_list_of_words_has_the_line_of_each(house, monkeypatch):
     monkeypatch.setattr(house, "texts", lambda: [("page.md", "One.\n\nIt is\ntold once\nmore.\n")])
     assert house.words() == [("page.md", 4, "told"), ("page.md", 4, "once more")]
+
+
+def test_pages_have_no_words_of_the_dialect(house):
+    """The two tutorials follow; every other page, README.md, CONTRIBUTING.md and CHANGELOG.md stay at 0."""
+    pages = [f"{path}:{line}: {word}" for path, line, word in house.words() if path.endswith(".md")]
+    assert [place for place in pages if not place.startswith("docs/tutorial")] == []

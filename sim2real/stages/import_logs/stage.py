@@ -125,7 +125,7 @@ def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
         for line in file.notes:
             console.note(line)
         raise
-    console.note(f"proposed from {file.path.name}, as nobody said what is what:")
+    console.note(f"proposed mapping for {file.path.name}:")
     lines, mapping = list(found.evidence), found.mapping
     if told.slides:
         mapping, line = in_lengths(mapping, told, file.path)
