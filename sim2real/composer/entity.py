@@ -6,7 +6,7 @@ import logging
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.errors import NotAttachedError
 from sim2real.composer.models.element import Element
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sim2real.composer.observation.observable.base import Observable
     from sim2real.composer.physics.base import BasePhysics
     from sim2real.composer.types import Array, ArrayLike, Hook, MjSpec, RandomState
+    from sim2real.types import PyTree
 
 _log = logging.getLogger(__name__)
 
@@ -57,7 +58,7 @@ class Entity(ABC):
         observable_options: Passed on to ``Observables.set_options``.
     """
 
-    def __init__(self, *args: Any, observable_options: dict[str, Any] | None = None, **kwargs: Any) -> None:
+    def __init__(self, *args: PyTree, observable_options: dict[str, PyTree] | None = None, **kwargs: PyTree) -> None:
         self._post_init_hooks: list[Hook] = []
         self._parent: weakref.ref[Entity] | None = None
         self._attached: list[Entity] = []
@@ -67,7 +68,7 @@ class Entity(ABC):
         self._observables.set_options(observable_options)
 
     @abstractmethod
-    def _build(self, *args: Any, **kwargs: Any) -> None:
+    def _build(self, *args: PyTree, **kwargs: PyTree) -> None:
         """Make the model."""
 
     def _build_observables(self) -> Observables:

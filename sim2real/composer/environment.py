@@ -8,7 +8,7 @@ import warnings
 import weakref
 from collections import OrderedDict
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import dm_env
 import numpy as np
@@ -20,6 +20,7 @@ from sim2real.composer.physics.c.compiled import Compiler
 from sim2real.composer.reward import split_reward
 from sim2real.composer.task import Task
 from sim2real.errors import UsageError
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from sim2real.composer.entity import Entity
@@ -38,10 +39,10 @@ class ObservationPadding(Enum):
     """Zeros."""
 
 
-class Observation(OrderedDict[str, Any]):
+class Observation(OrderedDict[str, PyTree]):
     """Name -> array; a name may leave out the models in front of it as long as only one key ends with it."""
 
-    def __missing__(self, key: str) -> Any:
+    def __missing__(self, key: str) -> PyTree:
         found = [k for k in self if k.endswith(f"/{key}")]
         if len(found) == 1:
             return self[found[0]]
@@ -101,7 +102,7 @@ class Environment(dm_env.Environment):
         self._max_reset_attempts, self._recompile = max_reset_attempts, recompile_mjcf_every_episode
         self._fixed_initial_state, self._legacy_step = fixed_initial_state, legacy_step
         self._compiled_by_reset = False
-        self._physics: Any = None
+        self._physics: PyTree = None
         self._compiler = Compiler(task)
         self._hooks = Hooks(task)
         self._build()
@@ -113,7 +114,7 @@ class Environment(dm_env.Environment):
         """Compile the models and start from them."""
         self._drop()
         self._physics = self._compiler.start(self._legacy_step)
-        self._proxy: Any = weakref.proxy(self._physics)
+        self._proxy: PyTree = weakref.proxy(self._physics)
         steps = self._n_sub_steps_given or self._task.physics_steps_per_control_step
         self._n_sub_steps = steps
         limit = self._time_limit / (self._physics.timestep() * steps)
@@ -183,7 +184,7 @@ class Environment(dm_env.Environment):
         self._reset_next_step, self._steps_taken = False, 0
         return dm_env.restart(self._observe())
 
-    def step(self, action: Any) -> dm_env.TimeStep:
+    def step(self, action: PyTree) -> dm_env.TimeStep:
         """Advance by a control step under an action; starts an episode when there is none, ignoring the action."""
         if self._reset_next_step:
             return self.reset()
@@ -215,27 +216,27 @@ class Environment(dm_env.Environment):
         step_type = dm_env.StepType.LAST if last else dm_env.StepType.MID
         return dm_env.TimeStep(step_type, reward, discount, self._observe())
 
-    def _observe(self) -> Any:
+    def _observe(self) -> PyTree:
         found = self._updater.get_observation()
         return Observation(found) if isinstance(found, dict) else found
 
-    def action_spec(self) -> Any:
+    def action_spec(self) -> PyTree:
         """Return shape and bounds of an action."""
         return self._task.action_spec(self._proxy)
 
-    def observation_spec(self) -> Any:
+    def observation_spec(self) -> PyTree:
         """Return name -> shape and dtype; before the first reset the observables are sampled for it."""
         if not self._is_probed:
             self._updater.reset(self._proxy, np.random.RandomState(0))
             self._is_probed = True
         return self._updater.observation_spec()
 
-    def reward_spec(self) -> Any:
+    def reward_spec(self) -> PyTree:
         """Return the task's reward spec, or that of a number."""
         spec = self._task.get_reward_spec()
         return super().reward_spec() if spec is None else spec
 
-    def discount_spec(self) -> Any:
+    def discount_spec(self) -> PyTree:
         """Return the task's discount spec, or that of a number in [0, 1]."""
         spec = self._task.get_discount_spec()
         return super().discount_spec() if spec is None else spec
@@ -247,7 +248,7 @@ class Environment(dm_env.Environment):
         )
         if self._task.get_reward_spec() is None or self._task.get_discount_spec() is None:
             raise NotImplementedError("the task declares no reward and discount specs")
-        step_type: Any = None
+        step_type: PyTree = None
         return dm_env.TimeStep(step_type, self.reward_spec(), self.discount_spec(), self.observation_spec())
 
     def close(self) -> None:

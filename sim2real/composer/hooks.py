@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from sim2real.composer.entity import Entity
 from sim2real.composer.task import Task
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sim2real.composer.types import Hook
+    from sim2real.types import PyTree
 
 T = TypeVar("T")
 
@@ -63,7 +64,7 @@ class Hooks:
         """Return whether nothing happens at a hook."""
         return not (_overrides(self._task, Task, name) or self._entity_hooks[name] or self._extra[name])
 
-    def run(self, name: str, *args: Any) -> None:
+    def run(self, name: str, *args: PyTree) -> None:
         """Run all hooks of a name with the arguments that the task's hook takes."""
         self.call(self._labels[name], getattr(self._task, name), *args)
         for label, hook in self._entity_hooks[name]:
@@ -71,7 +72,7 @@ class Hooks:
         for hook in self._extra[name]:
             self.call(name, hook, *args)
 
-    def call(self, label: str, function: Callable[..., T], *args: Any) -> T:
+    def call(self, label: str, function: Callable[..., T], *args: PyTree) -> T:
         """Return what a function returns; ``label`` says which one it is."""
         del label
         return function(*args)

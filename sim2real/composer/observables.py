@@ -6,7 +6,7 @@ import functools
 import inspect
 import weakref
 from collections import OrderedDict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer import define
 from sim2real.composer.observation.observable.base import Generic, Observable
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sim2real.composer.physics.base import BasePhysics
+    from sim2real.types import PyTree
 
 OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "corruptor", "enabled"})
 """What ``set_options`` can set."""
@@ -23,7 +24,7 @@ OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "c
 class ObservableKeys:
     """``observables.dict_keys.position`` is the key of ``position`` in an observation."""
 
-    def __init__(self, entity: Any, observables: dict[str, Observable]) -> None:
+    def __init__(self, entity: PyTree, observables: dict[str, Observable]) -> None:
         self._entity, self._observables = entity, observables
 
     def __getattr__(self, name: str) -> str:
@@ -41,7 +42,7 @@ def _declared(owner: type) -> tuple[str, ...]:
 class Observables:
     """Named observables of an entity; subclasses declare them with ``@composer.observable``."""
 
-    def __init__(self, entity: Any) -> None:
+    def __init__(self, entity: PyTree) -> None:
         self._entity = weakref.proxy(entity)
         self._observables: OrderedDict[str, Observable] = OrderedDict()
         self._keys = ObservableKeys(self._entity, self._observables)
@@ -69,7 +70,7 @@ class Observables:
         except KeyError:
             raise KeyError(self._unknown(name)) from None
 
-    def set_options(self, options: dict[str, Any] | None) -> None:
+    def set_options(self, options: dict[str, PyTree] | None) -> None:
         """Configure observables.
 
         Args:
@@ -101,18 +102,20 @@ class Observables:
         for value in self._observables.values():
             value.enabled = False
 
-    def add_observable(self, name: str, observable: Observable | Callable[[Any], Any], enabled: bool = True) -> None:
+    def add_observable(
+        self, name: str, observable: Observable | Callable[[PyTree], PyTree], enabled: bool = True
+    ) -> None:
         """Add an observable, or a function of ``physics`` that returns the value."""
         if not isinstance(observable, Observable):
             observable = Generic(observable)
         self._observables[name] = observable
         observable.enabled = enabled
 
-    def get_observation(self, physics: BasePhysics) -> dict[str, Any]:
+    def get_observation(self, physics: BasePhysics) -> dict[str, PyTree]:
         """Return the present value of every observable, without delays and buffers."""
         return {name: value(physics) for name, value in self._observables.items()}
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> PyTree:
         found = self.__dict__.get("_observables", {})
         if name in found:
             return found[name]

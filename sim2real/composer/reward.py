@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import reduce
 from operator import add
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sim2real.errors import UsageError
 
+if TYPE_CHECKING:
+    from sim2real.types import PyTree
 
-def split_reward(reward: Any) -> tuple[Any, dict[str, Any]]:
+
+def split_reward(reward: PyTree) -> tuple[PyTree, dict[str, PyTree]]:
     """Return what a task's ``get_reward`` returned as a number, the sum of its terms in their order, and the terms.
 
     Raises:

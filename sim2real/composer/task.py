@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_env import specs
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sim2real.composer.observation.observable.base import Observable
     from sim2real.composer.physics.base import BasePhysics
     from sim2real.composer.types import Array, RandomState
+    from sim2real.types import PyTree
 
 UNLIMITED = 1e10
 """Bound of an action that has none, in dm_control's specs."""
@@ -153,12 +154,12 @@ class Task(ABC):
     def initialize_episode(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
         """Set the state at the start of an episode."""
 
-    def before_step(self, physics: BasePhysics, action: Any, random_state: RandomState) -> None:
+    def before_step(self, physics: BasePhysics, action: PyTree, random_state: RandomState) -> None:
         """Act before a control step; default: the action, shape ``(nu,)``, becomes the control."""
         del random_state
         physics.set_control(action)
 
-    def before_substep(self, physics: BasePhysics, action: Any, random_state: RandomState) -> None:  # noqa: B027
+    def before_substep(self, physics: BasePhysics, action: PyTree, random_state: RandomState) -> None:  # noqa: B027
         """Act before a step of the physics."""
 
     def after_substep(self, physics: BasePhysics, random_state: RandomState) -> None:  # noqa: B027
@@ -168,7 +169,7 @@ class Task(ABC):
         """Act after a control step."""
 
     @abstractmethod
-    def get_reward(self, physics: BasePhysics) -> Any:
+    def get_reward(self, physics: BasePhysics) -> PyTree:
         """Return the reward of the step that was just taken, or its terms by name, whose sum it is."""
 
     def should_terminate_episode(self, physics: BasePhysics) -> bool | Array:

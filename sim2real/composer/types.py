@@ -143,6 +143,8 @@ class CarriedRandomState(RandomState, Protocol):
 Varying: TypeAlias = "ArrayLike | Callable[..., Any] | Sequence[Varying] | Mapping[str, Varying] | None"
 """A value, a variation that draws one, or lists and dicts of these: what ``variation.evaluate`` takes."""
 
+Value: TypeAlias = Any
+"""The value of an attribute in MJCF or in an ``MjSpec``: a number, a text, an array, an element, or a list of these."""
 Index: TypeAlias = Any
 """A key of an array: a number, a slice, an array, or a tuple of these; names too where rows have names."""
 ArrayModule: TypeAlias = Any

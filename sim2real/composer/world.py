@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from sim2real.composer.models.element import Elements
     from sim2real.composer.types import MjModel
+    from sim2real.types import PyTree
 
 
 @struct.dataclass
@@ -86,7 +87,7 @@ class ComposedWorld(BaseWorld):
         rate: float | None = None,
         color: str | None = None,
         order: int | None = None,
-        **options: Any,
+        **options: PyTree,
     ) -> None:
         self.environment = MjxEnvironment(task, **options)
         ticks = 1.0 / task.control_timestep
@@ -139,11 +140,11 @@ class ComposedWorld(BaseWorld):
             return self.environment.reset_apart(key, self._model(params), (qpos, qvel))
         return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel), self._lawful(params))
 
-    def output(self, state: State) -> Any:
+    def output(self, state: State) -> PyTree:
         """Return the message that says what a state is; default: the task's observation."""
         return Observations(state.observation)
 
-    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the message at the start of the episode."""
         state = (graph_state or GraphState()).state.get(self.name)
         return self.output(self.init_state(rng, graph_state) if state is None else state)
@@ -153,12 +154,12 @@ class ComposedWorld(BaseWorld):
         del action
         return state
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Take a control step under the newest action."""
         action = self._action(step_state)
         before = self.entered(step_state.state, action)
         params = step_state.params
-        state: Any = self.environment.step(before, action, self._model(params), self._lawful(params))
+        state: PyTree = self.environment.step(before, action, self._model(params), self._lawful(params))
         # What is over stays over: others look only now and then.
         truncated = jnp.where(before.done, before.truncated, state.truncated)
         state = state.replace(done=before.done | state.done, truncated=truncated)
@@ -220,7 +221,7 @@ class ComposedWorld(BaseWorld):
         state, controls = self.environment.step_apart(state, action, self._model(step_state.params))
         return step_state.replace(state=state), controls
 
-    def message(self, state: State, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> Any:
+    def message(self, state: State, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> PyTree:
         """Return what the world sends.
 
         Args:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,13 +15,13 @@ from sim2real.composer.models.tree import H, Handle, Tree
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import NativeDefault
+    from sim2real.composer.types import NativeDefault, Value
 
 _OF_SHORTCUTS = ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm")
 """What every actuator but ``<general>`` sets by itself."""
 
 
-def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Any]) -> H:
+def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Value]) -> H:
     """Add an element to a body of this model.
 
     Args:
@@ -78,7 +78,7 @@ def _name_frame_joint(model: Tree[H], frame: H, joint: H, name: str | None) -> N
     joint._native.name = full
 
 
-def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Any]) -> H:
+def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Value]) -> H:
     """Add an element that stands in no body; MuJoCo's parser reads its attributes.
 
     Args:
@@ -118,9 +118,9 @@ def _lay_down(model: Tree[Handle], element: Handle) -> None:
         translate.assign(native, kind, key, values[key])
 
 
-def _inherited(element: Handle) -> dict[str, Any]:
+def _inherited(element: Handle) -> dict[str, Value]:
     """Return what the classes of an element say of its own tag: the nearest one's word counts."""
-    found: dict[str, Any] = {}
+    found: dict[str, Value] = {}
     known = schema.attributes(element.kind, element.tag)
     for said in said_by_classes(element):
         if said.tag == element.tag:  # the last one that was spoken of: a class has one actuator for all tags
@@ -128,7 +128,7 @@ def _inherited(element: Handle) -> dict[str, Any]:
     return found
 
 
-def _fill(model: Tree[Handle], element: Handle, fixed: Mapping[str, Any], named: dict[str, Any]) -> None:
+def _fill(model: Tree[Handle], element: Handle, fixed: Mapping[str, Value], named: dict[str, Value]) -> None:
     """Set what MuJoCo's parser read: plain attributes, and those that name elements."""
     native = element._native
     for key, value in fixed.items():
@@ -180,7 +180,7 @@ def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> Non
         said.values.update(native_only)
 
 
-def _catch_up(element: Handle, said: dict[str, Any], key: str | None) -> None:
+def _catch_up(element: Handle, said: dict[str, Value], key: str | None) -> None:
     """Take over what an element holds now: arrays may have been written into, what it names may be called otherwise."""
     for name in REFERENCES.get(element.kind, ()):
         target = references.held(element, name) if name in said and name != key else None
@@ -197,7 +197,7 @@ def _catch_up(element: Handle, said: dict[str, Any], key: str | None) -> None:
             said[name] = np.array(explicit_values.show(value, said[name]))
 
 
-def reclass(model: Tree[Handle], element: Handle, name: str, value: Any) -> None:
+def reclass(model: Tree[Handle], element: Handle, name: str, value: Value) -> None:
     """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``."""
     value = getattr(value, "dclass", value)
     element.recorded().note(name, value)
@@ -232,7 +232,7 @@ def said_by_classes(element: Handle) -> Iterator[explicit_values.Given]:
         name = model.records.class_parent(name)
 
 
-def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) -> H:
+def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Value]) -> H:
     """Add a joint, a site, a geom or a pulley to a tendon's path.
 
     Args:
@@ -253,7 +253,7 @@ def extend_tendon(model: Tree[H], tendon: H, tag: str, attrs: dict[str, Any]) ->
     return tendon
 
 
-def extend_tuple(model: Tree[H], element: H, tag: str, attrs: dict[str, Any]) -> H:
+def extend_tuple(model: Tree[H], element: H, tag: str, attrs: dict[str, Value]) -> H:
     """Add an element to those that a tuple names.
 
     Args:
@@ -300,7 +300,7 @@ def remove(model: Tree[Handle], element: Handle) -> None:
     model.touch()
 
 
-def _given(attrs: dict[str, Any]) -> dict[str, Any]:
+def _given(attrs: dict[str, Value]) -> dict[str, Value]:
     """Leave those attributes that were given a value, under PyMJCF's names."""
     if "class_" in attrs:
         attrs["dclass"] = attrs.pop("class_")
@@ -309,12 +309,12 @@ def _given(attrs: dict[str, Any]) -> dict[str, Any]:
     return attrs
 
 
-def _foreign(model: Tree[Handle], dclass: Any) -> Any:
+def _foreign(model: Tree[Handle], dclass: Value) -> Value:
     """Return a class of defaults that belongs to another model, such as that of a frame's joint; else None."""
     return dclass if getattr(dclass, "root", model) is not model else None
 
 
-def _defaults(model: Tree[Handle], attrs: dict[str, Any]) -> NativeDefault | None:
+def _defaults(model: Tree[Handle], attrs: dict[str, Value]) -> NativeDefault | None:
     name = attrs.get("dclass", attrs.get("class_"))
     if name is None:
         return None
@@ -325,7 +325,7 @@ def _defaults(model: Tree[Handle], attrs: dict[str, Any]) -> NativeDefault | Non
     return found
 
 
-def _add_inertial(model: Tree[H], body: H, attrs: dict[str, Any]) -> H:
+def _add_inertial(model: Tree[H], body: H, attrs: dict[str, Value]) -> H:
     names = {"pos": "ipos", "quat": "iquat", "diaginertia": "inertia", "fullinertia": "fullinertia", "mass": "mass"}
     for key, value in attrs.items():
         if key not in names:

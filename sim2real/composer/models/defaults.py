@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from sim2real.composer.models.tree import Handle
-    from sim2real.composer.types import Native, NativeDefault
+    from sim2real.composer.types import Native, NativeDefault, Value
 
 
 class Defaults:
@@ -102,7 +102,7 @@ class _Shown(np.ndarray):
         """Let arrays that are computed from this one be plain."""
         self._write = None
 
-    def __setitem__(self, key: Any, value: Any) -> None:
+    def __setitem__(self, key: Value, value: Value) -> None:
         whole = np.array(self)
         whole[key] = value
         if self._write is None:
@@ -158,11 +158,11 @@ class DefaultElement(Element):
         return self.root.records.of_class(self._native, self.kind)
 
     @property
-    def full_identifier(self) -> Any:
+    def full_identifier(self) -> Value:
         """None, as dm_control has it: defaults have no name."""
         return None
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Value:
         value = super().__getattr__(name)
         if isinstance(value, np.ndarray):
             value = value.copy().view(_Shown)
@@ -170,13 +170,13 @@ class DefaultElement(Element):
             value.flags.writeable = False
         return value
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: Value) -> None:
         if value is None:
             raise UsageError(
                 f"{name} of {self!r} cannot be taken back", hint="set it to the value that is to hold instead"
             )
         value = value.name if isinstance(value, Element) else value
-        fixed: Mapping[str, Any] | None = None
+        fixed: Mapping[str, Value] | None = None
         if not translate.is_plain(self._native, self.kind, name, value):
             known = schema.attributes(self.kind, self._tag)
             if name not in known:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from sim2real.composer.models.mjcf.schema import KIND_OF_TAG
 from sim2real.composer.models.mjcf.translate import TREE_KINDS, mj
 from sim2real.composer.models.tree import Handle, Tree
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.types import Value
 
 _IN_BODIES = (*TREE_KINDS, "inertial")
 _LISTED = frozenset(TREE_KINDS)
@@ -33,7 +36,7 @@ class Element(Handle):
 
     root: Tree[Element]
 
-    def add(self, tag: str, **attrs: Any) -> Element:
+    def add(self, tag: str, **attrs: Value) -> Element:
         """Add an element to a body, a part of its path to a tendon, or to a tuple what it names.
 
         Args:
@@ -94,11 +97,11 @@ class Element(Handle):
         inertial = [] if self.inertial is None else [self.inertial]
         return inertial + [e for kind in TREE_KINDS for e in self.find_all(kind, immediate_children_only=True)]
 
-    def get_attributes(self) -> dict[str, Any]:
+    def get_attributes(self) -> dict[str, Value]:
         """Return the attributes that were given to this element: name -> value."""
         return {name: getattr(self, name) for name in self.recorded().values}
 
-    def set_attributes(self, **attrs: Any) -> None:
+    def set_attributes(self, **attrs: Value) -> None:
         """Set several attributes."""
         for name, value in attrs.items():
             setattr(self, name, value)
@@ -117,7 +120,7 @@ class Element(Handle):
         """Delete the element from its model, with what refers to it."""
         builder.remove(self.root, self)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Value:
         if name.startswith("__"):
             raise AttributeError(name)
         native, kind = self._native, self.kind
@@ -141,7 +144,7 @@ class Element(Handle):
             return self.root.default_class(said.values[name])
         return self._shown(name, said)
 
-    def _shown(self, name: str, said: explicit_values.Given) -> Any:
+    def _shown(self, name: str, said: explicit_values.Given) -> Value:
         """Return the value of a plain attribute, in PyMJCF's form where it was given."""
         try:
             value = translate.read(self._native, self.kind, name)
@@ -153,7 +156,7 @@ class Element(Handle):
             self.root.touch()
         return explicit_values.show(value, said.values[name]) if name in said.values else value
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: Value) -> None:
         if name == "name":
             self.root.check_name(self.kind, value)
             rename(self, value or "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from sim2real.composer.models.tree import Handle
+    from sim2real.composer.types import Value
 
 _INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
 _CHOICES = {
@@ -55,14 +56,14 @@ class Section:
         return self._name.rsplit(".", 1)[-1]
 
     @property
-    def _native(self) -> Any:
+    def _native(self) -> Value:
         """Return the part of the ``MjSpec`` that holds the fields."""
         found = self._model._spec
         for step in self._path.split(".") if self._path else ():
             found = getattr(found, step)
         return found
 
-    def add(self, tag: str, **attrs: Any) -> Any:
+    def add(self, tag: str, **attrs: Value) -> Value:
         """Add an element, such as ``actuator.add('motor', joint=...)``.
 
         Raises:
@@ -96,12 +97,12 @@ class Section:
         inner = "".join(f"{e.to_xml_string()}\n" for e in self.all_children())
         return f"<{self.tag}>\n{textwrap.indent(inner, '  ')}</{self.tag}>" if inner else f"<{self.tag}/>"
 
-    def set_attributes(self, **attrs: Any) -> None:
+    def set_attributes(self, **attrs: Value) -> None:
         """Set several attributes."""
         for name, value in attrs.items():
             setattr(self, name, value)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Value:
         if name.startswith("__"):
             raise AttributeError(name)
         if name in self._kinds or (self._kinds and (self._name, name) in schema.tables()):
@@ -119,7 +120,7 @@ class Section:
             self._model.touch_settings()
         return next((k for k, v in _CHOICES[name].items() if v == value), value) if name in _CHOICES else value
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: Value) -> None:
         native = self._native
         self._model.touch_settings()
         if self._name == "compiler" and name == "angle":
@@ -181,14 +182,14 @@ class DocumentsOnly:
     def __init__(self, name: str) -> None:
         self._name = name
 
-    def add(self, tag: str, **attrs: Any) -> Any:
+    def add(self, tag: str, **attrs: Value) -> Value:
         """Refuse; UsageError always."""
         raise UsageError(f"a <{tag}> cannot be added to <{self._name}> by a program", hint=schema.FROM_DOCUMENTS)
 
 
-def make_sections(model: Tree[Handle]) -> dict[str, Any]:
+def make_sections(model: Tree[Handle]) -> dict[str, Value]:
     """Return the sections of a model by name."""
-    found: dict[str, Any] = {name: Section(model, name, "", kinds) for name, kinds in schema.SECTIONS.items()}
+    found: dict[str, Value] = {name: Section(model, name, "", kinds) for name, kinds in schema.SECTIONS.items()}
     for name, path in (("option", "option"), ("size", ""), ("compiler", "compiler"), ("visual", "visual")):
         found[name] = Section(model, name, path)
     found["statistic"] = Section(model, "statistic", "stat")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar, cast
+from typing import TYPE_CHECKING, ClassVar, Generic, Self, TypeVar, cast
 
 from sim2real.composer.models.mjcf import translate
 from sim2real.composer.models.mjcf.explicit_values import Document, Given, PathPart, Records
@@ -14,7 +14,7 @@ from sim2real.composer.models.scope import Scope
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import MjSpec, Native
+    from sim2real.composer.types import MjSpec, Native, Value
 
 _ADDED_LATER = 1_000_000_000
 """Elements that were parsed are ordered by their line; those that a program added come after them."""
@@ -84,7 +84,7 @@ class Handle:
         return self._native is None
 
     @property
-    def parent(self) -> Any:
+    def parent(self) -> Value:
         """The body that holds this element, the section where it stands in no body, the model for the world."""
         if self.kind == "inertial":
             return self.root.handle("body", self._native)
@@ -127,7 +127,7 @@ class Tree(Scope, Generic[H]):
         self._handles: dict[Native | tuple[Native, str], H] = {}
         self._order: dict[Native, int] = {}
         self._clock = itertools.count(_ADDED_LATER)
-        self._sections: dict[str, Any] = {}  # by name; ``Model`` makes them, as they need what works on a tree
+        self._sections: dict[str, Value] = {}  # by name; ``Model`` makes them, as they need what works on a tree
 
     @classmethod
     def owning(cls, spec: MjSpec, document: Document | None = None) -> Self:
@@ -171,15 +171,15 @@ class Tree(Scope, Generic[H]):
         """Return the handle on an element that has one."""
         return self._handles[native]
 
-    def section_of(self, kind: str) -> Any:
+    def section_of(self, kind: str) -> Value:
         """Return the section that elements of a kind stand in."""
         return self._sections[SECTION_OF[kind]]
 
-    def default_class(self, name: Any) -> Any:
+    def default_class(self, name: Value) -> Value:
         """Return a class of defaults by its name."""
         return self._sections["default"].find("default", getattr(name, "dclass", name))
 
-    def enlist(self, kind: str, native: Native, tag: str, values: dict[str, Any]) -> H:
+    def enlist(self, kind: str, native: Native, tag: str, values: dict[str, Value]) -> H:
         """Note that an element was added after all others; return its handle."""
         self._order[native] = next(self._clock)
         self.records.note(native, tag, values)
@@ -196,7 +196,7 @@ class Tree(Scope, Generic[H]):
 
     # -- looking for elements
 
-    def find(self, kind: str, identifier: str | None = None, *, name: str | None = None) -> Any:
+    def find(self, kind: str, identifier: str | None = None, *, name: str | None = None) -> Value:
         """Return the element of a kind with a name such as ``finger`` or ``hand/finger``, or None.
 
         Args:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_env import specs
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from sim2real.composer.physics.base import BasePhysics
     from sim2real.composer.types import RandomState, Steps
+    from sim2real.types import PyTree
 
 DEFAULT_BUFFER_SIZE = 1
 DEFAULT_UPDATE_INTERVAL = 1
@@ -162,7 +163,7 @@ class _Channel:
 
     def observation_spec(self) -> specs.Array:
         """Return what ``read`` returns: shape, dtype, and bounds where they are known."""
-        spec: Any = self.spec
+        spec: PyTree = self.spec
         aggregator = self.observable.aggregator
         shape = spec.shape if self._strip else (self.size, *spec.shape)
         if aggregator is None:
@@ -206,14 +207,14 @@ class Updater:
         self._steps_per_read = physics_steps_per_control_step
         self._strip, self._pad_initial = strip_singleton_buffer_dim, pad_with_initial_value
         self._now = 0
-        self._channels: Any = None
+        self._channels: PyTree = None
         self._flat: list[_Channel] = []
 
     def reset(self, physics: BasePhysics, random_state: RandomState) -> None:
         """Start an episode: take the first samples."""
         self._now = 0
 
-        def channels(observables: dict[str, Any]) -> dict[str, _Channel]:
+        def channels(observables: dict[str, PyTree]) -> dict[str, _Channel]:
             made = type(observables)()
             for name, value in observables.items():
                 if value.enabled:
@@ -238,23 +239,23 @@ class Updater:
             if channel.due == now:
                 channel.update(now)
 
-    def get_observation(self) -> Any:
+    def get_observation(self) -> PyTree:
         """Return name -> array, in the structure of the observables."""
         self._require_reset()
         return self._each(lambda channel: channel.read(self._now))
 
-    def observation_spec(self) -> Any:
+    def observation_spec(self) -> PyTree:
         """Return name -> ``dm_env.specs.Array``, in the structure of the observables."""
         self._require_reset()
         return self._each(lambda channel: channel.observation_spec())
 
-    def _each(self, function: Callable[[_Channel], Any]) -> Any:
-        def group(channels: dict[str, _Channel]) -> dict[str, Any]:
+    def _each(self, function: Callable[[_Channel], PyTree]) -> PyTree:
+        def group(channels: dict[str, _Channel]) -> dict[str, PyTree]:
             return type(channels)((name, function(channel)) for name, channel in channels.items())
 
         return self._map(group, self._channels)
 
-    def _map(self, function: Callable[[Any], Any], groups: Any) -> Any:
+    def _map(self, function: Callable[[PyTree], PyTree], groups: PyTree) -> PyTree:
         return type(groups)(function(g) for g in groups) if self._nested else function(groups)
 
     def _require_reset(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
     import numpy.typing as npt
 
-    from sim2real.composer.types import MjModel
+    from sim2real.composer.types import Index, MjModel
+    from sim2real.types import PyTree
 
 _KIND_OF_SIZE = {size: name for name, kind in layout.KINDS.items() for size in kind.sizes}
 _COLUMNS = {
@@ -42,17 +43,17 @@ class NamedArray(NDArrayOperatorsMixin):
         self._model, self._field, self._holder = model, field, holder
 
     @property
-    def _array(self) -> Any:
+    def _array(self) -> PyTree:
         return getattr(self._holder, self._field.name)
 
     def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self._array, dtype=dtype) if copy else np.asarray(self._array, dtype=dtype)
 
-    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: PyTree, **kwargs: PyTree) -> PyTree:
         plain = [x._array if isinstance(x, NamedArray) else x for x in inputs]
         return getattr(ufunc, method)(*plain, **kwargs)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> PyTree:
         if name.startswith("__"):
             raise AttributeError(name)
         return getattr(self._array, name)
@@ -60,16 +61,16 @@ class NamedArray(NDArrayOperatorsMixin):
     def __len__(self) -> int:
         return len(self._array)
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[PyTree]:
         return iter(self._array)
 
     def __repr__(self) -> str:
         return f"{self._field.name}: {self._array!r}"
 
-    def __getitem__(self, key: Any) -> Any:
+    def __getitem__(self, key: Index) -> PyTree:
         return self._array[self.rows(key)]
 
-    def __setitem__(self, key: Any, value: Any) -> None:
+    def __setitem__(self, key: Index, value: PyTree) -> None:
         array, rows = self._array, self.rows(key)
         if is_jax(array):
             setattr(self._holder, self._field.name, array.at[rows].set(value))
@@ -81,7 +82,7 @@ class NamedArray(NDArrayOperatorsMixin):
         """``axes.row.convert_key_item(names)`` returns the rows of some names, as in dm_control."""
         return SimpleNamespace(row=SimpleNamespace(convert_key_item=self._rows))
 
-    def rows(self, key: Any) -> Any:
+    def rows(self, key: Index) -> Index:
         """Return the numeric index for a key of names, elements or numbers.
 
         Raises:
@@ -96,7 +97,7 @@ class NamedArray(NDArrayOperatorsMixin):
             return (row, *columns)
         return self._rows(key)
 
-    def _rows(self, key: Any) -> Any:
+    def _rows(self, key: Index) -> Index:
         if isinstance(key, str | Element):
             return layout.index(self._model, self._field, (self._number(key),), True)
         if isinstance(key, np.ndarray) and key.dtype.kind == "U":  # as np.ix_ makes them from names
@@ -124,7 +125,7 @@ class NamedArray(NDArrayOperatorsMixin):
         raise KeyError(f"{self._field.name}: {kind} {name!r} {what}. Available: {known}")
 
 
-def _column(key: Any) -> Any:
+def _column(key: Index) -> Index:
     if isinstance(key, str):
         return _COLUMNS[key]
     if isinstance(key, np.ndarray) and key.dtype.kind == "U":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from sim2real.composer.variation.base import evaluate
 if TYPE_CHECKING:
     from sim2real.composer.models.element import Element, Elements
     from sim2real.composer.types import RandomState, Varying
+    from sim2real.types import PyTree
 
 CONSTANTS = frozenset(
     {"mass", "inertia", "ipos", "iquat", "pos", "quat", "armature", "qpos0", "qpos_spring", "gear", "stiffness", "size"}
@@ -23,7 +24,7 @@ CONSTANTS = frozenset(
 class _Bound:
     __slots__ = ("initial", "variation")
 
-    def __init__(self, variation: Varying, initial: Any = None) -> None:
+    def __init__(self, variation: Varying, initial: PyTree = None) -> None:
         self.variation, self.initial = variation, initial
 
 
@@ -83,7 +84,7 @@ class PhysicsVariator:
             else:
                 bound[name] = _Bound(variation)
 
-    def apply_variations(self, physics: Any, random_state: RandomState) -> None:
+    def apply_variations(self, physics: PyTree, random_state: RandomState) -> None:
         """Draw a value for every bound attribute and set it."""
         derived = False
         for element, attributes in self._variations.items():

@@ -50,13 +50,13 @@ def attach(site: H, model: Tree[H]) -> H:
     return parent.enlist("body", frame, "body", pose)
 
 
-def _free_name(parent: Tree[Any], name: str) -> str:
+def _free_name(parent: Tree[Handle], name: str) -> str:
     """Return a name, with a number behind it where others have it already."""
     numbered = (f"{name}_{i}" for i in itertools.count(1))
     return next(n for n in itertools.chain([name], numbered) if n not in parent.attachments)
 
 
-def _warn_of_degrees(parent: Tree[Any], model: Tree[Handle]) -> None:
+def _warn_of_degrees(parent: Tree[Handle], model: Tree[Handle]) -> None:
     """Warn where dm_control would read a document's angles in another unit than MuJoCo, which reads degrees."""
     if parent._spec.compiler.degree or not model.records.is_silent_on_angles:
         return

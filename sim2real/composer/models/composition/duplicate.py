@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from sim2real.composer.models.composition import compose
 from sim2real.composer.models.mjcf import translate
 from sim2real.composer.models.mjcf.explicit_values import PathPart
 from sim2real.composer.models.mjcf.tendon_paths import path_of
-from sim2real.composer.models.tree import Tree
+from sim2real.composer.models.tree import Handle, Tree
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from sim2real.composer.types import Native
 
-T = TypeVar("T", bound=Tree[Any])
+T = TypeVar("T", bound=Tree[Handle])
 
 
 def duplicate(model: T) -> T:
     """Return an independent copy of a model and of all that is attached to it; it is attached to nothing."""
-    twins: dict[T, T] = {}
+    twins: dict[Tree[Handle], Tree[Handle]] = {}
     natives: dict[Native, Native] = {}
     made = _copy(model, twins, natives)
     for old, new in twins.items():
@@ -32,7 +32,9 @@ def duplicate(model: T) -> T:
     return made
 
 
-def _twin(model: Tree[Any], target: Any, twins: dict[T, T], natives: dict[Native, Native]) -> Any:
+def _twin(
+    model: Tree[Handle], target: Handle, twins: dict[Tree[Handle], Tree[Handle]], natives: dict[Native, Native]
+) -> Handle:
     """Return the copy of what an element of a model names."""
     if target.is_removed:
         return target
@@ -44,12 +46,14 @@ def _twin(model: Tree[Any], target: Any, twins: dict[T, T], natives: dict[Native
     return twins[target.root].handle(target.kind, natives[target._native])
 
 
-def _part(model: Tree[Any], part: PathPart, twins: dict[T, T], natives: dict[Native, Native]) -> PathPart:
+def _part(
+    model: Tree[Handle], part: PathPart, twins: dict[Tree[Handle], Tree[Handle]], natives: dict[Native, Native]
+) -> PathPart:
     values = {k: _twin(model, v, twins, natives) if hasattr(v, "root") else v for k, v in part.values.items()}
     return PathPart(part.tag, values, dict(part.written))
 
 
-def _copy(model: T, twins: dict[T, T], natives: dict[Native, Native]) -> T:
+def _copy(model: T, twins: dict[Tree[Handle], Tree[Handle]], natives: dict[Native, Native]) -> T:
     spec = compose.full_copy(model)
     made = twins[model] = type(model).owning(spec)
     made.shows_text = model.shows_text

@@ -11,7 +11,7 @@ import functools
 import itertools
 import weakref
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 from mujoco.introspect.structs import STRUCTS
@@ -22,9 +22,9 @@ from sim2real.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from sim2real.composer.types import MjSpec
+    from sim2real.composer.types import MjSpec, Value
 
-Settings = dict[tuple[str, str], Any]
+Settings: TypeAlias = "dict[tuple[str, str], Value]"
 
 _SMALLEST = {"timestep", "tolerance", "ls_tolerance", "noslip_tolerance", "ccd_tolerance", "znear"}
 _LARGEST = {
@@ -49,14 +49,14 @@ FLAGS: dict[str, tuple[str, int]] = {
 _clock = itertools.count()
 
 
-def _part(spec: MjSpec, path: str) -> Any:
+def _part(spec: MjSpec, path: str) -> Value:
     for step in path.split(".") if path else ():
         spec = getattr(spec, step)
     return spec
 
 
 @functools.cache
-def _defaults() -> dict[str, dict[str, tuple[Any, Any]]]:
+def _defaults() -> dict[str, dict[str, tuple[Value, Value]]]:
     """Return part -> field -> MuJoCo's default, and what compares fastest with it."""
     blank, found = mj.MjSpec(), {}
     for path in PARTS:
@@ -68,15 +68,15 @@ def _defaults() -> dict[str, dict[str, tuple[Any, Any]]]:
     return found
 
 
-def _entry(value: Any) -> tuple[Any, Any]:
+def _entry(value: Value) -> tuple[Value, Value]:
     return (value.copy(), value.tobytes()) if isinstance(value, np.ndarray) else (value, value)
 
 
 @functools.cache
 def _bits() -> dict[str, tuple[str, dict[str, int]]]:
     """Return part -> where MuJoCo notes which of its fields a document wrote, and the bit of each field."""
-    structs: dict[str, Any] = {"option": STRUCTS["mjOption"]}
-    parts: Any = STRUCTS["mjVisual"].fields
+    structs: dict[str, Value] = {"option": STRUCTS["mjOption"]}
+    parts: Value = STRUCTS["mjVisual"].fields
     structs |= {f"visual.{part.name}": part.type for part in parts}
     found = {}
     for path in PARTS:
@@ -97,7 +97,7 @@ def _author(spec: MjSpec, path: str, name: str) -> None:
         setattr(spec.authored, where, getattr(spec.authored, where) | bit)
 
 
-def _differ(a: Any, b: Any) -> bool:
+def _differ(a: Value, b: Value) -> bool:
     return a.tobytes() != b.tobytes() if isinstance(a, np.ndarray) else a != b
 
 
@@ -147,7 +147,7 @@ class Member(Protocol):
         ...
 
     @property
-    def attachments(self) -> Mapping[str, Any]:
+    def attachments(self) -> Mapping[str, Value]:
         """What is attached to it."""
         ...
 
@@ -189,7 +189,7 @@ class Overrides:
         when, covered = self._noted.get(key, (-1, ()))
         return model in covered and when > model.overrides.since(key)
 
-    def among(self, twins: Mapping[Any, Any]) -> Overrides:
+    def among(self, twins: Mapping[Value, Value]) -> Overrides:
         """Return the same of a copied model, among the copies of the others: model -> its copy."""
         made = Overrides()
         for key, (when, covered) in self._noted.items():
@@ -243,7 +243,7 @@ def note(model: Member, path: str, name: str) -> None:
     model.touch_settings()
 
 
-def in_world(model: Member, path: str, name: str, own: Any) -> Any:
+def in_world(model: Member, path: str, name: str, own: Value) -> Value:
     """Return the value of a setting in the world that a model is a part of, given the model's own.
 
     Args:

@@ -6,7 +6,7 @@ import functools
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 from xml.sax.saxutils import unescape
 
@@ -16,7 +16,7 @@ from sim2real.composer.models.mjcf import schema, translate
 from sim2real.composer.models.mjcf.translate import mj
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import Native
+    from sim2real.composer.types import Native, Value
 
 _ATTRIBUTES = r"""(?:\s+[\w:.-]+\s*=\s*(?:"[^"]*"|'[^']*'))*"""
 _TAG = re.compile(rf"<!--.*?-->|<([A-Za-z]\w*)({_ATTRIBUTES})|\n", re.DOTALL)
@@ -31,9 +31,9 @@ class Given:
     """The tag of an element, and the attributes that were given to it: name -> value, as it was written."""
 
     tag: str
-    values: dict[str, Any] = field(default_factory=dict)
+    values: dict[str, Value] = field(default_factory=dict)
 
-    def note(self, name: str, value: Any) -> None:
+    def note(self, name: str, value: Value) -> None:
         """Note that an attribute was set; None takes it back."""
         if value is None:
             self.values.pop(name, None)
@@ -52,10 +52,10 @@ class PathPart:
     """
 
     tag: str
-    values: dict[str, Any]
+    values: dict[str, Value]
     written: dict[str, str]
 
-    def is_outdated(self, model: Any) -> bool:
+    def is_outdated(self, model: Value) -> bool:
         """Return whether the ``MjSpec`` has other names than those by which the model's own elements are called now."""
         named = [(self.values[key], text) for key, text in self.written.items()]
         return any(e.root is not model or e.is_removed or e._native.name != text for e, text in named)
@@ -91,7 +91,7 @@ class Document:
         """Class of defaults -> the class above it, None for the one that holds for everything."""
         found: dict[str, str | None] = {}
 
-        def visit(node: Any, above: str | None) -> None:
+        def visit(node: Value, above: str | None) -> None:
             name = node.get("class", "main") if above is None else node.get("class")
             found[name] = above
             for below in node.findall("default"):
@@ -124,7 +124,7 @@ class Records:
         """Whether there may be a class of defaults that says something."""
         return self._has_defaults or not self.is_blank
 
-    def note_default(self, native: Native, kind: str, tag: str, name: str, value: Any) -> None:
+    def note_default(self, native: Native, kind: str, tag: str, name: str, value: Value) -> None:
         """Note that an attribute of a class of defaults was set."""
         self._has_defaults = True
         said = self.of_class(native, kind)
@@ -141,7 +141,7 @@ class Records:
         if self._document is not None:
             self._document.says_angle = True
 
-    def note(self, native: Native, tag: str, values: dict[str, Any]) -> None:
+    def note(self, native: Native, tag: str, values: dict[str, Value]) -> None:
         """Note that an element was added."""
         self._of[native] = Given(tag, values)
 
@@ -233,7 +233,7 @@ def _tag(native: Native, kind: str) -> str:
     return kind
 
 
-def show(value: Any, given: Any) -> Any:
+def show(value: Value, given: Value) -> Value:
     """Return a native value as PyMJCF shows it: keywords as text, arrays as long as they were given."""
     if isinstance(value, np.ndarray) and value.ndim == 1:
         size = len(given.split()) if isinstance(given, str) else np.size(given)
@@ -252,14 +252,14 @@ def show(value: Any, given: Any) -> Any:
     return given
 
 
-def _number(given: Any) -> float | None:
+def _number(given: Value) -> float | None:
     try:
         return float(given)
     except (TypeError, ValueError):
         return None
 
 
-def parse(value: Any) -> Any:
+def parse(value: Value) -> Value:
     """Return a value that no ``MjSpec`` holds, such as a servo's ``kp``, as a number, an array or text."""
     try:
         numbers = np.array(value.split() if isinstance(value, str) else value, float)

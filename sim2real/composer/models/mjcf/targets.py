@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.models import layout
 from sim2real.composer.models.mjcf import translate
 from sim2real.composer.models.mjcf.translate import mj
 
 if TYPE_CHECKING:
-    from sim2real.composer.models.tree import Tree
+    from sim2real.composer.models.tree import Handle, Tree
     from sim2real.composer.types import Native
 
 _OBJECTS = {
@@ -83,7 +83,7 @@ def _kind_of(kind: str, native: Native, key: str, number: int) -> str:
     return _OBJECTS.get(native.reftype if key == "refname" else native.objtype, "")
 
 
-def by_text(model: Tree[Any], kinds: Collection[str]) -> Iterator[tuple[Native, str, str, str]]:
+def by_text(model: Tree[Handle], kinds: Collection[str]) -> Iterator[tuple[Native, str, str, str]]:
     """Yield what the elements of a model name by text alone: the element, attribute, kind and name of the other.
 
     What a program named by element is left out, and so are the paths of tendons.
@@ -96,7 +96,7 @@ def by_text(model: Tree[Any], kinds: Collection[str]) -> Iterator[tuple[Native, 
             yield from ((native, *t) for t in targets(kind, native) if (native, t[0]) not in model.references)
 
 
-def of_classes(model: Tree[Any], kinds: Collection[str]) -> Iterator[tuple[Native, str, str, str]]:
+def of_classes(model: Tree[Handle], kinds: Collection[str]) -> Iterator[tuple[Native, str, str, str]]:
     """Yield what the classes of defaults of a model name, as ``by_text`` does."""
     for name in model.records.class_names() if not _IN_CLASSES.isdisjoint(kinds) else ():
         for kind in _IN_DEFAULTS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sim2real.composer.models.mjcf.explicit_values import PathPart
 from sim2real.composer.models.mjcf.translate import mj
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from sim2real.composer.models.tree import Handle, Tree
-    from sim2real.composer.types import Native
+    from sim2real.composer.types import Native, Value
 
 NAMING = {"joint": ("joint",), "site": ("site",), "geom": ("geom", "sidesite"), "pulley": ()}
 """Tag of a part of a path -> its attributes that name elements."""
@@ -29,17 +29,17 @@ _TAGS = {
 }
 
 
-def path_of(model: Tree[Any], native: Native) -> list[PathPart]:
+def path_of(model: Tree[Handle], native: Native) -> list[PathPart]:
     """Return the path of a tendon."""
     known = model.paths.setdefault(native, [])
     known += [_read(model, native, wrap) for wrap in list(native.path)[len(known) :]]
     return known
 
 
-def _read(model: Tree[Any], native: Native, wrap: Any) -> PathPart:
+def _read(model: Tree[Handle], native: Native, wrap: Value) -> PathPart:
     """Return what an ``MjSpec`` or its document has of a part of a path."""
     tag = _TAGS[wrap.type]
-    values: dict[str, Any] = {"coef": wrap.coef} if tag == "joint" else {}
+    values: dict[str, Value] = {"coef": wrap.coef} if tag == "joint" else {}
     if tag == "pulley":
         return PathPart(tag, {"divisor": wrap.divisor}, {})
     said = model.records.written(wrap)
@@ -54,7 +54,7 @@ def _read(model: Tree[Any], native: Native, wrap: Any) -> PathPart:
     return PathPart(tag, values, {k: v.name or "" for k, v in values.items() if hasattr(v, "root")})
 
 
-def make_part(model: Tree[Any], tag: str, attrs: dict[str, Any]) -> PathPart:
+def make_part(model: Tree[Handle], tag: str, attrs: dict[str, Value]) -> PathPart:
     """Return a part of a path.
 
     Args:

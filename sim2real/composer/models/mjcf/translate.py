@@ -13,7 +13,7 @@ import numpy as np
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import MjSpec, Native
+    from sim2real.composer.types import MjSpec, Native, Value
 
 mj: Any = mujoco
 
@@ -61,7 +61,7 @@ _TRACKING = {
     name: getattr(mj.mjtCamLight, f"mjCAMLIGHT_{name.upper()}")
     for name in ("fixed", "track", "trackcom", "targetbody", "targetbodycom")
 }
-_ENUMS: dict[tuple[str, str], dict[str, Any]] = {
+_ENUMS: dict[tuple[str, str], dict[str, Value]] = {
     ("geom", "type"): {
         name: getattr(mj.mjtGeom, f"mjGEOM_{name.upper()}")
         for name in ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
@@ -102,7 +102,7 @@ def native_name(kind: str, key: str) -> str:
     return _RENAMED.get(kind, {}).get(key, key)
 
 
-def read(native: Native, kind: str, key: str) -> Any:
+def read(native: Native, kind: str, key: str) -> Value:
     """Return an attribute of an element; AttributeError when there is none of that name."""
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return np.array(getattr(native.alt, key))
@@ -115,7 +115,7 @@ def read(native: Native, kind: str, key: str) -> Any:
     return value
 
 
-def is_plain(native: Native, kind: str, key: str, value: Any) -> bool:
+def is_plain(native: Native, kind: str, key: str, value: Value) -> bool:
     """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser."""
     found = _PLAIN.get((kind, key))
     if found is None:
@@ -171,7 +171,7 @@ def class_defaults(native: Native, kind: str) -> Native:
     return blank(kind) if found is None else found
 
 
-def assign(native: Native, kind: str, key: str, value: Any) -> None:
+def assign(native: Native, kind: str, key: str, value: Value) -> None:
     """Set an attribute of an element.
 
     Args:
@@ -206,10 +206,10 @@ def assign(native: Native, kind: str, key: str, value: Any) -> None:
         setattr(native, name, like(getattr(native, name), value))
 
 
-_PLANS: dict[tuple[str, str], tuple[str, int, Any, dict[str, Any] | None]] = {}
+_PLANS: dict[tuple[str, str], tuple[str, int, Value, dict[str, Value] | None]] = {}
 
 
-def _plan(native: Native, kind: str, key: str) -> tuple[str, int, Any, dict[str, Any] | None]:
+def _plan(native: Native, kind: str, key: str) -> tuple[str, int, Value, dict[str, Value] | None]:
     """Return the native name of an attribute, length and dtype where it is an array, and names of its values."""
     if key in _ORIENTATIONS and hasattr(native, "alt"):
         return key, 0, None, None
@@ -222,7 +222,7 @@ def _plan(native: Native, kind: str, key: str) -> tuple[str, int, Any, dict[str,
     return name, value.size if is_array else 0, value.dtype if is_array else None, _ENUMS.get((kind, key))
 
 
-def like(current: Any, value: Any) -> Any:
+def like(current: Value, value: Value) -> Value:
     """Return a value in the form that a native attribute takes: padded, parsed, counted."""
     if isinstance(current, mj.mjtLimited):
         return _LIMITED[value] if isinstance(value, str) else int(value)
@@ -240,7 +240,7 @@ def like(current: Any, value: Any) -> Any:
     return value
 
 
-def _numbers(value: Any) -> Any:
+def _numbers(value: Value) -> Value:
     return [float(word) for word in value.split()] if isinstance(value, str) else value
 
 
@@ -255,7 +255,7 @@ def _attributes(native_type: type) -> tuple[str, ...]:
     return tuple(n for n in names if isinstance(getattr(native_type, n), property))
 
 
-def _text(value: Any) -> str:
+def _text(value: Value) -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, bool):
@@ -267,8 +267,8 @@ def _text(value: Any) -> str:
 
 
 def from_xml(
-    kind: str, tag: str, attrs: Mapping[str, Any], references: Iterable[str]
-) -> tuple[Mapping[str, Any], dict[str, Any]]:
+    kind: str, tag: str, attrs: Mapping[str, Value], references: Iterable[str]
+) -> tuple[Mapping[str, Value], dict[str, Value]]:
     """Return the native attributes that MuJoCo's own parser reads from MJCF: plain ones, and those that name elements.
 
     Args:
@@ -290,7 +290,7 @@ def from_xml(
 @functools.lru_cache(maxsize=4096)
 def _parsed(
     kind: str, tag: str, plain: tuple[tuple[str, str], ...], references: tuple[str, ...]
-) -> tuple[dict[str, Any], dict[str, Any]]:
+) -> tuple[dict[str, Value], dict[str, Value]]:
     needed = (("name", "_"),) if kind in ("numeric", "text") else ()
     words = " ".join(f"{k}={quoteattr(v)}" for k, v in (*needed, *plain, *((k, f"@{k}") for k in references)))
     spec = mj.MjSpec()
@@ -325,7 +325,7 @@ def key_of(kind: str, tag: str, name: str, references: tuple[str, ...], plain: M
     return None
 
 
-def _is_reference(value: Any) -> bool:
+def _is_reference(value: Value) -> bool:
     """Return whether a parsed value is a placeholder, or a list with one."""
     if isinstance(value, list):
         value = next((v for v in value if v), "")
@@ -333,14 +333,14 @@ def _is_reference(value: Any) -> bool:
     return isinstance(value, str) and value[:1] == "@"
 
 
-def _detached(value: Any) -> Any:
+def _detached(value: Value) -> Value:
     """Return a value that outlives the spec it was read from."""
     if isinstance(value, np.ndarray):
         return value.copy()
     return list(value) if type(value).__name__.endswith("Vec") else value
 
 
-def same(a: Any, b: Any) -> bool:
+def same(a: Value, b: Value) -> bool:
     """Return whether two native values are equal."""
     if isinstance(a, np.ndarray):
         return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,8 +12,11 @@ from sim2real.composer.models.mjcf.tendon_paths import path_of
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.composer.models.tree import Handle, Tree
 
+if TYPE_CHECKING:
+    from sim2real.composer.types import Value
 
-def to_xml_string(element: Any, prefix_root: Tree[Any] | None, self_only: bool, pretty_print: bool) -> str:
+
+def to_xml_string(element: Value, prefix_root: Tree[Handle] | None, self_only: bool, pretty_print: bool) -> str:
     """Return an element as MJCF.
 
     Args:
@@ -28,7 +31,7 @@ def to_xml_string(element: Any, prefix_root: Tree[Any] | None, self_only: bool, 
 _ORDER = ("inertial", "joint", "geom", "site", "camera", "light", "body")
 
 
-def _node(element: Any, top: Tree[Any], self_only: bool) -> ElementTree.Element:
+def _node(element: Value, top: Tree[Handle], self_only: bool) -> ElementTree.Element:
     said = element.recorded().values
     node = ElementTree.Element(element.tag)
     if element.name and not element.is_worldbody and element.kind != "inertial":
@@ -54,7 +57,7 @@ def _node(element: Any, top: Tree[Any], self_only: bool) -> ElementTree.Element:
     return node
 
 
-def _text(value: Any, top: Tree[Any]) -> str:
+def _text(value: Value, top: Tree[Handle]) -> str:
     """Return a value as MJCF has it: elements by their names, numbers with all their digits."""
     if isinstance(value, Handle):
         return value.root.identify(value, relative_to=top)

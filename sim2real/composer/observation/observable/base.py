@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_env import specs
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from sim2real.composer.physics.base import BasePhysics
     from sim2real.composer.types import Aggregate, Array, Corrupt, RandomState, Steps
+    from sim2real.types import PyTree
 
 
 class Aggregator:
@@ -100,21 +101,23 @@ class Observable(ABC):
         return None
 
     @abstractmethod
-    def _callable(self, physics: BasePhysics) -> Callable[[], Any]:
+    def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         """Return a function that samples the raw value."""
 
-    def observation_callable(self, physics: BasePhysics, random_state: RandomState | None = None) -> Callable[[], Any]:
+    def observation_callable(
+        self, physics: BasePhysics, random_state: RandomState | None = None
+    ) -> Callable[[], PyTree]:
         """Return a function that samples the value and corrupts it."""
         sample, corruptor = self._callable(physics), self.corruptor
         if corruptor is None:
             return sample
         return lambda: corruptor(sample(), random_state=random_state)
 
-    def __call__(self, physics: BasePhysics, random_state: RandomState | None = None) -> Any:
+    def __call__(self, physics: BasePhysics, random_state: RandomState | None = None) -> PyTree:
         """Return a sample."""
         return self.observation_callable(physics, random_state)()
 
-    def configure(self, **options: Any) -> None:
+    def configure(self, **options: PyTree) -> None:
         """Set several attributes; AttributeError when there is none of a name."""
         for name, value in options.items():
             if not hasattr(self, name):
@@ -131,7 +134,7 @@ class Generic(Observable):
 
     def __init__(
         self,
-        raw_observation_callable: Callable[[Any], Any],
+        raw_observation_callable: Callable[[PyTree], PyTree],
         update_interval: Steps = 1,
         buffer_size: Steps | None = None,
         delay: Steps | None = None,
@@ -141,7 +144,7 @@ class Generic(Observable):
         self._raw_callable = raw_observation_callable
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: BasePhysics) -> Callable[[], Any]:
+    def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         return functools.partial(self._raw_callable, physics)
 
 
@@ -165,7 +168,7 @@ class MujocoFeature(Observable):
         self._kind, self._feature_name = kind, feature_name
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: BasePhysics) -> Callable[[], Any]:
+    def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         array, name = getattr(physics.named.data, self._kind), self._feature_name
         return lambda: array[name() if callable(name) else name]
 
@@ -194,7 +197,7 @@ class MujocoCamera(Observable):
         shape = (self.height, self.width, 1 if self._depth else 3)
         return specs.Array(shape, np.float32 if self._depth else np.uint8)
 
-    def _callable(self, physics: Any) -> Callable[[], Any]:
+    def _callable(self, physics: PyTree) -> Callable[[], PyTree]:
         def image() -> np.ndarray:
             pixels = physics.render(self.height, self.width, self._camera_name, depth=self._depth)
             return np.atleast_3d(pixels)

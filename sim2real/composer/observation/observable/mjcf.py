@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_env import specs
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sim2real.composer.models.element import Elements
     from sim2real.composer.physics.base import BasePhysics
     from sim2real.composer.types import Aggregate, Corrupt, MjvOption, Steps
+    from sim2real.types import PyTree
 
 
 def _check_elements(elements: Elements) -> None:
@@ -45,20 +46,20 @@ class MJCFFeature(Observable):
         delay: Steps | None = None,
         aggregator: str | Aggregate | None = None,
         corruptor: Corrupt | None = None,
-        index: Any = None,
+        index: PyTree = None,
     ) -> None:
         _check_elements(mjcf_element)
         self._kind, self._element, self._index = kind, mjcf_element, index
         super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
 
-    def _callable(self, physics: BasePhysics) -> Callable[[], Any]:
+    def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         binding, kind, index = physics.bind(self._element), self._kind, self._index
         if index is None:
             return lambda: getattr(binding, kind)
         index = np.asarray(index) if isinstance(index, list) else index
         return lambda: getattr(binding, kind)[index]
 
-    def __getitem__(self, key: Any) -> MJCFFeature:
+    def __getitem__(self, key: PyTree) -> MJCFFeature:
         if self._index is not None:
             raise NotImplementedError("slicing an already-sliced MJCFFeature observable is not supported")
         options = (self.update_interval, self.buffer_size, self.delay, self.aggregator, self.corruptor)
@@ -110,7 +111,7 @@ class MJCFCamera(Observable):
             channels, dtype, low, high = 3, np.uint8, 0, 255
         return specs.BoundedArray((self.height, self.width, channels), dtype, minimum=low, maximum=high)
 
-    def _callable(self, physics: Any) -> Callable[[], Any]:
+    def _callable(self, physics: PyTree) -> Callable[[], PyTree]:
         def image() -> np.ndarray:
             pixels = physics.render(
                 self.height,

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from typing import Literal
 
     from sim2real.composer.types import ArrayLike, Index
+    from sim2real.types import PyTree
 
 
 class Staleness:
@@ -72,7 +73,7 @@ class SyncedArray(np.ndarray):
 
     def __array_wrap__(
         self, array: np.ndarray, context: tuple[Any, ...] | None = None, return_scalar: bool = False
-    ) -> Any:
+    ) -> PyTree:
         """Return what is computed from this array as a plain one: sums of products then take a third less time."""
         return array[()] if return_scalar else array
 
@@ -139,7 +140,7 @@ class Binding(BaseBinding):
         """Drop the references to MuJoCo's arrays."""
         self._places.clear()
 
-    def read(self, name: str) -> Any:
+    def read(self, name: str) -> PyTree:
         """Return an attribute of all bound elements; out-of-date quantities are computed first."""
         place = self._places.get(name) or self._place(name)
         if place.derived and self._staleness.dirty:
@@ -149,5 +150,5 @@ class Binding(BaseBinding):
         place.plain[...] = place.array[place.index]
         return place.shown
 
-    def _plain(self, array: Any) -> np.ndarray:
+    def _plain(self, array: PyTree) -> np.ndarray:
         return np.asarray(array)

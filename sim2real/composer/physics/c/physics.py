@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sim2real.composer.models.element import Element, Elements
     from sim2real.composer.models.model import Model
     from sim2real.composer.types import ArrayLike, MjData, MjModel, MjvOption, MjvScene
+    from sim2real.types import PyTree
 
 _log = logging.getLogger(__name__)
 _RK4 = int(mj.mjtIntegrator.mjINT_RK4)
@@ -45,7 +46,7 @@ class Physics(BoundPhysics):
 
     def __init__(self, model: MjModel, legacy_step: bool = True, data: MjData | None = None) -> None:
         self.legacy_step = legacy_step
-        self.variables: dict[str, Any] = {}
+        self.variables: dict[str, PyTree] = {}
         self._suppress = False
         self._start(model, data)
 
@@ -210,7 +211,7 @@ class Physics(BoundPhysics):
         """Have everything computed again before the next computed attribute is read through a binding."""
         self.staleness.dirty = True
 
-    def bind(self, elements: Elements) -> Any:
+    def bind(self, elements: Elements) -> PyTree:
         """Return the attributes of an element, or of several of one kind; see ``BasePhysics.bind``.
 
         Bindings are kept: they know the places of the attributes in MuJoCo's arrays.
@@ -291,7 +292,7 @@ class Physics(BoundPhysics):
 
 
 def _restored(
-    kind: type[Physics], model: MjModel, data: MjData, legacy_step: bool, variables: dict[str, Any]
+    kind: type[Physics], model: MjModel, data: MjData, legacy_step: bool, variables: dict[str, PyTree]
 ) -> Physics:
     made = object.__new__(kind)
     made.legacy_step, made.variables, made._suppress = legacy_step, variables, False

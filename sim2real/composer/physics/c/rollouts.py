@@ -6,7 +6,7 @@ import copy
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from sim2real.graph.base import StepState
 if TYPE_CHECKING:
     from sim2real.composer.types import Array, ArrayLike, MjModel
     from sim2real.graph.node import BaseWorld
+    from sim2real.types import PyTree
 
 _LARGEST_BYTES = 2**26
 """Most memory for the states of the copies that run at a time."""
@@ -53,8 +54,8 @@ class StepLaw(Protocol):
     fields: tuple[str, ...]
 
     def __call__(
-        self, xp: Any, values: Mapping[str, Any], control: Any, qpos: Any, qvel: Any
-    ) -> tuple[Any, Any, dict[str, Any]]:
+        self, xp: PyTree, values: Mapping[str, PyTree], control: PyTree, qpos: PyTree, qvel: PyTree
+    ) -> tuple[PyTree, PyTree, dict[str, PyTree]]:
         """Return controls ``(..., nu)``, applied forces ``(..., nv)`` and the fields for the next step.
 
         Args:
@@ -95,11 +96,11 @@ class OpenLoop(Protocol):
                 more than positions, velocities and accelerations.
         """
 
-    def fields(self, params: Any, state: Any) -> dict[str, Array]:
+    def fields(self, params: PyTree, state: PyTree) -> dict[str, Array]:
         """Return the fields of the model that differ from the compiled one."""
         ...
 
-    def start(self, params: Any, state: Any) -> Start:
+    def start(self, params: PyTree, state: PyTree) -> Start:
         """Return where the physics starts."""
         ...
 
@@ -107,7 +108,7 @@ class OpenLoop(Protocol):
         """Return what is left of a tick without physics: the next step state, and the controls ``(substeps, nu)``."""
         ...
 
-    def message(self, state: Any, qpos: Array, qvel: Array, qacc: Array) -> Any:
+    def message(self, state: PyTree, qpos: Array, qvel: Array, qacc: Array) -> PyTree:
         """Return what the world sends.
 
         Args:
@@ -160,7 +161,7 @@ class Rollouts:
         self._law = law
         self._model = _general(model, names, derives)
         self._threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        self._batch: Any = None
+        self._batch: PyTree = None
 
     def __call__(
         self,

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
 from mujoco.mjx._src import scan  # private: mujoco-mjx is pinned, and a test would see it change
+
+if TYPE_CHECKING:
+    from sim2real.types import PyTree
 
 T = TypeVar("T")
 _vmap = scan._nvmap
@@ -29,7 +32,7 @@ def _held(f: Callable[..., T], carry: T | None, *args: jax.Array) -> T:
     return _vmap(f, carry, *args)
 
 
-def _barrier(leaf: Any) -> Any:
+def _barrier(leaf: PyTree) -> PyTree:
     """Return a leaf behind a barrier, unless it is a type of joint, which decides what is traced."""
     known = not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact)
     return leaf if known else jax.lax.optimization_barrier(leaf)

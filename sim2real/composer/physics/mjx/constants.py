@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from sim2real.composer.types import MjModel
+    from sim2real.types import PyTree
 
 _WIDTHS = {
     int(mj.mjtJoint.mjJNT_FREE): (3, 3),
@@ -72,7 +73,7 @@ def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
 
 
 @jax.jit
-def _at_reference(model: mjx.Model, data: Any) -> mjx.Data:
+def _at_reference(model: mjx.Model, data: PyTree) -> mjx.Data:
     """Return what follows from the reference position; traced once for all programs with a model of this form."""
     data = mjx.com_pos(model, mjx.kinematics(model, data.replace(qpos=model.qpos0)))
     return mjx.transmission(model, mjx.crb(model, mjx.tendon(model, mjx.camlight(model, data))))
@@ -81,7 +82,7 @@ def _at_reference(model: mjx.Model, data: Any) -> mjx.Data:
 def _twin(host: MjModel, model: mjx.Model) -> mjx.Model:
     """Return a model of Warp as one of MJX's JAX, which computes constants from fields that both have."""
     try:
-        twin: Any = mjx.put_model(host, impl="jax")
+        twin: PyTree = mjx.put_model(host, impl="jax")
     except NotImplementedError as error:
         raise UsageError(
             f"MJX-Warp computes what follows from masses and lengths with MJX's JAX, which cannot: {error}",
@@ -101,7 +102,7 @@ def _subtree_masses(host: MjModel, model: mjx.Model) -> jax.Array:
 
 def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
     """Return the inverse inertias that constraints see of bodies, degrees of freedom and tendons; ``(A M^-1 A^T)``."""
-    impl: Any = data._impl
+    impl: PyTree = data._impl
     M, J = _inertia_and_jacobians(model, data)
     factor = jax.scipy.linalg.cho_factor(M)
     inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(host.nv, dtype=M.dtype))

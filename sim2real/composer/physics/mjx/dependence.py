@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
+
+if TYPE_CHECKING:
+    from sim2real.types import PyTree
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Origin:
     argument: int | None
 
 
-def origins(function: Callable[..., Any], arguments: tuple[Any, ...], marked: Any) -> Any:
+def origins(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], marked: PyTree) -> PyTree:
     """Return an ``Origin`` for each leaf of what a function returns, in its tree.
 
     Errs on the side of caution: every result of an operation counts as depending on all that goes into it.

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import weakref
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from sim2real.composer.entity import Entity
     from sim2real.composer.types import MjModel
+    from sim2real.types import PyTree
 
 
 @struct.dataclass
@@ -58,7 +59,7 @@ class State:
 
     data: mjx.Data
     leaves: dict[str, jax.Array]
-    variables: dict[str, Any]
+    variables: dict[str, PyTree]
     key: jax.Array
     memory: dict[str, jax.Array]
     rings: dict[str, Samples]
@@ -145,7 +146,7 @@ class MjxEnvironment:
         self._changed: tuple[str, ...] = ()
         self._dry = self._stays_dirty = False
         self._steady = True
-        self._earned: Any = (np.zeros(()), np.zeros(()), {})  # like a reward, a discount and a reward's terms
+        self._earned: PyTree = (np.zeros(()), np.zeros(()), {})  # like a reward, a discount and a reward's terms
         self._discover()
 
     def _look_at_compiled(self, random_state: np.random.RandomState) -> None:
@@ -319,7 +320,7 @@ class MjxEnvironment:
 
         entry = physics.is_dirty
 
-        def substep(carry: Any, i: jax.Array) -> tuple[Any, None]:
+        def substep(carry: PyTree, i: jax.Array) -> tuple[PyTree, None]:
             tree, rings, dirty, diverged = carry
             physics.load(tree, random_state)
             physics.is_dirty = entry if self._steady or self.substeps == 1 else dirty
@@ -345,7 +346,7 @@ class MjxEnvironment:
         physics.load(tree, random_state)
         return rings, diverged
 
-    def action_spec(self) -> Any:
+    def action_spec(self) -> PyTree:
         """Return shape and bounds of an action, as the task says."""
         return self._action_spec
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 
@@ -15,6 +15,8 @@ from sim2real.errors import UsageError
 if TYPE_CHECKING:
     from mujoco import mjx
 
+    from sim2real.types import PyTree
+
 _GIVEN = ("qpos", "qvel")
 """What a start sets of the state, and what the physics then starts from."""
 
@@ -22,7 +24,7 @@ _GIVEN = ("qpos", "qvel")
 def check(
     environment: MjxEnvironment,
     entered: Callable[[State, jax.Array], State],
-    output: Callable[[State], Any],
+    output: Callable[[State], PyTree],
     name: str,
 ) -> None:
     """Refuse a task whose controls, or anything else that hooks set, depend on what the physics computes.
@@ -86,7 +88,7 @@ def _check_start(environment: MjxEnvironment, name: str) -> State:
     return jax.eval_shape(reset, shapes, place)
 
 
-def _check_message(state: State, marked: State, output: Callable[[State], Any], name: str) -> None:
+def _check_message(state: State, marked: State, output: Callable[[State], PyTree], name: str) -> None:
     """Check that a message says nothing but positions, velocities and accelerations."""
     known = _all_but(state.data, ("qpos", "qvel", "qacc"))
     everything = jax.tree_util.tree_map(lambda _: True, marked).replace(data=known)
@@ -99,7 +101,7 @@ def _all_but(tree: mjx.Data, names: tuple[str, ...]) -> mjx.Data:
     return jax.tree_util.tree_map(lambda _: True, tree).replace(**dict.fromkeys(names, False))
 
 
-def _named(tree: Any) -> dict[str, Any]:
+def _named(tree: PyTree) -> dict[str, PyTree]:
     is_leaf = lambda x: hasattr(x, "marked")  # noqa: E731
     return {jax.tree_util.keystr(p): x for p, x in jax.tree_util.tree_flatten_with_path(tree, is_leaf=is_leaf)[0]}
 

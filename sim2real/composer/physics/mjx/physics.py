@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from sim2real.composer.physics.mjx.views import MjxBinding, MjxDataView, MjxMode
 from sim2real.composer.physics.mjx.warp import warp_fields
 from sim2real.composer.physics.named import Named
 from sim2real.errors import UsageError
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -34,7 +35,7 @@ _WARP_SWITCHES: dict[str, str] = dict.fromkeys(_FLUID, "_impl.has_fluid")
 """The same on Warp."""
 
 
-Carried = tuple[mjx.Data, dict[str, jax.Array], dict[str, Any], jax.Array, dict[str, jax.Array]]
+Carried = tuple[mjx.Data, dict[str, jax.Array], dict[str, PyTree], jax.Array, dict[str, jax.Array]]
 """All that changes: the state, fields of the model, variables of tasks, a key, what variations keep."""
 
 
@@ -61,13 +62,13 @@ class MjxPhysics(Traced):
         host: MjModel,
         model: mjx.Model,
         data: mjx.Data | None,
-        variables: dict[str, Any],
+        variables: dict[str, PyTree],
         legacy: bool = True,
         engine: ModuleType | stepping.Lawful | WarpEngine = stepping,
     ) -> None:
         self._engine = engine
         self.host, self.mjx_model = host, model
-        self.mjx_data: Any = data
+        self.mjx_data: PyTree = data
         self.variables, self.start = variables, data
         self.legacy_step = legacy
         self.changed: set[str] = set()
@@ -79,7 +80,7 @@ class MjxPhysics(Traced):
         self.data, self.model = MjxDataView(self), MjxModelView(self)
         self.named = Named(host, self.model, self.data)
 
-    def read(self, field: layout.Field) -> Any:
+    def read(self, field: layout.Field) -> PyTree:
         """Return a whole field; computes everything anew first when an earlier write makes it out of date."""
         if not field.triggers:
             self._settle()
@@ -187,7 +188,7 @@ class MjxPhysics(Traced):
         """Return a field of this copy's model, such as ``dof_damping`` or ``opt.gravity``."""
         return _get(self.mjx_model, name)
 
-    def initial(self, elements: Elements, name: str) -> Any:
+    def initial(self, elements: Elements, name: str) -> PyTree:
         """Return an attribute of elements as it was compiled."""
         field, index = self.bind(elements).locate(name)
         holder = self._compiled if field.struct == "model" else self.mjx_data
@@ -272,7 +273,7 @@ class MjxPhysics(Traced):
         """
         start, model, outer, dirty = self.tree(random_state), self.mjx_model, self.failed, self.is_dirty
 
-        def once(carry: Any) -> Any:
+        def once(carry: PyTree) -> PyTree:
             _, tree, count = carry
             self.mjx_model, self.is_dirty = model, dirty
             self.load((*start[:3], tree[3], start[4]), random_state)
@@ -288,7 +289,7 @@ class MjxPhysics(Traced):
         return carry[0]
 
 
-def _get(holder: Any, path: str) -> Any:
+def _get(holder: PyTree, path: str) -> PyTree:
     """Return a field of a model or a state by its path, None when there is none."""
     for step in path.split("."):
         holder = getattr(holder, step, None)

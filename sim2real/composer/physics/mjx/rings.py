@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -15,16 +15,17 @@ from sim2real.composer.physics.mjx.random import JaxRandomState
 from sim2real.composer.variation import deterministic, distributions
 from sim2real.composer.variation.base import Variation
 from sim2real.errors import UsageError
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from sim2real.composer.types import Steps
 
-Call = Callable[..., Any]
+Call = Callable[..., PyTree]
 Samples: TypeAlias = dict[str, jax.Array]
 """The samples of an observable that may still be read, when they arrive, and when the next one is taken."""
 
 
-def _call(label: str, function: Call, *args: Any) -> Any:
+def _call(label: str, function: Call, *args: PyTree) -> PyTree:
     del label
     return function(*args)
 
@@ -183,7 +184,7 @@ def _bounds(value: object) -> tuple[int, int] | None:
     if isinstance(value, deterministic.Constant):
         return int(value.value), int(value.value)
     if isinstance(value, deterministic.Sequence):
-        values: Any = value.values
+        values: PyTree = value.values
         return int(min(values)), int(max(values))
     if isinstance(value, distributions.UniformInteger) and not any(map(callable, value.parameters)):
         low, high = value.parameters

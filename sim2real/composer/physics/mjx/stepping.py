@@ -7,18 +7,21 @@ several places, for a batch or for a derivative: on an H100 the training of an a
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
+
+if TYPE_CHECKING:
+    from sim2real.types import PyTree
 
 T = TypeVar("T", mjx.Model, mjx.Data)
 Law = Callable[[mjx.Model, mjx.Data], mjx.Model]
 """Model and state -> the model with what follows from the state, such as friction that wears off with speed."""
 
 
-def with_fields(tree: T, values: dict[str, Any]) -> T:
+def with_fields(tree: T, values: dict[str, PyTree]) -> T:
     """Return a model or a state with other values of some fields, by their paths, such as ``opt.gravity``."""
     return cast("T", tree.tree_replace(values))
 
@@ -91,7 +94,7 @@ def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
     data = mjx.fwd_velocity(model, data)
     if model.opt.disableflags & mjx.DisableBit.ACTUATION:
-        impl: Any = data._impl
+        impl: PyTree = data._impl
         data = with_fields(data, {"_impl.actuator_velocity": jnp.zeros_like(impl.actuator_velocity)})
     return mjx.sensor_vel(model, data).replace(qpos=qpos)
 
@@ -100,6 +103,6 @@ def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _react(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute forces and accelerations from what follows from positions and velocities."""
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
-    impl: Any = data._impl
+    impl: PyTree = data._impl
     data = data.replace(qacc=data.qacc_smooth) if impl.efc_J.size == 0 else mjx.solve(model, data)
     return mjx.sensor_acc(model, data)

@@ -9,7 +9,7 @@ import functools
 import random
 import traceback
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.errors
@@ -19,6 +19,9 @@ from jax.core import Tracer
 from sim2real.composer.define import cached_property
 from sim2real.composer.hooks import Hooks
 from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.types import PyTree
 
 T = TypeVar("T")
 
@@ -104,7 +107,7 @@ class TracedHooks(Hooks):
 
     watched: tuple[object, ...] = ()
 
-    def call(self, label: str, function: Callable[..., T], *args: Any) -> T:
+    def call(self, label: str, function: Callable[..., T], *args: PyTree) -> T:
         """Return what a function returns.
 
         Raises:
@@ -211,12 +214,12 @@ def _drawn() -> object:
     return _numbers(np.random.get_state()), random.getstate()
 
 
-def _numbers(state: Any) -> tuple[bytes, int, list[Any]]:
+def _numbers(state: PyTree) -> tuple[bytes, int, list[PyTree]]:
     _, keys, position, *rest = state
     return keys.tobytes(), position, rest
 
 
-def check_variables(before: dict[str, Any], after: dict[str, Any]) -> None:
+def check_variables(before: dict[str, PyTree], after: dict[str, PyTree]) -> None:
     """Check that a step leaves the variables of a task as large as it found them; UsageError with the variable."""
     for name, value in before.items():
         old, new = (
