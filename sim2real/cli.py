@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from sim2real.commands import exit_code
 from sim2real.commands.command_kinds import DEMO_PIPELINE, EXIT_CODES
 from sim2real.commands.table import COMMANDS
-from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
+from sim2real.errors import ERROR, OK, Sim2RealError, UsageError, did_you_mean
 from sim2real.runtime import compilation_cache
 from sim2real.stages.terminal.interruption import SignalHandling
 
@@ -88,8 +88,11 @@ def _dispatch(arguments: list[str]) -> None:
         COMMANDS[command](command, rest)
     else:
         kind = "flag" if command.startswith("-") else "command"
-        available = ", ".join([*COMMANDS, "--help", "--version"] if kind == "flag" else COMMANDS)
-        raise UsageError(f"unknown {kind} {command!r}. Available: {available}", hint="see `sim2real --help`")
+        available = [*COMMANDS, "--help", "--version"] if kind == "flag" else list(COMMANDS)
+        raise UsageError(
+            f"unknown {kind} {command!r}. Available: {', '.join(available)}",
+            hint=did_you_mean(command, available, "see `sim2real --help`"),
+        )
 
 
 if __name__ == "__main__":

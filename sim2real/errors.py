@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 OK = 0
 ERROR = 1
 USAGE = 2
@@ -58,3 +61,9 @@ class DeadlineExceeded(Sim2RealError):  # noqa: N818
     """A node missed more deadlines than --strict-timing allows (exit code 5)."""
 
     exit_code = DEADLINE
+
+
+def did_you_mean(word: str, names: Iterable[str], otherwise: str) -> str:
+    """Return a hint that names the closest of some names, or another hint if none is close."""
+    close = difflib.get_close_matches(word, list(names), n=1)
+    return f"did you mean {close[0]}?" if close else otherwise

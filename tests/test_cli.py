@@ -3,6 +3,7 @@
 import ast
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -118,6 +119,8 @@ def test_every_command_has_help(capsys, command):
         (["log", "mend"], "Available: recover"),
         (["log", "recover"], "log recover FILE"),
         (["info", "pendulm"], "did you mean pendulum?"),
+        (["identfy", "pendulum"], "did you mean identify?"),
+        (["identify", "pendulm"], "did you mean pendulum?"),
         (["info", "no_such"], "Pipelines: "),
         (["report", "no_such"], "Pipelines: "),
     ],
@@ -236,10 +239,14 @@ def test_view_and_report_find_the_newest_run(monkeypatch, calls, capsys, tmp_pat
 def test_info_of_installation_pipeline_and_run(calls, capsys, tmp_path):
     assert cli.main(["info"]) == 0
     assert "pendulum" in capsys.readouterr().out
-    assert cli.main(["info", "pendulum"]) == 0
+    assert cli.main(["info", "pendulum", "--verbose"]) == 0
     assert "--gate.limit" in capsys.readouterr().out
     cli.main(["record", "pendulum"])
     capsys.readouterr()
+    assert cli.main(["info", "pendulum"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 10
+    assert any(re.fullmatch(r"its stages +record finished, identify not finished, .*", line) for line in lines)
     (folder,) = (tmp_path / "runs" / "pendulum").iterdir()
     assert cli.main(["info", str(folder)]) == 0
     out = capsys.readouterr().out

@@ -112,6 +112,14 @@ class TargetFlags:
 
 
 @dataclass(frozen=True)
+class InfoFlags(TargetFlags):
+    """Flags of info."""
+
+    verbose: bool = False
+    """Print the default of every flag of a pipeline's stages."""
+
+
+@dataclass(frozen=True)
 class ViewFlags(TargetFlags):
     """Flags of view."""
 

@@ -44,17 +44,26 @@ def _programs() -> str:
     return f"{shown(folder)}, {compilation_cache.size_bytes(folder) / 1e6:.0f} MB"
 
 
-def pipeline(name: str, root: Path) -> str:
-    """Return a pipeline's defaults and how many runs it has."""
-    found = load_pipeline(name)
+def pipeline(name: str, root: Path, verbose: bool) -> str:
+    """Return a pipeline's files, runs and next command, at most ten lines; ``verbose`` adds the default of each flag."""
+    definition = load_pipeline(name)
+    runs = run_folders(root, name)
     head = {
-        "pipeline": found.name,
-        "summary": found.summary,
-        "runs": f"{len(run_folders(root, name))} in {shown(root)}",
+        "pipeline": definition.name,
+        "summary": definition.summary,
+        "folder": shown(definition.folder),
+        "runs": f"{len(runs)} in {shown(root)}",
     }
+    if runs:
+        stages = {stage: "out of date" if s.stale else "finished" for stage, s in standing(runs[-1]).items()}
+        states = [f"{stage} {stages.get(stage, 'not finished')}" for stage in STAGES]
+        head |= {"newest run": runs[-1].name, "its stages": ", ".join(states)}
+    head["all four stages"] = f"sim2real run {name}"
+    if not verbose:
+        return pairs(head | {"defaults of flags": f"sim2real info {name} --verbose"})
     blocks = [pairs(head)]
     for stage in STAGES:
-        config = getattr(found, stage)
+        config = getattr(definition, stage)
         rows = [[flag, _value(config, flag)] for flag in flag_names(config)]
         blocks.append(table(rows, [stage, "default"]))
     return "\n\n".join(blocks)

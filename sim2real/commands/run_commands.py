@@ -100,13 +100,13 @@ def info(command: str, arguments: list[str]) -> None:
     target, rest = (arguments[0], arguments[1:]) if has_target else (None, arguments)
     description = "About the installation; or about a pipeline, an MCAP log, a run folder."
     examples = epilog("sim2real info", f"sim2real info {DEMO_PIPELINE}", f"sim2real info runs/{DEMO_PIPELINE}/TIME")
-    parsed = flags.parse(flags.TargetFlags(), rest, f"sim2real {command} [PIPELINE|LOG|RUN]", description, examples)
+    parsed = flags.parse(flags.InfoFlags(), rest, f"sim2real {command} [PIPELINE|LOG|RUN]", description, examples)
     if target is None:
         print(texts.installation())
     elif Path(target).is_file():
         print(texts.log(Path(target)))
     elif target in available():
-        print(texts.pipeline(target, parsed.runs))
+        print(texts.pipeline(target, parsed.runs, parsed.verbose))
     else:
         print(texts.run(find_run.find_run(parsed.runs, target)))
 

@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, overload
 from weakref import WeakKeyDictionary
 
-from sim2real.errors import UsageError
+from sim2real.errors import UsageError, did_you_mean
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.latency.config import LatencyConfig
@@ -174,8 +174,12 @@ def load_pipeline(name: str) -> Pipeline:
     if name not in found:
         raise UsageError(
             f"unknown pipeline {name!r}. Available: {', '.join(sorted(found)) or 'none'}",
-            hint="run where ./pipelines/NAME/__init__.py exists, or install a package with the entry point "
-            f"group '{ENTRY_POINT_GROUP}'",
+            hint=did_you_mean(
+                name,
+                found,
+                "run where ./pipelines/NAME/__init__.py exists, or install a package with the entry point "
+                f"group '{ENTRY_POINT_GROUP}'",
+            ),
         )
     source = found[name]
     pipeline = getattr(_import_folder(source), "PIPELINE", None) if isinstance(source, Path) else source.load()
