@@ -45,7 +45,7 @@ def _programs() -> str:
 
 
 def pipeline(name: str, root: Path, verbose: bool) -> str:
-    """Return a pipeline's files, runs and next command, at most ten lines; ``verbose`` adds the default of each flag."""
+    """Return a pipeline's files, runs and next command, in ten lines; ``verbose`` adds the default of each flag."""
     definition = load_pipeline(name)
     runs = run_folders(root, name)
     head = {
