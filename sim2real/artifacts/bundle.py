@@ -1,27 +1,27 @@
-"""What train leaves: the policy bundle, and how training went."""
+"""The artifact of train: the policy bundle, and the history of the training."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sim2real.artifacts.episodes import EPISODES, Episodes
-from sim2real.artifacts.files import check, made, malformed, read_json, write_json
+from sim2real.artifacts.files import check, make_folder, malformed, read_json, write_json
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
-from sim2real.artifacts.summary import Rows, Summed
+from sim2real.artifacts.summary import Summed, Table
 from sim2real.policy.bundle import PolicyReference, load_bundle, make_runner, read_contract, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.network import NetworkSpec
 from sim2real.policy.runner import PolicyRunner
+from sim2real.types import Json
 
 BUNDLE, HISTORY = "bundle", "history.json"
 REWARD = "reward/"
-"""What curves of a named term of the reward begin with."""
+"""Prefix of the curve of a reward term."""
 _AGAIN = "run `sim2real train` again"
 
 
@@ -34,11 +34,10 @@ class History:
         seconds: Shape ``(K,)``: time since training began [s].
         returns: Shape ``(K, seeds)``: sum of rewards of an episode.
         success: Shape ``(K, seeds)``: share of success.
-        best_seed: The one whose policy was kept.
-        compile_s: Time to compile [s].
+        best_seed: The seed of the policy in the bundle.
         train_s: Time to train and evaluate [s].
         env_steps_per_s: Steps of all seeds per second.
-        settings: What was tried, for each curve, in words; empty: all have the same settings.
+        settings: Settings of each curve in words; empty if all curves have the same settings.
         others: Further curves ``(K, seeds)`` by name.
     """
 
@@ -54,7 +53,7 @@ class History:
     others: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that the curves fit together: they may come from a file."""
+        """Check the sizes of the curves, which can come from a file."""
         count = len(self.steps)
         check(count > 0, "no evaluation")
         check(self.seconds.shape == (count,), f"{self.seconds.shape} times of {count} evaluations")
@@ -67,8 +66,18 @@ class History:
 
     @property
     def terms(self) -> dict[str, np.ndarray]:
-        """Term of the reward -> what it added to the return ``(K, seeds)``; empty where terms have no names."""
+        """Reward term -> its part of the return ``(K, seeds)``; empty if terms have no names."""
         return {n.removeprefix(REWARD): curve for n, curve in self.others.items() if n.startswith(REWARD)}
+
+    def rows(self) -> Table:
+        """Return the last evaluation: a row for each seed, with its settings and the parts of its return."""
+        settings = ("settings",) if self.settings else ()
+        curves = zip(*(c[-1].tolist() for c in (self.returns, *self.terms.values())), strict=True)
+        rows = [
+            [str(seed), *self.settings[seed : seed + 1], *values, f"{self.success[-1, seed]:.1%}"]
+            for seed, values in enumerate(curves)
+        ]
+        return Table(("seed", *settings, "return", *(f"of it {name}" for name in self.terms), "success"), rows)
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
@@ -76,10 +85,10 @@ class History:
 
     @staticmethod
     def load(path: Path) -> History:
-        """Read what ``save`` wrote, or the one in the folder of a train stage.
+        """Read the file, or the one in the folder of a train stage.
 
         Raises:
-            Sim2RealError: When it is missing or not as it should be.
+            Sim2RealError: When the file is missing or malformed.
         """
         file = path / HISTORY if path.is_dir() else path
         with malformed(file, _AGAIN):
@@ -88,20 +97,19 @@ class History:
 
 @dataclass(frozen=True, repr=False)
 class Bundle(Summed):
-    """A policy and what it expects and promises.
+    """A policy and its contract.
 
     Attributes:
-        contract: What it sees, what it sends, at which rate, and what it was trained from.
+        contract: Observation, action, rate, and the sources of the training.
         weights: Name -> array, as ``Policy.from_weights`` takes them.
-        history: How training went; None where only the policy was copied.
-        episodes: What its episodes were drawn from; None where only the policy was copied.
-        sensitivity: How the policy does where a parameter is wrong; None where that was not simulated.
-        path: Its folder; None before it was saved.
-        spec: What the policy's network is.
-        graph: The policy as an ONNX model, of a network that is not one of ours; not read again by ``load``.
-        references: What JAX does on observations of the log and of training, with which the runner is compared when the
-            bundle is saved.
-        summary: How training went, in text and numbers; empty for one that was loaded.
+        history: History of the training; None if only the policy was copied.
+        episodes: Distributions of the training's episodes; None if only the policy was copied.
+        path: The bundle's folder; None before ``save``.
+        sensitivity: Success with one wrong parameter; None if it was not simulated.
+        spec: Layout of the network.
+        graph: The policy as an ONNX model if the network is a custom one; ``load`` does not read it.
+        references: Observations of log and training with JAX's actions, with which ``save`` compares the runner.
+        summary: Text and numbers about the training; empty for a loaded bundle.
     """
 
     contract: PolicyContract
@@ -113,21 +121,21 @@ class Bundle(Summed):
     spec: NetworkSpec = field(default_factory=NetworkSpec)
     graph: bytes | None = None
     references: Mapping[str, PolicyReference] = field(default_factory=dict)
-    summary: Mapping[str, Any] = field(default_factory=dict)  # pyright: ignore[reportIncompatibleMethodOverride]
+    summary: Mapping[str, Json] = field(default_factory=dict)  # pyright: ignore[reportIncompatibleMethodOverride]
 
-    def about(self) -> Mapping[str, Any]:
-        """Return what to say about it: name -> value."""
-        found: dict[str, Any] = {"rate": f"{self.contract.rate_hz:g} Hz"}
+    def about(self) -> Mapping[str, Json]:
+        """Return rate, success in simulation and folder, by name."""
+        facts: dict[str, Json] = {"rate": f"{self.contract.rate_hz:g} Hz"}
         if self.history is not None:
-            found["success in simulation"] = float(self.history.success.max())
-        return found if self.path is None else {**found, "folder": shown(self.path)}
+            facts["success in simulation"] = float(self.history.success.max())
+        return facts if self.path is None else {**facts, "folder": shown(self.path)}
 
-    def rows(self) -> Rows | None:
-        """Return what there is to say about its training."""
-        return (("training", ""), list(self.summary.items())) if self.summary else None
+    def rows(self) -> Table | None:
+        """Return the training's summary; None for a loaded bundle."""
+        return Table(("training", ""), list(self.summary.items())) if self.summary else None
 
     def runner(self, backend: str | None = None) -> PolicyRunner:
-        """Return what runs the policy, in numpy or, with ``"onnx"``, in onnxruntime.
+        """Return the policy's runner, in numpy or, with ``"onnx"``, in onnxruntime.
 
         Raises:
             UsageError: The backend is unknown, not installed or does not run this network.
@@ -143,7 +151,7 @@ class Bundle(Summed):
         Returns:
             Output -> name of the file or folder in it.
         """
-        folder = made(folder)
+        folder = make_folder(folder)
         save_bundle(
             folder / BUNDLE, self.weights, self.contract, spec=self.spec, graph=self.graph, references=self.references
         )
@@ -166,14 +174,14 @@ class Bundle(Summed):
             path: Its folder, or that of a train stage.
 
         Raises:
-            Sim2RealError: When a file is missing, damaged or of a format that this version does not know.
+            Sim2RealError: When a file is missing, damaged or of an unknown format.
         """
         path = Path(path)
         folder = path / BUNDLE if (path / BUNDLE).is_dir() else path
         contract, spec = read_contract(folder)
-        beside = folder.with_name(HISTORY)
-        history = History.load(beside) if beside.is_file() else None
+        history_file = folder.with_name(HISTORY)
+        history = History.load(history_file) if history_file.is_file() else None
         episodes = Episodes.load(folder.parent) if folder.with_name(EPISODES).is_file() else None
-        other = folder.with_name(SENSITIVITY)
-        weak = Sensitivity.load(other) if other.is_file() else None
-        return Bundle(contract, read_weights(folder), history, episodes, folder, weak, spec)
+        sensitivity_file = folder.with_name(SENSITIVITY)
+        sensitivity = Sensitivity.load(sensitivity_file) if sensitivity_file.is_file() else None
+        return Bundle(contract, read_weights(folder), history, episodes, folder, sensitivity, spec)

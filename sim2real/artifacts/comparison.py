@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Estimate, Identification
-from sim2real.artifacts.summary import Rows, Shown
+from sim2real.artifacts.summary import Shown, Table
+from sim2real.types import Json
 
 LEVEL = 0.01
 """Chance that a comparison of runs of one unchanged robot names any parameter as different."""
@@ -69,24 +69,25 @@ class Comparison(Shown):
         """Names of the parameters that differ beyond chance."""
         return tuple(p.name for p in self.parameters if p.differs)
 
-    def about(self) -> Mapping[str, Any]:
+    def about(self) -> Mapping[str, Json]:
         """Return name -> value for a short representation."""
         return {"runs": len(self.runs), "differ": ", ".join(self.different) or "no parameter"}
 
-    def rows(self) -> Rows:
+    def rows(self) -> Table:
         """Return the table of parameters: estimate and half-width of the 95 % interval of each run."""
         headers = ("parameter", "unit", *(run.name for run in self.runs), "differs beyond chance")
-        return headers, [
+        rows = [
             [p.name, p.unit, *map(with_interval, p.estimates), "not tested" if p.p_value is None else _verdict(p)]
             for p in self.parameters
         ]
+        return Table(headers, rows)
 
-    def figures(self) -> Rows:
+    def figures(self) -> Table:
         """Return the table of verdicts, errors and scores: one row a figure, one column a run."""
         columns = [_figures_of(run) for run in self.runs]
         names = dict.fromkeys(name for column in columns for name in column)
         headers = ("figure", *(run.name for run in self.runs))
-        return headers, [[name, *(column.get(name) for column in columns)] for name in names]
+        return Table(headers, [[name, *(column.get(name) for column in columns)] for name in names])
 
 
 def with_interval(estimate: Estimate | None) -> str:
@@ -129,12 +130,12 @@ def _verdict(parameter: ComparedParameter) -> str:
     return f"{'yes' if parameter.differs else 'no'}, p = {parameter.p_value:.2g}"
 
 
-def _figures_of(run: ComparedRun) -> dict[str, Any]:
+def _figures_of(run: ComparedRun) -> dict[str, Json]:
     """Return name -> value of one run's verdicts, held-out errors and scores on the robot."""
-    figures: dict[str, Any] = {"started": run.started}
-    if (found := run.identification) is not None:
-        figures["identification"] = found.verdict.status
-        for row in found.held_out:
+    figures: dict[str, Json] = {"started": run.started}
+    if (identification := run.identification) is not None:
+        figures["identification"] = identification.verdict.status
+        for row in identification.held_out:
             figures[f"error {row.horizon_s:g} s ahead, {row.name} [{row.unit}]"] = row.rmse.get("identified")
     if (deployment := run.deployment) is not None:
         if deployment.advice is not None:

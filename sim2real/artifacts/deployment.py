@@ -1,37 +1,38 @@
-"""What deploy leaves: the policy on the robot, beside the same policy in simulation."""
+"""The artifact of deploy: episodes of a policy on the robot, and of the same policy in simulation."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from sim2real.artifacts.estimation.drift import Drift
-from sim2real.artifacts.files import check, made, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import TRUTH, Recording
-from sim2real.artifacts.summary import Rows, Summed
+from sim2real.artifacts.summary import Summed, Table, words_and_unit
 from sim2real.errors import Sim2RealError
+from sim2real.log.schema import unit_of
+from sim2real.types import Json
 
 FORMAT = 2
 RESULT, SIMULATION = "result.json", "simulation.npz"
 PROBE = "probe.mcap"
-"""Log of the small steps by which the delay was measured."""
+"""Log of the small steps that measure the delay before the episodes."""
 _AGAIN = "run `sim2real deploy` again"
 _RUN = "{run}"
-"""Stands in the file for the run's folder, which may move, in the command to type next."""
+"""Placeholder for the run's folder in the next command, as the folder may move."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How well one episode went: name -> value, None where there is none, such as for a goal never reached.
+    """Scores of one episode: name -> value; the value is None if it does not exist, such as the time to a missed goal.
 
     Attributes:
-        real: On the robot.
-        simulation: Of the same policy in simulation; None where nothing was simulated.
+        simulation: Scores of the same policy in simulation; None without a simulation.
     """
 
     real: Mapping[str, float | None]
@@ -51,17 +52,16 @@ class Gap:
 
 @dataclass(frozen=True)
 class Replay:
-    """How far the recorded commands, played to models, are off the measurements of one position.
+    """Prediction errors of models that receive the recorded commands, for one measured position.
 
     Attributes:
-        name: What people call the position.
-        unit: Its unit.
-        horizon_s: How far ahead is predicted [s].
-        rmse: Model -> root mean square error; None where it diverged. ``as in this log`` has parameters fitted to it.
-        promised: That of the identified model on held-out recordings, more where this log moves more; None where that
-            is not known.
+        name: The position's name in tables.
+        horizon_s: Time between the last fitted sample and the prediction [s].
+        rmse: Model -> root mean square error; None if the model diverged. ``as in this log`` is fitted to this log.
+        promised: Error of the identified model on held-out recordings, scaled up if this log moves more; None if
+            unknown.
         column: The position's name among the columns.
-        free_run: Mean error of the identified model in free runs over held-out recordings; None where there was none.
+        free_run: Mean error of the identified model in free runs over held-out recordings; None without free runs.
     """
 
     name: str
@@ -75,14 +75,12 @@ class Replay:
 
 @dataclass(frozen=True)
 class Course:
-    """One measured column over a whole episode, beside all simulations of the same policy.
+    """One measured column over a whole episode, compared with all simulations of the same policy.
 
     Attributes:
-        episode: Number of the episode.
-        column: Name of the column.
-        beside: For a tenth of the episode it is at least this far outside of what the simulations cover up to 0.1 s
-            before and after; angles on the circle.
-        moved: Its range in the first and in the second half.
+        beside: The 0.9 quantile of the distance between the column and the band of all simulations within 0.1 s;
+            angles on the circle.
+        moved: Range of the column in the first and in the second half of the episode.
         least: Smallest range of any simulation in each half.
         most: Largest range of any simulation in each half.
     """
@@ -97,12 +95,11 @@ class Course:
 
 @dataclass(frozen=True)
 class Advice:
-    """What to do after a deployment.
+    """The verdict on a deployment, and the next command.
 
     Attributes:
-        status: The verdict.
-        reasons: Why, in sentences.
-        next: The command to type; "" where there is none.
+        reasons: Sentences.
+        next: The command to type; "" if none is needed.
         joint: The joint to look at; "" for none.
     """
 
@@ -114,23 +111,22 @@ class Advice:
 
 @dataclass(frozen=True, repr=False)
 class Deployment(Summed):
-    """Episodes on the robot beside the same policy in simulation.
+    """Episodes on the robot, and the same policy in simulation.
 
     Attributes:
-        episodes: How well each went.
-        gap: What differs.
+        gap: Quantities on the robot and in simulation.
         units: Field -> unit.
-        simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; times of its own as
-            ``t_FIELD``. Empty where nothing was simulated.
-        recordings: The robot's sessions.
-        probe: The small steps by which the delay was measured; None where it was not.
-        trained: Times on the robot beside those that the policy was trained with.
-        replay: The recorded commands, played to the identified and to the nominal model.
-        courses: Measured columns over whole episodes, beside the simulations.
-        drift: Which parameters are no longer what was identified; None where that was not tested.
-        advice: What to do next; None in older files and after a dry run.
-        dry_run: Whether nothing was moved: then there are no scores, no simulation and no gap.
-        summary: How the session of each episode went; empty for one that was loaded.
+        simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; a field with its own
+            times has them as ``t_FIELD``. Empty without a simulation.
+        recordings: The logs of the episodes.
+        probe: Log of the small steps that measure the delay; None if the delay was not measured.
+        trained: Times on the robot, and the times that the policy was trained with.
+        replay: Prediction errors of the identified and of the nominal model on the recorded commands.
+        courses: Measured columns over whole episodes, compared with the simulations.
+        drift: Test for parameters that have changed since the identification; None if it did not run.
+        advice: The verdict; None in older files and after a dry run.
+        dry_run: Whether commands were not sent: then there are no scores, no simulation and no gap.
+        summary: Summary of each episode's session; empty for a loaded artifact.
         format: Version of the file.
     """
 
@@ -147,32 +143,42 @@ class Deployment(Summed):
     advice: Advice | None = None
     dry_run: bool = False
     format: int = FORMAT
-    summary: tuple[Mapping[str, Any], ...] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
+    summary: tuple[Mapping[str, Json], ...] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def __post_init__(self) -> None:
-        """Check that there is an episode: it may come from a file."""
+        """Check that a file holds at least one episode."""
         check(bool(self.episodes), "no episode")
 
-    def about(self) -> Mapping[str, Any]:
-        """Return what to say about it: name -> value."""
+    def about(self) -> Mapping[str, Json]:
+        """Return episodes, verdict, reasons and the next command, by name."""
         advice = self.advice
-        found: dict[str, Any] = {"episodes": len(self.episodes), "dry run": self.dry_run or ""}
+        facts: dict[str, Json] = {"episodes": len(self.episodes), "dry run": self.dry_run or ""}
         if advice is not None:
-            found |= {"verdict": advice.status, "why": "; ".join(advice.reasons), "next": advice.next}
-        return {name: value for name, value in found.items() if value}
+            facts |= {"verdict": advice.status, "why": "; ".join(advice.reasons), "next": advice.next}
+        return {name: value for name, value in facts.items() if value}
 
-    def rows(self) -> Rows:
-        """Return a row for each quantity."""
-        headers = ("quantity", "robot", "simulation", "gap", "unit")
-        return headers, [[g.quantity, g.real, g.simulation, g.gap, g.unit] for g in self.gap]
+    def rows(self) -> Table:
+        """Return the gap: a row for each quantity."""
+        return _gap_table(("quantity", "robot", "simulation", "gap", "unit"), self.gap, self.units)
+
+    def times_table(self) -> Table:
+        """Return the times on the robot and in training: a row for each."""
+        return _gap_table(("times", "robot", "in training", "gap", "unit"), self.trained, {})
+
+    def replay_table(self) -> Table:
+        """Return the prediction errors of each model on the recorded commands: a row for each position."""
+        models = list(self.replay[0].rmse) if self.replay else []
+        horizon = f"commands played again, {self.replay[0].horizon_s:g} s" if self.replay else ""
+        rows = [[r.name, *(r.rmse.get(m) for m in models), r.promised, r.unit] for r in self.replay]
+        return Table((horizon, *models, "promised", "unit"), rows)
 
     def save(self, folder: Path | str) -> dict[str, str]:
-        """Write scores and simulation into a folder; the sessions' logs stand in it already.
+        """Write scores and simulation into a folder; the logs are in it already.
 
         Returns:
             Output -> name of the file in the folder.
         """
-        folder, advice = made(folder), self.advice
+        folder, advice = make_folder(folder), self.advice
         arrays = ("simulated", "recordings", "probe", "summary")
         if advice is not None:
             advice = replace(advice, next=advice.next.replace(shown(folder.parent), _RUN))
@@ -180,51 +186,64 @@ class Deployment(Summed):
         write_json(folder / RESULT, values | {"advice": advice})
         if self.dry_run:
             return {"result": RESULT}
-        columns = {f"{n}_{i}": v for i, own in enumerate(self.simulated) for n, v in own.items()}
+        columns = {f"{n}_{i}": v for i, episode in enumerate(self.simulated) for n, v in episode.items()}
         write_arrays(folder / SIMULATION, columns)
         return {"result": RESULT, "simulation": SIMULATION}
 
     @property
     def logs(self) -> tuple[Recording, ...]:
-        """What says how the robot is now: its sessions, and the small steps before them."""
+        """The logs of this deployment: its episodes, then the small steps before them."""
         return self.recordings if self.probe is None else (*self.recordings, self.probe)
 
     @staticmethod
     def read(folder: Path) -> Deployment:
-        """Read scores and verdict alone, without simulations and logs.
+        """Read scores and verdict, without simulations and logs.
 
         Raises:
-            Sim2RealError: When the file is missing, of another format, or not as it should be.
+            Sim2RealError: When the file is missing, malformed, or of another format.
         """
         file = folder / RESULT
         with malformed(file, _AGAIN):
-            found = read_json(file, Deployment)
-            if found.format != FORMAT:
-                raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
-        if found.advice is None:
-            return found
-        return replace(found, advice=replace(found.advice, next=found.advice.next.replace(_RUN, shown(folder.parent))))
+            deployment = read_json(file, Deployment)
+            if deployment.format != FORMAT:
+                raise Sim2RealError(f"{file} has format {deployment.format}, this version reads {FORMAT}", hint=_AGAIN)
+        if deployment.advice is None:
+            return deployment
+        return replace(
+            deployment,
+            advice=replace(deployment.advice, next=deployment.advice.next.replace(_RUN, shown(folder.parent))),
+        )
 
     @staticmethod
     def load(folder: Path | str) -> Deployment:
         """Read what ``save`` wrote, and the logs beside it.
 
         Raises:
-            Sim2RealError: When something is missing, of another format, or not as it should be.
+            Sim2RealError: When a file is missing, malformed, or of another format.
         """
         folder = Path(folder)
-        found = Deployment.read(folder)
+        deployment = Deployment.read(folder)
         arrays: dict[str, np.ndarray] = {}
-        if not found.dry_run:
+        if not deployment.dry_run:
             with malformed(folder / SIMULATION, _AGAIN):
                 arrays = read_arrays(folder / SIMULATION)
-        numbers = range(len(found.episodes))
+        numbers = range(len(deployment.episodes))
         # An embedded robot that runs on from one episode to the next writes a single file of true states.
         truths = [p if (p := folder / f"truth_{i}.bin").is_file() else folder / TRUTH for i in numbers]
         recordings = tuple(Recording.load(log_of(folder, i), truths[i]) for i in numbers)
         probe = Recording.load(folder / PROBE) if (folder / PROBE).is_file() else None
         simulated = tuple(_of_episode(arrays, i) for i in numbers)
-        return replace(found, simulated=simulated, recordings=recordings, probe=probe)
+        return replace(deployment, simulated=simulated, recordings=recordings, probe=probe)
+
+
+def _gap_table(headers: Sequence[str], gaps: Sequence[Gap], units: Mapping[str, str]) -> Table:
+    """Return a row for each quantity; its unit is the gap's, the field's, or the end of its name."""
+    rows = []
+    for gap in gaps:
+        words, unit = words_and_unit(gap.quantity)
+        unit = gap.unit or unit_of(gap.quantity, units) or unit
+        rows.append([words, gap.real, gap.simulation, gap.gap, unit])
+    return Table(headers, rows)
 
 
 def log_of(folder: Path, number: int) -> Path:
@@ -233,6 +252,6 @@ def log_of(folder: Path, number: int) -> Path:
 
 
 def _of_episode(arrays: Mapping[str, np.ndarray], number: int) -> dict[str, np.ndarray]:
-    """Return the columns of one episode's simulation: those whose names end with its number."""
+    """Return the columns of one episode's simulation, whose names end with its number."""
     suffix = f"_{number}"
     return {n.removesuffix(suffix): v for n, v in arrays.items() if n.endswith(suffix)}

@@ -1,4 +1,4 @@
-"""What the episodes of training are drawn from, beside what was recorded."""
+"""Distributions of the training's episodes, and the recorded values beside them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.summary import Interval, Table
 from sim2real.errors import Sim2RealError
 
 FORMAT = 1
@@ -23,12 +24,10 @@ class Varied:
     """A parameter that differs between episodes.
 
     Attributes:
-        name: Its name.
-        unit: Its unit.
-        value: The value that was identified, or the data sheet's.
-        low95: Lower end of the 95 % interval that was identified; None: there is none.
-        high95: Its upper end.
-        open: Whether the recordings left it open, so that it is drawn from all of its bounds.
+        value: The estimate, or the nominal value.
+        low95: Lower end of the estimate's 95 % interval; None without an interval.
+        high95: Upper end.
+        open: Whether the recordings do not determine it; it is then drawn from its bounds.
     """
 
     name: str
@@ -41,22 +40,22 @@ class Varied:
 
 @dataclass(frozen=True)
 class Episodes:
-    """What the episodes of a training are drawn from.
+    """The distributions of the episodes of a training.
 
     Attributes:
-        parameters: What differs between episodes, in the order of the table; pushes and starts too.
-        widening: Factor on the deviations of the posterior for what the model leaves unexplained.
-        noise: What the sensor's readings have on top of the motion.
-        timelines: How many timelines the episodes share.
-        cut: How many of them end before a pause that a program cannot hold.
-        again: How many were drawn again, as such a pause came in their first half.
+        parameters: Parameters that differ between episodes, with pushes and starts, in the order of the table.
+        widening: Factor on the posterior's deviations that covers errors of the model.
+        noise: Noise of the sensor's readings.
+        timelines: Number of timelines that the episodes share.
+        cut: Number of timelines that end before a pause that the program cannot hold.
+        again: Number of timelines that were drawn again, as such a pause was in their first half.
         longest_pause_s: Longest time between two policy steps [s].
-        push_hz: Pushes of each joint in a second [Hz]; 0: none.
+        push_hz: Pushes of each joint per second [Hz]; 0 for none.
         curriculum: Share of all differences between episodes at the first and at the last update.
-        draws: Parameter -> what was drawn ``(K,)``.
-        recorded_s: Node -> what its steps took on the robot ``(N,)`` [s].
-        drawn_s: Node -> what they take in the timelines ``(M,)`` [s].
-        off: Column of ``noise`` -> how far measurements lay off the identified model ``(N,)``, in its unit.
+        draws: Parameter -> drawn values ``(K,)``.
+        recorded_s: Node -> durations of its steps on the robot ``(N,)`` [s].
+        drawn_s: Node -> durations of its steps in the timelines ``(M,)`` [s].
+        off: Column of ``noise`` -> differences between measurements and the identified model ``(N,)``, in its unit.
         format: Version of the files.
     """
 
@@ -75,6 +74,20 @@ class Episodes:
     off: Mapping[str, np.ndarray] = field(default_factory=dict)
     format: int = FORMAT
 
+    def rows(self) -> Table:
+        """Return a row for each parameter: value, interval of the estimate, and interval of the draws."""
+        rows = []
+        for p in self.parameters:
+            low, high = np.quantile(self.draws[p.name], [0.025, 0.975]).tolist()
+            drawn, identified = Interval(low, high), Interval(p.low95, p.high95)
+            rows.append([p.name, p.value, identified, drawn, p.unit, "left open by the log" * p.open])
+        return Table(("parameter", "value", "95 % identified", "95 % drawn", "unit", ""), rows)
+
+    def noise_table(self) -> Table:
+        """Return a row for each reading with noise."""
+        rows = [[n.column, n.deviation, n.quantum, n.bias, n.unit] for n in self.noise]
+        return Table(("reading", "deviation", "step", "bias", "unit"), rows)
+
     def save(self, folder: Path) -> dict[str, str]:
         """Write it into a folder.
 
@@ -90,17 +103,17 @@ class Episodes:
         """Read what ``save`` wrote into a folder.
 
         Raises:
-            Sim2RealError: When it is missing, of another format, or not as it should be.
+            Sim2RealError: When a file is missing, malformed, or of another format.
         """
         with malformed(path / EPISODES, _AGAIN):
-            found = read_json(path / EPISODES, Episodes)
-            if found.format != FORMAT:
-                raise Sim2RealError(f"{path} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
+            episodes = read_json(path / EPISODES, Episodes)
+            if episodes.format != FORMAT:
+                raise Sim2RealError(f"{path} has format {episodes.format}, this version reads {FORMAT}", hint=_AGAIN)
         with malformed(path / DRAWS, _AGAIN):
             kinds: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in _ARRAYS}
             for name, values in read_arrays(path / DRAWS).items():
-                kind, _, of = name.partition("/")
+                kind, _, owner = name.partition("/")
                 check(kind in kinds and values.ndim == 1 and values.dtype.kind == "f", f"{name} is no list of numbers")
-                kinds[kind][of] = values
-            check(set(kinds["draws"]) == {p.name for p in found.parameters}, "draws of other parameters")
-        return replace(found, **kinds)
+                kinds[kind][owner] = values
+            check(set(kinds["draws"]) == {p.name for p in episodes.parameters}, "draws of other parameters")
+        return replace(episodes, **kinds)

@@ -1,4 +1,4 @@
-"""JSON and arrays as artifacts keep them: read into typed dataclasses, with errors that name the file."""
+"""JSON and array files of artifacts, read into typed dataclasses, with errors that name the file."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from sim2real.errors import Sim2RealError
 T = TypeVar("T")
 
 _FOREIGN = (ValueError, KeyError, TypeError, AttributeError, IndexError, OSError)
-"""What reading a malformed file raises."""
+"""Exceptions of reading a malformed file."""
 
 
 @contextmanager
 def malformed(path: Path, again: str) -> Iterator[None]:
-    """Turn what reading a malformed file raises into an error that names the file.
+    """Turn the exceptions of reading a malformed file into an error that names the file.
 
     Args:
-        again: How to make it anew, for the hint.
+        again: The hint of the error, such as the command that makes the file again.
     """
     try:
         yield
@@ -41,8 +41,8 @@ def malformed(path: Path, again: str) -> Iterator[None]:
         raise Sim2RealError(f"{path} is malformed: {reason}", hint=again) from error
 
 
-def made(folder: Path | str) -> Path:
-    """Return a folder's path; it is made if it is missing."""
+def make_folder(folder: Path | str) -> Path:
+    """Return a folder's path, and create the folder if it is missing."""
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     return path
@@ -55,13 +55,13 @@ def check(good: bool, reason: str) -> None:
 
 
 def read_json(path: Path, kind: type[T]) -> T:
-    """Return the document in a JSON file, checked against a dataclass; entries that it does not know are ignored.
+    """Return the document in a JSON file as a dataclass; unknown entries are ignored.
 
     Args:
-        kind: A dataclass; lists of numbers become arrays where it has arrays; null becomes NaN where a number stands.
+        kind: A dataclass. Lists of numbers become arrays in fields that are arrays; null becomes NaN in numbers.
 
     Raises:
-        ValueError: When it is no JSON, or an entry is missing or of another kind: the message says which.
+        ValueError: When the file is no JSON, or an entry is missing or of another type; the message names the entry.
     """
     try:
         document = _numbers(kind, msgspec.json.decode(path.read_bytes()))
@@ -71,13 +71,13 @@ def read_json(path: Path, kind: type[T]) -> T:
 
 
 def write_json(path: Path, document: object) -> None:
-    """Write a dataclass, or what it consists of, as JSON; a reader sees the old file or the new one, never a part.
+    """Write a document as JSON; a reader finds the old file or the new one, never a part.
 
     Args:
-        document: What to write; infinite numbers and NaN, which JSON lacks, become null.
+        document: A dataclass, or a dict of its fields; infinite numbers and NaN, which JSON lacks, become null.
 
     Raises:
-        Sim2RealError: When a text has bytes that are no text, as names of files may.
+        Sim2RealError: When a text has bytes that are no text, which names of files can have.
     """
     try:
         text = msgspec.json.format(msgspec.json.encode(document, enc_hook=_plain), indent=1)
@@ -89,7 +89,7 @@ def write_json(path: Path, document: object) -> None:
 
 
 def _numbers(kind: Any, value: Any) -> Any:
-    """Return a document with NaN for null where a type has numbers alone."""
+    """Return a document with NaN for null in entries that are numbers."""
     inner = get_args(kind)
     if kind is float:
         return math.nan if value is None else value
@@ -122,14 +122,14 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to a compressed npz file, which takes any name but those with a null character.
+    """Write arrays to a compressed npz file.
 
     Raises:
         Sim2RealError: When a name has a null character, at which a zip file cuts it off.
     """
-    if cut := [name for name in arrays if "\0" in name]:
-        raise Sim2RealError(f"{path} cannot be written: the name {cut[0]!r} has a null character")
-    # As numpy.savez_compressed does, whose arguments leave no room for an array called file.
+    if invalid := [name for name in arrays if "\0" in name]:
+        raise Sim2RealError(f"{path} cannot be written: the name {invalid[0]!r} has a null character")
+    # numpy.savez_compressed would do the same, but cannot write an array called "file".
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, values in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
@@ -147,12 +147,12 @@ def _array(kind: type, value: Any) -> Any:
 
 
 def number(value: float | None, missing: float = math.nan) -> float:
-    """Return a number of a document, with ``missing`` for null."""
+    """Return a number of a document, or ``missing`` for null."""
     return missing if value is None else value
 
 
 def _plain(value: object) -> Any:
-    """Return numpy's arrays and numbers as those of Python."""
+    """Return NumPy's arrays and numbers as lists and numbers of Python."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} has no plain JSON form: {value!r}")

@@ -1,11 +1,11 @@
-"""What identify found: ``parameters.json``, predictions and free runs beside it, and the timing of the recording."""
+"""The artifact of identify: ``parameters.json``, predictions, free runs, and the timing of the recording."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -13,45 +13,44 @@ from sim2real.artifacts.estimation.links import Link
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.estimation.quantity import Quantity
-from sim2real.artifacts.files import check, made, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.run.run_folder import Source
-from sim2real.artifacts.summary import Rows, Shown
+from sim2real.artifacts.summary import Interval, Shown, Table
 from sim2real.artifacts.timing import TIMING, Timing
 from sim2real.errors import Sim2RealError
+from sim2real.types import Json
 
 FORMAT = 3
 PARAMETERS, PREDICTIONS, FREE_RUNS = "parameters.json", "predictions.npz", "free_runs.npz"
 ROUND_TRIP = "round_trip_delay"
 """Name of the sum of all delays."""
 MODELS = ("identified", "no delay", "nominal")
-"""The models that predict: with the values found, the same fitted without delays, and with the data sheet's values."""
+"""Models that predict: with the estimates, fitted without delays, and with the nominal values."""
 _COLUMNS = ("t", "into", "segment", "recording", "held_out")
 _AGAIN = "run `sim2real identify` again"
 
 
 UNFINISHED = {"interrupted": "was interrupted", "not converged": "did not converge"}
-"""Verdict -> what happened to an identification that has no intervals."""
+"""Verdict on an identification without intervals -> the reason in words."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One identified parameter; None where a number does not apply, is infinite or not known.
+    """One identified parameter; a number is None if it does not apply, is infinite or unknown.
 
     Attributes:
-        name: Its name; ``NAME@RECORDING`` where each recording has its own.
+        name: Its name; ``NAME@RECORDING`` if each recording has a value of its own.
         unit: Unit of all numbers.
-        kind: What it is a parameter of; ``derived`` ones follow from others.
-        about: One line for tables and pages.
+        kind: Kind of the parameter; a ``derived`` one is computed from others.
+        about: Description in one line.
         nominal: The data sheet's value.
-        estimate: The value found.
-        standard_error: Its standard error.
         low95: Lower end of the 95 % interval.
-        high95: Its upper end.
+        high95: Upper end.
         lower: Lower bound of the search.
-        upper: Upper bound.
+        upper: Upper bound of the search.
         verdict: ``accepted``, ``negligible``, ``not reached``, ``fixed``, ``at a bound``, ``not identifiable`` or
             ``not converged``, or ``interrupted``.
-        truth: The embedded robot's own value.
+        truth: The value in the embedded robot.
     """
 
     name: str
@@ -86,20 +85,20 @@ class Matrix:
     matrix: np.ndarray
 
     def __post_init__(self) -> None:
-        """Check its size: it may come from a file."""
+        """Check the size, as the matrix can come from a file."""
         size = len(self.names)
         check(self.matrix.shape == (size, size), f"a matrix of {self.matrix.shape} for {size} names")
 
 
 @dataclass(frozen=True)
 class Determined:
-    """What the data determines at the estimate.
+    """Determinacy of the parameters at the estimate.
 
     Attributes:
-        condition: Condition number of the Jacobian, its columns in widths of the bounds.
-        undetermined: Groups of parameters of which at most combinations are determined.
-        messages: The same in words.
-        standard_error_per_minute: Parameter -> standard error to expect of one minute of such data.
+        condition: Condition number of the Jacobian; its columns are scaled by the widths of the bounds.
+        undetermined: Groups of parameters of which the data determines at most combinations.
+        messages: The same in sentences.
+        standard_error_per_minute: Parameter -> expected standard error after one minute of such data.
     """
 
     condition: float | None
@@ -110,7 +109,7 @@ class Determined:
 
 @dataclass(frozen=True)
 class Refinement:
-    """A local refinement: the loss before and after, and how many steps it took."""
+    """A local refinement: the loss before and after, and the number of steps."""
 
     before: float | None
     after: float | None
@@ -119,17 +118,17 @@ class Refinement:
 
 @dataclass(frozen=True)
 class Search:
-    """How the estimate was found.
+    """The search for the estimate.
 
     Attributes:
-        strategy: The search algorithm; None where the search was left out.
+        strategy: The search algorithm; None without a search.
         history: Best loss of each generation ``(G,)``.
-        evaluations: Candidates that were simulated.
-        refined: The refinements after it.
-        seconds: What all of it took [s].
-        loss: Of an interrupted search: the best loss so far.
-        done: Of an interrupted search: the shares of search and refinement that were done.
-        engine: What simulated, and why.
+        evaluations: Number of simulated candidates.
+        refined: The refinements after the search.
+        seconds: Duration of search and refinements [s].
+        loss: Best loss of an interrupted search.
+        done: Completed shares of an interrupted search and refinement.
+        engine: The simulator, and the reason for its choice.
     """
 
     strategy: str | None = None
@@ -144,7 +143,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Prediction:
-    """How far a model is off up to a horizon: field -> root mean square and mean absolute error; None without data."""
+    """Errors of a model up to a horizon: field -> root mean square and mean absolute error; None without data."""
 
     model: str
     horizon_s: float
@@ -155,15 +154,13 @@ class Prediction:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How far one position is off on held-out data, up to the longest horizon.
+    """Errors of one position on held-out data, up to the longest horizon.
 
     Attributes:
-        name: What people call it.
+        name: Its name in tables.
         column: Its name among the fields, such as ``position[1]``.
-        unit: Its unit.
-        horizon_s: The horizon [s].
-        rmse: Model -> root mean square error; None where it is infinite.
-        beaten_by: The baselines that are as good.
+        rmse: Model -> root mean square error; None if it is infinite.
+        beaten_by: Baselines with an error that is not larger.
     """
 
     name: str
@@ -174,13 +171,13 @@ class HeldOut:
     beaten_by: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that the error of the identified model is there: it may come from a file."""
-        check("identified" in self.rmse, f"no error of what was identified in {self.name!r}")
+        """Check that a file holds the error of the identified model."""
+        check("identified" in self.rmse, f"no error of the identified model in {self.name!r}")
 
 
 @dataclass(frozen=True)
 class FreeRun:
-    """How far one model is off in one field when all held-out data of a recording is simulated from one state."""
+    """Errors of one model in one field, with all held-out data of a recording simulated from one initial state."""
 
     model: str
     recording: int
@@ -193,21 +190,21 @@ class FreeRun:
 
 
 @dataclass(frozen=True)
-class Left:
-    """What was identified without one part of the recordings, and how far it is off there.
+class HeldOutPart:
+    """A fit without one part of the recordings, and its errors on that part.
 
     Attributes:
-        name: The part.
-        terms: Optional terms of the model that the rest of the data chose, or that it was given.
-        values: Parameter -> estimate without the part.
-        share: Parameter -> share of what all recordings say about it that this part says.
-        ahead: Field -> root mean square error up to the longest horizon.
-        free: Field -> root mean square error where the part is simulated in one go; empty where it was not.
+        name: Name of the held-out part.
+        terms: Optional terms of the model in this fit.
+        values: Parameter -> estimate of this fit.
+        share: Parameter -> share of the information in all recordings that the part holds.
+        ahead: Field -> root mean square error on the part up to the longest horizon.
+        free: Field -> root mean square error of a free run over the part; empty without a free run.
     """
 
     name: str
     terms: tuple[str, ...]
-    values: Mapping[str, Any]
+    values: Mapping[str, Json]
     share: Mapping[str, float]
     ahead: Mapping[str, float | None]
     free: Mapping[str, float | None] = field(default_factory=dict)
@@ -215,39 +212,33 @@ class Left:
 
 @dataclass(frozen=True, repr=False)
 class Identification(Shown):
-    """What identify found.
+    """The result of identify.
 
     Attributes:
-        pipeline: The robot.
-        logs: The recordings: those that were fitted, then those that were held out whole.
-        verdict: Whether it can be used, and why.
-        parameters: The estimates.
-        search: How they were found.
-        covariance: Of the estimates.
-        correlation: Of the estimates.
+        logs: The fitted recordings, then the recordings that are held out whole.
+        covariance: Covariance of the estimates.
+        correlation: Correlation of the estimates.
         residual_inflation: Factor on the variance of the estimates, as residuals are correlated in time.
         misfit: Root mean square of the residuals, in deviations of the measurement.
-        check: What the data determines.
         prediction: Errors over horizons.
-        held_out: Errors of each position on held-out data, the worst first.
-        free_run: Errors of the free runs.
-        aggregate: Each recording identified by itself, and all combined; empty unless that was asked for.
-        left_out: What was identified with one part left out, for each part; empty where that was not asked for.
-        terms: Optional terms of the model that were chosen, or given; None where it has none.
-        links: How delays are distributed; empty unless that was asked for.
-        noise: How measurements scatter around the model; empty in older files.
-        widening: Factor on the posterior's deviations that covers the model's own errors; None in older files.
-        segments: How many segments were simulated.
-        held_out_from_s: Where the first segment that was held out begins [s].
-        settle_s: Length of the first part of a held-out segment, to which its initial state was fitted [s].
-        sigma: Field -> deviation that a measurement was assumed to have.
+        held_out: Errors of each position on held-out data, the largest first.
+        aggregate: Quantities estimated from each recording alone; empty unless configured.
+        left_out: A fit for each held-out part; empty without folds.
+        terms: Optional terms of the model in the fit; None if the model has no optional terms.
+        links: Distributions of delays; empty unless configured.
+        noise: Noise of the sensor; empty in older files.
+        widening: Factor on the posterior's deviations that covers errors of the model; None in older files.
+        segments: Number of simulated segments.
+        held_out_from_s: Start of the first held-out segment [s].
+        settle_s: Length of the first part of a held-out segment, to which its initial state is fitted [s].
+        sigma: Field -> assumed deviation of a measurement.
         units: Field -> unit.
-        world: Name of the world that was identified in; None: the robot's own.
-        posterior: What training draws robots from; None where the search was interrupted.
+        world: Name of the simulated world; None for the robot's own.
+        posterior: Distribution from which training draws robots; None after an interrupted search.
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
             ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field.
-        free: The same of the free runs; empty without any.
-        timing: Of the first recording: what training draws its timing from; None where only the estimates were copied.
+        free: The same columns of the free runs; empty without free runs.
+        timing: Timing of the first recording, from which training draws its delays; None if only the estimates exist.
         format: Version of the file.
     """
 
@@ -265,7 +256,7 @@ class Identification(Shown):
     held_out: tuple[HeldOut, ...] = ()
     free_run: tuple[FreeRun, ...] = ()
     aggregate: tuple[Quantity, ...] = ()
-    left_out: tuple[Left, ...] = ()
+    left_out: tuple[HeldOutPart, ...] = ()
     terms: tuple[str, ...] | None = None
     links: tuple[Link, ...] = ()
     noise: tuple[Noise, ...] = ()
@@ -282,20 +273,48 @@ class Identification(Shown):
     timing: Timing | None = None
     format: int = FORMAT
 
-    def about(self) -> Mapping[str, Any]:
-        """Return what to say about it: name -> value."""
-        found = {"pipeline": self.pipeline, "verdict": self.verdict.status, "why": "; ".join(self.verdict.reasons)}
-        found |= {"next": self.verdict.next, "parameters": len(self.parameters)}
-        return {name: value for name, value in found.items() if value}
+    def about(self) -> Mapping[str, Json]:
+        """Return pipeline, verdict, reasons, the next command and the number of parameters, by name."""
+        facts = {"pipeline": self.pipeline, "verdict": self.verdict.status, "why": "; ".join(self.verdict.reasons)}
+        facts |= {"next": self.verdict.next, "parameters": len(self.parameters)}
+        return {name: value for name, value in facts.items() if value}
 
-    def rows(self) -> Rows:
+    def rows(self) -> Table:
         """Return a row for each parameter."""
-        own = [[p.name, p.estimate, p.low95, p.high95, p.unit, p.verdict] for p in self.parameters]
-        return ("parameter", "estimate", "low 95 %", "high 95 %", "unit", "verdict"), own
+        rows = [
+            [p.name, p.estimate, Interval(p.low95, p.high95), p.unit, p.nominal, p.truth, _off(p), p.verdict]
+            for p in self.parameters
+        ]
+        headers = ("parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict")
+        return Table(headers, rows)
+
+    def recordings_table(self) -> Table:
+        """Return a row for each quantity that is estimated from each recording alone."""
+        rows = [
+            [q.name, q.mean, q.standard_error, Interval(q.low95, q.high95), q.unit, q.between, q.agree]
+            for q in self.aggregate
+        ]
+        return Table(("over recordings", "mean", "s.e.", "95 % of the next", "unit", "spread", "agree"), rows)
+
+    def alternatives_table(self) -> Table:
+        """Return a row for each other model that fits the recordings as well."""
+        others = () if self.posterior is None else self.posterior.others
+        rows = [[other.about, f"{100 * other.weight:.0f} %"] for other in others]
+        return Table(("explains the recordings as well", "share of the draws"), rows)
+
+    def held_out_table(self) -> Table:
+        """Return the errors on held-out data: a row for each position, a column for each model."""
+        models = list(dict.fromkeys(model for row in self.held_out for model in row.rmse))
+        rows = [
+            [row.name, *(row.rmse.get(m) for m in models), row.unit, ", ".join(row.beaten_by) or "none"]
+            for row in self.held_out
+        ]
+        horizon = f"off {self.held_out[0].horizon_s:g} s ahead, held out" if self.held_out else ""
+        return Table((horizon, *models, "unit", "no better than"), rows)
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameter -> the value found, without derived ones."""
+        """Parameter -> estimate, without derived parameters."""
         return {p.name: p.estimate for p in self.parameters if p.kind != "derived"}
 
     @property
@@ -313,16 +332,16 @@ class Identification(Shown):
         return [m for m in MODELS if f"{name}_{m}" in self.samples]
 
     def disjoint(self) -> np.ndarray:
-        """Return a mask ``(N,)`` of samples in segments that do not overlap: of two that do, the later is left out."""
+        """Return a mask ``(N,)`` of the samples in segments that do not overlap an earlier one."""
         t_s, segment, recording = (self.samples[n] for n in ("t", "segment", "recording"))
-        chosen, end = np.zeros(len(t_s), bool), {}
+        mask, end = np.zeros(len(t_s), bool), {}
         for number in dict.fromkeys(segment.tolist()):
             rows = segment == number
-            own = int(recording[rows][0])
-            if t_s[rows][0] > end.get(own, -np.inf):
-                chosen |= rows
-                end[own] = t_s[rows][-1]
-        return chosen
+            log = int(recording[rows][0])
+            if t_s[rows][0] > end.get(log, -np.inf):
+                mask |= rows
+                end[log] = t_s[rows][-1]
+        return mask
 
     def save(self, folder: Path | str) -> dict[str, str]:
         """Write it into a folder.
@@ -330,7 +349,7 @@ class Identification(Shown):
         Returns:
             Output -> name of the file in the folder.
         """
-        folder = made(folder)
+        folder = make_folder(folder)
         written = {"parameters": PARAMETERS}
         self.write(folder / PARAMETERS)
         for name, file, columns in (("predictions", PREDICTIONS, self.samples), ("free_runs", FREE_RUNS, self.free)):
@@ -340,7 +359,7 @@ class Identification(Shown):
         return written if self.timing is None else {**written, **self.timing.save(folder)}
 
     def write(self, path: Path) -> None:
-        """Write the estimates and what is said about them, without samples and timing, as JSON."""
+        """Write estimates and verdict as JSON, without samples and timing."""
         arrays = ("samples", "free", "timing")
         write_json(path, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays})
 
@@ -349,30 +368,39 @@ class Identification(Shown):
         """Read what ``save`` wrote.
 
         Args:
-            path: The folder, or its ``parameters.json``: then it may stand alone, without predictions.
+            path: The folder, or its ``parameters.json``; a file without predictions beside it is read, too.
 
         Raises:
-            Sim2RealError: When it is missing, of another format, or not as it should be.
+            Sim2RealError: When the file is missing, malformed, or of another format.
         """
         path = Path(path)
         file = path / PARAMETERS if path.is_dir() else path
         with malformed(file, _AGAIN):
-            found = read_json(file, Identification)
-            if found.format != FORMAT:
-                raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
-            check(all(np.isfinite(p.estimate) for p in found.parameters), "an estimate is no number")
-        beside: dict[str, Any] = {}
+            identification = read_json(file, Identification)
+            if identification.format != FORMAT:
+                raise Sim2RealError(
+                    f"{file} has format {identification.format}, this version reads {FORMAT}", hint=_AGAIN
+                )
+            check(all(np.isfinite(p.estimate) for p in identification.parameters), "an estimate is no number")
+        others: dict[str, Json] = {}
         if file.with_name(TIMING).is_file():
-            beside["timing"] = Timing.load(file.with_name(TIMING))
-        for name, other in (("samples", PREDICTIONS), ("free", FREE_RUNS)):
-            if (there := file.with_name(other)).is_file():
-                with malformed(there, _AGAIN):
-                    beside[name] = _columns(read_arrays(there))
-        return replace(found, **beside)
+            others["timing"] = Timing.load(file.with_name(TIMING))
+        for name, samples_file in (("samples", PREDICTIONS), ("free", FREE_RUNS)):
+            if (samples_path := file.with_name(samples_file)).is_file():
+                with malformed(samples_path, _AGAIN):
+                    others[name] = _columns(read_arrays(samples_path))
+        return replace(identification, **others)
+
+
+def _off(p: Estimate) -> str:
+    """Return the error of an estimate as a share of the truth; in its unit if the truth is 0."""
+    if p.truth is None:
+        return ""
+    return f"{100 * (p.estimate / p.truth - 1):+.1f} %" if p.truth else f"{p.estimate:+.2g} {p.unit}"
 
 
 def _columns(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns after checking that all have one value for each of at least one sample."""
+    """Return the columns; each must have one value a sample, and at least one sample."""
     missing = set(_COLUMNS) - set(samples)
     check(not missing, f"no {', '.join(sorted(missing))}")
     wrong = [n for n, v in samples.items() if v.ndim != 1 or v.shape != samples["t"].shape]

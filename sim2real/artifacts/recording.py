@@ -1,4 +1,4 @@
-"""A recorded session: its log and, of an embedded robot, the file with its true states and latencies."""
+"""A recorded session: its log and, for an embedded robot, the file of its true states and latencies."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.summary import Summed
+from sim2real.artifacts.summary import Summed, Table
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
 from sim2real.hardware.emulation.truth import Truth, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
+from sim2real.types import Json
 
 LOG, TRUTH = "session.mcap", "truth.bin"
 
@@ -26,10 +26,8 @@ class Recording(Summed):
     """A recorded session.
 
     Attributes:
-        path: The log.
-        episode: What it holds.
-        truth_path: An embedded robot's true states and latencies; None where there are none.
-        warnings: What the log lacks: it was cut, or parts of it cannot be read.
+        truth_path: File of an embedded robot's true states and latencies; None for any other robot.
+        warnings: Sentences about missing or unreadable parts of the log.
     """
 
     path: Path
@@ -39,14 +37,14 @@ class Recording(Summed):
 
     @staticmethod
     def load(path: Path | str, truth: Path | None = None) -> Recording:
-        """Read a log; one that was cut is read up to the cut.
+        """Read a log; a log that was cut is read up to the cut.
 
         Args:
             path: The log, or the folder of a record stage.
-            truth: The embedded robot's account; default: the one beside the log, if there is one.
+            truth: File of an embedded robot's true states; default: the file beside the log, if it exists.
 
         Raises:
-            Sim2RealError: When it is no log.
+            Sim2RealError: When the file is no log.
         """
         path = Path(path)
         log = path / LOG if path.is_dir() else path
@@ -54,46 +52,50 @@ class Recording(Summed):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", TruncatedLogWarning)
             episode = read_log(log)
-        said = tuple(str(w.message) for w in caught if issubclass(w.category, TruncatedLogWarning))
-        return Recording(log, episode, truth if truth.is_file() else None, said)
+        messages = tuple(str(w.message) for w in caught if issubclass(w.category, TruncatedLogWarning))
+        return Recording(log, episode, truth if truth.is_file() else None, messages)
 
     @property
     def pipeline(self) -> str | None:
-        """Name of the pipeline that recorded it; None where the log does not say."""
+        """Name of the pipeline that recorded the log; None if the log has no name."""
         return self.episode.metadata.get("pipeline")
 
     @property
     def dry_run(self) -> bool:
-        """Whether nothing was moved: its commands were never sent."""
+        """Whether the commands were computed and not sent."""
         return self.episode.metadata.get("dry_run") is True
 
     @property
     def units(self) -> Mapping[str, str]:
-        """Field -> unit, as the log's channels say; a field with different units in different nodes is left out."""
+        """Field -> unit, from the log's channels; without fields whose unit differs between nodes."""
         pairs = {pair for fields in self.episode.units.values() for pair in fields.items()}
         fields = [field for field, _ in pairs]
-        told = {field: unit for field, unit in sorted(pairs) if fields.count(field) == 1}
-        return {**self.episode.metadata.get("units", {}), **told}  # older logs: units are the session's
+        unique = {field: unit for field, unit in sorted(pairs) if fields.count(field) == 1}
+        return {**self.episode.metadata.get("units", {}), **unique}  # older logs: units are the session's
 
     @property
-    def end(self) -> Mapping[str, Any]:
-        """What the session said at its end; empty after a crash."""
+    def end(self) -> Mapping[str, Json]:
+        """The metadata that the session wrote at its end; empty after a crash."""
         return self.episode.metadata.get("log", {}).get("session_end") or {}
 
     @property
-    def summary(self) -> Mapping[str, Any]:
-        """How the session went: timing by node, losses, the gate's counts; empty after a crash."""
+    def summary(self) -> Mapping[str, Json]:
+        """Timing by node, losses and the gate's counts of the session; empty after a crash."""
         return self.end
 
-    def about(self) -> Mapping[str, Any]:
-        """Return what to say about it: name -> value."""
+    def about(self) -> Mapping[str, Json]:
+        """Return pipeline, log, duration, steps and warnings, by name."""
         steps = ", ".join(f"{name} {len(s)}" for name, s in self.episode.steps.items())
-        found = {"pipeline": self.pipeline, "log": shown(self.path), "duration": f"{self.episode.duration_s:.1f} s"}
-        return {**found, "steps": steps, **({"warnings": "; ".join(self.warnings)} if self.warnings else {})}
+        facts = {"pipeline": self.pipeline, "log": shown(self.path), "duration": f"{self.episode.duration_s:.1f} s"}
+        return {**facts, "steps": steps, **({"warnings": "; ".join(self.warnings)} if self.warnings else {})}
+
+    def rows(self) -> Table:
+        """Return the timing of each node."""
+        return self.timing.rows()
 
     @cached_property
     def timing(self) -> Timing:
-        """How long everything took."""
+        """Durations of steps, bus transfers and transports."""
         return Timing.of(self.episode)
 
     @cached_property
@@ -108,7 +110,7 @@ class Recording(Summed):
     def true_states(self) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
         """Return times ``(N,)`` [s] since the session's start and true states ``(N,)`` by name, within the session.
 
-        None for a robot that is not embedded, and where the log does not say when it started.
+        None for a robot that is not embedded, and for a log without the start of its clock.
         """
         if self.truth is None or "monotonic_ns" not in self.end:
             return None

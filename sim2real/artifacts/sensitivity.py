@@ -1,4 +1,4 @@
-"""How well a policy does when one parameter of its model is wrong: ``sensitivity.json`` of the train stage."""
+"""Success of a policy if one parameter of its model is wrong: ``sensitivity.json`` of the train stage."""
 
 from __future__ import annotations
 
@@ -9,28 +9,27 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.files import check, malformed, read_json, write_json
+from sim2real.artifacts.summary import Table
 from sim2real.errors import Sim2RealError
 
 FORMAT = 1
 SENSITIVITY = "sensitivity.json"
 BROKEN = 0.8
-"""A policy counts as broken where its success is below this share of what it is on the model as identified."""
-_TRAINED = 0.5
-"""Least success of a policy of which it makes sense to ask what breaks it."""
+"""A parameter breaks a policy if success falls below this share of the success on the identified model."""
+_MIN_SUCCESS = 0.5
+"""Below this success on the identified model, the policy needs more training first."""
 _AGAIN = "run `sim2real train` again"
 
 
 @dataclass(frozen=True)
 class Moved:
-    """One parameter, moved; the others follow as the recording ties them together.
+    """One parameter at several values; the others follow by their covariance.
 
     Attributes:
-        name: Its name.
-        unit: Its unit.
-        estimate: The value found [unit].
+        estimate: The estimate [unit].
         half_width: Half the width of its 95 % interval [unit].
-        values: Shape ``(M,)``: what it was moved to, within its bounds [unit].
-        success: Shape ``(M,)``: mean success there.
+        values: Shape ``(M,)``: values within the bounds [unit].
+        success: Shape ``(M,)``: mean success at these values.
     """
 
     name: str
@@ -46,11 +45,11 @@ class Sensitivity:
     """A policy's success on models in which one parameter is wrong.
 
     Attributes:
-        format: Of the file.
-        multiples: Shape ``(M,)``: by how many half-widths of its 95 % interval each parameter was moved, ascending.
-        success: Mean success on the model as identified.
-        episodes: Episodes of which each success is the mean; the same ones for all.
-        parameters: The parameters, the worst first.
+        format: Version of the file.
+        multiples: Shape ``(M,)``: distances from the estimate, in half-widths of the 95 % interval, ascending.
+        success: Mean success on the identified model.
+        episodes: Number of episodes of each mean; all values use the same episodes.
+        parameters: The parameters, the most harmful first.
     """
 
     format: int
@@ -60,43 +59,37 @@ class Sensitivity:
     parameters: tuple[Moved, ...]
 
     def __post_init__(self) -> None:
-        """Check that the sizes fit: it may come from a file."""
+        """Check the sizes, as the curves can come from a file."""
         count = self.multiples.shape
         check(len(count) == 1 and count[0] > 0, "no multiples")
         check(all(p.values.shape == p.success.shape == count for p in self.parameters), "curves of mixed sizes")
 
     @staticmethod
     def of(multiples: np.ndarray, success: float, episodes: int, parameters: Sequence[Moved]) -> Sensitivity:
-        """Return the parameters in the order in which they break the policy.
-
-        Args:
-            multiples: Shape ``(M,)``.
-            episodes: Episodes of which each success is the mean.
-            parameters: The parameters, in any order.
-        """
-        found = Sensitivity(FORMAT, multiples, success, episodes, tuple(parameters))
-        worst = sorted(found.parameters, key=lambda p: (abs(found.breaks_at(p) or np.inf), float(p.success.min())))
+        """Return the sensitivity with its parameters sorted, the most harmful first."""
+        unsorted = Sensitivity(FORMAT, multiples, success, episodes, tuple(parameters))
+        worst = sorted(parameters, key=lambda p: (abs(unsorted.breaks_at(p) or np.inf), float(p.success.min())))
         return Sensitivity(FORMAT, multiples, success, episodes, tuple(worst))
 
     def breaks_at(self, moved: Moved) -> float | None:
-        """Return the smallest multiple at which a parameter breaks the policy, with its sign; None: at none."""
+        """Return the smallest multiple at which a parameter breaks the policy, with its sign; None if there is none."""
         broken = self.multiples[moved.success < BROKEN * self.success]
         return float(min(broken, key=abs)) if broken.size else None
 
     @property
-    def said(self) -> str:
-        """What to measure better, in one sentence."""
-        most = f"{np.abs(self.multiples).max():g}"
+    def advice(self) -> str:
+        """The parameter that should be measured better, in one sentence."""
+        largest = f"{np.abs(self.multiples).max():g}"
         if not self.parameters:
-            return "No parameter has an interval to be moved by."
+            return "No parameter has an interval, so none was moved."
         worst = self.parameters[0]
         lowest = float(worst.success.min())
-        if self.success < _TRAINED:
-            return f"The policy does badly on the model as identified already ({self.success:.2f}): train longer first."
+        if self.success < _MIN_SUCCESS:
+            return f"The success on the identified model is only {self.success:.2f}: train longer first."
         if (at := self.breaks_at(worst)) is None:
             return (
-                f"Nothing within {most} half-widths of the 95 % intervals breaks this policy: success stays above "
-                f"{BROKEN:.0%} of {self.success:.2f}, and is lowest, {lowest:.2f}, with {worst.name!r} moved."
+                f"No parameter breaks this policy within {largest} half-widths of its 95 % interval: success stays "
+                f"above {BROKEN:.0%} of {self.success:.2f}, and is lowest, {lowest:.2f}, with {worst.name!r} moved."
             )
         i = int(np.flatnonzero(self.multiples == at)[0])
         return (
@@ -105,20 +98,30 @@ class Sensitivity:
             f"{self.success:.2f} to {worst.success[i]:.2f}."
         )
 
+    def rows(self) -> Table:
+        """Return a row for each parameter: estimate, half-width, the multiple that breaks the policy, success."""
+        headers = ("parameter", "unit", "estimate", "half-width", "breaks at", *(f"{m:+g}" for m in self.multiples))
+        rows = []
+        for p in self.parameters:
+            at = self.breaks_at(p)
+            success = [f"{s:.2f}" for s in p.success]
+            rows.append([p.name, p.unit, p.estimate, p.half_width, None if at is None else f"{at:+g}", *success])
+        return Table(headers, rows)
+
     def save(self, path: Path) -> None:
         """Write it as JSON."""
         write_json(path, self)
 
     @staticmethod
     def load(path: Path) -> Sensitivity:
-        """Read what ``save`` wrote, or the one in the folder of a train stage.
+        """Read the file, or the one in the folder of a train stage.
 
         Raises:
-            Sim2RealError: When it is missing, of another format, or not as it should be.
+            Sim2RealError: When the file is missing, malformed, or of another format.
         """
         file = path / SENSITIVITY if path.is_dir() else path
         with malformed(file, _AGAIN):
-            found = read_json(file, Sensitivity)
-            if found.format != FORMAT:
-                raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
-            return found
+            sensitivity = read_json(file, Sensitivity)
+            if sensitivity.format != FORMAT:
+                raise Sim2RealError(f"{file} has format {sensitivity.format}, this version reads {FORMAT}", hint=_AGAIN)
+            return sensitivity

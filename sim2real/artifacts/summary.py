@@ -1,4 +1,4 @@
-"""Artifacts in a few words: on the console, and as a table in a notebook."""
+"""What an artifact shows of itself: a few facts and tables, for the console, a page and a notebook."""
 
 from __future__ import annotations
 
@@ -6,23 +6,71 @@ import html
 import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+if TYPE_CHECKING:
+    from sim2real.types import Json
 
 _WIDTH = 80
-"""Most characters of a value on the console."""
-Rows = tuple[Sequence[str], Sequence[Sequence[Any]]]
-"""Headers of a table, and its rows."""
+"""Maximum number of characters of a value on the console."""
+_UNITS = {"_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_nm": "N m", "_v": "V", "_m": "m", "_s": "s"}
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A 95 % interval as a cell of a table; None at both ends where it is unknown."""
+
+    low: float | None
+    high: float | None
+
+    def __str__(self) -> str:
+        return "" if self.low is None or self.high is None else f"[{self.low:.4g}, {self.high:.4g}]"
+
+
+Cell: TypeAlias = str | float | bool | Interval | None
+"""A text, a number, a yes or no, an interval; None for a missing value."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of an artifact; each reader (console, page, notebook) formats its cells.
+
+    Attributes:
+        headers: Titles of the columns; the column ``unit`` holds units.
+        rows: The cells by row; the first one names the row.
+    """
+
+    headers: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+
+    def records(self) -> list[dict[str, Cell]]:
+        """Return each row as header -> cell, for JSON."""
+        return [dict(zip(self.headers, row, strict=True)) for row in self.rows]
+
+    def without(self, *headers: str) -> Table:
+        """Return the table without some columns."""
+        keep = [i for i, header in enumerate(self.headers) if header not in headers]
+        return Table([self.headers[i] for i in keep], [[row[i] for i in keep] for row in self.rows])
+
+
+def words_and_unit(name: str) -> tuple[str, str]:
+    """Split a quantity's name into words and unit: ``angle_rms_rad`` into "angle rms" and "rad"; unit "1" for none."""
+    for suffix, unit in _UNITS.items():
+        if name.endswith(suffix):
+            return name.removesuffix(suffix).replace("_", " "), unit
+    return name.replace("_", " "), "1"
 
 
 class Shown(ABC):
-    """An artifact that a notebook shows in a few words instead of all its numbers."""
+    """An artifact that a notebook shows as a few facts and a table, instead of all its numbers."""
 
     @abstractmethod
-    def about(self) -> Mapping[str, Any]:
-        """Return what to say about it: name -> value."""
+    def about(self) -> Mapping[str, Json]:
+        """Return the facts: name -> value."""
 
-    def rows(self) -> Rows | None:
-        """Return a table that a notebook shows below it; None: it has none."""
+    def rows(self) -> Table | None:
+        """Return the artifact's main table; None if it has none."""
         return None
 
     def __repr__(self) -> str:
@@ -34,29 +82,29 @@ class Shown(ABC):
         shown = f"<b>{type(self).__name__}</b><table>{pairs}</table>"
         if (table := self.rows()) is None:
             return shown
-        return f"{shown}<table>{_row('th', table[0])}{''.join(_row('td', row) for row in table[1])}</table>"
+        return f"{shown}<table>{_row('th', table.headers)}{''.join(_row('td', row) for row in table.rows)}</table>"
 
 
 class Summed(Shown):
-    """An artifact of a stage with a ``summary`` of how the stage went, in text and numbers."""
+    """An artifact of a stage with a ``summary``: text and numbers about the stage's run."""
 
     if TYPE_CHECKING:
 
         @property
-        def summary(self) -> Any:
-            """How the stage went."""
+        def summary(self) -> Json:
+            """Text and numbers about the stage's run."""
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[Json]:
         """Yield the artifact and its summary: earlier versions returned a pair of them."""
         yield self
         yield self.summary
 
 
-def _row(tag: str, cells: Sequence[Any]) -> str:
+def _row(tag: str, cells: Sequence[Json]) -> str:
     return f"<tr>{''.join(f'<{tag}>{html.escape(_text(cell))}</{tag}>' for cell in cells)}</tr>"
 
 
-def _text(value: Any) -> str:
+def _text(value: Json) -> str:
     if value is None:
         return "-"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,7 +1,7 @@
-"""How long everything took on the robot: what training draws its timing from, so that it needs no log.
+"""The timing of one session, from which training draws its delays without the log.
 
 ``timing.npz`` has every node's computation times and bus transfers, and every connection's transport times, in order.
-``timing.json`` has their quantiles for people, and what else the session counted: lost answers, overruns, the clock.
+``timing.json`` has their quantiles for people, and the session's counts: lost answers, overruns, the clock.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.files import check, made, malformed, read_arrays, read_json, write_arrays, write_json
-from sim2real.artifacts.summary import Rows, Shown
+from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.summary import Shown, Table
 from sim2real.errors import Sim2RealError
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.episode import TICKS_PER_S, Episode
 from sim2real.graph.fitting import resample
 from sim2real.log.ages import input_ages
+from sim2real.types import Json
 
 FORMAT = 2
 _READ = (1, FORMAT)  # 1: without the times of the bus
@@ -39,9 +39,9 @@ class Spread:
 
     @staticmethod
     def of(seconds: np.ndarray) -> Spread:
-        """Return the spread of times ``(N,)`` [s]; NaN does not count."""
-        there = seconds[np.isfinite(seconds)]
-        return Spread(*np.quantile(there, [0.5, 0.99, 1.0]).tolist()) if there.size else Spread(None, None, None)
+        """Return the spread of times ``(N,)`` [s] without NaN."""
+        finite = seconds[np.isfinite(seconds)]
+        return Spread(*np.quantile(finite, [0.5, 0.99, 1.0]).tolist()) if finite.size else Spread(None, None, None)
 
 
 NONE = Spread(None, None, None)
@@ -52,15 +52,15 @@ class NodeTiming:
     """The timing of one node.
 
     Attributes:
-        steps: How many steps it made.
-        period: From one step's awakening to the next.
-        lateness: From a step's start to when its thread really ran.
-        computation: From a step's start to its end, the thread's awakening and the bus included.
-        bus: The part of it from getting the bus to having the device's answer, questions asked again included; without
-            any sample for a node that talks to no device, and where that was not recorded.
-        bus_wait: How long a step waited before for another node's use of the bus.
-        age: Input -> how long before a step's start the newest message that it used was sent.
-        overruns: Steps that ended after the next was due; None where they were not counted.
+        steps: Number of steps.
+        period: Time between the wake-ups of two steps.
+        lateness: Time from a step's start to the wake-up of its thread.
+        computation: Time from a step's start to its end, with wake-up and bus.
+        bus: Part of the computation from the lock of the bus to the device's answer, with retries; no sample for a node
+            without a device, and in logs without bus times.
+        bus_wait: Time that a step waits for the lock of the bus.
+        age: Input -> time from the sending of the newest used message to the step's start.
+        overruns: Number of steps that ended after the start of the next slot; None if they were not counted.
     """
 
     steps: int
@@ -75,14 +75,14 @@ class NodeTiming:
 
 @dataclass(frozen=True)
 class ConnectionTiming:
-    """What became of the messages of one connection.
+    """The messages of one connection.
 
     Attributes:
         reader: The node that reads.
         input: Name of its input.
-        messages: How many were sent.
-        unread: How many no step used, because newer ones had come or the episode had ended.
-        transport: From a message's sending to its receipt.
+        messages: Number of sent messages.
+        unread: Number of messages that no step used, as newer ones came or the episode ended.
+        transport: Time from sending to receipt.
     """
 
     reader: str
@@ -97,11 +97,11 @@ class BusTiming:
     """Transactions, losses and late answers on a device's bus.
 
     Attributes:
-        transactions: Questions asked.
-        lost: Answers that never came.
-        retries: Questions asked again.
-        late: Answers whose sample's time is uncertain, or that came after their question had been repeated.
-        lateness: By how much answers took longer than their bytes.
+        transactions: Number of requests.
+        lost: Number of requests without an answer.
+        retries: Number of repeated requests.
+        late: Number of answers with an uncertain sample time, or after a repeated request.
+        lateness: Time of an answer beyond the time of its bytes.
     """
 
     transactions: int
@@ -116,14 +116,12 @@ class Timing(Shown):
     """The timing of one session.
 
     Attributes:
-        nodes: Node -> its timing.
-        connections: What became of the messages of each connection.
-        bus: The bus; None where there is none, such as in a log that was imported.
-        stamps: Node -> ``recorded`` or, in a log that was imported, ``generated`` from a rate.
-        monotonic_ns: Time 0 of the session on the computer's monotonic clock [ns]; None where it is not known.
-        steps_s: Node -> how long each of its steps took ``(N,)`` [s], in their order.
-        bus_s: Node -> how long each of its transactions on the bus took ``(T,)`` [s], in their order.
-        transport_s: (reader, input) -> how long each message was under way ``(M,)`` [s], in their order.
+        bus: The bus; None without a bus, as in an imported log.
+        stamps: Node -> ``recorded`` or, in an imported log, ``generated`` from a rate.
+        monotonic_ns: Time 0 of the session on the computer's monotonic clock [ns]; None if unknown.
+        steps_s: Node -> duration of each step ``(N,)`` [s], in order.
+        bus_s: Node -> duration of each bus transaction ``(T,)`` [s], in order.
+        transport_s: ``reader/input`` -> transport time of each message ``(M,)`` [s], in order.
         format: Version of the files.
     """
 
@@ -139,9 +137,9 @@ class Timing(Shown):
 
     @staticmethod
     def of(episode: Episode) -> Timing:
-        """Return the timing of a log, its own account of the session included."""
-        end: Mapping[str, Any] = episode.metadata.get("log", {}).get("session_end") or {}
-        counted: Mapping[str, Any] = end.get("timing", {})
+        """Return the timing of a log, with the counts that the session wrote at its end."""
+        end: Mapping[str, Json] = episode.metadata.get("log", {}).get("session_end") or {}
+        counted: Mapping[str, Json] = end.get("timing", {})
         # A session's own summary has the nodes in their graph's order, with overruns; other logs lack only that.
         names = [*(n for n in counted if n in episode.steps), *(n for n in episode.steps if n not in counted)]
         stamps = episode.metadata.get("stamps", {})
@@ -162,16 +160,16 @@ class Timing(Shown):
         )
 
     def computation(self, longest_s: float = math.inf) -> tuple[dict[str, DelayDistribution], dict[str, int]]:
-        """Return how long each node's steps take, as training and simulation draw it.
+        """Return the distribution of each node's computation time, from which training and simulation draw.
 
         Args:
-            longest_s: Longer steps are left out [s]: hiccups, which would put a pause into every timeline.
+            longest_s: Longer steps are dropped [s]: such hiccups would put a pause into every timeline.
 
         Returns:
-            The distributions by node, and how many steps were left out, for those nodes that had some.
+            The distributions by node, and the number of dropped steps of each node that has some.
 
         Raises:
-            Sim2RealError: When that would be most steps of a node.
+            Sim2RealError: When most steps of a node would be dropped.
         """
         delays: dict[str, DelayDistribution] = {}
         dropped: dict[str, int] = {}
@@ -187,14 +185,14 @@ class Timing(Shown):
                 dropped[name] = int(took.size - usual.size)
         return delays, dropped
 
-    def about(self) -> Mapping[str, Any]:
-        """Return what to say about it: name -> value."""
-        return {"nodes": ", ".join(f"{name} {own.steps} steps" for name, own in self.nodes.items())}
+    def about(self) -> Mapping[str, Json]:
+        """Return the nodes and their numbers of steps."""
+        return {"nodes": ", ".join(f"{name} {node.steps} steps" for name, node in self.nodes.items())}
 
-    def rows(self) -> Rows:
+    def rows(self) -> Table:
         """Return a row for each node."""
-        own = [[n, t.steps, t.computation.p50, t.computation.p99, t.overruns] for n, t in self.nodes.items()]
-        return ("node", "steps", "computation p50 [s]", "p99 [s]", "overruns"), own
+        rows = [[n, t.steps, t.computation.p50, t.computation.p99, t.overruns] for n, t in self.nodes.items()]
+        return Table(("node", "steps", "computation p50 [s]", "p99 [s]", "overruns"), rows)
 
     def save(self, folder: Path | str, name: str = "timing") -> dict[str, str]:
         """Write it into a folder.
@@ -202,7 +200,7 @@ class Timing(Shown):
         Returns:
             Output -> name of the file in the folder.
         """
-        folder = made(folder)
+        folder = make_folder(folder)
         document, samples = f"{name}.json", f"{name}.npz"
         write_json(folder / document, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS})
         write_arrays(folder / samples, {f"{kind}/{n}": v for kind in _ARRAYS for n, v in getattr(self, kind).items()})
@@ -216,24 +214,24 @@ class Timing(Shown):
             path: The JSON file, or the folder with ``timing.json``.
 
         Raises:
-            Sim2RealError: When it is missing, of another format, or not as it should be.
+            Sim2RealError: When a file is missing, malformed, or of another format.
         """
         path = Path(path)
         file = path / TIMING if path.is_dir() else path
         with malformed(file, _AGAIN):
-            found = read_json(file, Timing)
-            if found.format not in _READ:
-                raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
+            timing = read_json(file, Timing)
+            if timing.format not in _READ:
+                raise Sim2RealError(f"{file} has format {timing.format}, this version reads {FORMAT}", hint=_AGAIN)
         samples = file.with_suffix(".npz")
         with malformed(samples, _AGAIN):
             kinds: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in _ARRAYS}
             for name, values in read_arrays(samples).items():
-                kind, _, of = name.partition("/")
+                kind, _, owner = name.partition("/")
                 check(kind in kinds and values.ndim == 1 and values.dtype.kind == "f", f"{name} is no list of times")
-                kinds[kind][of] = values
-            check(set(kinds["steps_s"]) == set(found.nodes), "its nodes are others than those of the JSON file")
-            check(set(kinds["bus_s"]) <= set(found.nodes), "a node on the bus is none of the JSON file's")
-        return replace(found, format=FORMAT, **kinds)
+                kinds[kind][owner] = values
+            check(set(kinds["steps_s"]) == set(timing.nodes), "its nodes differ from those of the JSON file")
+            check(set(kinds["bus_s"]) <= set(timing.nodes), "the JSON file lacks a node that is on the bus")
+        return replace(timing, format=FORMAT, **kinds)
 
 
 def _node(episode: Episode, name: str, overruns: int | None, bus: Mapping[str, np.ndarray]) -> NodeTiming:
@@ -256,7 +254,7 @@ def _connection(episode: Episode, reader: str, name: str) -> ConnectionTiming:
     return ConnectionTiming(reader, name, len(messages), int((messages.seq_in < 0).sum()), transport)
 
 
-def _bus(end: Mapping[str, Any]) -> BusTiming:
+def _bus(end: Mapping[str, Json]) -> BusTiming:
     return BusTiming(
         transactions=int(end.get("transactions", 0)),
         lost=int(end.get("lost_replies", 0)),

@@ -10,7 +10,7 @@ from typing import Any
 
 from sim2real.artifacts.run.manifest import plain, versions
 from sim2real.artifacts.run.run_folder import STAGES, attempts, run_folders
-from sim2real.artifacts.run.stage_status import standing
+from sim2real.artifacts.run.stage_status import stage_status
 from sim2real.commands.flags import flag_names
 from sim2real.hardware import entries
 from sim2real.runtime import compilation_cache
@@ -72,7 +72,7 @@ def pipeline(name: str, root: Path, verbose: bool) -> str:
 def run(run_dir: Path) -> str:
     """Return the stages of a run, their inputs and outputs."""
     rows, files = [], []
-    stale = {s.newest.folder.name: s.stale for s in standing(run_dir).values() if s.stale}
+    stale = {s.newest.folder.name: s.stale for s in stage_status(run_dir).values() if s.stale}
     for stage in STAGES:
         for attempt in attempts(run_dir, stage):
             manifest, name = attempt.manifest, attempt.folder.name

@@ -1,4 +1,4 @@
-"""The age of the messages that a node's steps used, computed from a log."""
+"""The age of the messages that a node's steps use, computed from a log."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from sim2real.graph.node import TICKS_PER_S
 
 
 def input_ages(episode: Episode, node: str) -> dict[str, np.ndarray]:
-    """Return how long before each step's start the newest message that it used was sent, by input.
+    """Return the time from the sending of the newest used message to each step's start, by input.
 
-    This shows the effect of a hiccup that step times alone do not show: punctual steps that use old messages.
+    Ages show hiccups that step times do not show: punctual steps that use old messages.
 
     Returns:
-        Input -> ages ``(N,)`` [s]; NaN before the first message. Empty if steps are missing in the log, as it is then
-        not known which step used which message.
+        Input -> ages ``(N,)`` [s]; NaN before the first message. Empty if the log lacks steps, as the step of a message
+        is then unknown.
     """
     log = episode.metadata.get("log", {})
     if log.get("missing_steps", {}).get(node):

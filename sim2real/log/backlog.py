@@ -1,4 +1,4 @@
-"""What waits in the queue of a log's writer: a slow writer is told from a stuck disk, and the memory has a bound."""
+"""The backlog of a log's writer: it distinguishes a slow writer from a stuck disk, and limits the queue's memory."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from dataclasses import dataclass
 from typing import Final
 
 RECORD_BYTES: Final = 500
-"""Memory of a record that waits, besides its arrays: measured, 450 bytes a step of six numbers."""
-_MOST_BYTES: Final = 2**30
+"""Memory of a queued record without its arrays [bytes]."""
+_MAX_BYTES: Final = 2**30
 _LATE_S: Final = 1.0
 STUCK_S: Final = 60.0
-"""So long without one record written, the disk is stuck: longer than any working disk needs for one."""
+"""The disk is stuck if one record takes longer [s]."""
 
 
 @dataclass(frozen=True)
 class Backlog:
-    """What the writer of a log still has to write.
+    """The records that the writer of a log has not written yet.
 
     Attributes:
-        records: Number of records that wait.
-        bytes: Their memory, estimated.
-        behind_s: How long ago the record was queued that is written now; 0 where none waits.
-        idle_s: How long the writer has been busy with one record, or one flush; 0 where none waits.
+        records: Number of queued records.
+        bytes: Their estimated memory.
+        behind_s: Age of the record that is being written [s]; 0 for an empty queue.
+        idle_s: Time since the writer began the present record or flush [s]; 0 for an empty queue.
     """
 
     records: int
@@ -32,12 +32,12 @@ class Backlog:
 
     @property
     def late(self) -> bool:
-        """Whether the writer is so far behind that the user should know."""
+        """Whether the writer is far enough behind for a warning."""
         return self.records > 0 and self.behind_s > _LATE_S
 
     @property
     def stuck(self) -> bool:
-        """Whether the disk takes no data, rather than the writer being slow."""
+        """Whether the disk takes no data."""
         return self.idle_s > STUCK_S
 
     def __str__(self) -> str:
@@ -48,9 +48,9 @@ class Backlog:
         return f"the writer of the log is {self.behind_s:.1f} s behind; {waiting}, the disk takes data"
 
 
-def most_bytes() -> int:
-    """Return how much memory the records that wait may take: 1 GiB, or a quarter of a smaller machine's memory."""
+def max_queue_bytes() -> int:
+    """Return the limit of the queue's memory [bytes]: 1 GiB, or a quarter of the machine's memory if that is less."""
     try:
-        return min(_MOST_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4)
+        return min(_MAX_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4)
     except (AttributeError, ValueError, OSError):  # not on every platform
-        return _MOST_BYTES
+        return _MAX_BYTES

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
-# The ROS name of every element type and its code in `struct`.
+# Element type -> its ROS name; below: element type -> its code in `struct`.
 ROS_TYPES = {"b1": "bool", "f4": "float32", "f8": "float64"} | {
     f"{kind}{size}": f"{name}{8 * size}" for kind, name in (("i", "int"), ("u", "uint")) for size in (1, 2, 4, 8)
 }
@@ -31,8 +31,7 @@ class CdrConstant:
     """Bytes that are the same in every message.
 
     Attributes:
-        data: The bytes.
-        alignment: Their alignment [bytes].
+        alignment: Alignment of the bytes [bytes].
     """
 
     data: bytes
@@ -44,14 +43,13 @@ class CdrField:
     """A value that differs between messages: a scalar, or an array of fixed shape in row-major order.
 
     Attributes:
-        name: Its name.
         dtype: Type of its elements.
-        shape: Its shape; ``()`` for a scalar.
+        shape: ``()`` for a scalar.
         code: The element type's code in the module ``struct``.
     """
 
     name: str
-    dtype: np.dtype[Any]
+    dtype: np.dtype[np.generic]
     shape: tuple[int, ...] = ()
     code: str = field(init=False)
 
@@ -108,10 +106,11 @@ class Layout:
 
     def __init__(self, parts: Iterable[CdrConstant | CdrField]) -> None:
         self.fields: list[CdrField] = []
-        self._template: list[Any] = [ENCAPSULATION]
+        self._template: list[bytes | None] = [ENCAPSULATION]
         self._slots: list[int] = []
         formats, offsets, position = ["<4s"], [], 0
         for part in parts:
+            # Align each part to its element size, relative to the end of the encapsulation.
             padding = -position % (part.alignment if isinstance(part, CdrConstant) else part.dtype.itemsize)
             position += padding
             formats.append(f"{padding}x")
@@ -120,13 +119,13 @@ class Layout:
                 self._template.append(part.data)
                 position += len(part.data)
                 continue
-            bytes_ = part.size * part.dtype.itemsize
-            formats.append(f"{bytes_}s" if part.shape else part.code)
+            size = part.size * part.dtype.itemsize
+            formats.append(f"{size}s" if part.shape else part.code)
             self._slots.append(len(self._template))
             self._template.append(None)
             self.fields.append(part)
             offsets.append(len(ENCAPSULATION) + position)
-            position += bytes_
+            position += size
         self._struct = struct.Struct("".join(formats))
         self.size = self._struct.size
         self.dtype = np.dtype(
@@ -153,7 +152,7 @@ class Layout:
                 f"a message has {len(values)} fields, expected {len(self.fields)}: "
                 f"{', '.join(f.name for f in self.fields)}"
             )
-        arguments = self._template.copy()
+        arguments: list[object] = list(self._template)
         for slot, part, value in zip(self._slots, self.fields, values, strict=True):
             arguments[slot] = _array_bytes(part, value) if part.shape else value
         try:

@@ -1,4 +1,4 @@
-"""Reads a log file once, from beginning to end, and sorts its messages by channel; decodes them on request."""
+"""Reads a log file once from beginning to end, sorts its messages by channel, and decodes them on request."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -29,12 +28,13 @@ from sim2real.log.records import (
     records,
 )
 from sim2real.log.session_file import LIBRARY
+from sim2real.types import Json
 
 # Bytes in a message record before its content (opcode, length), and before the message's own data (channel, sequence,
 # log time, publish time).
 _PREFIX_BYTES, _DATA_AT = 9, 31
 _MESSAGE = int(Opcode.MESSAGE)  # a plain number: it is compared for every message
-# Role of a channel -> keys that its metadata must have.
+# Role of a channel -> required keys of its metadata.
 _ROLES = {
     "step": {"node"},
     "output": {"node", "fields"},
@@ -52,7 +52,7 @@ class Range:
 
     Attributes:
         start_s: Its start [s from the episode's start]; None: no limit.
-        end_s: Its end, which does not belong to it [s]; None: no limit.
+        end_s: Its exclusive end [s]; None: no limit.
     """
 
     start_s: float | None = None
@@ -76,16 +76,15 @@ class Contents:
         attachments: File name -> content.
         epoch_ns: Wall clock at the episode's time 0 [ns]; 0 if the episode never started.
         channels: Channel number -> channel.
-        messages: Channel number -> message records, in the order of the file; empty unless chunks were opened.
+        messages: Channel number -> message records, in the order of the file; empty if no chunk was opened.
         indexed: Channel number -> number of messages, according to the chunks' indices.
-        chunks: Number of chunks.
-        last_log_time: Latest log time of any chunk [ns].
-        damage: What could not be read.
+        last_log_time: Latest log time of all chunks [ns].
+        damage: The unreadable places.
     """
 
     library: str = ""
-    session: dict[str, Any] | None = None
-    end: dict[str, Any] | None = None
+    session: dict[str, Json] | None = None
+    end: dict[str, Json] | None = None
     attachments: dict[str, bytes] = field(default_factory=dict)
     epoch_ns: int = 0
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -114,10 +113,10 @@ class Contents:
                 "itemsize": _DATA_AT + layout.size,
             }
         )
-        found = self.messages[channel]
-        if any(len(m) != dtype.itemsize for m in found):
+        messages = self.messages[channel]
+        if any(len(m) != dtype.itemsize for m in messages):
             raise Sim2RealError(f"topic {self.channels[channel].topic} holds messages that do not fit its own fields")
-        rows = np.frombuffer(b"".join(found), dtype)
+        rows = np.frombuffer(b"".join(messages), dtype)
         begin, end = span.log_times(self.epoch_ns)
         rows = rows[(rows["log_time"] >= begin) & (rows["log_time"] < end)]
         return rows[np.argsort(rows["sequence"], kind="stable")]
@@ -125,45 +124,45 @@ class Contents:
     def payloads(self, channel: int, span: Range) -> list[tuple[int, bytes]]:
         """Return log time [ns] and encoded bytes of a channel's messages within a range."""
         begin, end = span.log_times(self.epoch_ns)
-        found = [(int.from_bytes(m[15:23], "little"), m[_DATA_AT:]) for m in self.messages[channel]]
-        return [(time, payload) for time, payload in found if begin <= time < end]
+        messages = [(int.from_bytes(m[15:23], "little"), m[_DATA_AT:]) for m in self.messages[channel]]
+        return [(time, payload) for time, payload in messages if begin <= time < end]
 
 
 def walk(path: str | Path, span: Range | None = None) -> Contents:
     """Read a log file once.
 
     Args:
-        span: Range whose chunks are opened for their messages; None: none is opened.
+        span: Chunks in this range are opened for their messages; None: no chunk is opened.
 
     Raises:
         Sim2RealError: When the file is missing, not an MCAP file, not a log of sim2real, or cut off before the end of
             its session metadata.
     """
-    found = Contents()
-    with in_words(path), opened(path) as data:
-        for record in records(data, found.damage):
+    contents = Contents()
+    with readable_errors(path), opened(path) as data:
+        for record in records(data, contents.damage):
             if record.opcode == Opcode.MESSAGE_INDEX:
                 channel = data[record.start] | data[record.start + 1] << 8
-                found.indexed[channel] = found.indexed.get(channel, 0) + (record.end - record.start - 6) // 16
+                contents.indexed[channel] = contents.indexed.get(channel, 0) + (record.end - record.start - 6) // 16
             elif record.opcode == Opcode.CHUNK:
-                _take_chunk(found, data, record, span)
+                _take_chunk(contents, data, record, span)
             else:
-                _take_other(found, data, record)
-    if found.session is None:
-        if found.library not in ("", LIBRARY):
+                _take_other(contents, data, record)
+    if contents.session is None:
+        if contents.library not in ("", LIBRARY):
             raise Sim2RealError(
-                f"{path} is an MCAP file of {found.library!r}, not a log of sim2real",
+                f"{path} is an MCAP file of {contents.library!r}, not a log of sim2real",
                 hint="record with `sim2real record`, or convert it",
             )
-        if not found.chunks:
+        if not contents.chunks:
             raise cut_before_session(path)
-        found.damage.skip("the session's metadata")
-    return found
+        contents.damage.skip("the session's metadata")
+    return contents
 
 
 @contextmanager
-def in_words(path: str | Path) -> Iterator[None]:
-    """Convert exceptions that damaged bytes cause in the block, of whatever type, into an error about the file.
+def readable_errors(path: str | Path) -> Iterator[None]:
+    """Convert the exceptions that damaged bytes cause in the block into an error about the file.
 
     Raises:
         Sim2RealError: When the block raised one of them.
@@ -175,53 +174,53 @@ def in_words(path: str | Path) -> Iterator[None]:
     except BROKEN as error:
         raise Sim2RealError(
             f"the log {path} is damaged: {type(error).__name__}: {error}",
-            hint="`sim2real log recover FILE` saves what is readable, or record again",
+            hint="`sim2real log recover FILE` saves the readable part, or record again",
         ) from error
 
 
-def _take_chunk(found: Contents, data: mmap.mmap, record: Record, span: Range | None) -> None:
-    found.chunks += 1
+def _take_chunk(contents: Contents, data: mmap.mmap, record: Record, span: Range | None) -> None:
+    contents.chunks += 1
     first, last = chunk_times(data, record)
-    found.last_log_time = max(found.last_log_time, last)
+    contents.last_log_time = max(contents.last_log_time, last)
     if span is None:
         return
-    begin, end = span.log_times(found.epoch_ns)
-    # The first chunk is always opened: it repeats the channels' definitions with a checksum.
-    if found.chunks > 1 and found.channels and (last < begin or first >= end):
+    begin, end = span.log_times(contents.epoch_ns)
+    # Open the first chunk always: it repeats the channels' definitions with a checksum.
+    if contents.chunks > 1 and contents.channels and (last < begin or first >= end):
         return
-    content = chunk_content(data, record, found.damage)
-    messages = found.messages
+    content = chunk_content(data, record, contents.damage)
+    messages = contents.messages
     for opcode, start, end in chunk_records(content):
         if opcode == _MESSAGE:
             channel = content[start] | content[start + 1] << 8
             if channel in messages:
                 messages[channel].append(content[start - _PREFIX_BYTES : end])
         elif opcode == Opcode.CHANNEL:
-            _take_channel(found, parsed(Channel, content, Record(opcode, start, end), found.damage))
+            _take_channel(contents, parsed(Channel, content, Record(opcode, start, end), contents.damage))
 
 
-def _take_channel(found: Contents, channel: Channel | None) -> None:
-    about = {} if channel is None else channel.metadata
-    needed, epoch_ns = _ROLES.get(about.get("role", "")), about.get("epoch_ns", "")
-    if channel is None or needed is None or not needed <= set(about):
+def _take_channel(contents: Contents, channel: Channel | None) -> None:
+    metadata_of = {} if channel is None else channel.metadata
+    needed, epoch_ns = _ROLES.get(metadata_of.get("role", "")), metadata_of.get("epoch_ns", "")
+    if channel is None or needed is None or not needed <= set(metadata_of):
         return
     if epoch_ns.isascii() and epoch_ns.isdigit() and len(epoch_ns) <= _DIGITS:
-        found.channels[channel.id] = channel
-        found.epoch_ns = int(epoch_ns)
-        if about["role"] in _DECODED_ROLES:
-            found.messages.setdefault(channel.id, [])
+        contents.channels[channel.id] = channel
+        contents.epoch_ns = int(epoch_ns)
+        if metadata_of["role"] in _DECODED_ROLES:
+            contents.messages.setdefault(channel.id, [])
 
 
-def _take_other(found: Contents, data: mmap.mmap, record: Record) -> None:
+def _take_other(contents: Contents, data: mmap.mmap, record: Record) -> None:
     if record.opcode == Opcode.CHANNEL:
-        _take_channel(found, parsed(Channel, data, record, found.damage))
-    elif record.opcode == Opcode.HEADER and (header := parsed(Header, data, record, found.damage)) is not None:
-        found.library = header.library
+        _take_channel(contents, parsed(Channel, data, record, contents.damage))
+    elif record.opcode == Opcode.HEADER and (header := parsed(Header, data, record, contents.damage)) is not None:
+        contents.library = header.library
     elif record.opcode == Opcode.ATTACHMENT:
-        if (attachment := parsed(Attachment, data, record, found.damage)) is not None:
-            found.attachments[attachment.name] = attachment.data
-    elif record.opcode == Opcode.METADATA and (entry := parsed(Metadata, data, record, found.damage)) is not None:
+        if (attachment := parsed(Attachment, data, record, contents.damage)) is not None:
+            contents.attachments[attachment.name] = attachment.data
+    elif record.opcode == Opcode.METADATA and (entry := parsed(Metadata, data, record, contents.damage)) is not None:
         if entry.name == metadata.SESSION:
-            found.session = metadata.decode(entry.metadata)
+            contents.session = metadata.decode(entry.metadata)
         elif entry.name == metadata.SESSION_END:
-            found.end = metadata.decode(entry.metadata)
+            contents.end = metadata.decode(entry.metadata)

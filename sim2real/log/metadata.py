@@ -7,22 +7,22 @@ import json
 import zlib
 from collections.abc import Mapping
 from os import PathLike
-from typing import Any
 
 import numpy as np
 
 from sim2real.errors import Sim2RealError
+from sim2real.types import Json
 
 SESSION = "session"
 SESSION_END = "session_end"
 FORMAT = 1
 
 
-def encode(name: str, document: Mapping[str, Any]) -> dict[str, str]:
+def encode(name: str, document: Mapping[str, Json]) -> dict[str, str]:
     """Encode a document as the strings of an MCAP metadata record.
 
     ``json`` is the whole document, and ``crc32`` its checksum, as MCAP has none for metadata. Top-level strings,
-    numbers and booleans are stored under their own names too, for other viewers.
+    numbers and booleans are also stored under their names, for other viewers.
 
     Args:
         name: The record's name, for errors.
@@ -41,7 +41,7 @@ def encode(name: str, document: Mapping[str, Any]) -> dict[str, str]:
     return {**plain, "format": str(FORMAT), "crc32": f"{zlib.crc32(text.encode()):08x}", "json": text}
 
 
-def decode(record: Mapping[str, str]) -> dict[str, Any] | None:
+def decode(record: Mapping[str, str]) -> dict[str, Json] | None:
     """Return the document of a metadata record; None if it is damaged.
 
     Raises:
@@ -56,14 +56,14 @@ def decode(record: Mapping[str, str]) -> dict[str, Any] | None:
             f"the log has format {version}; this sim2real reads up to format {FORMAT}", hint="upgrade sim2real"
         )
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):  # the checksum is right, yet it is not JSON: the file was made so on purpose
+        document = json.loads(text)
+    except (ValueError, RecursionError):  # a file with a right checksum and no JSON: made on purpose
         return None
-    return found if isinstance(found, dict) else None
+    return document if isinstance(document, dict) else None
 
 
-def _plain(value: object) -> Any:
-    """Convert a value that JSON does not know."""
+def _plain(value: object) -> Json:
+    """Convert a value that JSON lacks."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, PathLike):

@@ -6,37 +6,37 @@ import json
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Messages, Steps
 from sim2real.log.cdr import read_text
-from sim2real.log.file_contents import Contents, Range, in_words, walk
+from sim2real.log.file_contents import Contents, Range, readable_errors, walk
 from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields, units_of_fields
+from sim2real.types import Json
 
 # Positions of an event's level, and of its name before alignment [bytes].
 _LEVEL_AT, _NAME_AT = 12, 13
 
 
 class TruncatedLogWarning(UserWarning):
-    """The log is incomplete: its session crashed, or a part of the file is unreadable. The rest is used."""
+    """The log is incomplete: its session crashed, or a part of the file is unreadable. The rest is read."""
 
 
 def read_log(path: str | Path, start_s: float | None = None, end_s: float | None = None) -> Episode:
     """Read a log, or a time range of it.
 
-    What is readable of a damaged log is read, with a warning. The episode's metadata has the session's own entries and
+    The readable part of a damaged log is read, with a warning. The episode's metadata has the session's entries and
     ``log``, a dictionary with ``epoch_ns`` (wall clock at time 0), ``session_end`` (None after a crash),
     ``attachments`` (names), ``events`` (each with time_s, level, kind, text), ``first_seq`` (node -> number of its
-    first step in the episode, 0 in a whole log), ``missing_steps`` (node -> number of steps lost before or between
-    those that were read) and ``skipped`` (descriptions of what was unreadable).
+    first step in the episode, 0 in a whole log), ``missing_steps`` (node -> number of lost steps before the last one)
+    and ``skipped`` (descriptions of the unreadable places).
 
     Args:
-        start_s: Read steps that ended, and messages that arrived, at this time or later [s from the episode's start];
-            None: from the start.
-        end_s: Read those before this time [s from the episode's start]; None: to the end.
+        start_s: Read steps that end, and messages that arrive, at this time or later [s from the episode's start];
+            default: from the start.
+        end_s: Read steps and messages before this time [s from the episode's start]; default: to the end.
 
     Returns:
         The episode. ``seq_in`` is -1 if the consuming step is not in the episode.
@@ -46,23 +46,23 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
             its session metadata.
 
     Warns:
-        TruncatedLogWarning: When the session has no end or something was unreadable.
+        TruncatedLogWarning: When the session has no end, or a part is unreadable.
     """
     if start_s is not None and end_s is not None and not start_s <= end_s:
         raise UsageError(f"the range begins at {start_s} s, after its end at {end_s} s")
     span = Range(start_s, end_s)
     contents = walk(path, span)
-    with in_words(path):
+    with readable_errors(path):
         steps, outputs, sequences = _steps_and_outputs(contents, span)
         messages, events = _connections(contents, span, sequences), _events(contents, span)
         units = _units(contents)
-    # Steps before the first one count as lost, unless a range was asked for that starts later.
+    # Steps before the first one count as lost, unless the range starts later.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
     missing = {
         node: int(s[-1]) + 1 - len(s) - (firsts[node] if start_s else 0) for node, s in sequences.items() if len(s)
     }
     _warn(path, contents, missing)
-    facts = {
+    log_metadata = {
         "epoch_ns": contents.epoch_ns,
         "session_end": contents.end,
         "attachments": list(contents.attachments),
@@ -75,13 +75,13 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         steps=steps,
         messages=messages,
         outputs=outputs,
-        metadata={**(contents.session or {}), "log": facts},
+        metadata={**(contents.session or {}), "log": log_metadata},
         complete=contents.end is not None,
         units=units,
     )
 
 
-def read_session(path: str | Path) -> dict[str, Any]:
+def read_session(path: str | Path) -> dict[str, Json]:
     """Return the session's metadata, without reading steps and messages.
 
     Raises:
@@ -105,8 +105,8 @@ def read_attachment(path: str | Path, name: str) -> bytes:
     return attachments[name]
 
 
-def summary(path: str | Path) -> dict[str, Any]:
-    """Return facts about a log that can be read without decoding messages.
+def summary(path: str | Path) -> dict[str, Json]:
+    """Return a summary of a log without decoding messages.
 
     Returns:
         ``bytes`` (file size), ``chunks`` (their number), ``epoch_ns``, ``duration_s``, ``complete``, ``session`` (None
@@ -132,10 +132,10 @@ def summary(path: str | Path) -> dict[str, Any]:
 
 
 def _units(contents: Contents) -> dict[str, dict[str, str]]:
-    """Return node -> field -> unit, for the nodes whose channels say it."""
+    """Return node -> field -> unit, for the nodes whose channels have units."""
     channels = contents.with_role("output").values()
-    found = {c.metadata["node"]: units_of_fields(json.loads(c.metadata["fields"])) for c in channels}
-    return {node: units for node, units in found.items() if units}
+    by_node = {c.metadata["node"]: units_of_fields(json.loads(c.metadata["fields"])) for c in channels}
+    return {node: units for node, units in by_node.items() if units}
 
 
 def _steps_and_outputs(
@@ -152,7 +152,7 @@ def _steps_and_outputs(
             number, channel = output_channels[node]
             described = json.loads(channel.metadata["fields"])
             values = contents.columns(number, layout_of_fields(described), span)
-            # A step and its output may be in different chunks, one of which may be lost: keep complete pairs.
+            # Keep complete pairs: a step and its output can be in different chunks, and one chunk can be lost.
             _, in_steps, in_values = np.intersect1d(rows["sequence"], values["sequence"], return_indices=True)
             rows, values = rows[in_steps], values[in_values]
             for entry in described:
@@ -187,7 +187,7 @@ def _connections(
     return connections
 
 
-def _events(contents: Contents, span: Range) -> list[dict[str, Any]]:
+def _events(contents: Contents, span: Range) -> list[dict[str, Json]]:
     events = []
     for number in contents.with_role("events"):
         for log_time, payload in contents.payloads(number, span):
@@ -199,14 +199,14 @@ def _events(contents: Contents, span: Range) -> list[dict[str, Any]]:
 
 
 def _warn(path: str | Path, contents: Contents, missing: Mapping[str, int]) -> None:
-    """Warn of what the log lacks; the warning points to the caller of ``read_log``."""
-    lacks = []
+    """Warn of missing parts of the log; the warning points to the caller of ``read_log``."""
+    problems = []
     if contents.end is None:
-        lacks.append("its session has no end: the process that recorded it crashed or still runs")
+        problems.append("its session has no end: the process that recorded it crashed or still runs")
     if contents.damage.skipped:
-        lacks.append(f"unreadable: {'; '.join(contents.damage.skipped)}")
+        problems.append(f"unreadable: {'; '.join(contents.damage.skipped)}")
     lost = [f"{count} of node {node!r}" for node, count in missing.items() if count]
     if lost:
-        lacks.append(f"steps are missing: {', '.join(lost)}")
-    if lacks:
-        warnings.warn(f"the log {path} is not whole: {'. '.join(lacks)}", TruncatedLogWarning, stacklevel=3)
+        problems.append(f"steps are missing: {', '.join(lost)}")
+    if problems:
+        warnings.warn(f"the log {path} is not whole: {'. '.join(problems)}", TruncatedLogWarning, stacklevel=3)

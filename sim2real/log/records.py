@@ -14,7 +14,7 @@ from io import BytesIO
 from itertools import islice
 from pathlib import Path
 from threading import get_ident
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -24,32 +24,48 @@ from mcap.writer import MCAP0_MAGIC
 
 from sim2real.errors import Sim2RealError
 
+if TYPE_CHECKING:
+    import zstandard
+
 _PREFIX = struct.Struct("<BQ")
 _CHUNK_TIMES = struct.Struct("<QQ")
-# Plain integers, as comparing with them is faster, and it is done for every record.
+# Plain integers compare faster than enum members, and every record is compared.
 _CHUNK, _MESSAGE_INDEX, _DATA_END = int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX), int(Opcode.DATA_END)
 _INDEX_BYTES = struct.Struct("<2xI")
-# After damage, reading resumes at a chunk or at the session's end. A chunk is found by the name of its compression,
-# which comes after the prefix, two times, a size and a checksum; the session's end by its name, after the prefix.
+# After damage, reading resumes at a chunk or at the session's end. The search looks for the name of the chunk's
+# compression, which comes after the prefix, two times, a size and a checksum, or for the name of the session's end.
 _LANDMARK = re.compile(rb"(?P<chunk>\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)|\x0b\x00\x00\x00session_end")
 _CHUNK_NAME_AT = 37
 _METADATA_NAME_AT = _PREFIX.size
-# LZ4 compresses at most 255 to 1. A chunk that claims more is not genuine, and decompressing it could fill the memory.
-_TIGHTEST = 256
-# Zstandard packs equal bytes without such a limit, as those of a black image; a chunk that claims more is not genuine.
-_TIGHTEST_ZSTD_BYTES = 1 << 28
+# LZ4 compresses at most 255 to 1. A larger claim is false, and decompressing such a chunk could fill the memory.
+_MAX_RATIO = 256
+# Zstandard has no such limit for equal bytes, as of a black image; this is the limit for such chunks.
+_MAX_ZSTD_BYTES = 1 << 28
 _BLOCK = 1 << 20
 # Up to this size, a chunk's uncompressed size is accepted whatever the ratio.
 _SMALL_BYTES = 64 * 1024
-# Reading stops once this multiple of the file's size was read: records overlap, and might do so without end.
-_MOST_READ = 4
-# So many unreadable places are described; a file may have millions.
-_MOST_DESCRIBED = 100
-# What parsing a damaged record may raise, or using values that do not fit each other.
+# Reading stops after this multiple of the file's size, as overlapping records could repeat without end.
+_MAX_READ_RATIO = 4
+# Number of unreadable places with a description; a file can have millions.
+_MAX_DESCRIBED = 100
+# Exceptions of parsing a damaged record, and of using values that do not fit each other.
 BROKEN = (
     *(McapError, struct.error, zlib.error, ValueError, LookupError, TypeError),
     *(AttributeError, ArithmeticError, MemoryError, RecursionError),
 )
+
+
+R = TypeVar("R", covariant=True)
+
+
+class RecordType(Protocol[R]):
+    """A class of ``mcap.records``."""
+
+    __name__: str
+
+    def read(self, stream: ReadDataStream, /) -> R:
+        """Return the record in a stream."""
+        ...
 
 
 class Record(NamedTuple):
@@ -62,11 +78,10 @@ class Record(NamedTuple):
 
 @dataclass
 class Damage:
-    """What could not be read.
+    """The unreadable places of a file.
 
     Attributes:
-        skipped: Descriptions of what is unreadable and where, in the order of the file; the last one counts the places
-            beyond the first hundred.
+        skipped: Descriptions of the places, in the order of the file; the last one counts those beyond the first 100.
         cut: Whether the file ends before the end of its data section.
         count: Number of unreadable places.
     """
@@ -75,13 +90,13 @@ class Damage:
     cut: bool = False
     count: int = 0
 
-    def skip(self, what: str) -> None:
+    def skip(self, description: str) -> None:
         """Add the description of an unreadable place."""
         self.count += 1
-        beyond = self.count - _MOST_DESCRIBED
-        self.skipped[_MOST_DESCRIBED:] = [f"{beyond} more places"] if beyond > 0 else []
+        beyond = self.count - _MAX_DESCRIBED
+        self.skipped[_MAX_DESCRIBED:] = [f"{beyond} more places"] if beyond > 0 else []
         if beyond <= 0:
-            self.skipped.append(what)
+            self.skipped.append(description)
 
 
 @contextmanager
@@ -93,9 +108,9 @@ def opened(path: str | Path) -> Iterator[mmap.mmap]:
     """
     path = Path(path)
     if not path.is_file():
-        found = sorted(p.name for p in path.parent.glob("*.mcap"))
+        names = sorted(p.name for p in path.parent.glob("*.mcap"))
         raise Sim2RealError(
-            f"there is no log {path}", hint=f"logs in that folder: {', '.join(found)}" if found else "check the path"
+            f"there is no log {path}", hint=f"logs in that folder: {', '.join(names)}" if names else "check the path"
         )
     with open(path, "rb") as stream:
         magic = stream.read(len(MCAP0_MAGIC))
@@ -118,11 +133,11 @@ def cut_before_session(path: str | Path) -> Sim2RealError:
 def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
     """Yield the records of the data section without reading their content.
 
-    Each record has its length, which leads to the next one. If a length is damaged, reading resumes at the next bytes
-    that look like a chunk or the session's end.
+    The length of each record leads to the next one. If a length is damaged, reading resumes at the next bytes that look
+    like a chunk or the session's end.
 
     Args:
-        damage: Damage that is found is added here.
+        damage: Receives the damage.
 
     Raises:
         Sim2RealError: When records overlap.
@@ -133,8 +148,8 @@ def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
         record = _record(data, position)
         if record is not None:
             read += record.end - position
-            if read > _MOST_READ * len(data):
-                raise Sim2RealError("the records of the file overlap: no recorder wrote it")
+            if read > _MAX_READ_RATIO * len(data):
+                raise Sim2RealError("the records of the file overlap, which no recorder writes")
             yield record
             position = record.end
             if record.opcode in (_CHUNK, _MESSAGE_INDEX):
@@ -142,7 +157,7 @@ def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
             elif record.opcode == _DATA_END:
                 return
             continue
-        # A damaged length may have led past good chunks: search from the end of the last record known to be whole.
+        # A damaged length can lead past good chunks: search from the end of the last record that is surely whole.
         resume = _next_landmark(data, trusted)
         if resume is None:
             break
@@ -161,7 +176,7 @@ def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
     """Return the content of a chunk, decompressed and checked; empty if it is damaged.
 
     Args:
-        damage: Damage that is found is added here.
+        damage: Receives the damage.
     """
     try:
         return _decompressed(Chunk.read(stream_of(data, record)))
@@ -173,7 +188,7 @@ def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
 def chunk_records(content: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of the records in a chunk's content, without reading their content.
 
-    These are the fields of ``Record``, but plain tuples are faster, and there is one for each message.
+    The tuples have the fields of ``Record``; plain tuples are faster, and there is one for each message.
 
     Raises:
         ValueError: When the records' lengths do not add up to the content's.
@@ -188,12 +203,12 @@ def chunk_records(content: bytes) -> Iterator[tuple[int, int, int]]:
         yield opcode, start, position
 
 
-def parsed(kind: type[Any], data: mmap.mmap | bytes, record: Record, damage: Damage) -> Any | None:
+def parsed(kind: RecordType[R], data: mmap.mmap | bytes, record: Record, damage: Damage) -> R | None:
     """Return a record parsed by a class of ``mcap.records``; None if it is damaged.
 
     Args:
         data: The file, or a chunk's content.
-        damage: Damage that is found is added here.
+        damage: Receives the damage.
     """
     try:
         return kind.read(stream_of(data, record))
@@ -216,13 +231,13 @@ def _record(data: mmap.mmap, position: int) -> Record | None:
     end = start + length
     if end > len(data) or not opcode:
         return None
-    # Lengths of chunks and message indices, most of a file, can be checked; of the others the opcode is checked.
+    # Check the lengths inside of chunks and message indices, which are most of a file; check the opcode of the others.
     if opcode == _MESSAGE_INDEX:
         plausible = length >= 6 and length == 6 + _INDEX_BYTES.unpack_from(data, start)[0]
     elif opcode == _CHUNK:
         plausible = _is_chunk(data, start, length)
     elif opcode > _DATA_END:
-        # A private record (from 0x80 on) or one of a later format, unless it is a chunk with a damaged opcode.
+        # Accept a private record (from 0x80 on) or one of a later format, but no chunk with a damaged opcode.
         plausible = _begins_record(data, end) and not _is_chunk(data, start, length)
     else:
         plausible = opcode != _DATA_END or length == 4
@@ -248,10 +263,10 @@ def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
 
 
 def _decompressed(chunk: Chunk) -> bytes:
-    """Return a chunk's content; a wrong size or checksum is an error, found without decompressing more than claimed."""
+    """Return a chunk's content, without decompressing more than its claimed size; check size and checksum."""
     size = chunk.uncompressed_size
-    most = _TIGHTEST * len(chunk.data) + _SMALL_BYTES
-    if size > (max(most, _TIGHTEST_ZSTD_BYTES) if chunk.compression == "zstd" else most):
+    limit = _MAX_RATIO * len(chunk.data) + _SMALL_BYTES
+    if size > (max(limit, _MAX_ZSTD_BYTES) if chunk.compression == "zstd" else limit):
         raise ValueError(f"it claims to hold {size} bytes: more than can be packed into {len(chunk.data)}")
     if chunk.compression == "lz4":
         import lz4.frame
@@ -271,15 +286,15 @@ def _decompressed(chunk: Chunk) -> bytes:
 
 
 @lru_cache(maxsize=16)
-def _zstd(_thread: int) -> Any:
-    """Return a thread's decompressor; to make one takes longer than to decompress a small chunk."""
+def _zstd(_thread: int) -> zstandard.ZstdDecompressor:
+    """Return a thread's decompressor, which takes longer to create than a small chunk takes to decompress."""
     import zstandard
 
     return zstandard.ZstdDecompressor()
 
 
-def _blocks(stream: Any) -> Iterator[bytes]:
-    """Yield the content of a stream in blocks, so that memory is taken only for what is there."""
+def _blocks(stream: zstandard.ZstdDecompressionReader) -> Iterator[bytes]:
+    """Yield the content of a stream in blocks, so that memory grows only with the real content."""
     while block := stream.read(_BLOCK):
         yield block
 

@@ -1,4 +1,4 @@
-"""Copies what is readable of a damaged MCAP file into a new one."""
+"""Copies the readable records of a damaged MCAP file into a new one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Recovery:
 
     Attributes:
         messages: Topic -> number of messages written.
-        skipped: Descriptions of what was unreadable.
+        skipped: Descriptions of the unreadable places.
         cut: Whether the source ends before the end of its data section.
     """
 
@@ -34,9 +34,9 @@ class Recovery:
 
 
 def recover(source: str | Path, target: str | Path) -> Recovery:
-    """Copy what is readable of a damaged MCAP file into a new one that every MCAP reader opens.
+    """Copy the readable records of a damaged MCAP file into a new one that every MCAP reader opens.
 
-    The new file has a ``session_end`` only if the old one has: a session that crashed still counts as crashed.
+    The new file has a ``session_end`` only if the old one has: a crashed session stays crashed.
 
     Args:
         target: The new file; it must not exist.
@@ -71,39 +71,39 @@ class _Definitions:
     Attributes:
         schemas: Number -> schema.
         channels: Number -> channel.
-        sure: Numbers of channels that are defined in a chunk, which has a checksum; other definitions may be damaged.
+        checked: Numbers of the channels that a chunk defines; chunks have checksums, other definitions can be damaged.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    sure: set[int] = field(default_factory=set)
+    checked: set[int] = field(default_factory=set)
 
 
 def _definitions(data: mmap.mmap) -> _Definitions:
     """Collect a file's schemas and channels; definitions in chunks take precedence, as chunks have checksums."""
-    loose, sure = _Definitions(), _Definitions()
-    unheeded = Damage()  # not reported here, but when the records are copied
+    loose, checked = _Definitions(), _Definitions()
+    ignored = Damage()  # the copy of the records reports the damage
 
-    def take(found: _Definitions, source: mmap.mmap | bytes, record: Record) -> None:
-        if record.opcode == Opcode.SCHEMA and (schema := parsed(Schema, source, record, unheeded)) is not None:
-            found.schemas[schema.id] = schema
-        elif record.opcode == Opcode.CHANNEL and (channel := parsed(Channel, source, record, unheeded)) is not None:
-            found.channels[channel.id] = channel
+    def take(definitions: _Definitions, source: mmap.mmap | bytes, record: Record) -> None:
+        if record.opcode == Opcode.SCHEMA and (schema := parsed(Schema, source, record, ignored)) is not None:
+            definitions.schemas[schema.id] = schema
+        elif record.opcode == Opcode.CHANNEL and (channel := parsed(Channel, source, record, ignored)) is not None:
+            definitions.channels[channel.id] = channel
 
-    for record in records(data, unheeded):
+    for record in records(data, ignored):
         if record.opcode != Opcode.CHUNK:
             take(loose, data, record)
             continue
-        content = chunk_content(data, record, unheeded)
+        content = chunk_content(data, record, ignored)
         for inner in _whole(content):
-            take(sure, content, inner)
-    return _Definitions(loose.schemas | sure.schemas, loose.channels | sure.channels, set(sure.channels))
+            take(checked, content, inner)
+    return _Definitions(loose.schemas | checked.schemas, loose.channels | checked.channels, set(checked.channels))
 
 
 def _whole(content: bytes, damage: Damage | None = None) -> list[Record]:
     """Return the records in a chunk's content; none if their lengths do not add up."""
     try:
-        return [Record(*found) for found in chunk_records(content)]
+        return [Record(*record_fields) for record_fields in chunk_records(content)]
     except ValueError as error:
         if damage is not None:
             damage.skip(str(error))
@@ -126,7 +126,7 @@ class _Copier:
         """Copy a record of the data section.
 
         Args:
-            damage: Damage that is found is added here.
+            damage: Receives the damage.
         """
         if record.opcode == Opcode.HEADER:
             self._header = parsed(Header, data, record, damage) or self._header
@@ -148,7 +148,7 @@ class _Copier:
         """Write the channels without messages, and the index."""
         self._begin()
         # If chunks define channels, one that is defined only elsewhere is a damaged copy of one of those.
-        for number in sorted(self._known.sure or self._known.channels):
+        for number in sorted(self._known.checked or self._known.channels):
             self._channel(number)
         self._writer.finish()
 

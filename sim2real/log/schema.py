@@ -6,13 +6,13 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import named_leaves
 from sim2real.log.cdr import ROS_TYPES, CdrConstant, CdrField, Layout, length, text
+from sim2real.types import Json, PyTree
 
 STEP_FIELDS = ("seq", "scheduled", "start", "woken", "ts_overwrite", "end", "drift")
 MESSAGE_FIELDS = ("seq_out", "seq_in")
@@ -53,12 +53,12 @@ class Topic:
 
 @dataclass(frozen=True)
 class JointSource:
-    """Where the joint states of one node come from.
+    """The source of the joint states of one node.
 
     Attributes:
         topic: The topic of joint states; its layout has the names of this node's joints.
         picks: For each of position, velocity and effort, ``(leaf, element)`` in the node's output for every joint; leaf
-            is -1 if the joint lacks the quantity. Empty for a quantity that no joint has.
+            is -1 if the joint lacks the quantity. Empty if all joints lack the quantity.
     """
 
     topic: Topic
@@ -72,12 +72,12 @@ def snake(name: str) -> str:
     return result if result[:1].isalpha() else f"field_{result}".rstrip("_")
 
 
-def output_topic(node: str, example: Any, units: Mapping[str, str] | None = None) -> Topic:
+def output_topic(node: str, example: PyTree, units: Mapping[str, str] | None = None) -> Topic:
     """Return the topic of a node's output.
 
     Args:
         example: An output, such as ``init_output`` returns.
-        units: Field, or entry of one (``"aim[0]"``) -> unit, as far as known.
+        units: Field, or entry of one (``"aim[0]"``) -> unit.
 
     Raises:
         Sim2RealError: When two leaves get the same name, or one has a dtype that ROS lacks.
@@ -109,21 +109,21 @@ def output_topic(node: str, example: Any, units: Mapping[str, str] | None = None
     )
 
 
-def layout_of_fields(described: Sequence[Mapping[str, Any]]) -> Layout:
+def layout_of_fields(described: Sequence[Mapping[str, Json]]) -> Layout:
     """Return the layout of an output from ``fields`` in its channel's metadata; its fields have the original names."""
     return Layout(part for entry in described if (part := _field(entry)).size)
 
 
-def units_of_fields(described: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+def units_of_fields(described: Sequence[Mapping[str, Json]]) -> dict[str, str]:
     """Return field, or entry of one -> unit, from ``fields`` in a channel's metadata."""
-    found: dict[str, str] = {}
+    units: dict[str, str] = {}
     for entry in described:
         unit, name = entry.get("unit"), entry["original"]
         if isinstance(unit, str):
-            found[name] = unit
+            units[name] = unit
         elif isinstance(unit, list):
-            found |= {f"{name}[{i}]": str(u) for i, u in enumerate(unit) if u}
-    return found
+            units |= {f"{name}[{i}]": str(u) for i, u in enumerate(unit) if u}
+    return units
 
 
 def step_topic(node: str) -> Topic:
@@ -143,16 +143,16 @@ def input_topic(node: str, input_name: str) -> Topic:
 
 def joint_source(
     node: str,
-    example: Any,
+    example: PyTree,
     joints: Mapping[str, Mapping[str, str]],
     units: Mapping[str, str] | None = None,
 ) -> JointSource:
-    """Return how a node's output becomes ``sensor_msgs/msg/JointState``.
+    """Return the source of the ``sensor_msgs/msg/JointState`` messages in a node's output.
 
     Args:
         joints: Joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the output: ``"th"``, or
             ``"q[2]"`` for an element of the flattened field.
-        units: Field, or entry of one -> unit, as far as known.
+        units: Field, or entry of one -> unit.
 
     Raises:
         Sim2RealError: When a quantity, a field or an element does not exist.
@@ -165,7 +165,7 @@ def joint_source(
                 f"joint {joint!r} of node {node!r} has no {sorted(unknown)[0]!r}. Available: {', '.join(quantities)}"
             )
     picks: list[tuple[tuple[int, int], ...]] = []
-    described: list[dict[str, Any]] = []
+    described: list[dict[str, Json]] = []
     parts: list[CdrConstant | CdrField] = [
         CdrField("sec", np.dtype("<i4")),
         CdrField("nanosec", np.dtype("<u4")),
@@ -193,11 +193,11 @@ def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, s
     """Return original name -> ROS name.
 
     Args:
-        where: What they are part of, for errors.
-        kind: What they are names of, for errors.
+        where: Place of the names, for errors.
+        kind: Kind of the named things, for errors.
 
     Raises:
-        Sim2RealError: When two of them get the same ROS name.
+        Sim2RealError: When two names become the same ROS name.
     """
     taken: dict[str, str] = {}
     for original in originals:
@@ -217,7 +217,7 @@ def unit_of(name: str, units: Mapping[str, str]) -> str:
 
 
 def _unit(name: str, size: int, units: Mapping[str, str]) -> str | list[str]:
-    """Return the unit of a field; a list if its entries have different ones; empty if none is known."""
+    """Return the unit of a field; a list if its entries have different units; empty if it is unknown."""
     entries = [unit_of(f"{name}[{i}]", units) for i in range(size)]
     return entries if len(set(entries)) > 1 else "".join(set(entries))
 
@@ -228,7 +228,7 @@ def _scalars(units: Mapping[str, str]) -> str:
     return json.dumps([{"name": name, "original": name, **common, "unit": unit} for name, unit in units.items()])
 
 
-def _field(entry: Mapping[str, Any]) -> CdrField:
+def _field(entry: Mapping[str, Json]) -> CdrField:
     return CdrField(entry["original"], np.dtype(entry["dtype"]), tuple(entry["shape"]))
 
 

@@ -1,4 +1,4 @@
-"""Writes the file of one session, in the order that lets a crashed session be read. For one thread at a time."""
+"""Writes the file of one session, in an order that keeps crashed sessions readable. For one thread at a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
@@ -32,6 +32,7 @@ from sim2real.log.schema import (
     step_topic,
     unique_names,
 )
+from sim2real.types import Json, PyTree
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -43,14 +44,14 @@ CHUNK_BYTES = 64 * 1024
 
 @dataclass
 class _Node:
-    """How the steps of one node are written.
+    """The topics of one node.
 
     Attributes:
         step: Topic of its step records.
         output: Topic of its outputs.
-        filled: Indices of the output's leaves that have elements; empty ones are not written.
+        filled: Indices of the output's leaves with elements; empty leaves are not written.
         leaves: Number of leaves of the output.
-        joints: Where its joint states come from, or None.
+        joints: Source of its joint states, or None.
     """
 
     step: Topic
@@ -67,12 +68,10 @@ class SessionFile:
 
     Args:
         path: The file; it must not exist.
-        metadata: The session's metadata: JSON-able.
-        attachments: File name -> content.
         outputs: Node -> an example of its output.
         inputs: The connections, as (node, input name).
         joint_states: Node -> joint -> quantity -> field of the node's output; see ``McapRecorder``.
-        units: Node -> field, or entry of one -> unit, for the channels' metadata.
+        units: Node -> field, or entry of one -> unit.
 
     Attributes:
         counts: Topic -> number of messages written.
@@ -84,9 +83,9 @@ class SessionFile:
     def __init__(
         self,
         path: Path,
-        metadata: Mapping[str, Any],
+        metadata: Mapping[str, Json],
         attachments: Mapping[str, bytes],
-        outputs: Mapping[str, Any],
+        outputs: Mapping[str, PyTree],
         inputs: Iterable[tuple[str, str]],
         joint_states: Mapping[str, Mapping[str, Mapping[str, str]]],
         units: Mapping[str, Mapping[str, str]] | None = None,
@@ -144,7 +143,7 @@ class SessionFile:
             channel = self._writer.register_channel(topic.name, "cdr", schema, metadata)
             Channel(channel, topic.name, "cdr", metadata, schema).write(loose)
             self._channels[topic.name] = channel
-        # Also in front of the first chunk, where the writer puts them: losing that chunk must not lose the others.
+        # Write the definitions also before the first chunk, so that the loss of that chunk does not lose the others.
         self._stream.write(loose.end())
         for event in self._early_events:
             self.event(*event)
@@ -175,8 +174,8 @@ class SessionFile:
         """Write the record of a message."""
         topic = self._inputs.get((record.node, record.input))
         if topic is None:
-            known = ", ".join(f"{node}/{name}" for node, name in self._inputs)
-            raise Sim2RealError(f"input {record.node}/{record.input} is not in this log. Available: {known}")
+            available = ", ".join(f"{node}/{name}" for node, name in self._inputs)
+            raise Sim2RealError(f"input {record.node}/{record.input} is not in this log. Available: {available}")
         payload = topic.layout.pack((record.seq_out, record.seq_in))
         sent, received = (self._epoch_ns + 1000 * ticks for ticks in (record.sent, record.received))
         self._add(topic, payload, record.seq_out, received, sent)
@@ -185,8 +184,8 @@ class SessionFile:
         """Write an event.
 
         Args:
-            monotonic_ns: When it happened, on the monotonic clock [ns].
-            ticks: When it happened, for a simulated clock [us from the episode's start]; None: use ``monotonic_ns``.
+            monotonic_ns: Time of the event on the monotonic clock [ns].
+            ticks: Time on a simulated clock [us from the episode's start]; None: use ``monotonic_ns``.
             level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
         """
         topic = self._topics[-1]
@@ -206,14 +205,14 @@ class SessionFile:
         self._add(topic, payload, self.counts.get(topic.name, 0), time_ns, time_ns)
 
     def flush(self) -> None:
-        """Pass everything written so far to the operating system, so that it survives the end of this process."""
+        """Pass the written records to the operating system, so that they survive the end of this process."""
         self._writer.flush()
 
     def sync(self) -> None:
-        """Wait until everything flushed so far is on the disk, so that it survives a loss of power."""
+        """Wait until the flushed records are on the disk, so that they survive a loss of power."""
         os.fsync(self._stream.fileno())
 
-    def finish(self, end: Mapping[str, Any]) -> None:
+    def finish(self, end: Mapping[str, Json]) -> None:
         """Write ``session_end`` and the index, and close."""
         self._writer.flush()
         self._writer.add_metadata(document.SESSION_END, document.encode(document.SESSION_END, end))
@@ -223,12 +222,12 @@ class SessionFile:
         self._stream.close()
 
     def abandon(self) -> None:
-        """Close a file that could not be finished."""
+        """Close the file without its end."""
         with suppress(OSError):
             self._stream.close()
 
     def _all_topics(self) -> list[Topic]:
-        """Return the topics of all channels; that of events is the last one."""
+        """Return the topics of all channels; the topic of events is the last one."""
         topics = [t for node in self._nodes.values() for t in (node.step, node.output) if t.layout.fields]
         topics += self._inputs.values()
         topics += [node.joints.topic for node in self._nodes.values() if node.joints is not None][:1]
@@ -244,7 +243,7 @@ class SessionFile:
 
 
 def _nodes(
-    outputs: Mapping[str, Any],
+    outputs: Mapping[str, PyTree],
     joint_states: Mapping[str, Mapping[str, Mapping[str, str]]],
     units: Mapping[str, Mapping[str, str]],
 ) -> dict[str, _Node]:
@@ -252,10 +251,10 @@ def _nodes(
     nodes, types = {}, {}
     for name, example in outputs.items():
         leaves = list(named_leaves(example).values())
-        own = units.get(name, {})
-        joints = joint_source(name, example, joint_states[name], own) if name in joint_states else None
+        node_units = units.get(name, {})
+        joints = joint_source(name, example, joint_states[name], node_units) if name in joint_states else None
         filled = [i for i, leaf in enumerate(leaves) if np.size(leaf)]
-        node = _Node(step_topic(name), output_topic(name, example, own), filled, len(leaves), joints)
+        node = _Node(step_topic(name), output_topic(name, example, node_units), filled, len(leaves), joints)
         other = types.setdefault(node.output.schema, name)
         if other != name:
             raise Sim2RealError(
@@ -279,8 +278,8 @@ def _inputs(inputs: Iterable[tuple[str, str]], nodes: Mapping[str, _Node]) -> di
     return topics
 
 
-def _to_host(leaves: list[Any]) -> list[Any]:
-    """Return the leaves as numpy arrays or numbers; all transfers start before the first one is waited for."""
+def _to_host(leaves: list[PyTree]) -> list[PyTree]:
+    """Return the leaves as NumPy arrays or numbers; all transfers start before the first wait."""
     for leaf in leaves:
         if hasattr(leaf, "copy_to_host_async"):
             leaf.copy_to_host_async()

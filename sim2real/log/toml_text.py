@@ -1,4 +1,4 @@
-"""Values and keys as TOML writes them; the standard library only reads TOML."""
+"""Values and keys in TOML, which the standard library reads and does not write."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ def toml_value(value: object) -> str:
     """Return a text, a number, a boolean or a list of them as TOML writes it.
 
     Raises:
-        UsageError: When it is none of them, or a text has half a character, as names of files may.
+        UsageError: When it is of another type, or a text has half a character, which names of files can have.
     """
     if isinstance(value, str):
         try:
             value.encode()
         except UnicodeEncodeError:
             raise UsageError(
-                f"{value!r} cannot be written: it has bytes that are no text", hint="rename what has this name"
+                f"{value!r} cannot be written: it has bytes that are no text",
+                hint="rename the file or joint",
             ) from None
-        # TOML has JSON's escapes, but none for half of a character, and it wants DEL escaped.
+        # TOML has the escapes of JSON, and needs one for DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -38,5 +39,5 @@ def toml_value(value: object) -> str:
 
 
 def toml_key(key: str) -> str:
-    """Return a part of a key: as it is where TOML takes that, else quoted."""
+    """Return a part of a key, quoted if TOML needs quotes."""
     return key if _BARE.fullmatch(key) else toml_value(key)

@@ -16,16 +16,16 @@ import numpy as np
 
 from sim2real.errors import ERROR, OK, Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord, named_leaves
-from sim2real.log.backlog import RECORD_BYTES, Backlog, most_bytes
+from sim2real.log.backlog import RECORD_BYTES, Backlog, max_queue_bytes
 from sim2real.log.session_file import SessionFile
 
-# A crash may cost at most 0.25 s of data; 0.05 s are left for a writer thread that wakes late.
+# A crash costs at most 0.25 s of data; 0.05 s of it is the margin for a writer thread that wakes late.
 FLUSH_PERIOD_S = 0.2
 SYNC_PERIOD_S = 1.0
-# How often `close` looks whether the writer comes on, and how often it says so.
-LOOK_S, SAY_S = 0.2, 5.0
-# Records between two looks at the memory that the queue takes.
-LOOK_EVERY = 256
+# `close` checks the writer's progress, and reports it, with these periods.
+CHECK_PERIOD_S, REPORT_PERIOD_S = 0.2, 5.0
+# The queue's memory is checked once in this many records.
+RECORDS_PER_CHECK = 256
 # The warning level of rcl_interfaces/msg/Log.
 WARN = 30
 
@@ -34,23 +34,22 @@ class McapRecorder:
     """Writes one episode of a graph into one MCAP file; a ``Recorder``.
 
     ``start``, ``step``, ``message`` and ``write_event`` only queue: they never wait for the disk, and may be called
-    from any thread. An error while writing is raised by the next call. Used as a context manager, an exception that
-    leaves the block becomes the status of the session. If the process ends without closing the log, it is closed with
-    the status ``aborted``.
+    from any thread. The next call raises an error of the writer. As a context manager, it writes an exception that
+    leaves the block as the status of the session. If the process ends without ``close``, the status is ``aborted``.
 
-    A writer that falls behind loses nothing: `backlog` says how far behind it is, and `close` waits as long as it
-    comes on. The memory of the queue has a bound: beyond it every call raises an error, and what is queued is written.
+    A writer that falls behind loses no record: ``backlog`` returns its delay, and ``close`` waits while it makes
+    progress. The queue's memory has a limit: beyond it every call raises an error, and the queued records are written.
 
     Args:
         path: The file; it must not exist.
-        metadata: Facts about the session (pipeline, configuration, versions, ...): JSON-able. The key ``log`` is
+        metadata: Metadata of the session (pipeline, configuration, versions, ...), as JSON has it. The key ``log`` is
             reserved.
         attachments: File name -> content.
         outputs: Node -> an example of its output, such as ``init_output`` returns; all outputs must have its shapes.
         inputs: The connections, as (node, input name).
         joint_states: Node -> joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the node's output
             (``"th"``, ``"q[2]"``): also written as ``/joint_states``, which viewers plot without configuration.
-        units: Node -> field, or entry of one (``"aim[0]"``) -> unit, as far as known.
+        units: Node -> field, or entry of one (``"aim[0]"``) -> unit.
 
     Raises:
         Sim2RealError: When the file exists or cannot be created, the metadata cannot be written as JSON, two names get
@@ -68,7 +67,7 @@ class McapRecorder:
         units: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
         if "log" in metadata:
-            raise Sim2RealError("the session's metadata has a key 'log', where the reader puts facts about the log")
+            raise Sim2RealError("the session's metadata has the key 'log', which is reserved for the reader")
         self.path = Path(path)
         self._names = {node: dict.fromkeys(named_leaves(example)) for node, example in outputs.items()}
         self._file = SessionFile(self.path, metadata, attachments, outputs, inputs, joint_states or {}, units)
@@ -76,8 +75,8 @@ class McapRecorder:
         self._queue = queue.SimpleQueue()
         self._longest_queue = 0
         self._longest_behind_s = 0.0
-        self._most_bytes = most_bytes()
-        # Memory of the arrays of each node's outputs: all have the shapes of the example.
+        self._max_bytes = max_queue_bytes()
+        # Memory of the arrays in each node's outputs, which have the shapes of the example.
         self._sizes = {
             node: sum(np.asarray(leaf).nbytes for leaf in named_leaves(example).values())
             for node, example in outputs.items()
@@ -85,7 +84,7 @@ class McapRecorder:
         self._queued = dict.fromkeys(outputs, 0)  # steps of each node, which one thread counts
         self._written = dict.fromkeys(outputs, 0)
         self._puts = 0
-        self._at_s = self._began_s = 0.0  # when the record being written was queued, and when that began
+        self._at_s = self._began_s = 0.0  # when the present record was queued, and when its write began
         self._busy = False
         self._error: BaseException | None = None
         self._failed: Sim2RealError | None = None
@@ -126,12 +125,12 @@ class McapRecorder:
         Args:
             kind: A short name, for example ``"watchdog"``.
             level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
-            ticks: When it happened, for a simulated clock [us from the episode's start]; None: now.
+            ticks: Time of the event on a simulated clock [us from the episode's start]; None: now.
         """
         self._put(self._file.event, time.monotonic_ns(), ticks, level, kind, text)
 
     def backlog(self) -> Backlog:
-        """Return what waits to be written; from any thread."""
+        """Return the records that are not written yet; callable from any thread."""
         records = self._queue.qsize() + self._busy
         arrays = sum(self._sizes[n] * max(0, self._queued[n] - self._written[n]) for n in self._sizes)
         now_s = time.monotonic()
@@ -143,19 +142,19 @@ class McapRecorder:
         status: str = "finished",
         exit_code: int = OK,
         summary: Mapping[str, Any] | None = None,
-        told: Callable[[str], None] | None = None,
+        report: Callable[[str], None] | None = None,
     ) -> None:
-        """Write everything that is queued and ``session_end``, and close the file. Later calls do nothing.
+        """Write all queued records and ``session_end``, and close the file. Later calls do nothing.
 
-        It waits as long as the writer comes on, however long the queue is.
+        It waits while the writer makes progress.
 
         Args:
-            status: How the session ended, in a word or a sentence.
-            summary: More facts for ``session_end`` (overruns, drops, ...): JSON-able.
-            told: Called with a sentence every few seconds while it waits.
+            status: End of the session, in a word or a sentence.
+            summary: More values for ``session_end`` (overruns, drops, ...), as JSON has them.
+            report: Called with the progress, a sentence, every few seconds.
 
         Raises:
-            Sim2RealError: When something could not be written, or the disk has taken no data for a minute.
+            Sim2RealError: When a record could not be written, or the disk has taken no data for a minute.
         """
         with self._lock:
             if self._closed:
@@ -163,7 +162,7 @@ class McapRecorder:
             self._closed = True
         atexit.unregister(self._close_at_exit)
         self._queue.put(None)
-        self._drain(told)
+        self._drain(report)
         if self._error is None:
             try:
                 self._file.finish(
@@ -208,44 +207,45 @@ class McapRecorder:
             raise self._overflow
         self._queue.put((time.monotonic(), write, arguments))
         self._puts += 1
-        if not self._puts % LOOK_EVERY and self._overflow is None and (left := self.backlog()).bytes > self._most_bytes:
+        # Check the queue's memory once in many records, as the check takes longer than a put.
+        if self._puts % RECORDS_PER_CHECK == 0 and (left := self.backlog()).bytes > self._max_bytes:
             self._overflow = Sim2RealError(
-                f"{left}: more than {self._most_bytes / 1e6:.0f} MB of the log {self.path} would wait in memory",
+                f"{left}: more than {self._max_bytes / 1e6:.0f} MB of the log {self.path} would wait in memory",
                 hint="the log holds every record until now; record fewer or smaller outputs, at a lower rate, close "
-                "what else runs on this machine, or write to a faster, local disk",
+                "other programs on this machine, or write to a faster, local disk",
             )
 
-    def _drain(self, told: Callable[[str], None] | None) -> None:
+    def _drain(self, report: Callable[[str], None] | None) -> None:
         """Wait until the writer has written the queue.
 
         Raises:
-            Sim2RealError: When the disk is stuck; a slow writer is not.
+            Sim2RealError: When the disk is stuck.
         """
-        say_s = time.monotonic() + SAY_S
+        report_s = time.monotonic() + REPORT_PERIOD_S
         while self._thread.is_alive():
-            self._thread.join(LOOK_S)
+            self._thread.join(CHECK_PERIOD_S)
             left = self.backlog()
             if left.stuck and self._thread.is_alive():
                 raise Sim2RealError(
                     f"the disk took no data for {left.idle_s:.0f} s: the log {self.path} has no end, "
                     f"{left.records:,} records are lost",
-                    hint="what is there opens all the same; write logs to a local disk",
+                    hint="the written part of the log can be read; write logs to a local disk",
                 )
-            if told is not None and left.records and time.monotonic() >= say_s:
-                told(f"writing the log: {left}")
-                say_s += SAY_S
+            if report is not None and left.records and time.monotonic() >= report_s:
+                report(f"writing the log: {left}")
+                report_s += REPORT_PERIOD_S
 
     def _failure(self) -> Sim2RealError:
-        """Return the error that all calls raise from now on: always the same object, so that it is reported once."""
+        """Return the error that all later calls raise; it is one object, so that it is reported once."""
         if self._failed is None:
             hint = None
             if isinstance(self._error, OSError):
-                hint = "check the disk's free space; what was written before opens with a warning"
+                hint = "check the disk's free space; the part written before opens with a warning"
             self._failed = Sim2RealError(f"writing the log {self.path} failed: {self._error}", hint)
         return self._failed
 
     def _run(self) -> None:
-        """Write what is in the queue until None comes."""
+        """Write the records of the queue until None comes."""
         try:
             flush_at = time.monotonic() + FLUSH_PERIOD_S
             sync_at = time.monotonic() + SYNC_PERIOD_S
@@ -255,6 +255,7 @@ class McapRecorder:
                     if item is None:
                         return
                     self._write(*item)
+                # Flush after each period, so that a crash costs little data; sync less often, as it takes longer.
                 if (now := time.monotonic()) < flush_at:
                     continue
                 left = self.backlog()
@@ -285,13 +286,13 @@ class McapRecorder:
             self.close("aborted", ERROR)
 
 
-def _snapshot(node: str, output: Any, names: dict[str, None]) -> list[Any]:
+def _snapshot(node: str, output: Any, expected: dict[str, None]) -> list[Any]:
     """Return the leaves of an output; writable numpy arrays are copied, as the caller may change them."""
-    if isinstance(output, Mapping) and output.keys() == names.keys():
-        leaves = [output[name] for name in names]
-    elif isinstance(output, Mapping) and names and not any(isinstance(value, Mapping) for value in output.values()):
+    if isinstance(output, Mapping) and output.keys() == expected.keys():
+        leaves = [output[name] for name in expected]
+    elif isinstance(output, Mapping) and expected and not any(isinstance(value, Mapping) for value in output.values()):
         raise Sim2RealError(
-            f"the output of node {node!r} has the fields {', '.join(output)}, expected {', '.join(names)}"
+            f"the output of node {node!r} has the fields {', '.join(output)}, expected {', '.join(expected)}"
         )
     else:
         import jax  # imported late: a log of plain dictionaries is written without JAX

@@ -1,15 +1,19 @@
-"""The parts of a page (figures, tables, notes), and the formatting of numbers in them."""
+"""The parts of a page (figures, tables, notes), and the format of their numbers."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from sim2real.artifacts.summary import Cell, Interval, Table
+
 MISSING = "–"  # noqa: RUF001 - a dash, as is usual in tables
 
-_UNITS = {"_rad_s": "rad/s", "_m_s": "m/s", "_rad": "rad", "_nm": "N m", "_v": "V", "_m": "m", "_s": "s"}
+
+_NUMBER = re.compile(r"[+-]?\d+(\.\d+)? ?%?")
 
 
 @dataclass(frozen=True)
@@ -18,9 +22,8 @@ class FigureBlock:
 
     Attributes:
         svg: The figure as SVG.
-        caption: What it shows.
         narrow: Whether two such figures fit side by side.
-        kind: The kind of block, for the template.
+        kind: Kind of block, for the template.
     """
 
     svg: str
@@ -34,13 +37,12 @@ class TableBlock:
     """A table.
 
     Attributes:
-        caption: What it shows.
         columns: Headers of the columns.
         rows: Cells as text; the first of each row is its header.
         text_columns: Indices of columns with text, which are aligned left.
-        remarks: A remark for each row, shown small below its header.
+        remarks: A remark for each row, in small letters below its header.
         folded: Whether it is collapsed at first.
-        kind: The kind of block, for the template.
+        kind: Kind of block, for the template.
     """
 
     caption: str
@@ -51,10 +53,19 @@ class TableBlock:
     folded: bool = False
     kind: str = "table"
 
+    @staticmethod
+    def of(caption: str, table: Table) -> TableBlock:
+        """Return an artifact's table as text: numbers with four digits, short times in ms, pretty units."""
+        units = [header == "unit" for header in table.headers]
+        readable = [_in_ms(row, units) for row in table.rows]
+        rows = [[cell_text(cell, unit) for cell, unit in zip(row, units, strict=True)] for row in readable]
+        text = [i for i, column in enumerate(zip(*table.rows, strict=True)) if i and any(map(_is_text, column))]
+        return TableBlock(caption, [_with_minus(header) for header in table.headers], rows, text)
+
 
 @dataclass(frozen=True)
 class NoteBlock:
-    """A note that the reader should see first."""
+    """A note before the other blocks."""
 
     text: str
     kind: str = "note"
@@ -85,7 +96,7 @@ MARKS: Mapping[Tone, str] = {"good": "✓", "doubt": "!", "bad": "✗"}
 
 @dataclass(frozen=True)
 class Banner:
-    """A verdict at the top of a section, readable without its colour: a sign and words say the same."""
+    """A verdict at the top of a section; a sign and words repeat the meaning of its colour."""
 
     tone: Tone
     title: str
@@ -99,7 +110,7 @@ class Banner:
 
 @dataclass(frozen=True)
 class Tile:
-    """An important number, shown large at the top."""
+    """An important number, in large letters at the top."""
 
     label: str
     value: str
@@ -118,6 +129,49 @@ class PageSection:
     banner: Banner | None = None
 
 
+def cell_text(cell: Cell, unit: bool = False) -> str:
+    """Return a cell of an artifact's table as text.
+
+    Args:
+        unit: Whether the cell is a unit.
+    """
+    if unit:
+        return pretty_unit(str(cell or ""))
+    if isinstance(cell, Interval):
+        return interval(cell.low, cell.high)
+    return MISSING if cell == "" else _with_minus(cell) if isinstance(cell, str) else number(cell)
+
+
+def _in_ms(row: Sequence[Cell], units: Sequence[bool]) -> Sequence[Cell]:
+    """Return a row in ms if its unit is s and all its numbers are below 1; other rows are unchanged."""
+    if "s" not in [cell for cell, unit in zip(row, units, strict=True) if unit]:
+        return row
+    numbers = [x for cell in row for x in (_ends(cell) if isinstance(cell, Interval) else (cell,))]
+    if any(abs(x) >= 1.0 for x in numbers if isinstance(x, float) and math.isfinite(x)):
+        return row
+    return ["ms" if unit else _scaled(cell, 1e3) for cell, unit in zip(row, units, strict=True)]
+
+
+def _ends(ends: Interval) -> tuple[float | None, float | None]:
+    return ends.low, ends.high
+
+
+def _scaled(cell: Cell, factor: float) -> Cell:
+    if isinstance(cell, Interval):
+        return Interval(*(None if x is None else factor * x for x in _ends(cell)))
+    return factor * cell if isinstance(cell, float) else cell
+
+
+def _is_text(cell: Cell) -> bool:
+    """Return whether a cell is aligned left; a number with decimals that its artifact chose is not."""
+    return isinstance(cell, bool) or (isinstance(cell, str) and not _NUMBER.fullmatch(cell))
+
+
+def _with_minus(text: str) -> str:
+    """Return a number that is written as text with a minus sign instead of a hyphen."""
+    return text.replace("-", "\u2212") if _NUMBER.fullmatch(text) else text
+
+
 def number(value: object, digits: int = 4) -> str:
     """Return a number as text with ``digits`` significant digits; other values as ``str`` does."""
     if value is None:
@@ -132,7 +186,7 @@ def number(value: object, digits: int = 4) -> str:
         return MISSING if math.isnan(value) else ("∞" if value > 0 else "\u2212∞")
     if not value:
         return "0"
-    # Trailing zeros stay: they show how precisely a number is known.
+    # Keep trailing zeros, which show the precision of a number.
     text = f"{value:#.{digits}g}".rstrip(".")
     if "e" in text:
         mantissa, exponent = text.split("e")
@@ -151,8 +205,8 @@ def interval(low: float | None, high: float | None, digits: int = 4) -> str:
     """Return an interval as text.
 
     Args:
-        low: Lower end; None: unknown.
-        high: Upper end; None: unknown.
+        low: Lower end; None if unknown.
+        high: Upper end; None if unknown.
     """
     return MISSING if low is None or high is None else f"{number(low, digits)} to {number(high, digits)}"
 
@@ -167,14 +221,6 @@ def decimals_for(error: float | None, value: float) -> int:
 def pretty_unit(unit: str) -> str:
     """Return a unit or a formula with powers as superscripts."""
     return unit.replace("^2", "²").replace("^3", "³") or "1"
-
-
-def spoken(name: str) -> tuple[str, str]:
-    """Split a quantity's name into words and unit, e.g. ``angle_rms_rad`` into "angle rms" and "rad"."""
-    for suffix, unit in _UNITS.items():
-        if name.endswith(suffix):
-            return name.removesuffix(suffix).replace("_", " "), unit
-    return name.replace("_", " "), "1"
 
 
 def flat(tree: object, prefix: str = "") -> Iterable[tuple[str, str]]:

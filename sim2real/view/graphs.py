@@ -1,4 +1,4 @@
-"""Pictures of a graph of nodes, and of when its steps run, for a notebook."""
+"""Pictures of a graph of nodes and of its timeline, for a notebook."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class Picture:
 def plot_timeline(
     timeline: Timeline, episode: int = 0, begin_s: float = 0.0, end_s: float = 0.2, order: Sequence[str] = ()
 ) -> Picture:
-    """Draw when steps run, and which message is used by which step.
+    """Draw the steps of a timeline, and the messages between them.
 
     Args:
-        begin_s: First time that is shown [s].
-        end_s: Last time that is shown [s].
+        begin_s: Start of the drawn interval [s].
+        end_s: End of the drawn interval [s].
         order: The nodes from top to bottom; default: as in the timeline.
 
     Returns:
@@ -57,12 +57,12 @@ def plot_timeline(
         of the step that uses it.
 
     Raises:
-        UsageError: When there is no such episode, node or stretch of time.
+        UsageError: When the episode, a node or the interval does not exist.
     """
     if not 0 <= episode < timeline.episodes:
         raise UsageError(f"there is no episode {episode}: the timeline has {timeline.episodes}")
     if not begin_s < end_s:
-        raise UsageError(f"nothing lies between {begin_s} and {end_s} s", hint="begin_s must be below end_s")
+        raise UsageError(f"the interval from {begin_s} to {end_s} s is empty", hint="begin_s must be below end_s")
     names = list(order or timeline.vertices)
     if unknown := [n for n in names if n not in timeline.vertices]:
         raise UsageError(f"the timeline has no node {', '.join(unknown)}. Nodes: {', '.join(timeline.vertices)}")
@@ -73,9 +73,11 @@ def plot_timeline(
         for name, y in lanes.items():
             v = timeline.vertices[name]
             start, end = (t[episode, : v.count[episode]] / TICKS_PER_S for t in (v.start, v.end))
-            seen = (end >= begin_s) & (start <= end_s)
-            # A step that takes no time is a line of its own.
-            spans = [(s, max(e - s, 1e-3 * (end_s - begin_s))) for s, e in zip(start[seen], end[seen], strict=True)]
+            visible = (end >= begin_s) & (start <= end_s)
+            # Draw a step without duration as a thin line.
+            spans = [
+                (s, max(e - s, 1e-3 * (end_s - begin_s))) for s, e in zip(start[visible], end[visible], strict=True)
+            ]
             axes.broken_barh(spans, (y - _BAR / 2, _BAR), facecolors=BLUE, edgecolors=INK, linewidth=0.4)
         for (reader, _), edge in timeline.edges.items():
             if reader in lanes and edge.sender in lanes:
@@ -89,26 +91,26 @@ def plot_timeline(
 
 
 def plot_graph(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> Picture:
-    """Draw the nodes of a graph with their rates, and the connections with what is special about them.
+    """Draw the nodes of a graph with their rates, and the connections with their options.
 
-    Nodes stand from left to right, senders before readers unless their ``order`` says another. A dashed arrow is a
-    connection that is skipped, a thick one blocks.
+    Senders are left of their readers, unless ``order`` differs. A dashed arrow is a skipped connection, a thick one
+    blocks.
     """
-    own = by_name(nodes)
-    names = topological(own)
-    names.sort(key=lambda n: (own[n].order is None, own[n].order or 0))
-    place = {name: _WIDE * i for i, name in enumerate(names)}
+    by_node = by_name(nodes)
+    names = topological(by_node)
+    names.sort(key=lambda n: (by_node[n].order is None, by_node[n].order or 0))
+    places = {name: _WIDE * i for i, name in enumerate(names)}
     with styled():
         figure = new_figure(3.2, max(4.0, 1.9 * len(names)))
         axes = figure.subplots()
-        for name, x in place.items():
-            chosen = own[name].color
-            color = chosen if chosen is not None and is_color_like(chosen) else BLUE
+        for name, x in places.items():
+            configured = by_node[name].color
+            color = configured if configured is not None and is_color_like(configured) else BLUE
             box = {"boxstyle": "round,pad=0.5", "facecolor": "white", "edgecolor": color, "linewidth": 1.6}
-            axes.text(x, 0.0, f"{name}\n{own[name].rate:g} Hz", ha="center", va="center", color=INK, bbox=box)
-        for node in own.values():
+            axes.text(x, 0.0, f"{name}\n{by_node[name].rate:g} Hz", ha="center", va="center", color=INK, bbox=box)
+        for node in by_node.values():
             for i, c in enumerate(node.inputs.values()):
-                _draw_connection(axes, place[c.output_node.name], place[node.name], i, c)
+                _draw_connection(axes, places[c.output_node.name], places[node.name], i, c)
         axes.set_xlim(-_WIDE / 2, _WIDE * (len(names) - 0.5))
         axes.set_ylim(-_HIGH, _HIGH)
         axes.axis("off")

@@ -1,4 +1,4 @@
-"""Figures with panels one above the other over a time axis."""
+"""Figures with panels over a common time axis."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class Panel:
         lines: The lines.
         title: Title; empty for none.
         spans: Shaded intervals [s].
-        zoom: Interval that a second column shows enlarged [s]; None: none.
-        framed: Roles of the lines that determine the vertical axis' range; other lines may be cut. Empty: all.
+        zoom: Enlarged interval in a second column [s]; None for no second column.
+        framed: Roles of the lines that determine the vertical range; empty for all lines.
     """
 
     label: str
@@ -84,8 +84,8 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
         zoom = panels[0].zoom
         if zoom and len(zooms) == 1:
             grid[0, 1].set_title(f"{zoom[0]:g} to {zoom[1]:g} s", fontweight="normal", color=MUTED)
-        seen = {line.label: line for panel in panels for line in panel.lines}
-        entries: list[Artist] = [_legend_entry(line) for line in seen.values()]
+        by_label = {line.label: line for panel in panels for line in panel.lines}
+        entries: list[Artist] = [_legend_entry(line) for line in by_label.values()]
         entries += [Patch(facecolor=SHADE, edgecolor=GRID, label=shade)] if any(p.spans for p in panels) else []
         style.legend_above(figure, entries)
         return to_svg(figure, name, label)

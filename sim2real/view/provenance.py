@@ -1,4 +1,4 @@
-"""What a stage ran with: the end of its section."""
+"""Configuration, files and versions of a stage, at the end of its section."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from sim2real.view.blocks import Block, FoldBlock, pairs_table
 
 
 def about(artifact: StageFolder) -> list[Block]:
-    """Return what a stage ran with: folded away at the end of its section."""
+    """Return configuration, files and versions of a stage as a folded block."""
     m = artifact.manifest
     when = {k: m[k] for k in ("started", "duration_s", "command", "git") if m.get(k) is not None}
     files = {n: e.get("sha256", "") for n, e in m.get("outputs", {}).items()}

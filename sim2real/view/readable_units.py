@@ -1,4 +1,4 @@
-"""Identified parameters in units that people read."""
+"""Estimates in readable units."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower",
 
 
 def in_readable_unit(e: Estimate) -> Estimate:
-    """Return a parameter in ms where it is a time below a second; others as they are."""
+    """Return an estimate in ms if it is a time below a second; others unchanged."""
     largest = max(abs(v) for v in (e.estimate, e.upper, e.truth) if v is not None)
     if e.unit != "s" or largest >= 1.0:
         return e

@@ -1,4 +1,4 @@
-"""What a Rerun recording shows, independent of Rerun: one tab for each episode, with curves and a scene."""
+"""The content of a Rerun recording, independent of Rerun: one tab for each episode, with curves and a scene."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Curve:
     """One line of a plot.
 
     Attributes:
-        entity: Where it stands in the recording.
-        label: What the legend calls it.
-        look: How it looks, in every plot the same: measured, identified, nominal, truth, command.
+        entity: Path of the curve in the recording.
+        label: Name in the legend.
+        look: Style, which is the same in every plot: measured, identified, nominal, truth, command.
         t_s: Times ``(N,)`` [s]; a NaN among the values interrupts the line.
         values: Values ``(N,)``.
     """
@@ -52,11 +52,10 @@ class Tab:
     """One episode.
 
     Attributes:
-        title: The tab's name.
-        entity: What all its entities begin with.
+        entity: Prefix of all its entities.
         plots: Title -> curves, from top to bottom.
-        motions: What the 3-D view shows.
-        episode: Where the schedule comes from, if there is one.
+        motions: Motions in the 3-D view.
+        episode: Source of the schedule; None without a schedule.
     """
 
     title: str
@@ -70,7 +69,7 @@ def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
     """Return the tabs of a run's finished stages.
 
     Raises:
-        Sim2RealError: When what a stage wrote is missing or malformed.
+        Sim2RealError: When a file of the stage is missing or malformed.
     """
     tabs = []
     if "record" in artifacts:
@@ -111,7 +110,7 @@ def _episode_tab(title: str, entity: str, log: Signals, simulated: list[Series])
         if index < len(commands):
             curves.append(_curve(f"{entity}/simulation", models[commands[index]], "identified", "simulation"))
         plots.setdefault(_titled(series.name, log.units), []).extend(curves)
-    # The motors' commands come last: where another node sent a field of that name too, theirs is drawn.
+    # Put the motors' commands last, so that they win over fields of the same name from other nodes.
     motions = [_motion(f"{entity}/scene/robot", log.measured, [*log.commanded, *last], ghost=False)]
     if simulated:
         states = [s for s in simulated if s.name not in commands]
@@ -140,14 +139,14 @@ def _identify_tab(found: Identification, recording: int, which: str) -> Tab:
 
 
 def states_of(steps: Steps) -> tuple[np.ndarray, list[str]]:
-    """Return when a node's state changes [s], and what it changes to: waiting, late, computing, idle.
+    """Return the times of a node's changes of state [s], and the new states: waiting, late, computing, idle.
 
-    A state that lasts for no time at all is left out.
+    States without duration are skipped.
     """
     due = steps.scheduled + steps.drift
     times = np.stack([np.minimum(due, steps.start), steps.start, steps.woken, steps.end], axis=1).ravel()
     names = ["waiting", "late", "computing", IDLE] * len(steps)
-    # After an overrun a step is due before the one in front of it has ended; it waits only from that end on.
+    # After an overrun a step is due before the previous one ends; it waits only from that end on.
     times = np.maximum.accumulate(times)
     lasting = np.append(np.diff(times) > 0, True)
     return times[lasting] / TICKS_PER_S, [name for name, lasts in zip(names, lasting, strict=True) if lasts]
@@ -158,7 +157,7 @@ def _curve(folder: str, series: Series, look: str, label: str) -> Curve:
 
 
 def _motion(entity: str, states: list[Series], commands: list[Series], ghost: bool) -> SceneMotion:
-    """Return one motion on the times of the first state; everything else holds its last value until the next."""
+    """Return one motion at the times of the first state; other columns hold their last value."""
     t_s = states[0].t_s if states else np.empty(0)
     columns = {}
     for series in [*commands, *states]:
@@ -173,6 +172,6 @@ def _titled(name: str, units: Mapping[str, str]) -> str:
 
 
 def _interrupted(t_s: np.ndarray, values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Put a NaN right after the end of each segment: the next one starts from a state of its own."""
+    """Insert a NaN after the end of each segment, as the next one starts from another state."""
     cuts = np.flatnonzero(np.diff(segment)) + 1
     return np.insert(t_s, cuts, t_s[cuts - 1] + 1e-6), np.insert(values, cuts, np.nan)

@@ -1,6 +1,6 @@
 """A run as a Rerun recording: signals, schedule and a 3-D scene on one timeline.
 
-All is sent after the run, so that no control loop waits for a viewer, and by columns: 16 us a row instead of 276.
+The data is sent after the run, so that no control loop waits for a viewer, and by columns, which is 17 times faster.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from sim2real.view.rerun_content import IDLE, Curve, Tab, states_of, tabs_of
 from sim2real.view.timing import color_of, in_order, slowest_period_s
 
 TIMELINE = "time"
-"""The only timeline: of several the viewer would pick one by itself."""
+"""The only timeline, so that the viewer has no choice of another one."""
 
 Scene = Callable[[Any, np.ndarray, Mapping[str, np.ndarray], str, bool], None]
 """Draws a robot: ``log_scene(recording, t_s, columns, entity, ghost)``.
 
-``recording`` is a ``rerun.RecordingStream``, ``t_s`` ``(N,)`` [s], ``columns`` the fields ``(N,)`` by name. What never
-moves is logged as static below ``entity``, what moves is sent by columns on the timeline ``time``. A ghost is a model's
-prediction, drawn so that it can stand in the robot's own place.
+``recording`` is a ``rerun.RecordingStream``, ``t_s`` ``(N,)`` [s], ``columns`` the fields ``(N,)`` by name. Parts
+that do not move are logged as static below ``entity``, moving parts by columns on the timeline ``time``. A ghost is a
+model's prediction, drawn so that it can overlap the robot.
 """
 
 # Readable on the viewer's dark background and on its light one; measured, identified, ... as on the page.
@@ -37,7 +37,7 @@ _COLORS = {
 _WIDTHS = {"measured": 2.0, "identified": 1.6, "nominal": 1.4, "truth": 1.2, "command": 1.6}
 _STATES = {"waiting": (110, 120, 132), "late": (226, 138, 48), "computing": (66, 150, 230)}
 _PERIODS = 1.5
-"""How much of the schedule is shown on either side of the time cursor, in periods of the slowest node."""
+"""Visible part of the schedule on either side of the time cursor [periods of the slowest node]."""
 
 
 def view(run_dir: Path, save: Path | None = None, scene: Scene | None = None) -> None:
@@ -53,7 +53,7 @@ def view(run_dir: Path, save: Path | None = None, scene: Scene | None = None) ->
     rr = _rerun()
     tabs = tabs_of(finished_stages(run_dir))  # before a viewer opens
     name = f"{pipeline_of(run_dir)} {Path(run_dir).resolve().name}"
-    # A viewer keeps one arrangement for each application: another run, with other stages, must not inherit this one's.
+    # Use one application for each run, as the viewer stores one arrangement per application.
     recording = rr.RecordingStream(f"sim2real {name}")
     try:
         if save is None:
@@ -69,7 +69,7 @@ def view(run_dir: Path, save: Path | None = None, scene: Scene | None = None) ->
 
 
 def build(recording: Any, tabs: Sequence[Tab], name: str, scene: Scene | None = None) -> None:
-    """Send the content of a run, and how to arrange it, to a recording.
+    """Send the content of a run and its arrangement to a recording.
 
     Args:
         recording: A ``rerun.RecordingStream``.
@@ -97,16 +97,16 @@ def _send_curve(recording: Any, curve: Curve) -> None:
 
 
 def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
-    """Send each node's states as lanes, how late it woke and how old its inputs were."""
+    """Send each node's states as lanes, and its lateness and age of inputs as curves."""
     rr = _rerun()
     for node in in_order(episode):
         steps = episode.steps[node]
         if not len(steps):
             continue
         lane = f"{folder}/schedule/{node}"
-        # The viewer takes null as "no state", but Rerun's own `rrd verify` calls that malformed.
-        own = _own_color(episode, node)
-        looks = {**_STATES, **({"computing": own} if own else {})}
+        # Send an invisible idle state: the viewer accepts null, but Rerun's `rrd verify` rejects it.
+        color = _own_color(episode, node)
+        looks = {**_STATES, **({"computing": color} if color else {})}
         named = rr.StateConfiguration(
             values=[*_STATES, IDLE],
             labels=[*_STATES, IDLE],
@@ -120,16 +120,16 @@ def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
         for name, age_s in input_ages(episode, node).items():
             lines[f"age/{node}/{name}"] = f"{name} in {node}", 1e3 * age_s
         for entity, (label, values) in lines.items():
-            looks = rr.SeriesLines(names=label, widths=1.2, colors=own)
+            looks = rr.SeriesLines(names=label, widths=1.2, colors=color)
             recording.log(f"{folder}/{entity}", looks, static=True)
             times = _time(steps.woken / TICKS_PER_S)
             recording.send_columns(f"{folder}/{entity}", [times], rr.Scalars.columns(scalars=values))
 
 
 def _own_color(episode: Episode, node: str) -> tuple[int, int, int] | None:
-    """Return the colour that a node was given, if any."""
-    own = color_of(episode, node, "")
-    return (int(own[1:3], 16), int(own[3:5], 16), int(own[5:7], 16)) if own else None
+    """Return a node's configured colour, if any."""
+    color = color_of(episode, node, "")
+    return (int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)) if color else None
 
 
 def _blueprint(tabs: Sequence[Tab], with_scene: bool) -> Any:

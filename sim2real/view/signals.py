@@ -1,4 +1,4 @@
-"""Time series out of an episode: what was measured, what was commanded, and what was true."""
+"""Time series of an episode: measurements, commands, and true states."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Series:
     """One quantity over time.
 
     Attributes:
-        name: Name of the field, with its index where the field has several entries.
-        source: The node or model that it comes from.
+        name: Name of the field, with an index if the field has several entries.
+        source: Node or model of the series.
         t_s: Times ``(N,)`` [s].
         values: Values ``(N,)``.
     """
@@ -32,15 +32,15 @@ class Series:
 
 @dataclass(frozen=True)
 class Signals:
-    """A recorded session, made ready for plotting.
+    """The time series of a recorded session.
 
     Attributes:
         episode: The log.
         measured: Outputs of nodes without inputs, at the time of the sample.
         commanded: Outputs of the other nodes, at the time of sending.
-        truth: True states by name, of an embedded robot.
-        units: Field -> unit, where the log says it.
-        warnings: What the log lacks.
+        truth: True states of an embedded robot, by name.
+        units: Field -> unit.
+        warnings: Missing parts of the log.
     """
 
     episode: Episode
@@ -52,11 +52,11 @@ class Signals:
 
     @property
     def dry(self) -> bool:
-        """Whether nothing was moved: what was commanded was not sent."""
+        """Whether the commands were not sent."""
         return is_dry(self.episode)
 
     def last_command(self) -> list[Series]:
-        """Return the outputs of the nodes that no other node reads: what reaches the motors."""
+        """Return the outputs of the nodes that no other node reads, which are the commands to the motors."""
         graph = self.episode.metadata.get("graph", {})
         read = {i.get("from") for node in graph.values() for i in node.get("inputs", {}).values()}
         last = [s for s in self.commanded if s.source not in read]
@@ -93,22 +93,20 @@ def signals_of(recording: Recording) -> Signals:
 
 def simulated_series(columns: Mapping[str, np.ndarray]) -> list[Series]:
     """Return the series of one simulated episode: fields ``NAME`` at times ``t_NAME``, else ``t``."""
-    found: list[Series] = []
+    series: list[Series] = []
     for name, values in columns.items():
         if name == "t" or name.startswith("t_"):
             continue
         t_s = columns.get(f"t_{name.partition('[')[0]}", columns["t"])  # a vector's entries share their times
         if len(t_s) != len(values):
-            # Commands have a rate of their own: evenly over the same time, if nothing says when they were sent.
+            # Spread commands without times evenly, as their rate differs from that of the measurements.
             t_s = np.arange(len(values)) * (float(columns["t"][-1]) / len(values))
-        found += components(name, "simulation", t_s, values)
-    return found
+        series += components(name, "simulation", t_s, values)
+    return series
 
 
 def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals, units: Mapping[str, str]) -> list[Series]:
-    """Return the series of a simulated episode, with angles on the turn on which the robot's begin.
-
-    A joint that turns freely may begin whole turns away from where the simulation does, which is the same place.
+    """Return the series of a simulated episode, with angles shifted by whole turns to the robot's first angle.
 
     Args:
         columns: See ``simulated_series``.
@@ -118,21 +116,21 @@ def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals, units: Map
     real, last = {s.name: s for s in log.measured}, log.last_command()
     real |= {f"command[{i}]": s for i, s in enumerate(last)}
     real |= {"command": last[0]} if len(last) == 1 else {}
-    found = []
+    shifted = []
     for series in simulated_series(columns):
         robot = real.get(series.name)
         turns = 0.0
         if robot is not None and unit_of(robot.name, units) == "rad" and len(robot.values) and len(series.values):
             turns = np.round((robot.values[0] - series.values[0]) / (2 * np.pi))
-        found.append(replace(series, values=series.values + 2 * np.pi * turns) if np.isfinite(turns) else series)
-    return found
+        shifted.append(replace(series, values=series.values + 2 * np.pi * turns) if np.isfinite(turns) else series)
+    return shifted
 
 
 def components(name: str, source: str, t_s: np.ndarray, values: np.ndarray) -> list[Series]:
-    """Return one series for each entry of a field; none if it does not hold numbers.
+    """Return one series for each entry of a field; empty for a field without numbers.
 
     Args:
-        source: The node or model that it comes from.
+        source: Node or model of the field.
         t_s: Times ``(N,)`` [s].
         values: Values ``(N, ...)``.
     """

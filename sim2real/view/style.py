@@ -17,8 +17,8 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-# A page may redefine each colour, for dark mode and for print; a figure by itself has the values below. The hues are
-# those of Okabe and Ito, darkened so that text is readable on white.
+# A page can redefine each colour, for dark mode and for print; a single figure has the values below. The hues are those
+# of Okabe and Ito, darkened so that text is readable on white.
 INK, MUTED, GRID, SHADE = "#1b2430", "#5c6875", "#d9dfe6", "#eef2f6"
 BLUE, ORANGE, GREEN, PURPLE = "#0a66b0", "#b8520a", "#0b7a52", "#8a3f86"
 _VARIABLES = {
@@ -75,7 +75,7 @@ _RC: dict[str, Any] = {
 }
 
 Dash: TypeAlias = str | tuple[int, tuple[float, ...]]
-"""The dashes of a line, as matplotlib takes them."""
+"""The dashes of a line in matplotlib."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ ROLES = {
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Apply the style in the block, in which figures must be made and saved."""
+    """Apply the style in the block; figures must be created and saved inside it."""
     with mpl.rc_context(cast(Any, _RC)):
         yield
 
@@ -116,7 +116,7 @@ def new_figure(height_in: float, width_in: float = WIDTH_IN) -> Figure:
 def render(figure: Figure) -> str:
     """Return a figure as an SVG document.
 
-    ``Figure.savefig`` draws a figure twice, the first time only for its layout; here the layout is computed alone.
+    ``Figure.savefig`` would draw the figure twice, the first time only for its layout.
     """
     engine = figure.get_layout_engine()
     if engine is not None:
@@ -151,7 +151,7 @@ def legend_above(figure: Figure, entries: Sequence[Artist]) -> None:
 
 
 def plain_log(axis: Axis) -> None:
-    """Label a logarithmic axis with plain numbers: powers would appear as TeX source, as it is not parsed."""
+    """Label a logarithmic axis with plain numbers, as powers would appear as TeX source."""
     axis.set_major_locator(LogLocator(base=10, subs=(1.0,)))
     low, high = axis.get_view_interval()
     if high < 30 * low:

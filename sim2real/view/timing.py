@@ -37,35 +37,34 @@ class Times:
 
 
 def times(steps: Steps) -> Times:
-    """Return a node's times."""
+    """Return the times of a node's steps."""
     return Times(np.diff(steps.woken) / 1e3, (steps.woken - steps.start) / 1e3, (steps.end - steps.woken) / 1e3)
 
 
 def in_order(episode: Episode) -> list[str]:
-    """Return the nodes' names: those with an ``order`` first, then the others, senders before readers if possible."""
+    """Return the nodes' names: first those with an ``order``, then the others, senders before readers if possible."""
     senders: Mapping[str, set[str]] = {
         n: {i["from"] for i in node.get("inputs", {}).values()} for n, node in episode.metadata.get("graph", {}).items()
     }
     order: list[str] = []
-    left = list(episode.steps)
-    while left:
-        ready = [n for n in left if not (senders.get(n, set()) & set(left) - {n})] or left
+    remaining = list(episode.steps)
+    while remaining:
+        ready = [n for n in remaining if not (senders.get(n, set()) & set(remaining) - {n})] or remaining
         order.append(ready[0])
-        left.remove(ready[0])
-    own = {n: node.get("order") for n, node in episode.metadata.get("graph", {}).items()}
-    place = {n: own[n] if isinstance(own.get(n), int) else math.inf for n in order}
-    return sorted(order, key=lambda n: place[n])  # a stable sort: equal ones keep their order
+        remaining.remove(ready[0])
+    orders = {n: node.get("order") for n, node in episode.metadata.get("graph", {}).items()}
+    place = {n: orders[n] if isinstance(orders.get(n), int) else math.inf for n in order}
+    return sorted(order, key=lambda n: place[n])  # a stable sort
 
 
 def color_of(episode: Episode, node: str, default: str) -> str:
     """Return a node's colour as ``#rrggbb``.
 
     Args:
-        episode: The log, whose metadata may have the node's colour.
-        default: Returned if the node has no colour that matplotlib knows.
+        default: Returned if the node has no valid colour.
     """
-    own = episode.metadata.get("graph", {}).get(node, {}).get("color")
-    return to_hex(own) if isinstance(own, str) and is_color_like(own) else default
+    color = episode.metadata.get("graph", {}).get(node, {}).get("color")
+    return to_hex(color) if isinstance(color, str) and is_color_like(color) else default
 
 
 def slowest_period_s(episode: Episode) -> float:
@@ -98,7 +97,7 @@ def histograms(episode: Episode, name: str) -> str:
             else:
                 row[3].annotate("no inputs", (0.03, 0.8), xycoords="axes fraction", color=MUTED)
         for axes, title in zip(
-            grid[0], ("Period", "Lateness of awakening", "Computation", "Age of inputs"), strict=True
+            grid[0], ("Period", "Lateness of the wake-up", "Computation", "Age of inputs"), strict=True
         ):
             axes.annotate(title, (0, 1.22), xycoords="axes fraction", fontweight="bold", fontsize=9, color=INK)
         for axes in grid[-1]:
@@ -117,7 +116,7 @@ def schedule(episode: Episode, name: str) -> str:
     middle = int(1e6 * episode.duration_s / 2)
     with styled():
         figure = new_figure(1.15 + 0.42 * len(nodes))
-        titles = (f"At {middle / 1e6:.1f} s", f"Around the latest awakening: {worst}, {late[worst].max() / 1e3:.1f} ms")
+        titles = (f"At {middle / 1e6:.1f} s", f"Around the latest wake-up: {worst}, {late[worst].max() / 1e3:.1f} ms")
         grid = figure.subplots(1, 2, sharey=True)
         for axes, begin, title in zip(grid, (middle, max(0, moment - int(0.4 * length))), titles, strict=True):
             for row, node in enumerate(nodes):
@@ -132,7 +131,7 @@ def schedule(episode: Episode, name: str) -> str:
         own_colors = any(color_of(episode, n, BLUE) != BLUE for n in nodes)
         entries = [
             Patch(facecolor=BLUE, label="computing, or in the node's own colour" if own_colors else "computing"),
-            Patch(facecolor=ORANGE, label="late awakening"),
+            Patch(facecolor=ORANGE, label="late wake-up"),
             Patch(facecolor="none", edgecolor=MUTED, hatch="////", label="waiting for its inputs"),
         ]
         style.legend_above(figure, entries)
@@ -153,7 +152,7 @@ def _histogram(axes: Axes, values: np.ndarray, span: tuple[float, float], color:
 
 def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: str) -> None:
     """Draw the steps of one node that overlap an interval [us]; computation is drawn in ``color``."""
-    # After an overrun a step is due before the previous one has ended; its waiting is drawn from that end on.
+    # Draw the waiting from the previous step's end on, as after an overrun a step is due before it.
     free = np.concatenate([[0], steps.end[:-1]])
     due_at = np.minimum(np.maximum(steps.scheduled + steps.drift, free), steps.start)
     near = (steps.end >= begin) & (due_at <= end)

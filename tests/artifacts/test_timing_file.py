@@ -84,7 +84,7 @@ def test_samples_of_other_nodes_are_refused(episode, tmp_path):
     document = json.loads((tmp_path / "timing.json").read_text())
     del document["nodes"]["agent"]
     (tmp_path / "timing.json").write_text(json.dumps(document))
-    with pytest.raises(Sim2RealError, match="its nodes are others"):
+    with pytest.raises(Sim2RealError, match="its nodes differ from"):
         Timing.load(tmp_path)
     with pytest.raises(Sim2RealError, match="cannot read"):
         Timing.load(tmp_path / "nowhere.json")
@@ -108,5 +108,5 @@ def test_what_was_written_before_the_bus_was_timed_is_read(episode, tmp_path):
 def test_a_node_on_the_bus_that_is_none_of_the_sessions_is_refused(episode, tmp_path):
     timing = Timing.of(episode)
     replace(timing, bus_s={"other": np.ones(3)}).save(tmp_path)
-    with pytest.raises(Sim2RealError, match="a node on the bus"):
+    with pytest.raises(Sim2RealError, match="lacks a node that is on the bus"):
         Timing.load(tmp_path)

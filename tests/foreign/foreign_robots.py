@@ -9,7 +9,7 @@ import numpy as np
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.importer import import_opened
 from sim2real.log.importing.proposal import propose
-from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.quantities import ImportHints
 
 KINDS = ("sine", "triangle", "chirp", "gait", "multisine")
 
@@ -47,7 +47,7 @@ def csv(path, columns, end=""):
 def imported(path, **asked):
     """Return the episode that a file becomes without a mapping, and the proposal."""
     file = open_foreign(path)
-    found = propose(file, Asked("x", **asked))
+    found = propose(file, ImportHints("x", **asked))
     return import_opened(file, found.mapping), found
 
 

@@ -70,10 +70,10 @@ def test_a_word_in_a_position_is_refused_with_its_line(tmp_path, recorded):
     ("name", "values", "listed"),
     [
         ("dq_a", lambda q: spoilt(q[:, 0], "ERR"), "column 'dq_a' holds 'ERR'"),
-        ("phase", lambda q: ["warm"] * len(q), "left out, as they hold no numbers: phase"),
-        ("gripper_state", lambda q: ["open"] * len(q), "left out, as they hold no numbers: gripper_state"),
-        ("effort_a", lambda q: np.full(len(q), np.nan), "left out: 'effort_a' has no number in any sample"),
-        ("dq_a", lambda q: np.full(len(q), np.nan), "left out: 'dq_a' has no number in any sample"),
+        ("phase", lambda q: ["warm"] * len(q), "skipped, as they hold no numbers: phase"),
+        ("gripper_state", lambda q: ["open"] * len(q), "skipped, as they hold no numbers: gripper_state"),
+        ("effort_a", lambda q: np.full(len(q), np.nan), "skipped: 'effort_a' has no number in any sample"),
+        ("dq_a", lambda q: np.full(len(q), np.nan), "skipped: 'dq_a' has no number in any sample"),
     ],
 )
 def test_columns_that_do_not_matter_are_left_out_and_listed(tmp_path, recorded, name, values, listed):
@@ -89,7 +89,7 @@ def test_a_joint_without_a_number_is_left_out_or_refused_where_it_is_asked_for(t
     _, found = imported(path)
     assert found.joints == ("b",)
     assert found.mapping.nodes["actuator"].fields["goal"].source == ("goal_b",)
-    assert "left out: 'q_a' has no number" in said(found)
+    assert "skipped: 'q_a' has no number" in said(found)
     with pytest.raises(UsageError, match="are not the robot's 2 joints"):
         imported(path, joints=("a", "b"))
 
@@ -100,7 +100,7 @@ def test_vectors_with_columns_that_have_no_number(tmp_path, recorded):
     np.savez(tmp_path / "run.npz", t_s=t, goal=goal, q=q, dq=np.stack([nan, q[:, 1]], 1), effort=np.stack([nan] * 2, 1))
     episode, found = imported(tmp_path / "run.npz")
     assert list(episode.outputs["sensor"]) == ["position"]
-    assert "left out: 'dq' lacks numbers" in said(found)
+    assert "skipped: 'dq' lacks numbers" in said(found)
     np.savez(tmp_path / "run.npz", t_s=t, goal=goal, q=np.stack([q[:, 0], nan], 1))
     with pytest.raises(UsageError, match="2 columns for 1 joints"):
         imported(tmp_path / "run.npz")
@@ -141,5 +141,5 @@ def test_cells_of_another_recorder_with_decimal_commas(tmp_path, recorded):
     episode, found = imported(tmp_path / "run.csv")
     assert len(episode.outputs["sensor"]["position"]) == sum(cell != "null" for cell in table["q_a"])
     said = "\n".join(found.evidence)
-    assert "left out, as they hold no numbers: phase" in said
-    assert "left out: columns without a name: 1" in said
+    assert "skipped, as they hold no numbers: phase" in said
+    assert "skipped: columns without a name: 1" in said

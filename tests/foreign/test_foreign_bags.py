@@ -15,7 +15,7 @@ from sim2real.log import read_log
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.importer import import_opened
 from sim2real.log.importing.proposal import propose
-from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.quantities import ImportHints
 
 SET_BACK = 402_500_000
 COUNT = len(Q)
@@ -36,7 +36,7 @@ def never(k, ns):
 def imported(path):
     """Return the episode that a bag becomes without a mapping, and the proposal."""
     file = open_foreign(path)
-    found = propose(file, Asked("rig", joints=("a", "b")))
+    found = propose(file, ImportHints("rig", joints=("a", "b")))
     return import_opened(file, found.mapping), found
 
 
@@ -113,7 +113,7 @@ def test_a_topic_that_is_not_read_stops_nothing_and_is_named(tmp_path, kind, mes
     types = {"sensor_msgs/msg/Imu": "float64 x\n", "pkg/msg/Big": "float64[] x\n"}
     episode, found = imported(bags.write(tmp_path / "x.mcap", rows, types))
     is_right(episode)
-    assert any(line.startswith(f"left out: /extra ({kind})") and said in line for line in found.evidence)
+    assert any(line.startswith(f"skipped: /extra ({kind})") and said in line for line in found.evidence)
 
 
 def test_a_joint_state_that_cannot_be_decoded_is_reported_by_its_number(tmp_path):
@@ -181,11 +181,11 @@ def test_the_command_prints_what_was_left_out(tmp_path, capsys, monkeypatch):
     bags.write(tmp_path / "bag" / "bag_1.mcap", bags.rows(begin=300))
     assert cli.main(["import", "bag"]) == 0
     err = capsys.readouterr().err
-    assert err.count("left out: /extra (demo/msg/Note): it has a wstring") == 1
+    assert err.count("skipped: /extra (demo/msg/Note): it has a wstring") == 1
     stage = newest(tmp_path / "runs", "robot", "record")
     assert stage.manifest["inputs"]["source_1"]["path"].endswith("bag/bag_1.mcap")
     assert cli.main(["import", "bag", "--mapping", str(stage.output("mapping")), "--out", "again.mcap"]) == 0
-    assert "left out: /extra" in capsys.readouterr().err
+    assert "skipped: /extra" in capsys.readouterr().err
     np.testing.assert_allclose(read_log("again.mcap").outputs["sensor"]["position"], Q)
 
 
@@ -248,7 +248,7 @@ def with_jaw(joints, every=1, first=False):
 def test_two_senders_on_a_topic_each_with_joints_of_its_own(tmp_path, every, first, joints):
     """Those of the commands are meant, or those that are asked for."""
     file = open_foreign(bags.write(tmp_path / "x.mcap", with_jaw(("jaw",), every, first)))
-    found = propose(file, Asked("rig", joints=joints))
+    found = propose(file, ImportHints("rig", joints=joints))
     is_right(import_opened(file, found.mapping))
     assert found.joints == ("a", "b")
     said = f"/joint_states#{1 + first} are the messages of a, b", f"/joint_states#{2 - first} are the messages of jaw"
@@ -261,8 +261,8 @@ def test_two_senders_without_a_word_on_which_is_meant(tmp_path):
     rows = [(t, k, {**m, "name": m["name"] if t != "/cmd" else []}, ns) for t, k, m, ns in with_jaw(("jaw",))]
     file = open_foreign(bags.write(tmp_path / "x.mcap", rows))
     with pytest.raises(UsageError, match=r"(?s)Candidates: '/joint_states#1.position'.*#2.position'.*--joints"):
-        propose(file, Asked("rig"))
-    is_right(import_opened(file, propose(file, Asked("rig", joints=("a", "b"))).mapping))
+        propose(file, ImportHints("rig"))
+    is_right(import_opened(file, propose(file, ImportHints("rig", joints=("a", "b"))).mapping))
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_two_senders_that_cannot_be_told_apart(tmp_path, joints, named):
         rows = [(t, k, {**m, "name": m["name"] if len(m["position"]) == 2 else []}, n) for t, k, m, n in rows]
     file = open_foreign(bags.write(tmp_path / "x.mcap", rows))
     with pytest.raises(UsageError, match=named):
-        propose(file, Asked("rig"))
+        propose(file, ImportHints("rig"))
 
 
 @pytest.mark.parametrize("empty", [("/joint_states",), ("/joint_states", "/cmd")])

@@ -11,7 +11,7 @@ from sim2real.log import ImportMapping, import_file, read_log
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.importer import import_opened
 from sim2real.log.importing.proposal import propose
-from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.quantities import ImportHints
 
 pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed")
 pq = pytest.importorskip("pyarrow.parquet")
@@ -74,7 +74,7 @@ def arm(values):
 
 def proposed(path, episode=None, joints=()):
     file = open_foreign(path, None, episode)
-    found = propose(file, Asked("arm", joints=joints))
+    found = propose(file, ImportHints("arm", joints=joints))
     return import_opened(file, found.mapping), found
 
 

@@ -10,7 +10,7 @@ from sim2real.errors import UsageError
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.importer import import_opened
 from sim2real.log.importing.proposal import propose
-from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.quantities import ImportHints
 from sim2real.log.importing.signal_names import meaning
 
 BEGIN_S = 1_714_564_800  # 2024-05-01 12:00:00 UTC
@@ -172,7 +172,7 @@ def following(stamps):
 def test_a_table_with_dates_is_imported_at_its_time(tmp_path):
     stamps = [f"2024-05-01T12:00:{t:09.6f}" for t in TIME.tolist()]
     file = opened(tmp_path, following(stamps))
-    episode = import_opened(file, propose(file, Asked("rig")).mapping)
+    episode = import_opened(file, propose(file, ImportHints("rig")).mapping)
     np.testing.assert_array_equal(episode.steps["sensor"].start, 5000 * np.arange(COUNT))
     assert episode.metadata["source"]["time_zero_us"] == BEGIN_S * 10**6
 
@@ -181,15 +181,15 @@ def test_a_table_with_dates_is_imported_at_its_time(tmp_path):
 def test_dates_in_another_form_are_refused_by_their_line(tmp_path, form):
     file = opened(tmp_path, following([form.format(1, t) for t in TIME.tolist()]))
     with pytest.raises(UsageError, match=r"(?s)line 2 of .*column 't' holds .*2024.*write dates as 2024-05-01T12:00"):
-        propose(file, Asked("rig"))
+        propose(file, ImportHints("rig"))
 
 
 @pytest.mark.parametrize("tick_s", [0.01, 0.1, 1.0])
 def test_a_clock_that_is_coarser_than_the_samples_is_named(tmp_path, tick_s):
     file = opened(tmp_path, following([f"{t // tick_s * tick_s:.3f}" for t in (TIME + 1e-9).tolist()]))
     with pytest.raises(UsageError, match=r"(?s)'t' .* repeat the one before in \d+% of 400 rows.*--rate-hz"):
-        propose(file, Asked("rig"))
-    found = propose(file, Asked("rig", rate_hz=200.0))
+        propose(file, ImportHints("rig"))
+    found = propose(file, ImportHints("rig", rate_hz=200.0))
     episode = import_opened(file, found.mapping)
     np.testing.assert_array_equal(episode.steps["sensor"].start, 5000 * np.arange(COUNT))
     assert episode.metadata["stamps"]["sensor"] == "generated"

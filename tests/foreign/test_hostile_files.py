@@ -17,7 +17,7 @@ from sim2real.log import recover
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.log.importing.proposal import propose
-from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.quantities import ImportHints
 from sim2real.log.importing.signals import collect
 
 MOST_S, MOST_MB = 5.0, 60
@@ -101,7 +101,7 @@ def test_arrays_that_are_too_large_or_no_numbers_stop_no_others(tmp_path):
     )
     file = open_foreign(tmp_path / "x.npz")
     assert file.keys == ["q", "words"]  # words may be numbers, or dates
-    assert "left out, as they hold no numbers: words" in collect(file)[1]
+    assert "skipped, as they hold no numbers: words" in collect(file)[1]
     for name, why in (("frames", "4 dim"), ("odd", "no numbers"), ("wide", "1001 columns")):
         assert any(name in note and why in note for note in file.notes)
     assert file.signal("frames").shape == frames.shape  # a mapping may name it
@@ -116,7 +116,7 @@ def test_many_columns_without_a_name_are_refused_before_each_is_compared_with_ea
     table = np.cumsum(np.random.default_rng(0).normal(size=(60, 400)), axis=0)
     np.savetxt(tmp_path / "x.csv", table, delimiter=",", header=",".join(f"x{i}" for i in range(400)), comments="")
     with pytest.raises(UsageError, match=r"401 signals are too many to compare.* more\n") as caught:
-        propose(open_foreign(tmp_path / "x.csv"), Asked("rig", rate_hz=50.0))
+        propose(open_foreign(tmp_path / "x.csv"), ImportHints("rig", rate_hz=50.0))
     assert len(str(caught.value)) < 1500
 
 
@@ -187,7 +187,7 @@ def test_files_with_flipped_bytes_are_read_or_refused_in_words(tmp_path, repetit
             path = tmp_path / f"flipped.{name.partition('.')[2]}"
             path.write_bytes(data)
             try:
-                propose(open_foreign(path), Asked("rig"))
+                propose(open_foreign(path), ImportHints("rig"))
             except Sim2RealError:
                 refused += 1
     assert refused

@@ -55,12 +55,12 @@ def test_a_sign_that_no_data_can_tell_is_refused_with_both_candidates(tmp_path, 
     goal = SHAPES[shape](f, T)
     path = log(tmp_path, goal, -servo(T, goal))
     with pytest.raises(
-        UsageError, match=r"cannot tell signs: a follows \d+ ms later, or with the opposite sign \d+ ms"
+        UsageError, match=r"signs are ambiguous: a follows \d+ ms later, or with the opposite sign \d+ ms"
     ):
         imported(path)
     _, found = imported(path, as_told=True)
     assert goal_scales(found) == [1.0]
-    assert "they are kept as the file has them" in "\n".join(found.evidence)
+    assert "the signs of the file are kept" in "\n".join(found.evidence)
 
 
 @pytest.mark.parametrize("f", [0.6, 1.0, 3.0])
@@ -76,7 +76,9 @@ def test_other_joints_tell_a_sign_that_one_alone_leaves_open(tmp_path):
     goal = np.stack([SHAPES["sine"](3.0, T), SHAPES["gait"](0.8, T)], axis=1)
     q = np.stack([-SHAPES["sine"](3.0, T - late), SHAPES["gait"](0.8, T - late)], axis=1)
     columns = {"t_s": T, "goal_a": goal[:, 0], "goal_b": goal[:, 1], "q_a": q[:, 0] + NOISE, "q_b": q[:, 1] - NOISE}
-    with pytest.raises(UsageError, match="cannot tell signs: a follows 113 ms later, or with the opposite sign 280 ms"):
+    with pytest.raises(
+        UsageError, match="signs are ambiguous: a follows 113 ms later, or with the opposite sign 280 ms"
+    ):
         imported(csv(tmp_path / "run.csv", columns))
 
 
@@ -88,7 +90,7 @@ def test_the_order_of_commands_that_look_alike_is_refused_without_names(tmp_path
     _, found = imported(tmp_path / "right.npz")
     assert found.mapping.nodes["actuator"].fields["goal"].source == ("goal",)
     np.savez(tmp_path / "wrong.npz", t_s=T, goal=goal[:, [1, 2, 0]], q=q)
-    with pytest.raises(UsageError, match=r"cannot tell (the order|signs)"):
+    with pytest.raises(UsageError, match=r"(order of commands|signs).* ambiguous"):
         imported(tmp_path / "wrong.npz")
 
 
@@ -103,5 +105,5 @@ def test_a_drift_tells_the_sign_and_what_is_beside_it_the_lag():
 def test_exchanged_labels_are_refused(tmp_path, seed):
     rng = np.random.default_rng(seed)
     goal = 0.12 * np.sin(2 * np.pi * np.outer(T, rng.uniform(0.1, 2, 8)) + rng.uniform(0, 6, 8)).sum(axis=1)
-    with pytest.raises(UsageError, match=r"move before they are told to: a by 8\d ms"):
+    with pytest.raises(UsageError, match=r"move before their commands: a by 8\d ms"):
         imported(csv(tmp_path / "run.csv", {"t_s": T, "goal_a_rad": servo(T, goal), "q_a_rad": goal}))

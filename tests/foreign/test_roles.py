@@ -39,7 +39,7 @@ COPIES = {
 def test_commands_that_are_the_measurements_are_refused(tmp_path, recorded, copy):
     t, goal, q = recorded
     np.savez(tmp_path / "run.npz", t_s=t, goal=COPIES[copy](goal, q), q=q)
-    with pytest.raises(UsageError, match=r"are the measurements themselves: goal\[:,0\] is q\[:,0\]"):
+    with pytest.raises(UsageError, match=r"are copies of the measurements: goal\[:,0\] is q\[:,0\]"):
         imported(tmp_path / "run.npz")
 
 
@@ -81,7 +81,7 @@ def bag(path, t, goal, q, ahead_s=0.0):
 def test_topics_that_are_exchanged_are_refused_but_a_clock_that_is_ahead_is_not(tmp_path, recorded):
     """The recorder's clock is one for both topics: if positions lead by it, too, no clock explains that."""
     t, goal, q = recorded
-    with pytest.raises(UsageError, match="move before they are told to: a by"):
+    with pytest.raises(UsageError, match="move before their commands: a by"):
         imported(bag(tmp_path / "exchanged.mcap", t, q, goal))
     _, found = imported(bag(tmp_path / "ahead.mcap", t, goal, q, 0.2))
     assert found.mapping.nodes["actuator"].stamp_offset == pytest.approx(0.09 - 0.2, abs=0.02)
@@ -113,7 +113,7 @@ def test_what_is_zero_throughout_is_left_out(tmp_path, monkeypatch, recorded, na
     )
     episode, found = imported(Path("run.npz"))
     assert set(episode.outputs["actuator"]) == {"goal"}
-    assert f"left out: '{name}' is 0 throughout" in "\n".join(found.evidence)
+    assert f"skipped: '{name}' is 0 throughout" in "\n".join(found.evidence)
     assert from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description.commands == ("goal",)
 
 

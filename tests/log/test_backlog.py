@@ -45,11 +45,11 @@ def recorder(tmp_path):
 def test_close_waits_for_a_slow_writer_as_long_as_it_comes_on(recorder, monkeypatch):
     """The whole queue takes ten times as long as a disk may be silent."""
     monkeypatch.setattr(backlog, "STUCK_S", 0.2)
-    monkeypatch.setattr(writer, "LOOK_S", 0.01)
-    monkeypatch.setattr(writer, "SAY_S", 0.5)
+    monkeypatch.setattr(writer, "CHECK_PERIOD_S", 0.01)
+    monkeypatch.setattr(writer, "REPORT_PERIOD_S", 0.5)
     feed(slow(recorder, 0.01), 200)
     said = []
-    recorder.close(told=said.append)
+    recorder.close(report=said.append)
     assert len(read_log(recorder.path).steps["n"]) == 200
     assert said
     assert all(text.startswith("writing the log: the writer of the log is ") for text in said)
@@ -58,7 +58,7 @@ def test_close_waits_for_a_slow_writer_as_long_as_it_comes_on(recorder, monkeypa
 
 def test_a_stuck_disk_ends_the_wait_and_is_blamed(recorder, monkeypatch):
     monkeypatch.setattr(backlog, "STUCK_S", 0.3)
-    monkeypatch.setattr(writer, "LOOK_S", 0.01)
+    monkeypatch.setattr(writer, "CHECK_PERIOD_S", 0.01)
     gate = threading.Event()
     feed(slow(recorder, 0.0, gate), 50)
     with pytest.raises(Sim2RealError, match=r"the disk took no data for 0 s: .* has no end, 5\d records are lost"):
@@ -90,8 +90,8 @@ def test_the_backlog_tells_a_slow_writer_from_a_stuck_disk_and_from_a_pause(reco
 
 
 def test_memory_has_a_bound_beyond_which_the_recording_ends_and_nothing_is_lost(recorder, monkeypatch):
-    monkeypatch.setattr(recorder, "_most_bytes", 200_000)
-    monkeypatch.setattr(writer, "LOOK_EVERY", 8)
+    monkeypatch.setattr(recorder, "_max_bytes", 200_000)
+    monkeypatch.setattr(writer, "RECORDS_PER_CHECK", 8)
     gate = threading.Event()
     slow(recorder, 0.0, gate)
     said = r"more than 0 MB .* would wait in memory[\s\S]*hint: the log holds"

@@ -12,7 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.log import import_file
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.proposal import propose
-from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.quantities import ImportHints
 
 JOINTS = ["pan", "lift", "grip"]
 HEADER = """std_msgs/Header header
@@ -73,7 +73,7 @@ def bag(path, recorded):
 def test_a_ros_2_bag_is_proposed_and_imported(tmp_path, recorded):
     t_ns, goal, q = recorded
     file = open_foreign(bag(tmp_path / "bag.mcap", recorded))
-    found = propose(file, Asked("rig", joints=("pan", "lift", "grip")))
+    found = propose(file, ImportHints("rig", joints=("pan", "lift", "grip")))
     assert found.mapping.nodes["sensor"].stamps == "/joint_states.header.stamp"
     assert found.mapping.nodes["actuator"].stamps == "/position_controller/commands.log_time"
     episode = import_file(tmp_path / "bag.mcap", found.mapping)
@@ -103,7 +103,7 @@ def test_messages_in_json(tmp_path, recorded):
             for channel, message in zip(topics, ({"q": q[k].tolist()}, {"goal": goal[k].tolist()}), strict=True):
                 writer.add_message(channel, at, json.dumps(message).encode(), at)
         writer.finish()
-    found = propose(open_foreign(tmp_path / "run.mcap"), Asked("rig"))
+    found = propose(open_foreign(tmp_path / "run.mcap"), ImportHints("rig"))
     episode = import_file(tmp_path / "run.mcap", found.mapping)
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], q)
     np.testing.assert_allclose(episode.outputs["actuator"]["goal"], goal)

@@ -97,7 +97,7 @@ def test_contradictions_are_named(recorded, change, said):
 
 def test_a_clock_that_is_ahead_is_named(recorded):
     t, goal, q = recorded
-    assert "before it is told to" in evidence.contradictions((t + 0.2, t), goal, q)[0]
+    assert "before its command" in evidence.contradictions((t + 0.2, t), goal, q)[0]
 
 
 def test_the_grid_of_dated_stamps_does_not_drift():

@@ -67,7 +67,7 @@ def test_a_mapping_of_ones_own_a_format_a_range_and_a_name_for_the_log(workplace
     ("arguments", "named"),
     [
         ([], "import needs a file"),
-        (["one.npz"], "too few to tell what follows what"),
+        (["one.npz"], "too few for a correlation"),
         (["one.npz", "--pipeline", "no_such_robot"], "no_such_robot"),
         (["one.npz", "--pipeline", "pendulum"], "no mapping file"),
         (["one.npz", "--mapping", "none.toml"], "none.toml"),

@@ -50,7 +50,7 @@ def spoilt(values, index, value):
         ({"u": np.array([{}] * COUNT)}, ["'u'", "Python objects", "save it again"]),
         ({"q": U}, ["'q'", "shape (50,)", "no column 0"]),
         ({"q": np.zeros((COUNT, 0))}, ["'q'", "no column 0"]),
-        ({"u": Q}, ["field actuator.action", "shape (2,)", "the mapping says (1,)"]),
+        ({"u": Q}, ["field actuator.action", "shape (2,)", "(1,) in the mapping"]),
         ({"t": STAMPS_US[:0] / 1e6, "u": U[:0]}, ["node 'actuator' has no samples"]),
         ({"t": Q}, ["stamps 't'", "(50, 2)"]),
     ],
@@ -193,7 +193,7 @@ def node(**changes):
     [
         ({"pipeline": "rig"}, ["no nodes", "[nodes.NAME]"]),
         ({"pipeline": "rig", "nodes": {}}, ["no nodes"]),
-        ({"nodes": node()["nodes"]}, ["which pipeline", 'pipeline = "NAME"']),
+        ({"nodes": node()["nodes"]}, ["does not name the pipeline", 'pipeline = "NAME"']),
         ({"pipeline": 3, "nodes": {}}, ["pipeline has the wrong kind: 3"]),
         ({**node(), "rate_hz": 3}, ["unknown key 'rate_hz'", "Available: pipeline, nodes"]),
         ({"pipeline": "rig", "nodes": {"sensor": 3}}, ["nodes.sensor must be a table"]),

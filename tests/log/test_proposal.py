@@ -10,7 +10,7 @@ from sim2real.log.importing.files.foreign import joined, open_foreign
 from sim2real.log.importing.importer import import_opened
 from sim2real.log.importing.mapping import load_mapping, to_toml
 from sim2real.log.importing.proposal import propose
-from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.quantities import ImportHints
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def columns(t, goal, q, stamp="t_s", names=("goal_{}", "q_{}")):
 
 
 def proposed(path, **asked):
-    return propose(open_foreign(path), Asked("rig", **asked))
+    return propose(open_foreign(path), ImportHints("rig", **asked))
 
 
 def check(path, found, goal, q):
@@ -111,7 +111,7 @@ def test_files_of_one_recording_are_joined(tmp_path, recorded):
     np.savez(tmp_path / "commands.npz", t_s=t, cmd=goal)
     np.savez(tmp_path / "states.npz", t_s=t[5:], q_rad=q[5:])
     file = joined([open_foreign(tmp_path / "commands.npz"), open_foreign(tmp_path / "states.npz")])
-    found = propose(file, Asked("rig"))
+    found = propose(file, ImportHints("rig"))
     episode = import_opened(file, found.mapping)
     np.testing.assert_allclose(episode.outputs["sensor"]["position"], q[5:])
     np.testing.assert_allclose(episode.outputs["actuator"]["goal"], goal)
@@ -142,7 +142,7 @@ def test_a_velocity_is_taken_where_it_is_the_rate_of_the_positions(tmp_path, rec
     np.savez(tmp_path / "other.npz", t_s=t, goal=goal, q_rad=q, dq=np.cos(3 * t)[:, None] * [1.0, 2.0, 3.0])
     other = proposed(tmp_path / "other.npz")
     assert "velocity" not in other.mapping.nodes["sensor"].fields
-    assert "left out" in "\n".join(other.evidence)
+    assert "skipped" in "\n".join(other.evidence)
 
 
 def test_names_of_a_models_joints_choose_columns(tmp_path, recorded):

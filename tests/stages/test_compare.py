@@ -56,7 +56,7 @@ def test_parameters_that_cannot_be_tested_are_shown_without_a_test():
     found = comparison(fixed, identification([1.0, 3.5], [0.1, 0.1]), other_unit)
     assert [p.name for p in found.parameters] == ["p0", "p1"]
     assert found.parameters[1].p_value is None
-    assert found.rows()[1][1] == ["p1", "1", "3", "3.5 ± 0.2", "-", "not tested"]
+    assert found.rows().rows[1] == ["p1", "1", "3", "3.5 ± 0.2", "-", "not tested"]
 
 
 def test_runs_are_compared_from_the_command_line(finished_run_dir, run_copy, tmp_path, capsys):

@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.stages.train.explain import disturbance_rows, parameter_rows
+from sim2real.stages.train.explain import disturbance_rows
 from sim2real.stages.train.training_setup import prepare
 from sim2real.train.environment.variation import VariationConfig
 
@@ -31,7 +31,7 @@ def made(prepared):
 
 
 def test_what_is_shown_is_what_is_drawn_at_the_end_of_the_training(made):
-    rows = {row[0]: row for row in parameter_rows(made.episodes)[0]}
+    rows = {row[0]: row for row in made.episodes.rows().rows}
     assert set(rows) == {"gain", "gravity", "damping", "friction", "start position", "push"}
     draws = made.episodes.draws
     for name, value, size in (("gain", made.values["gain"], 0.2), ("start position", 0.0, 0.3), ("push", 0.0, 3.0)):

@@ -15,7 +15,7 @@ from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, finished, newest, open_stage
-from sim2real.artifacts.run.stage_status import TAKES, standing
+from sim2real.artifacts.run.stage_status import TAKES, stage_status
 from sim2real.commands import info, run_loop
 from sim2real.commands.flags import RunFlags
 from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -192,11 +192,11 @@ def test_what_was_made_from_an_older_stage_is_made_again(tmp_path, by_hand, foll
     stages = Stages(tmp_path / "runs", ("fine",) * 3)
     run_dir = stages.run(iterations)
     stages(by_hand, getattr(load_pipeline("pendulum"), by_hand), run_dir)
-    assert [stage for stage, s in standing(run_dir).items() if s.stale] == follows
+    assert [stage for stage, s in stage_status(run_dir).items() if s.stale] == follows
     again = Stages(tmp_path / "runs", ("fine",) * 3)
     again.run(iterations, resume=run_dir)
     assert [stage for stage, _ in again.calls] == follows
-    assert not any(s.stale for s in standing(run_dir).values())
+    assert not any(s.stale for s in stage_status(run_dir).values())
 
 
 def test_info_and_the_report_say_what_is_out_of_date_and_why(tmp_path):
@@ -225,9 +225,9 @@ def test_an_identification_of_other_logs_is_current_until_the_robot_is_recorded_
     usual = load_pipeline("pendulum")
     stages("record", usual.record, run_dir)
     stages("identify", replace(usual.identify, log=(str(run_dir / log),)), run_dir)
-    assert (not standing(run_dir)["identify"].stale) == current
+    assert (not stage_status(run_dir)["identify"].stale) == current
     stages("record", usual.record, run_dir)
-    assert standing(run_dir)["identify"].stale
+    assert stage_status(run_dir)["identify"].stale
 
 
 def test_a_policy_of_the_nominal_model_and_a_run_without_a_recording_are_not_stale(tmp_path):
@@ -236,10 +236,10 @@ def test_a_policy_of_the_nominal_model_and_a_run_without_a_recording_are_not_sta
     stages("identify", usual.identify, run_dir)
     with open_stage(stages.root, "pendulum", "train", replace(usual.train, model="nominal"), {}, run_dir) as opened:
         opened.output("bundle", "bundle").mkdir()
-    assert not standing(run_dir)["train"].stale
-    assert standing(run_dir)["deploy"].stale
+    assert not stage_status(run_dir)["train"].stale
+    assert stage_status(run_dir)["deploy"].stale
     (tmp_path / "log").write_text("log")
     alone = Stages(tmp_path / "alone")
     done = alone("identify", replace(usual.identify, log=(str(tmp_path / "log"),)), None)
-    assert [s.stale for s in standing(done.run_dir).values()] == [""]
+    assert [s.stale for s in stage_status(done.run_dir).values()] == [""]
     assert finished(done.run_dir, "record") is None

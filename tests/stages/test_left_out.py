@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sim2real.artifacts.identification import Left
+from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty.uncertainty import Uncertainty
@@ -21,7 +21,7 @@ ANGLE = Position("th", "tilt", "rad", 0.001)
 
 
 def left(name, value=1.0, ahead=0.1, share=0.2, **more):
-    return Left(name, (), {"gain": value}, {"gain": share}, {"th": ahead}, **more)
+    return HeldOutPart(name, (), {"gain": value}, {"gain": share}, {"th": ahead}, **more)
 
 
 def test_one_more_part_stays_below_the_promise_as_often_as_it_says():

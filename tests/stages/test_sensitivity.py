@@ -86,7 +86,7 @@ def test_the_parameter_that_breaks_it_is_found_and_no_other(judged):
     assert judged.parameters[0].name == "gain"
     assert {p.name for p in judged.parameters} == {*VALUES, "round_trip_delay"}
     assert [judged.breaks_at(p) for p in judged.parameters[1:]] == [None] * 6
-    assert judged.said.startswith("Measure 'gain' better: 4 half-widths of its 95 % interval ")
+    assert judged.advice.startswith("Measure 'gain' better: 4 half-widths of its 95 % interval ")
 
 
 def test_it_breaks_where_the_angle_is_too_far_off(judged):
@@ -124,13 +124,13 @@ def test_the_worst_comes_first_and_the_file_says_the_same(tmp_path):
     parameters = [curve("mild", 0.9, 0.9, 0.9, 0.7), curve("none", 1, 1, 1, 0.9), curve("first", 1, 0.5, 1, 1)]
     made = Sensitivity.of(multiples, 1.0, 16, parameters)
     assert [(p.name, made.breaks_at(p)) for p in made.parameters] == [("first", -1.0), ("mild", 2.0), ("none", None)]
-    assert made.said == (
+    assert made.advice == (
         "Measure 'first' better: 1 half-width of its 95 % interval below the estimate, at 0.9 u, success falls from "
         "1.00 to 0.50."
     )
     made.save(tmp_path / "sensitivity.json")
     again = Sensitivity.load(tmp_path)
-    assert again.said == made.said
+    assert again.advice == made.advice
     np.testing.assert_array_equal(again.parameters[0].success, made.parameters[0].success)
     (tmp_path / "sensitivity.json").write_text('{"format": 1, "multiples": []}')
     with pytest.raises(Sim2RealError, match=r"sensitivity\.json is malformed"):
@@ -140,8 +140,8 @@ def test_the_worst_comes_first_and_the_file_says_the_same(tmp_path):
 def test_nothing_breaks_it_and_a_policy_that_never_works_are_said():
     multiples = np.array([-2.0, -1.0, 1.0, 2.0])
     fine = Sensitivity.of(multiples, 0.9, 16, [curve("a", 0.9, 0.9, 0.9, 0.85)])
-    assert fine.said.startswith("Nothing within 2 half-widths of the 95 % intervals breaks this policy")
+    assert fine.advice.startswith("No parameter breaks this policy within 2 half-widths of its 95 % interval")
     assert (
-        "does badly on the model as identified already (0.02)"
-        in Sensitivity.of(multiples, 0.02, 16, [curve("a", 0, 0, 0, 0)]).said
+        "The success on the identified model is only 0.02"
+        in Sensitivity.of(multiples, 0.02, 16, [curve("a", 0, 0, 0, 0)]).advice
     )

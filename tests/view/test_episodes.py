@@ -28,7 +28,12 @@ def episodes():
 def test_every_part_has_a_panel(episodes):
     text = episodes_svg(episodes, "here")
     ET.fromstring(text)
-    for title in ("gain [1/s]", "round_trip_delay [ms]", "steps of agent [ms]", "q[0], off the model [rad]"):
+    for title in (
+        "gain [1/s]",
+        "round_trip_delay [ms]",
+        "steps of agent [ms]",
+        "q[0]: difference from the model [rad]",
+    ):
         assert title in text
 
 

@@ -162,7 +162,7 @@ def test_text_is_never_parsed_as_mathematics(drawn, picture):
     assert synthetic_run.EVIL in texts(drawn["intervals"])
     for name, figure in drawn.items():
         assert not [t for t in figure.findobj(Text) if t.get_parse_math()], name
-    assert "late awakening" in ["".join(t.itertext()) for t in ET.fromstring(picture).iter(f"{SVG}text")]
+    assert "late wake-up" in ["".join(t.itertext()) for t in ET.fromstring(picture).iter(f"{SVG}text")]
 
 
 def test_units_stand_at_the_axes(drawn):
@@ -178,7 +178,7 @@ def test_lines_differ_by_more_than_colour(drawn):
 
 
 def test_the_latest_awakening_is_named(drawn):
-    assert "Around the latest awakening: agent, 4.0 ms" in texts(drawn["schedule"])
+    assert "Around the latest wake-up: agent, 4.0 ms" in texts(drawn["schedule"])
 
 
 def test_nodes_have_their_own_order_and_colour(drawn, log):
@@ -260,13 +260,13 @@ def test_only_what_lies_behind_the_fitted_start_counts_as_residual(found):
 
 def test_the_assumed_deviation_is_drawn_where_it_is_known(found):
     told = texts(figure_of(residuals.figure, replace(found, sigma={"th": 0.002})))
-    assert "assumed of the measurement" in told
+    assert "assumed noise of the measurement" in told
     assert any("5 times the assumed" in t for t in told)
 
 
 def test_a_parameter_that_may_be_zero_is_drawn_between_its_bounds(found):
     zero = replace(found.parameters[0], nominal=0.0, lower=-1.0, upper=1.0, estimate=0.25)
-    assert "place between the bounds [%]" in texts(figure_of(intervals.intervals, [zero, *found.parameters]))
+    assert "position between the bounds [%]" in texts(figure_of(intervals.intervals, [zero, *found.parameters]))
 
 
 def test_recordings_that_disagree_are_named(drawn):

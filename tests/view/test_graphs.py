@@ -44,7 +44,7 @@ def test_a_graph_shows_its_nodes_and_what_is_special_about_connections():
     ("options", "said"),
     [
         ({"episode": 2}, "no episode 2: the timeline has 2"),
-        ({"begin_s": 1.0, "end_s": 0.5}, "nothing lies between"),
+        ({"begin_s": 1.0, "end_s": 0.5}, "interval from 1.0 to 0.5 s is empty"),
         ({"order": ["eye"]}, "no node eye"),
     ],
 )

@@ -33,8 +33,8 @@ def test_numbers_stand_with_their_intervals_and_what_is_not_known_is_left_out(li
         "sensor_delay + actuator_delay, mean", "sensor_delay + actuator_delay, 95 % of the messages",
         "sensor_delay, deviation", "sensor_delay, lost", "sensor_delay, lost in a row",
     ]  # fmt: skip
-    assert table.rows[0][1:] == ["6.70", "6.50", "6.90", "ms"]
-    assert table.rows[3][1:] == ["3.00", "2.00", "4.00", "%"]
+    assert table.rows[0][1:] == ["6.700", "6.500 to 6.900", "ms"]
+    assert table.rows[3][1:] == ["3.000", "2.000 to 4.000", "%"]
     assert link_blocks([]) == []
 
 

@@ -15,9 +15,10 @@ import synthetic_run
 from sketches import sketched
 
 from sim2real.artifacts.estimation.posterior import Alternative, Posterior
-from sim2real.artifacts.identification import Identification, Judgement, Left
+from sim2real.artifacts.identification import HeldOutPart, Identification, Judgement
+from sim2real.artifacts.summary import words_and_unit
 from sim2real.errors import Sim2RealError
-from sim2real.view.blocks import MISSING, decimals_for, fixed, number, spoken
+from sim2real.view.blocks import MISSING, decimals_for, fixed, number
 from sim2real.view.identification.section import _alternatives, _banner, _parts
 from sim2real.view.page.page import deploy_page, identify_page, report
 
@@ -94,7 +95,7 @@ def test_the_numbers_are_there(page):
 def test_the_head_names_the_worst_position_and_a_table_has_them_all(page):
     words = page.words
     assert {"held-out RMSE of th, the worst of 2, after 1 s", "0.0234 rad"} <= set(words)
-    rows = words.index("Held-out RMSE of every position after 1 s, the worst first")
+    rows = words.index("Held-out RMSE of every position after 1 s, the largest first")
     assert {"no better than", "no delay", "none", "0.01170"} <= set(words[rows : rows + 60])
 
 
@@ -144,7 +145,7 @@ def test_free_runs_and_recordings_have_blocks_only_where_there_are_any(run):
     page = identify_page(run / "identify").read_text(encoding="utf-8")
     assert [f'id="{n}-' in page for n in names] == [False, True]
     assert "Over 3 recordings" in page
-    assert "they differ in round_trip_delay." in page
+    assert "Their differences in round_trip_delay exceed the standard errors." in page
 
 
 def test_every_stage_has_a_section_and_an_entry_in_the_contents(page):
@@ -313,9 +314,9 @@ def test_a_value_has_as_many_decimals_as_its_standard_error_is_worth():
 
 
 def test_a_quantity_says_its_unit():
-    assert spoken("angle_rms_rad") == ("angle rms", "rad")
-    assert spoken("speed_rms_rad_s") == ("speed rms", "rad/s")
-    assert spoken("success") == ("success", "1")
+    assert words_and_unit("angle_rms_rad") == ("angle rms", "rad")
+    assert words_and_unit("speed_rms_rad_s") == ("speed rms", "rad/s")
+    assert words_and_unit("success") == ("success", "1")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
@@ -333,12 +334,12 @@ def test_a_browser_shows_it_without_an_error(path, tmp_path):
 
 def test_parts_that_were_left_out_have_a_table_with_mean_and_worst():
     rows = tuple(
-        Left(name, terms, {}, {}, {"th": error}, {})
+        HeldOutPart(name, terms, {}, {}, {"th": error}, {})
         for name, terms, error in (("0 to 9 s", ("drag",), 0.1), ("9 to 18 s", (), 0.3))
     )
     found = Identification("robot", (), Judgement("", ()), (), left_out=rows, terms=("drag",), units={"th": "rad"})
     (table,) = _parts(found)
-    assert table.columns == ["left out", "terms", "th ahead [rad]"]
+    assert table.columns == ["held-out part", "terms", "th ahead [rad]"]
     assert table.rows == [
         ["0 to 9 s", "drag", "0.100"], ["9 to 18 s", "none", "0.300"], ["mean", "", "0.200"], ["worst", "", "0.300"],
     ]  # fmt: skip

@@ -25,8 +25,8 @@ def test_the_sentence_comes_first_then_the_figure_then_every_number(blocks):
     assert note.text.startswith("Measure 'friction' better: 2 half-widths")
     assert "<svg" in figure.svg
     assert "<b>gain" not in figure.svg
-    assert table.columns[-4:] == ("\u22122", "\u22121", "+1", "+2")
-    assert table.rows[0] == ["friction", "rad/s²", "3.000", "0.25", "\u22122", "0.20", "0.90", "1.00", "1.00"]
+    assert table.columns[-4:] == ["\u22122", "\u22121", "+1", "+2"]
+    assert table.rows[0] == ["friction", "rad/s²", "3.000", "0.2500", "\u22122", "0.20", "0.90", "1.00", "1.00"]
     assert [row[0] for row in table.rows] == ["friction", "<b>gain</b>"]
 
 

@@ -22,30 +22,30 @@ def test_a_log_that_tells_nothing_of_servos_has_no_block():
 def test_answers_are_told_in_words():
     (block,) = servo_blocks([episode(end())])
     assert list(block.items) == [
-        "400 answers came; 3 were missed, and asked for again.",
-        "No answer came so late that it is not sure when its sample was taken.",
+        "400 answers came; 3 were lost, and requested again.",
+        "No answer came so late that the sample's time is uncertain.",
         "Beyond the time that its bytes take, half of the answers took 0.10 ms or less, 99 % 3.50 ms or less, the "
         "slowest 20.00 ms.",
-        "Nothing was odd about what was measured: no joint stood still under load.",
+        "No measurement was suspicious: no joint stood still under load.",
     ]
     (block,) = servo_blocks([episode(end(late=8))])
     assert block.items[1] == (
-        "8 answers (2.0%) came so late that it is not sure when its sample was taken: set the adapter's latency timer "
-        "to 1 ms, and close what else runs."
+        "8 answers (2.0%) came so late that the sample's time is uncertain: set the adapter's latency timer to 1 ms, "
+        "and close other programs."
     )
 
 
 def test_what_was_odd_is_told_of_each_episode():
     odd = "joint 'tilt' has read 0.1 rad for 2.00 s, though it is pushed with 40% of its torque"
     (block,) = servo_blocks([episode(end(suspects=[odd])), episode(end())])
-    assert block.items[-1] == f"Odd, but no reason to stop, in episode 0: {odd}."
+    assert block.items[-1] == f"Suspicious, but no reason to stop, in episode 0: {odd}."
     (block,) = servo_blocks([episode(end(suspects=[odd]))])
-    assert block.items[-1] == f"Odd, but no reason to stop: {odd}."
+    assert block.items[-1] == f"Suspicious, but no reason to stop: {odd}."
 
 
 def test_what_was_sent_is_a_table_and_of_a_dry_run_what_would_have_been():
     row = {"name": "tilt", "unit": "rad", "commands": 50, "low": -0.5, "mean": 0.1, "high": 1.0, "cut": 5}
-    assert servo_blocks([episode({"sent": [row]})])[0].caption == "What the motors were sent"
+    assert servo_blocks([episode({"sent": [row]})])[0].caption == "Commands to the motors"
     (table,) = servo_blocks([episode({"sent": [row]}, dry=True)] * 2)
-    assert table.caption == "What would have been sent to the motors"
+    assert table.caption == "Commands to the motors, which were not sent"
     assert table.rows[1] == ["episode 1: tilt", "rad", "50", "\N{MINUS SIGN}0.5000", "0.1000", "1.000", "5", "10.0%"]

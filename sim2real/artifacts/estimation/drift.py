@@ -1,31 +1,29 @@
-"""Which parameters of a robot are no longer what was identified, tested on a later log."""
+"""The drift test: parameters of a robot that differ from their estimates in a later log."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-_MUCH = 0.5
-"""Share of what the change explains that explains most, from which on another one may be the cause. In 26 logs of nine
-hidden robots, on which this was chosen, the right one explained 0.98 of that at least; later, of an SO-101, once 0.49.
-A torque limit that was hardly felt explained nothing, and was sure."""
-_RARE = 0.1
-"""Probability by chance below which a change that explains much may be told as likely, by itself."""
+from sim2real.artifacts.summary import Interval, Table
+
+_MIN_SHARE = 0.5
+"""A change can be the cause if it explains this share of the error that the best change explains."""
+_MAX_CHANCE = 0.1
+"""A single change is reported as likely if its probability by chance is lower."""
 
 
 @dataclass(frozen=True)
 class Changed:
-    """One way in which a robot may have changed: a parameter, the sum of the delays, or a cause that moves several.
+    """A possible change of a robot: of a parameter, of the sum of the delays, or of a cause of several changes.
 
     Attributes:
-        name: What has changed.
-        unit: Unit of ``before`` and ``now``; of a cause "": they are factors.
-        before: What was identified.
-        now: What the later log says, if nothing else has changed.
-        low95: Lower end of the 95 % interval of ``now``, for the identification's own uncertainty as well.
-        high95: Its upper end.
-        explains: Share of the error that the change takes away, beyond what the identification leaves open.
-        p: Probability of as much by chance, or by a factor of less than a twentieth, before the correction for several
-            tests.
+        unit: Unit of ``before`` and ``now``; "" for a cause, as they are factors.
+        before: The estimate.
+        now: The value that fits the later log best if only this has changed.
+        low95: Lower end of the 95 % interval of ``now``; it includes the uncertainty of the estimate.
+        high95: Upper end.
+        explains: Share of the error that the change removes, beyond the uncertainty of the estimate.
+        p: Probability of such a share by chance, or by a factor below 1/20; not corrected for several tests.
     """
 
     name: str
@@ -40,14 +38,14 @@ class Changed:
 
 @dataclass(frozen=True)
 class Drift:
-    """What a later log says about the parameters that were identified.
+    """The result of the drift test on a later log.
 
     Attributes:
-        changes: Each way in which the robot may have changed, the one that explains most first.
-        level: Share of robots that did not change for which any of the tests raises an alarm.
-        alarms: Names of those that are significant at this level, all tests together (Holm), and explain a tenth of the
-            error at least, the surest first.
-        seconds: How much of the log is in motion, and was tested [s].
+        changes: Possible changes, the largest ``explains`` first.
+        level: False-alarm rate of all tests together, per log.
+        alarms: Names of the changes that are significant at this level (Holm) and explain at least 0.1 of the error,
+            the smallest ``p`` first.
+        seconds: Length of the tested part of the log, in which the robot moves [s].
     """
 
     changes: tuple[Changed, ...]
@@ -57,23 +55,36 @@ class Drift:
 
     @property
     def named(self) -> Changed | None:
-        """What has changed: of the significant changes that explain much the surest; None where none is significant.
+        """The smallest ``p`` of the significant changes that explain much; None without alarm.
 
-        The one that explains most may be another: a model that lacks a part of the friction errs in every motion, and
-        more friction explains some of that, whatever has changed.
+        The largest ``explains`` can belong to another parameter: if the model lacks a part of the friction, more
+        friction explains some error of every motion.
         """
         significant = [c for c in self.changes if c.name in self.alarms]
-        most = max((c.explains for c in significant), default=0.0)
-        return min((c for c in significant if c.explains >= _MUCH * most), key=lambda c: c.p, default=None)
+        largest = max((c.explains for c in significant), default=0.0)
+        return min((c for c in significant if c.explains >= _MIN_SHARE * largest), key=lambda c: c.p, default=None)
 
     @property
     def likely(self) -> Changed | None:
-        """What has most likely changed if something has, where no test raises an alarm.
-
-        What explains most, if that is more than half of the error, and by itself rare by chance: of an arm with twice
-        the friction it is that in the cases that the tests leave open.
-        """
+        """The likely change if no test raises an alarm; None if no change explains half of the error."""
         if self.alarms or not self.changes:
             return None
-        most = self.changes[0]
-        return most if most.explains > _MUCH and most.p < _RARE else None
+        best = self.changes[0]
+        return best if best.explains > _MIN_SHARE and best.p < _MAX_CHANCE else None
+
+    def rows(self) -> Table:
+        """Return a row for each possible change."""
+        headers = ("changed alone", "identified", "now", "95 % interval", "unit", "explains", "alarm")
+        rows = [
+            [
+                c.name,
+                c.before,
+                c.now,
+                Interval(c.low95, c.high95),
+                c.unit or "factor",
+                c.explains,
+                c.name in self.alarms,
+            ]
+            for c in self.changes
+        ]
+        return Table(headers, rows)

@@ -1,15 +1,20 @@
-"""What identification says about a link: how long messages take, how much that varies, and how many are lost."""
+"""The delay of a link: its distribution, and the share of lost messages."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from sim2real.artifacts.summary import Interval, Table
+
+_HEADERS = ("link", "estimate", "95 % interval", "unit")
+
 
 @dataclass(frozen=True)
 class Ranged:
-    """A number with its 95 % interval; None where the log says nothing about it."""
+    """A number with its 95 % interval; None if the log does not determine it."""
 
     value: float | None
     low95: float | None
@@ -18,22 +23,21 @@ class Ranged:
 
 @dataclass(frozen=True)
 class Link:
-    """A link, as the motion shows it.
+    """The delay of a link, estimated from the motion.
 
     Attributes:
         name: The delay's parameter.
-        parts: What mean and 95th percentile are the sum of: a log of motion tells only their sum. The link's own name
-            alone where it is told apart.
-        mean: The mean of the delay, of all parts together, in the middle of a recording [s].
-        deviation: The standard deviation of this link's delay alone [s].
-        p95: What 95 % of the messages do not exceed, of all parts together [s].
-        lost: Share of the messages that were lost: their reader saw the message before once more.
-        burst: How many messages in a row are lost, on average; None where none was.
-        drift: How much faster the clock of the stamps runs than that of the commands [s/s].
-        delays: Shape ``(K,)``: delays, of all parts together [s].
-        share: Shape ``(K,)``: share of the messages that have each of them.
-        jitter: The standard deviation of the commands' delay [s]; as of its mean, a log of motion tells only that of
-            all links between command and motion together.
+        parts: Delays whose sum has this mean and 95th percentile, as a log of motion determines only their sum; the
+            link's name alone if the log determines its delay alone.
+        mean: Mean of the sum in the middle of a recording [s].
+        deviation: Standard deviation of this link's delay alone [s].
+        p95: 95th percentile of the sum [s].
+        lost: Share of lost messages: their reader uses the previous message again.
+        burst: Mean number of lost messages in a row; None without losses.
+        drift: Rate of the stamps' clock relative to the commands' clock, minus 1 [s/s].
+        delays: Shape ``(K,)``: values of the sum [s].
+        share: Shape ``(K,)``: share of the messages with each of these values.
+        jitter: Standard deviation of the commands' delay, over all links between command and motion together [s].
     """
 
     name: str
@@ -49,23 +53,34 @@ class Link:
     jitter: Ranged = Ranged(None, None, None)
 
     @property
-    def told_apart(self) -> bool:
+    def separate(self) -> bool:
         """Whether the mean is this link's alone."""
         return len(self.parts) == 1
 
-    def rows(self) -> list[tuple[str, Ranged, float, str]]:
-        """Return what is known of it: what it is, the number, the factor to the unit that people read, and that unit.
-
-        Of a sum, its parts are named.
-        """
-        whole, own = " + ".join(self.parts), self.name
-        shown = [
-            (f"{whole}, mean", self.mean, 1e3, "ms"),
-            (f"{whole}, 95 % of the messages", self.p95, 1e3, "ms"),
-            (f"{own}, deviation", self.deviation, 1e3, "ms"),
+    def rows(self) -> Table:
+        """Return a row for each number that the log determines."""
+        total, name = " + ".join(self.parts), self.name
+        numbers = [
+            (f"{total}, mean", self.mean, 1e3, "ms"),
+            (f"{total}, 95 % of the messages", self.p95, 1e3, "ms"),
+            (f"{name}, deviation", self.deviation, 1e3, "ms"),
             (f"{' + '.join(self.parts[1:]) or 'commands'}, deviation", self.jitter, 1e3, "ms"),
-            (f"{own}, lost", self.lost, 100.0, "%"),
-            (f"{own}, lost in a row", self.burst, 1.0, ""),
-            (f"{own}, drift of the clock", self.drift, 1e6, "us/s"),
+            (f"{name}, lost", self.lost, 100.0, "%"),
+            (f"{name}, lost in a row", self.burst, 1.0, ""),
+            (f"{name}, drift of the clock", self.drift, 1e6, "us/s"),
         ]
-        return [row for row in shown if row[1].value is not None]
+        rows = [
+            [label, factor * r.value, Interval(_scaled(r.low95, factor), _scaled(r.high95, factor)), unit]
+            for label, r, factor, unit in numbers
+            if r.value is not None
+        ]
+        return Table(_HEADERS, rows)
+
+
+def links_table(links: Sequence[Link]) -> Table:
+    """Return the rows of several links as one table."""
+    return Table(_HEADERS, [row for link in links for row in link.rows().rows])
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value

@@ -1,4 +1,4 @@
-"""What a log shows of a sensor: how its readings scatter around the motion."""
+"""The noise of a sensor: how its readings scatter around the motion."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _COLUMN = re.compile(r"(.+?)(?:\[(\d+)\])?")
 
 @dataclass(frozen=True)
 class Noise:
-    """How one measured quantity lies off the identified model.
+    """The differences between one measured quantity and the identified model.
 
     Attributes:
-        column: Its name: a field of the sensor's message, with an index ``[i]`` where the field is a vector.
+        column: A field of the sensor's message, with an index ``[i]`` if the field is a vector.
         unit: Unit of all numbers.
-        deviation: Standard deviation of what changes from sample to sample; jitter of the sampling times is part of it.
-        quantum: Step between neighbouring readings; 0: none was found.
-        bias: Standard deviation of what stays the same over a segment.
+        deviation: Standard deviation of the part that changes from sample to sample; includes jitter of sampling times.
+        quantum: Step between neighbouring readings; 0 if readings have no step.
+        bias: Standard deviation of the part that is constant over a segment.
     """
 
     column: str
@@ -30,12 +30,12 @@ class Noise:
     bias: float
 
     def __post_init__(self) -> None:
-        """Check that these are sizes: they may come from a file."""
+        """Check the numbers, which can come from a file."""
         sizes = (self.deviation, self.quantum, self.bias)
         check(all(math.isfinite(s) and s >= 0.0 for s in sizes), f"{self.column}: noise of {sizes}")
 
     @property
     def place(self) -> tuple[str, int | None]:
-        """The field of the message, and the index in it; None: the field is a number."""
+        """The field of the message, and the index in it; None if the field is a number."""
         name, index = _COLUMN.fullmatch(self.column).groups()  # type: ignore[union-attr]  # .+? takes whatever there is
         return name, None if index is None else int(index)

@@ -1,4 +1,4 @@
-"""The estimate with its covariance, and the models that explain the recordings as well: what training draws from."""
+"""The posterior, from which training draws: estimate, covariance, and other models that fit the recordings."""
 
 from __future__ import annotations
 
@@ -20,14 +20,13 @@ TRANSFORMS = {
     "log": (np.log, lambda x, m: m.exp(x), lambda v: v),
     "logit": (lambda v: np.log(v / (1.0 - v)), lambda x, m: 1.0 / (1.0 + m.exp(-x)), lambda v: v * (1.0 - v)),
 }
-"""The scales on which parameters are searched, and on which their uncertainty is Normal."""
+"""Scales of the search; on its scale, the uncertainty of a parameter is Normal."""
 
 
 def from_scale(transform: str, x: Any, numpy: ModuleType = np) -> Any:
-    """Return values for points on a scale.
+    """Return the values of points on a scale.
 
     Args:
-        x: The points, of any shape.
         numpy: ``numpy``, or ``jax.numpy`` inside a program.
     """
     return TRANSFORMS[transform][1](x, numpy)
@@ -35,12 +34,12 @@ def from_scale(transform: str, x: Any, numpy: ModuleType = np) -> Any:
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another model that explains the recordings as well as the estimate.
+    """Another model that fits the recordings as well as the estimate.
 
     Attributes:
-        about: What it is.
-        weight: Share of the draws that are of it, in [0, 1].
-        posterior: Its parameters; without alternatives of its own.
+        about: Description of the model.
+        weight: Share of the draws that come from this model, in [0, 1].
+        posterior: Parameters of the model; has no alternatives.
     """
 
     about: str
@@ -48,7 +47,7 @@ class Alternative:
     posterior: Posterior
 
     def __post_init__(self) -> None:
-        """Check that it is a share, of one distribution: it may come from a file."""
+        """Check the share, which can come from a file."""
         check(
             0.0 <= self.weight <= 1.0 and not self.posterior.others, f"{self.about!r} is no single model with a share"
         )
@@ -59,17 +58,17 @@ class Posterior:
     """A Normal distribution on the parameters' scales, folded back at their bounds; with alternatives, a mixture.
 
     Attributes:
-        names: P of them, with ``@recording`` where each recording has its own.
-        transform: How each scale makes a value.
+        names: Names of P parameters; ``NAME@recording`` if each recording has a value of its own.
+        transform: Scale of each parameter.
         mean: Shape ``(P,)``, on the scales.
         covariance: Shape ``(P, P)``, on the scales.
-        low: Shape ``(P,)``: bounds on the scales.
-        high: Shape ``(P,)``.
-        without: Parameter that alternatives have and this model lacks -> what it is without.
-        others: The alternatives, with what is left of the draws for this one.
+        low: Shape ``(P,)``: lower bounds on the scales.
+        high: Shape ``(P,)``: upper bounds on the scales.
+        without: Parameter of an alternative that this model lacks -> the value that it stands for here.
+        others: The alternatives; this model gets the rest of the draws.
 
     Raises:
-        ValueError: When the sizes differ, an entry is no number, or alternatives leave a parameter open.
+        ValueError: When the sizes differ, an entry is no number, or an alternative has other parameters.
     """
 
     names: tuple[str, ...]
@@ -82,7 +81,7 @@ class Posterior:
     others: tuple[Alternative, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that it is one distribution: it may come from a file."""
+        """Check the distribution, which can come from a file."""
         size = len(self.names)
         shapes = {a.shape for a in (self.mean, self.low, self.high)}
         fits = shapes == {(size,)} and self.covariance.shape == (size, size) and len(self.transform) == size
@@ -90,11 +89,11 @@ class Posterior:
         finite = all(np.isfinite(a).all() for a in (self.mean, self.covariance, self.low, self.high))
         check(finite, "an entry of the posterior is no number")
         check(sum(o.weight for o in self.others) < 1.0 + 1e-9, "shares of alternatives beyond all draws")
-        known = {frozenset((*p.names, *p.without)) for p in (self, *(o.posterior for o in self.others))}
-        check(len(known) == 1, "alternatives are of other parameters")
+        parameter_sets = {frozenset((*p.names, *p.without)) for p in (self, *(o.posterior for o in self.others))}
+        check(len(parameter_sets) == 1, "alternatives are of other parameters")
 
     def sample(self, rng: np.random.Generator, count: int, widen: float = 1.0) -> dict[str, np.ndarray]:
-        """Draw parameter sets, of all alternatives by their shares: name -> ``(count,)``.
+        """Draw parameter sets from this model and its alternatives by their shares: name -> ``(count,)``.
 
         Args:
             widen: Factor on the standard deviations.
@@ -105,13 +104,13 @@ class Posterior:
         shares = np.array([1.0 - sum(o.weight for o in self.others), *(o.weight for o in self.others)])
         which = rng.choice(len(parts), size=count, p=np.maximum(shares, 0.0) / np.maximum(shares, 0.0).sum())
         drawn = [part.sample(rng, count, widen) for part in parts]
-        return {n: np.stack([own[n] for own in drawn])[which, np.arange(count)] for n in drawn[0]}
+        return {n: np.stack([draws[n] for draws in drawn])[which, np.arange(count)] for n in drawn[0]}
 
     def _own(self, rng: np.random.Generator, count: int, widen: float) -> dict[str, np.ndarray]:
         values, axes = np.linalg.eigh(self.covariance)
         root = axes * np.sqrt(np.maximum(values, 0.0))
         x = self.mean + widen * rng.standard_normal((count, len(self.mean))) @ root.T
-        # Folded back at the bounds, not clipped: clipped ones would heap up there.
-        turns = np.abs((x - self.low) / (self.high - self.low) % 2.0 - 1.0)
-        x = np.where((x < self.low) | (x > self.high), self.high - turns * (self.high - self.low), x)
+        # Fold draws back at the bounds: clipping would put many draws exactly on a bound.
+        folds = np.abs((x - self.low) / (self.high - self.low) % 2.0 - 1.0)
+        x = np.where((x < self.low) | (x > self.high), self.high - folds * (self.high - self.low), x)
         return {n: from_scale(t, x[:, i]) for i, (n, t) in enumerate(zip(self.names, self.transform, strict=True))}

@@ -1,4 +1,4 @@
-"""One quantity, identified from each of several recordings by itself."""
+"""One quantity, estimated separately from each of several recordings."""
 
 from __future__ import annotations
 
@@ -11,19 +11,16 @@ from sim2real.artifacts.files import check
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity, estimated from each of R recordings by itself, and from all together.
+    """One quantity, estimated from each of R recordings alone, and the mean of these estimates.
 
     Attributes:
-        name: Its name.
-        unit: Its unit.
-        estimates: Shape ``(R,)``: one a recording.
+        estimates: Shape ``(R,)``.
         standard_errors: Shape ``(R,)``.
-        mean: Their mean.
         standard_error: Of the mean.
         between: Deviation between recordings, beyond their standard errors.
         low95: Lower end of the 95 % interval for a further recording.
-        high95: Its upper end.
-        agree: Whether their standard errors explain how much the estimates differ.
+        high95: Upper end.
+        agree: Whether the standard errors explain the differences between the estimates.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The iterations of a run: what each did again, how it went, what it found, and what the next one does."""
+"""The iterations of a run: stages, success, verdict and plan of each."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sim2real.artifacts.files import malformed, read_json, write_json
+from sim2real.artifacts.summary import Table
 
 ITERATIONS = "iterations.json"
 
@@ -15,13 +16,13 @@ class Iteration:
     """One time around the loop.
 
     Attributes:
-        number: Its number, from 1.
-        stages: Folder of each stage that ran, in order, relative to the run.
-        real: Success on the robot, a mean over episodes; None where the task knows none.
-        simulation: The same in simulation.
-        verdict: What the deployment said, or that it was refused asks for.
+        number: Number of the iteration, from 1.
+        stages: Folders of the stages that ran, in order, relative to the run.
+        real: Mean success of the episodes on the robot; None if the task has no success.
+        simulation: Mean success in simulation.
+        verdict: Verdict of the deployment, or the remedy for its refusal.
         why: The first reason.
-        then: What followed, in words.
+        then: The next steps, in words.
     """
 
     number: int
@@ -34,20 +35,20 @@ class Iteration:
 
     @property
     def deployment(self) -> str | None:
-        """Folder of the deployment that was judged; None where it was refused."""
+        """Folder of the judged deployment; None if it was refused."""
         return next((name for name in reversed(self.stages) if name.partition(".")[0] == "deploy"), None)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What an iteration does. It is on disk before the iteration starts, so that an interrupted one can go on.
+    """The plan of an iteration. It is on disk before the iteration starts, so that an interrupted one can resume.
 
     Attributes:
-        stages: The stages that run, in order; none where the run stops.
-        words: That in words.
-        log: The logs to identify from, relative to the run folder; none: the newest recording.
-        terms: The optional terms to identify with; None: as the flags say.
-        seed: The seed of the training; None: as the flags say.
+        stages: The stages to run, in order; empty if the run stops.
+        words: The plan in words.
+        log: The logs to identify from, relative to the run folder; empty for the newest recording.
+        terms: The optional terms to identify with; None for the flags' value.
+        seed: The seed of the training; None for the flags' value.
         before: Stage folders that were finished when the iteration started.
     """
 
@@ -64,21 +65,27 @@ class Iterations:
     """All iterations of a run, the oldest first.
 
     Attributes:
-        rows: Those that ended.
-        plan: What the next one does; None where none is to come.
+        rows: The finished iterations.
+        plan: Plan of the next one; None after the last.
     """
 
     rows: tuple[Iteration, ...] = ()
     plan: Plan | None = None
 
+    def table(self) -> Table:
+        """Return a row for each finished iteration."""
+        headers = ("iteration", "ran", "success", "in simulation", "verdict", "why", "then")
+        rows = [[str(r.number), ", ".join(r.stages), r.real, r.simulation, r.verdict, r.why, r.then] for r in self.rows]
+        return Table(headers, rows)
+
     def save(self, run_dir: Path) -> Path:
-        """Write them into the run folder; return the file."""
+        """Write the iterations into the run folder, and return the file."""
         write_json(run_dir / ITERATIONS, self)
         return run_dir / ITERATIONS
 
     @staticmethod
     def load(run_dir: Path) -> Iterations:
-        """Read those of a run; none where it has not gone around.
+        """Read the iterations of a run; empty if it has none.
 
         Raises:
             Sim2RealError: When the file is malformed.

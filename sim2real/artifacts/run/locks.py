@@ -1,7 +1,7 @@
-"""Locks on files, by which a reader sees whether the process that wrote a file is still there.
+"""Locks on files: a lock shows readers that the process that writes the file still runs.
 
-The kernel releases such a lock when the process ends, however it ends. Where the platform or the file system has no
-locks, a file counts as locked: nobody can say that its writer died.
+The kernel releases the lock when the process ends for any reason. On a platform or file system without locks, a file
+counts as locked, because the end of its writer cannot be detected.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ _HELD = (errno.EAGAIN, errno.EACCES)
 
 
 def held_lock(fd: int) -> int | None:
-    """Lock an open file; return a new file descriptor that holds the lock until it is closed, None without locks."""
+    """Lock an open file; return a new file descriptor that holds the lock until it is closed, or None without locks."""
     if fcntl is None:
         return None
-    own = os.dup(fd)
+    duplicate = os.dup(fd)
     try:
-        fcntl.flock(own, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(duplicate, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
-        os.close(own)
+        os.close(duplicate)
         return None
-    return own
+    return duplicate
 
 
 def read_with_lock(path: Path) -> tuple[str, bool]:
@@ -37,21 +37,21 @@ def read_with_lock(path: Path) -> tuple[str, bool]:
 
     Raises:
         OSError: When it cannot be read.
-        UnicodeDecodeError: When it is no text.
+        UnicodeDecodeError: When it is no UTF-8.
     """
     while True:
         with path.open("rb") as file:
             locked = _is_locked(file.fileno())
             text = file.read().decode("utf-8")
             with suppress(FileNotFoundError):
-                # Its writer replaces the file before it releases the lock: of the old file, nothing is to be said.
+                # The writer replaces the file before it releases the lock: read the new file if this is the old one.
                 if not locked and os.stat(path).st_ino != os.fstat(file.fileno()).st_ino:
                     continue
             return text, locked
 
 
 def _is_locked(fd: int) -> bool:
-    """Return whether another open file holds the lock; True, too, where there are no locks."""
+    """Return whether another open file holds the lock; also True without locks."""
     if fcntl is None:
         return True
     try:

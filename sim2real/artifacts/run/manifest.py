@@ -1,4 +1,4 @@
-"""A stage's ``manifest.json``: what it ran on, with what, and what came out; plain JSON, replaced atomically."""
+"""A stage's ``manifest.json``: inputs, configuration, outputs and status; plain JSON, replaced atomically."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from enum import Enum
 from importlib import metadata
 from numbers import Integral, Real
 from pathlib import Path, PurePath
-from typing import Any
 
 from sim2real.artifacts.run.locks import held_lock, read_with_lock
 from sim2real.errors import Sim2RealError
+from sim2real.types import Json
 
 MANIFEST = "manifest.json"
 RUNNING = "running"
 DIED = "died"
-"""Status of a stage whose process ended without a word: it was killed, or the machine lost its power."""
+"""Status of a stage whose process ended without writing its end: it was killed, or the machine lost its power."""
 _TEXTS = ("pipeline", "stage", "status", "started")
 _DRAFT = f".{MANIFEST}.tmp"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-# Most manifests have 4 kB; long summaries need more.
+# Most manifests have 4 kB; manifests with long summaries are larger.
 _RESERVED_BYTES = 32 * 1024
 PACKAGES = ("sim2real", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "flax", "optax", "evosax", "mcap")
 
 
-def read_manifest(folder: Path) -> dict[str, Any] | None:
+def read_manifest(folder: Path) -> dict[str, Json] | None:
     """Return a stage folder's manifest, or None if it is missing or malformed.
 
-    The status is `died` where the manifest says `running` and no process holds the lock on it.
+    The status is `died` if the manifest has `running` and no process holds the lock on it.
     """
     try:
         text, locked = read_with_lock(folder / MANIFEST)
@@ -48,7 +48,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 
 def _is_manifest(value: object) -> bool:
-    """Whether a JSON document has a manifest's entries, and its outputs lie in its folder."""
+    """Return whether a JSON document has a manifest's entries, and its outputs are in its folder."""
     if not isinstance(value, dict) or any(not isinstance(value.get(k), str) for k in _TEXTS):
         return False
     for kind in ("inputs", "outputs"):
@@ -64,11 +64,11 @@ def _is_manifest(value: object) -> bool:
     return True
 
 
-def write_manifest(folder: Path, manifest: Mapping[str, Any], lock: bool = False) -> int | None:
-    """Write a stage folder's manifest; a reader sees the old one or the new one, never a part.
+def write_manifest(folder: Path, manifest: Mapping[str, Json], lock: bool = False) -> int | None:
+    """Write a stage folder's manifest; a reader finds the old one or the new one, never a part.
 
     Args:
-        lock: Whether to hold a lock on it, which readers see as long as this process lives.
+        lock: Whether to hold a lock on it, which shows readers that this process runs.
 
     Returns:
         The file descriptor that holds the lock; its owner closes it. None without a lock.
@@ -78,28 +78,28 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any], lock: bool = False
     """
     text = json.dumps(plain(manifest), indent=2, allow_nan=False)
     draft = folder / _DRAFT
-    # Written over what `reserve` left, and cut to its length afterwards: it needs no room of its own on a full disk.
+    # Overwrite the reserved bytes, then cut the file to its length: this needs no new space on a full disk.
     with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
         file.write(f"{text}\n".encode())
         file.truncate()
         file.flush()
         os.fsync(file.fileno())
-        # Locked before it has its name: no reader finds it without the lock.
+        # Lock before the rename: no reader finds the manifest without its lock.
         held = held_lock(file.fileno()) if lock else None
     os.replace(draft, folder / MANIFEST)
     return held
 
 
 def reserve(folder: Path) -> None:
-    """Reserve disk space for the folder's next manifest: even on a full disk it must say how the stage ended."""
+    """Reserve disk space for the folder's next manifest, which records the stage's end even on a full disk."""
     with (folder / _DRAFT).open("wb") as file:
         file.write(b" " * _RESERVED_BYTES)
         file.flush()
         os.fsync(file.fileno())
 
 
-def in_words(error: BaseException, folder: Path) -> BaseException:
-    """Return the exception to show the user: a plain error where a full disk is the cause, else the same."""
+def readable_error(error: BaseException, folder: Path) -> BaseException:
+    """Return the exception to show the user: an error with a hint if the disk is full, else the same exception."""
     if not isinstance(error, OSError) or error.errno not in _FULL:
         return error
     where = f" (writing {os.fsdecode(error.filename)})" if isinstance(error.filename, str | bytes) else ""
@@ -109,14 +109,14 @@ def in_words(error: BaseException, folder: Path) -> BaseException:
     )
 
 
-def plain(value: object) -> Any:
+def plain(value: object) -> Json:
     """Return a value as dicts, lists, strings, numbers, booleans and None.
 
     Dataclasses become dicts, arrays nested lists, enums their names, paths strings; numbers that JSON lacks become the
     strings 'inf', '-inf' and 'nan'.
 
     Raises:
-        TypeError: When the value, or one inside it, is none of these.
+        TypeError: When the value, or one inside it, is of another type.
     """
     if value is None or isinstance(value, bool | str):
         return value
@@ -135,7 +135,7 @@ def plain(value: object) -> Any:
         return [plain(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    import numpy as np  # only for arrays: `sim2real info` does without
+    import numpy as np  # here, as `sim2real info` starts faster without it
 
     array = np.asarray(value)
     if array.dtype == object:
@@ -162,21 +162,23 @@ def sha256(path: Path) -> str:
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions of the packages that a result may depend on; None for one that is not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
+    """Return the versions of the packages that affect results; None for a missing package."""
+    versions_by_name: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            versions_by_name[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = None
-    return found
+            versions_by_name[name] = None
+    return versions_by_name
 
 
-def git_state(folder: Path | None = None) -> dict[str, Any] | None:
-    """Return the commit of the repository that holds a folder (default: the working directory) and if it is dirty.
+def git_state(folder: Path | None = None) -> dict[str, Json] | None:
+    """Return the commit of the repository that holds a folder, and whether tracked files differ from it.
 
-    Files that git does not track do not make it dirty: run folders usually lie beside the code. None outside of a
-    repository, or without git.
+    None outside of a repository, or without git.
+
+    Args:
+        folder: Default: the working directory.
     """
     safe = {"core.fsmonitor": "false", "core.hooksPath": os.devnull}
 
@@ -197,8 +199,8 @@ def git_state(folder: Path | None = None) -> dict[str, Any] | None:
         return done.stdout.strip()
 
     try:
-        # A repository may come from anywhere, and its settings may name programs that git would run: file system
-        # monitors, hooks, filters. They are switched off; the user's own settings stay.
+        # Switch off programs in the repository's settings that git would run (file system monitors, hooks, filters),
+        # because the repository can come from an unknown source. The user's own settings stay.
         for line in git("config", "--list", "--name-only", "--show-scope").splitlines():
             scope, _, key = line.partition("\t")
             if scope in ("local", "worktree") and key.startswith("filter."):

@@ -1,7 +1,7 @@
 """Run folders: ``runs/<pipeline>/<time>/{record,identify,train,deploy}/``, each with a manifest.
 
-A stage that is run again in the same run folder gets ``<stage>.2``, ``<stage>.3``, ...: a folder is made once, by the
-process that writes into it, and never renamed. So two processes never write into the same one, nothing recorded is
+A repeated stage in the same run folder gets ``<stage>.2``, ``<stage>.3``, ...: the process that writes into a folder
+creates it, and the folder is never renamed. So two processes never write into the same folder, files are never
 overwritten, references to files stay valid, and a failed attempt does not hide a finished one.
 """
 
@@ -16,47 +16,47 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from sim2real.artifacts.run.manifest import (
     RUNNING,
     git_state,
-    in_words,
     plain,
     read_manifest,
+    readable_error,
     reserve,
     sha256,
     versions,
     write_manifest,
 )
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError
+from sim2real.types import Json
 
 STAGES = ("record", "identify", "train", "deploy")
 DRY = "dry run"
-"""Status of a stage that ended well but moved nothing: later stages do not use it."""
+"""Status of a finished stage that sent no commands: later stages do not use it."""
 INTERRUPTED = 130
 _NAME = re.compile(r"\w[\w.-]*")
 
 
 @dataclass(frozen=True)
 class Source:
-    """A file that an artifact was made from: its path, relative to the run folder, and its SHA-256."""
+    """A source file of an artifact: its path, relative to the run folder, and its SHA-256."""
 
     path: str
     sha256: str
 
     @staticmethod
     def of(path: Path, run_dir: Path) -> Source:
-        """Describe a file that an artifact in a run folder was made from."""
+        """Return the source for a file."""
         return Source(portable(path, run_dir), sha256(path))
 
 
 @dataclass(frozen=True)
 class StageFolder:
-    """A stage's folder and what its manifest says."""
+    """A stage's folder and its manifest."""
 
     folder: Path
-    manifest: Mapping[str, Any]
+    manifest: Mapping[str, Json]
 
     @property
     def run_dir(self) -> Path:
@@ -70,24 +70,24 @@ class StageFolder:
 
     @property
     def finished(self) -> bool:
-        """Whether the stage came to its end."""
+        """Whether the stage finished."""
         return self.manifest.get("status") == "finished"
 
     @property
     def dry(self) -> bool:
-        """Whether it moved nothing: its commands were never sent."""
+        """Whether the stage sent no commands."""
         return self.manifest.get("dry_run") is True
 
     @property
     def outputs(self) -> dict[str, Path]:
-        """Name -> path of what the stage wrote."""
+        """Name -> path of each output."""
         return {name: self.folder / entry["path"] for name, entry in self.manifest.get("outputs", {}).items()}
 
     def output(self, name: str) -> Path:
         """Return the path of one output.
 
         Raises:
-            Sim2RealError: When the stage wrote none of this name, or it has been deleted.
+            Sim2RealError: When the stage has no such output, or the file was deleted.
         """
         paths = self.outputs
         if name not in paths:
@@ -103,11 +103,11 @@ class StageFolder:
 
 @dataclass
 class OpenStage:
-    """A stage that is running: it writes into ``folder`` and says what it wrote."""
+    """A running stage, which writes into ``folder`` and registers its outputs."""
 
     folder: Path
     _outputs: dict[str, Path] = field(default_factory=dict)
-    _summary: dict[str, Any] = field(default_factory=dict)
+    _summary: dict[str, Json] = field(default_factory=dict)
     _result: StageFolder | None = None
 
     @property
@@ -116,13 +116,10 @@ class OpenStage:
         return self.folder.parent
 
     def output(self, name: str, path: Path | str) -> Path:
-        """Name a file or folder that the stage writes, before or after writing it; it is hashed when the stage ends.
+        """Register an output, before or after it is written, and return its absolute path; the stage's end hashes it.
 
         Args:
-            path: Inside of the stage's folder; relative paths are relative to it.
-
-        Returns:
-            The absolute path.
+            path: A file or folder, relative to the stage's folder.
         """
         full = self.folder / path
         if not full.resolve().is_relative_to(self.folder.resolve()):
@@ -130,15 +127,15 @@ class OpenStage:
         self._outputs[name] = full
         return full
 
-    def summary(self, values: Mapping[str, Any]) -> None:
-        """Add the numbers that belong in the table at the end and in the manifest; call it as often as needed."""
+    def summary(self, values: Mapping[str, Json]) -> None:
+        """Add values to the summary, which the console prints and the manifest holds."""
         self._summary.update(plain(values))
 
     @property
     def result(self) -> StageFolder:
-        """The finished stage: what a stage function returns; available after the ``with`` block."""
+        """The finished stage, available after the ``with`` block."""
         if self._result is None:
-            raise RuntimeError("the stage is still running: ask for its result after the `with` block")
+            raise RuntimeError("the stage is still running: read its result after the `with` block")
         return self._result
 
 
@@ -147,25 +144,25 @@ def open_stage(
     root: Path,
     pipeline: str,
     stage: str,
-    config: Any,
+    config: object,
     inputs: Mapping[str, Path] | None = None,
     run_dir: Path | None = None,
     dry_run: bool = False,
 ) -> Iterator[OpenStage]:
-    """Run a stage in a folder of its own, with a manifest from the first moment to the last.
+    """Run a stage in a new folder, with a manifest from its start to its end.
 
     Args:
         stage: Name of the stage, which is also the name of its folder.
         config: The resolved configuration, a dataclass.
-        inputs: Name -> file or folder that the stage reads; hashed before it starts.
+        inputs: Name -> input file or folder; hashed before the stage starts.
         run_dir: Run folder to add to; None makes a new one.
 
     Yields:
-        The running stage; at its end the manifest says 'finished', 'dry run', 'failed' or 'interrupted', and the exit
-        code.
+        The running stage. At its end, the manifest gets the status (finished, dry run, failed, interrupted) and the
+        exit code.
 
     Raises:
-        UsageError: When the stage's or the pipeline's name cannot be that of a folder.
+        UsageError: When the name of the stage or the pipeline is no valid folder name.
         Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
     """
     _check_names(pipeline, stage)
@@ -181,21 +178,23 @@ def open_stage(
         yield running
         _close(running, manifest, start, DRY if dry_run else "finished", OK)
     except BaseException as error:
-        told = in_words(error, folder)
+        failure = readable_error(error, folder)
         try:
-            _close(running, manifest, start, *_failure(told), told)
+            _close(running, manifest, start, *_failure(failure), failure)
         except OSError as other:
-            told.add_note(f"then: the manifest could not be written: {other}")
-        if told is error:
+            failure.add_note(f"then: the manifest could not be written: {other}")
+        if failure is error:
             raise
-        raise told from error
+        raise failure from error
     finally:
         if lock is not None:
             os.close(lock)
 
 
-def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str, Any], dry_run: bool) -> dict[str, Any]:
-    """Return the manifest of a stage that begins now."""
+def _first_manifest(
+    pipeline: str, stage: str, config: object, inputs: Mapping[str, Json], dry_run: bool
+) -> dict[str, Json]:
+    """Return the manifest of a stage that starts now."""
     return {
         "format": 1,
         "pipeline": pipeline,
@@ -216,7 +215,7 @@ def _first_manifest(pipeline: str, stage: str, config: Any, inputs: Mapping[str,
 
 
 def _check_names(pipeline: str, stage: str) -> None:
-    """Refuse names that are no folder in the folder of runs; a pipeline's name may come from a file."""
+    """Refuse names that are no folder in the folder of runs, as a pipeline's name can come from a file."""
     if not stage.isidentifier():
         raise UsageError(f"{stage!r} is no name for a stage", hint="letters, digits and '_'; a letter first")
     if not _NAME.fullmatch(pipeline):
@@ -226,15 +225,12 @@ def _check_names(pipeline: str, stage: str) -> None:
 
 
 def portable(path: Path, run_dir: Path) -> str:
-    """Return a path as an artifact of a run refers to it: relative to the run folder.
-
-    So a run that is moved, or copied to another machine, still finds its own files.
-    """
+    """Return a path relative to the run folder, so that a moved or copied run finds its files."""
     return Path(os.path.relpath(path.resolve(), run_dir.resolve())).as_posix()
 
 
 def new_run(root: Path, pipeline: str) -> Path:
-    """Make a run folder named by the time (UTC, to the millisecond): the names are unique and sort by age."""
+    """Create a run folder named by the time (UTC, to the millisecond); the names are unique and sort by age."""
     while True:
         now = datetime.now(UTC)
         folder = Path(root) / pipeline / f"{now:%Y%m%d-%H%M%S}-{now.microsecond // 1000:03d}"
@@ -249,11 +245,11 @@ def new_run(root: Path, pipeline: str) -> Path:
 
 
 def attempts(run_dir: Path, stage: str) -> list[StageFolder]:
-    """Return all attempts at a stage in a run folder, the latest first: by number, for a clock may be set back."""
+    """Return all attempts at a stage in a run folder, the latest number first, as clocks can be set back."""
     numbers = [int(f.suffix[1:]) for f in run_dir.glob(f"{stage}.*") if f.suffix[1:].isdecimal()]
     folders = [*(run_dir / f"{stage}.{n}" for n in sorted(numbers, reverse=True)), run_dir / stage]
-    found = [(folder, read_manifest(folder)) for folder in folders]
-    return [StageFolder(folder, manifest) for folder, manifest in found if manifest is not None]
+    manifests = [(folder, read_manifest(folder)) for folder in folders]
+    return [StageFolder(folder, manifest) for folder, manifest in manifests if manifest is not None]
 
 
 def finished(run_dir: Path, stage: str) -> StageFolder | None:
@@ -273,23 +269,23 @@ def open_folder(folder: Path, stage: str) -> StageFolder:
 
 
 def finished_stages(run_dir: Path) -> dict[str, StageFolder]:
-    """Return stage -> its latest finished attempt, in the order of the stages; a dry run where there is no other.
+    """Return stage -> its latest finished attempt, in the order of the stages; a dry run if there is no other.
 
     Raises:
-        Sim2RealError: When there is none at all.
+        Sim2RealError: When no stage is finished.
     """
-    found = {}
+    latest = {}
     for stage in STAGES:
-        tried = attempts(run_dir, stage)
-        done = [a for a in tried if a.finished] + [a for a in tried if a.manifest.get("status") == DRY]
+        all_attempts = attempts(run_dir, stage)
+        done = [a for a in all_attempts if a.finished] + [a for a in all_attempts if a.manifest.get("status") == DRY]
         if done:
-            found[stage] = done[0]
-    if not found:
+            latest[stage] = done[0]
+    if not latest:
         raise Sim2RealError(
             f"{run_dir} has no finished stage. Looked for: {', '.join(STAGES)}",
             hint="make one with `sim2real record PIPELINE`, or name another run",
         )
-    return found
+    return latest
 
 
 def pipeline_of(run_dir: Path) -> str:
@@ -310,14 +306,14 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
     """Return the newest finished artifact of a stage.
 
     Args:
-        run_dir: Run folder to look in first; without the artifact there, the newest of all runs is taken.
+        run_dir: Run folder to search first; then the newest of all runs is taken.
 
     Raises:
-        Sim2RealError: When there is none; the message says what was looked for and the hint which command makes it.
+        Sim2RealError: When no run has one; the hint names the command that makes it.
     """
-    own = finished(run_dir, stage) if run_dir else None
-    if own is not None:
-        return own
+    here = finished(run_dir, stage) if run_dir else None
+    if here is not None:
+        return here
     folders = sorted((Path(root) / pipeline).glob("*"))
     candidates = [done for folder in folders if (done := finished(folder, stage)) is not None]
     if not candidates:
@@ -334,7 +330,7 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
 
 
 def _stage_folder(run_dir: Path, stage: str) -> Path:
-    """Make a stage's folder under the first free number; whoever makes it owns it, also beside other processes."""
+    """Create a stage's folder under the first free number; only the process that creates it writes into it."""
     number = 1
     while True:
         folder = run_dir / (stage if number == 1 else f"{stage}.{number}")
@@ -355,7 +351,7 @@ def _not_writable(folder: Path, error: OSError) -> Sim2RealError:
 
 
 def _failure(error: BaseException) -> tuple[str, int]:
-    """Return the status and the exit code that an exception ends a stage with."""
+    """Return the status and the exit code of a stage that ends with an exception."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted", INTERRUPTED
     if isinstance(error, SystemExit | GeneratorExit):
@@ -366,7 +362,7 @@ def _failure(error: BaseException) -> tuple[str, int]:
 
 def _close(
     stage: OpenStage,
-    manifest: dict[str, Any],
+    manifest: dict[str, Json],
     start: float,
     status: str,
     code: int,

@@ -10,7 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.artifacts.identification import Left
+from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
 from sim2real.identify.fit import Fit
 from sim2real.identify.problem.problem import Problem
@@ -98,7 +98,7 @@ def leave_out(
     choose: bool,
     free_run_s: float = 0.0,
     among: np.ndarray | None = None,
-) -> list[Left]:
+) -> list[HeldOutPart]:
     """Identify without each part, from the estimate of all, and predict it.
 
     Args:
@@ -117,7 +117,7 @@ def leave_out(
 
 def compare_sets(
     found: Fit, parts: Sequence[Fold], sets: Sequence[np.ndarray], settle_s: float, free_run_s: float
-) -> list[list[Left]]:
+) -> list[list[HeldOutPart]]:
     """Identify without each part with some sets of terms, and predict it: for each set what ``leave_out`` returns.
 
     The descent of a set begins at the end of the set before, too: with more terms no fit is worse, once it converged.
@@ -194,7 +194,7 @@ def _predicted(
     ends: Sequence[np.ndarray],
     settle_s: float,
     free_run_s: float,
-) -> list[Left]:
+) -> list[HeldOutPart]:
     """Return how far estimates without each part, ``(P,)`` each, are off on that part."""
     problem, table = found.problem, found.problem.table
     values = [
@@ -211,7 +211,7 @@ def _predicted(
     ahead = _ahead(found.windows, parts, stacked, settle_s)
     free = _free(problem, parts, stacked, settle_s, free_run_s) if free_run_s else [{} for _ in parts]
     rows = zip(parts, names, values, shares, ahead, free, strict=True)
-    return [Left(part.name, *row) for part, *row in rows]
+    return [HeldOutPart(part.name, *row) for part, *row in rows]
 
 
 def _ahead(

@@ -1,4 +1,4 @@
-"""Imports the files of other recorders: turns their signals into steps and outputs of nodes, and writes a log."""
+"""Imports files of other recorders: converts their signals to steps and outputs of nodes, and writes a log."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,8 +15,9 @@ from sim2real.graph.episode import Episode, StepRecord, Steps
 from sim2real.log.importing import plausibility
 from sim2real.log.importing.files.foreign import ForeignFile, open_foreign
 from sim2real.log.importing.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, load_mapping, positive
-from sim2real.log.importing.sample_selection import align_turns, kept_samples, plausible_samples
+from sim2real.log.importing.sample_selection import align_turns, plausible_samples, selected_samples
 from sim2real.log.session_file import SessionFile
+from sim2real.types import Json
 
 RECORDED, GENERATED = "recorded", "generated"
 _MAX_TICKS = 2**53  # 285 years [us]: whole numbers up to here are exact in float64
@@ -53,7 +53,7 @@ def import_file(
 ) -> Episode:
     """Read a file of another recorder as an episode.
 
-    Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are kept, rounded to
+    Each sample becomes a step that starts and ends at the sample's time stamp. Recorded stamps are selected, rounded to
     microseconds. If the first one is within 1 s after 0, time 0 is that of the file; otherwise time 0 is the first
     sample. Without recorded stamps, they are generated from the node's rate; stamps of a LeRobot data set that are
     ``frame_index / fps`` count as generated. The episode's metadata has ``stamps``
@@ -62,16 +62,16 @@ def import_file(
 
     Args:
         mapping: The mapping from signals to fields, or the mapping file.
-        samples: The samples to take, for every node; None: all.
-        format: ``npz``, ``json``, ``csv``, ``lerobot`` or ``mcap``; None: chosen by the file's suffix.
-        episode: Number of the episode of a LeRobot data set; None: the only one.
+        samples: Range of samples of every node; default: all.
+        format: ``npz``, ``json``, ``csv``, ``lerobot`` or ``mcap``; default: from the file's suffix.
+        episode: Number of the episode of a LeRobot data set; default: the only one.
 
     Raises:
         UsageError: When the file or the mapping cannot be read, they do not fit each other, the signals of a node
             differ in length, a sample is not finite, or stamps do not increase.
     """
-    found = mapping if isinstance(mapping, ImportMapping) else load_mapping(mapping)
-    return import_opened(open_foreign(Path(path), format, episode), found, samples)
+    selected_mapping = mapping if isinstance(mapping, ImportMapping) else load_mapping(mapping)
+    return import_opened(open_foreign(Path(path), format, episode), selected_mapping, samples)
 
 
 def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | None = None) -> Episode:
@@ -79,24 +79,28 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
 
     Args:
         file: The file, or several that were joined.
-        samples: The samples to take; None: all.
+        samples: Range of samples; default: all.
     """
+    # Read all signals, and select the samples of each node.
     signals = {name: _signals(file, name, node) for name, node in mapping.nodes.items()}
     first, stop = _range(file, {name: s.count for name, s in signals.items()}, samples)
     ticks, outputs, stamps, dropped = {}, {}, {}, {}
     for name, node in mapping.nodes.items():
-        found, last = signals[name], signals[name].count if stop is None else stop
-        kept = kept_samples(node, found.fields, found.stamps, first, last)
-        kept = plausible_samples(f"node {name} in {file.path}", node, found.fields, _seconds(node, found, kept), kept)
+        node_signals, last = signals[name], signals[name].count if stop is None else stop
+        selected = selected_samples(node, node_signals.fields, node_signals.stamps, first, last)
+        selected = plausible_samples(
+            f"node {name} in {file.path}", node, node_signals.fields, _seconds(node, node_signals, selected), selected
+        )
         outputs[name] = {
-            field: _samples(file, f"{name}.{field}", found.fields[field], how, kept)
+            field: _samples(file, f"{name}.{field}", node_signals.fields[field], how, selected)
             for field, how in node.fields.items()
         }
-        ticks[name] = _ticks(file, name, node, found, kept)
-        stamps[name] = GENERATED if found.stamps is None or node.stamps in file.nominal else RECORDED
-        dropped[name] = last - first - len(kept)
+        ticks[name] = _ticks(file, name, node, node_signals, selected)
+        stamps[name] = GENERATED if node_signals.stamps is None or node.stamps in file.nominal else RECORDED
+        dropped[name] = last - first - len(selected)
+    # Move time 0 to the file's zero or the first sample.
     align_turns(mapping, outputs, ticks)
-    from_file = [name for name, found in signals.items() if found.stamps is not None]
+    from_file = [name for name, node_signals in signals.items() if node_signals.stamps is not None]
     zero = _time_zero([ticks[name] for name in from_file], first)
     for name in from_file:
         ticks[name] -= zero
@@ -139,8 +143,8 @@ def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> Non
 
     Args:
         path: The log; it must not exist.
-        episode: What ``import_file`` returned.
-        mapping: The mapping that it was imported with.
+        episode: The result of ``import_file``.
+        mapping: The mapping of the import.
 
     Raises:
         Sim2RealError: When the log exists or cannot be written, or names collide.
@@ -162,14 +166,14 @@ def write_log(path: str | Path, episode: Episode, mapping: ImportMapping) -> Non
             file.step(record, [values[k] for values in episode.outputs[name].values()])
         file.finish({"status": "finished", "exit_code": OK, "messages": file.counts})
     except BaseException:
-        # An incomplete import is of no use, unlike an incomplete recording.
+        # Remove an incomplete log, as the import can be repeated.
         file.abandon()
         Path(path).unlink(missing_ok=True)
         raise
 
 
-def facts(episode: Episode) -> dict[str, Any]:
-    """Return the facts about an import that are printed at its end."""
+def facts(episode: Episode) -> dict[str, Json]:
+    """Return the summary of an import."""
     kinds = episode.metadata["stamps"]
     return {
         "source": episode.metadata["source"]["file"],
@@ -178,8 +182,8 @@ def facts(episode: Episode) -> dict[str, Any]:
         "rate [Hz]": {name: node["rate_hz"] for name, node in episode.metadata["graph"].items()},
         "stamps": kinds,
         **(
-            {"left out": lost}
-            if (lost := {n: k for n, k in episode.metadata["source"]["dropped"].items() if k})
+            {"dropped": dropped}
+            if (dropped := {n: k for n, k in episode.metadata["source"]["dropped"].items() if k})
             else {}
         ),
     }
@@ -200,7 +204,7 @@ def _signals(file: ForeignFile, name: str, node: NodeMapping) -> _Signals:
         if rate.ndim:
             raise UsageError(
                 f"rate_hz of node {name!r} is {rate_hz!r}, which has the shape {rate.shape}",
-                hint="if these are its stamps, say stamps instead of rate_hz",
+                hint="if the signal has the stamps, write stamps instead of rate_hz",
             )
         rate_hz = positive(float(rate), f"{rate_hz!r} in {file.path}")
     lengths = {field: len(values) for field, values in fields.items() if values.ndim}
@@ -208,13 +212,14 @@ def _signals(file: ForeignFile, name: str, node: NodeMapping) -> _Signals:
         lengths[f"stamps {node.stamps!r}"] = len(stamps)
     if not lengths:
         raise UsageError(
-            f"node {name!r} gets only constants from {file.path}", hint="name its stamps: then there are samples"
+            f"node {name!r} gets only constants from {file.path}",
+            hint="add the node's stamps, which determine its samples",
         )
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{signal} {length}" for signal, length in lengths.items())
         raise UsageError(
             f"the signals of node {name!r} differ in length: {listed}",
-            hint="what has other stamps belongs into another node",
+            hint="put signals with other stamps into another node",
         )
     count = next(iter(lengths.values()))
     if not count:
@@ -234,16 +239,16 @@ def _field(file: ForeignFile, where: str, how: FieldMapping) -> np.ndarray:
         ) from None
     if not how.turn or not values.ndim:
         return values
-    # Of all samples, not of those that are taken: a part of a file is then in the same turn as the whole.
+    # Count turns over all samples, so that a part of a file has the same turns as the whole.
     return plausibility.counted(values.reshape(len(values), -1), how.turn).reshape(values.shape)
 
 
 def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) -> tuple[int, int | None]:
-    """Return the first sample to take, and the one after the last; None: to the end."""
+    """Return the first sample, and the one after the last; None for the end."""
     if samples is None:
         return 0, None
     if samples.step not in (None, 1):
-        raise UsageError(f"samples are taken one by one, not every {samples.step}", hint="leave the step out")
+        raise UsageError(f"a range of samples has no step, got {samples.step}", hint="remove the step")
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise UsageError(
@@ -254,22 +259,22 @@ def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) 
     first, stop, _ = samples.indices(count)
     beyond = [n for n in (samples.start, samples.stop) if n is not None and not -count <= n <= count]
     if beyond or first >= stop:
-        asked = ":".join("" if n is None else str(n) for n in (samples.start, samples.stop))
-        raise UsageError(f"samples {asked} are not in {file.path}: it has {count}", hint=f"choose from 0:{count}")
+        text = ":".join("" if n is None else str(n) for n in (samples.start, samples.stop))
+        raise UsageError(f"samples {text} are not in {file.path}: it has {count}", hint=f"choose from 0:{count}")
     return first, stop
 
 
-def _seconds(node: NodeMapping, signals: _Signals, kept: np.ndarray) -> np.ndarray:
+def _seconds(node: NodeMapping, signals: _Signals, selected: np.ndarray) -> np.ndarray:
     """Return the stamps of samples, recorded or generated [s]."""
     if signals.stamps is None:
-        return kept / (signals.rate_hz or 1.0)
-    return signals.stamps[kept] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
+        return selected / (signals.rate_hz or 1.0)
+    return signals.stamps[selected] * (STAMP_UNITS[node.stamp_unit] * 1e-9)
 
 
-def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, kept: np.ndarray) -> np.ndarray:
+def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMapping, selected: np.ndarray) -> np.ndarray:
     """Return a field's samples, scaled, shape ``(N, ...)``; a constant is repeated."""
-    values = values[kept] if values.ndim else np.broadcast_to(values, kept.shape)
-    _check_finite(file, f"field {where}", values, kept)
+    values = values[selected] if values.ndim else np.broadcast_to(values, selected.shape)
+    _check_finite(file, f"field {where}", values, selected)
     dtype = values.dtype if values.dtype.kind == "f" else np.dtype(np.float64)
     scale = np.asarray(how.scale)
     if scale.ndim and scale.shape != values.shape[1:]:
@@ -281,21 +286,21 @@ def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMappin
     shape = scaled.shape[1:] if how.shape is None else how.shape
     if np.prod(shape, dtype=int) != np.prod(scaled.shape[1:], dtype=int):
         raise UsageError(
-            f"a sample of field {where} has the shape {scaled.shape[1:]} in {file.path}, the mapping says {shape}",
+            f"a sample of field {where} has the shape {scaled.shape[1:]} in {file.path}, and {shape} in the mapping",
             hint="correct the shape, or choose columns of the source",
         )
     return np.ascontiguousarray(scaled.reshape(len(scaled), *shape))
 
 
-def _ticks(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, kept: np.ndarray) -> np.ndarray:
+def _ticks(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, selected: np.ndarray) -> np.ndarray:
     """Return the stamps of samples, shape ``(N,)``, int64 [us]."""
     if signals.stamps is None:
-        # The slots that the timing rules give to a node of this rate.
-        return np.floor((kept - kept[:1]) * 1e6 / (signals.rate_hz or 1.0) + 0.5).astype(np.int64)
-    stamps = signals.stamps[kept]
+        # Use the slots of the timing rules for a node of this rate.
+        return np.floor((selected - selected[:1]) * 1e6 / (signals.rate_hz or 1.0) + 0.5).astype(np.int64)
+    stamps = signals.stamps[selected]
     what = f"stamps {node.stamps!r} of node {name!r}"
     hint = f"stamp_unit is {node.stamp_unit!r}; available: {', '.join(STAMP_UNITS)}"
-    _check_finite(file, what, stamps, kept)
+    _check_finite(file, what, stamps, selected)
     nanoseconds = STAMP_UNITS[node.stamp_unit]
     if np.abs(stamps * (nanoseconds / 1000)).max() >= _MAX_TICKS:
         raise UsageError(f"{what} in {file.path} are centuries away: {stamps[0]} {node.stamp_unit}", hint=hint)
@@ -306,20 +311,20 @@ def _ticks(file: ForeignFile, name: str, node: NodeMapping, signals: _Signals, k
     if (wrong := np.flatnonzero(np.diff(ticks) <= 0)).size:
         k = int(wrong[0])
         raise UsageError(
-            f"{what} in {file.path} do not increase: sample {kept[k]} at {stamps[k]} {node.stamp_unit}, "
-            f"sample {kept[k + 1]} at {stamps[k + 1]} {node.stamp_unit}",
+            f"{what} in {file.path} do not increase: sample {selected[k]} at {stamps[k]} {node.stamp_unit}, "
+            f"sample {selected[k + 1]} at {stamps[k + 1]} {node.stamp_unit}",
             hint=f"samples must be a microsecond apart at least; {hint}",
         )
     return ticks + round(1e6 * node.stamp_offset)
 
 
-def _check_finite(file: ForeignFile, what: str, values: np.ndarray, kept: np.ndarray) -> None:
+def _check_finite(file: ForeignFile, what: str, values: np.ndarray, selected: np.ndarray) -> None:
     finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not finite.all():
         k = int(np.argmin(finite))
         raise UsageError(
-            f"{what} is no finite number in sample {kept[k]} of {file.path}: {values[k]}",
-            hint='cut it off with --samples A:B, or leave such samples out: missing = "drop" in the mapping',
+            f"{what} is no finite number in sample {selected[k]} of {file.path}: {values[k]}",
+            hint='cut it off with --samples A:B, or write missing = "drop" into the mapping, which skips such samples',
         )
 
 

@@ -1,4 +1,4 @@
-"""Mapping files (TOML): say which signal of a file of another recorder is which field of which node."""
+"""Mapping files (TOML), which assign the signals of another recorder's file to the fields of nodes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sim2real.errors import UsageError
 from sim2real.log.toml_text import toml_key, toml_value
+from sim2real.types import Json
 
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Unit of time stamps -> nanoseconds."""
@@ -20,22 +20,22 @@ MAPPING = "import.toml"
 """The mapping file in a pipeline's folder."""
 _COMMANDING = "actuator"
 _POLICIES = {"missing": ("refuse", "drop"), "repeated": ("refuse", "first"), "implausible": ("refuse", "drop")}
-"""Key of a node that says what happens to samples -> values; the first is the default."""
+"""Key of a node's policy for unusable samples -> values; the first is the default."""
 _HINT = "the guide 'Import' has a mapping file with every key"
 
 
 @dataclass(frozen=True)
 class FieldMapping:
-    """Where a field of a node's output comes from.
+    """The source of a field of a node's output.
 
     Attributes:
-        source: Name of a signal in the file, as ``ForeignFile.signal`` takes it; several signals are stacked.
+        source: Name of a signal in the file, as for ``ForeignFile.signal``; several signals are stacked.
         unit: Unit of the field, after scaling.
         scale: The field is ``scale * signal + offset``; one number, or one for each column.
         offset: See ``scale`` [the field's unit].
         shape: Shape of one sample; None: as in the file.
         column: Column of a two-dimensional signal; None: all columns.
-        turn: A turn in the signal's unit, where angles jump at its end: turns are counted; 0: angles are as they are.
+        turn: A turn in the signal's unit, to count turns of angles that jump at its end; 0: no counting.
     """
 
     source: tuple[str, ...]
@@ -49,19 +49,18 @@ class FieldMapping:
 
 @dataclass(frozen=True)
 class NodeMapping:
-    """Where a node's messages come from.
+    """The source of a node's messages.
 
     Attributes:
-        fields: Field -> where it comes from.
-        rate_hz: Rate from which time stamps are generated [Hz], or the name of a signal that has it; None: use
-            ``stamps``.
+        fields: Field -> its source.
+        rate_hz: Rate of generated time stamps [Hz], or the name of a signal with the rate; None: use ``stamps``.
         stamps: Signal with the recorded time stamps; None: use ``rate_hz``.
         stamp_unit: Unit of the recorded stamps, one of ``STAMP_UNITS``.
-        order: Of messages with equal stamps, those of nodes with a lower number were sent first.
-        missing: What happens to samples that lack a number: ``refuse``, or ``drop`` to leave them out.
-        repeated: What happens to samples with the stamp of the one before: ``refuse``, or ``first`` to keep the first.
-        stamp_offset: Added to the recorded stamps, where a stream has a clock of its own [s].
-        implausible: What happens to samples whose positions leap away and back: ``refuse``, or ``drop``.
+        order: Order of messages with equal stamps: those of nodes with a lower number are first.
+        missing: Policy for samples that lack a number: ``refuse``, or ``drop`` to skip them.
+        repeated: Policy for samples with the stamp of the one before: ``refuse``, or ``first`` to keep the first.
+        stamp_offset: Added to the recorded stamps, for a stream with its own clock [s].
+        implausible: Policy for samples whose positions leap away and back: ``refuse``, or ``drop``.
     """
 
     fields: Mapping[str, FieldMapping]
@@ -77,12 +76,12 @@ class NodeMapping:
 
 @dataclass(frozen=True)
 class ImportMapping:
-    """How the file of another recorder becomes a log.
+    """The mapping of another recorder's file to a log.
 
     Attributes:
-        pipeline: The pipeline that the log is for.
-        nodes: Node -> where its messages come from.
-        path: The mapping file; None if the mapping was not read from one.
+        pipeline: Pipeline of the log.
+        nodes: Node -> source of its messages.
+        path: The mapping file; None if the mapping comes from elsewhere.
     """
 
     pipeline: str
@@ -99,30 +98,32 @@ class ImportMapping:
         return {"source": file} | ({} if self.path is None else {"mapping": self.path})
 
     @staticmethod
-    def from_dict(tables: Mapping[str, Any], pipeline: str | None = None, path: Path | None = None) -> ImportMapping:
+    def from_dict(tables: Mapping[str, Json], pipeline: str | None = None, path: Path | None = None) -> ImportMapping:
         """Return the mapping of a parsed TOML document.
 
         Args:
-            pipeline: The pipeline that the log is for; None: the one that the document names.
-            path: The file that the document was read from, for errors.
+            pipeline: Pipeline of the log; default: the document's.
+            path: The document's file, for errors.
 
         Raises:
             UsageError: When a key is unknown, missing or of the wrong type.
         """
         where = "the mapping" if path is None else str(path)
         _known(tables, ("pipeline", "nodes"), where)
-        own = _value(tables, "pipeline", str, where)
-        if own is None and pipeline is None:
-            raise UsageError(f"{where} does not say which pipeline the log is for", hint='add pipeline = "NAME"')
-        if own is not None and pipeline not in (None, own):
+        named = _value(tables, "pipeline", str, where)
+        if named is None and pipeline is None:
+            raise UsageError(f"{where} does not name the pipeline of the log", hint='add pipeline = "NAME"')
+        if named is not None and pipeline not in (None, named):
             raise UsageError(
-                f"{where} is for pipeline {own!r}, not for {pipeline!r}", hint="name the mapping with --mapping FILE"
+                f"{where} is for pipeline {named!r}, not for {pipeline!r}", hint="name the mapping with --mapping FILE"
             )
         nodes = _value(tables, "nodes", dict, where) or {}
         if not nodes:
             raise UsageError(f"{where} has no nodes", hint="add a table [nodes.NAME] for each node; " + _HINT)
-        found = {name: _node(name, _table(node, f"{where}: nodes.{name}"), where) for name, node in nodes.items()}
-        return ImportMapping(str(own or pipeline), found, path)
+        nodes_by_name = {
+            name: _node(name, _table(node, f"{where}: nodes.{name}"), where) for name, node in nodes.items()
+        }
+        return ImportMapping(str(named or pipeline), nodes_by_name, path)
 
 
 def load_mapping(path: str | Path | None, pipeline: str | None = None, package: str | None = None) -> ImportMapping:
@@ -130,17 +131,18 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
 
     Args:
         path: The file; None: the one in the pipeline's package.
-        pipeline: The pipeline that the log is for; None: the one that the file names.
-        package: Name of the pipeline's package, which must have been imported.
+        pipeline: Pipeline of the log; default: the file's.
+        package: Name of the pipeline's package, which must be imported.
 
     Raises:
-        UsageError: When there is no such file, it is not TOML, or its content is not a valid mapping.
+        UsageError: When the file does not exist, is not TOML, or is no valid mapping.
     """
     if path is None and package is not None:
         path = Path(str(sys.modules[package].__file__)).with_name(MAPPING)
     if path is None:
         raise UsageError(
-            "nothing says which signal is which", hint="name the robot with --pipeline NAME, or a --mapping FILE.toml"
+            "there is no mapping of the file's signals",
+            hint="name the robot with --pipeline NAME, or a --mapping FILE.toml",
         )
     path = Path(path)
     try:
@@ -154,7 +156,7 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
     return ImportMapping.from_dict(tables, pipeline, path)
 
 
-def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
+def _node(name: str, table: Mapping[str, Json], document: str) -> NodeMapping:
     where = f"{document}: nodes.{name}"
     keys = ("fields", "rate_hz", "stamps", "stamp_unit", "order", *_POLICIES, "stamp_offset")
     _known(table, keys, where)
@@ -166,7 +168,7 @@ def _node(name: str, table: Mapping[str, Any], document: str) -> NodeMapping:
     if (rate_hz is None) == (stamps is None):
         raise UsageError(
             f"{where} needs either 'stamps' or 'rate_hz'" + (", not both" if stamps is not None else ""),
-            hint="stamps that were recorded are kept; from rate_hz they are generated, and marked so",
+            hint="stamps keeps the recorded stamps; rate_hz generates stamps, and marks them as generated",
         )
     if isinstance(rate_hz, int | float):
         rate_hz = positive(float(rate_hz), f"{where}: rate_hz")
@@ -205,7 +207,7 @@ def positive(value: float, where: str) -> float:
     return value
 
 
-def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
+def _field(table: Mapping[str, Json], where: str) -> FieldMapping:
     _known(table, ("source", "unit", "scale", "offset", "shape", "column", "turn"), where)
     source = _value(table, "source", (str, list), where)
     sources = [source] if isinstance(source, str) else source or []
@@ -238,13 +240,13 @@ def _field(table: Mapping[str, Any], where: str) -> FieldMapping:
     )
 
 
-def _table(value: object, where: str) -> Mapping[str, Any]:
+def _table(value: object, where: str) -> Mapping[str, Json]:
     if not isinstance(value, Mapping):
         raise UsageError(f"{where} must be a table, got {value!r}", hint=_HINT)
     return value
 
 
-def _value(table: Mapping[str, Any], key: str, kind: Any, where: str) -> Any:
+def _value(table: Mapping[str, Json], key: str, kind: type | tuple[type, ...], where: str) -> Json:
     """Return a key's value, after checking its type; None if there is no such key."""
     value = table.get(key)
     # A boolean counts as an int in Python.
@@ -253,7 +255,7 @@ def _value(table: Mapping[str, Any], key: str, kind: Any, where: str) -> Any:
     return value
 
 
-def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str) -> None:
+def _known(table: Mapping[str, Json], keys: tuple[str, ...], where: str) -> None:
     for key in table:
         if key not in keys:
             close = difflib.get_close_matches(key, keys, n=1)
@@ -272,21 +274,21 @@ def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
     """Return a mapping as the text of a mapping file.
 
     Args:
-        comments: Lines that stand above it.
+        comments: Lines above it.
     """
     lines = [
         *(f"# {part}" for line in comments for part in _printable(line)),
         f"pipeline = {toml_value(mapping.pipeline)}",
     ]
     for name, node in mapping.nodes.items():
-        keys: dict[str, Any] = {"stamps": node.stamps} if node.stamps is not None else {"rate_hz": node.rate_hz}
+        keys: dict[str, Json] = {"stamps": node.stamps} if node.stamps is not None else {"rate_hz": node.rate_hz}
         keys |= {"stamp_unit": node.stamp_unit} if node.stamps is not None and node.stamp_unit != "s" else {}
         keys |= {"order": node.order} if node.order != int(name == _COMMANDING) else {}
         keys |= {k: v for k in _POLICIES if (v := getattr(node, k)) != "refuse"}
         keys |= {"stamp_offset": node.stamp_offset} if node.stamp_offset else {}
         lines += ["", f"[nodes.{toml_key(name)}]", *(f"{key} = {toml_value(value)}" for key, value in keys.items())]
         for field, how in node.fields.items():
-            parts: dict[str, Any] = {"source": how.source[0] if len(how.source) == 1 else list(how.source)}
+            parts: dict[str, Json] = {"source": how.source[0] if len(how.source) == 1 else list(how.source)}
             parts |= {"unit": how.unit} if how.unit else {}
             parts |= {
                 k: v for k, plain in (("scale", 1.0), ("offset", 0.0), ("turn", 0.0)) if (v := getattr(how, k)) != plain

@@ -1,4 +1,4 @@
-"""What velocities and goals say of the unit of positions: a rate has the unit of what changes."""
+"""The unit of positions from velocities and goals, whose units are related to it."""
 
 from __future__ import annotations
 
@@ -12,68 +12,70 @@ from sim2real.log.importing.evidence import DEGREES
 from sim2real.log.importing.quantities import clean, matched, velocities
 from sim2real.log.importing.signals import Signal
 
-_CLOSE = 0.9
-"""Correlation from which a unit is told."""
+_MIN_R = 0.9
+"""A signal determines the unit from this correlation on."""
 _UNITS = {"rad": 1.0, "deg": DEGREES}
 
 
-def told_units(
+def units_from_signals(
     signals: Sequence[Signal], measured: Signal, command: Signal, t_s: Sequence[np.ndarray], rows: np.ndarray
 ) -> list[tuple[float, str]]:
-    """Return how many units of the positions a radian is by each signal that says so, and how.
+    """Return the number of position units in a radian, and the reason, for each signal that determines it.
 
     Args:
         measured: Positions, in the order of the joints.
         t_s: Stamps of both [s].
-        rows: The samples of the positions that are whole.
+        rows: The samples of the positions without a missing number.
     """
-    found = [_by_velocity(velocity, measured, t_s[0], rows) for velocity in velocities(signals, measured)]
+    units = [_by_velocity(velocity, measured, t_s[0], rows) for velocity in velocities(signals, measured)]
     if command.meaning.quantity in ("", "position"):
-        found.append(_by_goal(measured, command, t_s, rows))
-    return [told for told in found if told is not None]
+        units.append(_by_goal(measured, command, t_s, rows))
+    return [unit for unit in units if unit is not None]
 
 
 def _by_velocity(velocity: Signal, measured: Signal, t_s: np.ndarray, rows: np.ndarray) -> tuple[float, str] | None:
-    own = matched(velocity, measured, np.arange(measured.width))
-    rows = rows[own.finite[rows]]
+    matching = matched(velocity, measured, np.arange(measured.width))
+    rows = rows[matching.finite[rows]]
     if len(rows) < 50:
         return None
     rate = np.gradient(measured.values[rows], t_s[rows], axis=0)
-    like = following(rate, own.values[rows], float(np.median(np.diff(t_s[rows]))), 0.1)
-    slope = np.diag(like.slope)[np.abs(np.diag(like.r)) > _CLOSE]
+    relation = following(rate, matching.values[rows], float(np.median(np.diff(t_s[rows]))), 0.1)
+    slope = np.diag(relation.slope)[np.abs(np.diag(relation.r)) > _MIN_R]
     ratio = evidence.unit_ratio(slope)
-    off = np.abs(slope / (ratio or 1.0))
-    if ratio is None or not ((off > 0.6) & (off < 1.7)).all():
+    error = np.abs(slope / (ratio or 1.0))
+    if ratio is None or not ((error > 0.6) & (error < 1.7)).all():
         return None
-    return _told(velocity, 1 / ratio)
+    return _unit_from(velocity, 1 / ratio)
 
 
 def _by_goal(
     measured: Signal, command: Signal, t_s: Sequence[np.ndarray], rows: np.ndarray
 ) -> tuple[float, str] | None:
-    own = np.flatnonzero(clean(t_s[1], command))
-    if min(len(own), len(rows)) < 50:
+    command_rows = np.flatnonzero(clean(t_s[1], command))
+    if min(len(command_rows), len(rows)) < 50:
         return None
-    held, joined, period_s = on_grid(t_s[1][own], command.values[own], t_s[0][rows], measured.values[rows])
+    held, joined, period_s = on_grid(
+        t_s[1][command_rows], command.values[command_rows], t_s[0][rows], measured.values[rows]
+    )
     if len(held) < 50:
         return None
-    like = following(held, joined, period_s)
-    best = np.abs(like.r).argmax(axis=1)
+    relation = following(held, joined, period_s)
+    best = np.abs(relation.r).argmax(axis=1)
     at = np.arange(len(best)), best
-    slope = np.abs(like.slope[at][np.abs(like.r[at]) > _CLOSE])
+    slope = np.abs(relation.slope[at][np.abs(relation.r[at]) > _MIN_R])
     ratio = evidence.unit_ratio(slope)
-    # A position that stays far behind its goal may have any unit, unless a name says that of the goal.
+    # A position far behind its goal can have any unit, unless the goal's name has a unit.
     weak = ratio is not None and not 0.6 < float(np.median(slope)) / ratio < 1.7
     if ratio is None or (weak and ratio != 1.0):
         return None
-    return _told(command, ratio)
+    return _unit_from(command, ratio)
 
 
-def _told(by: Signal, ratio: float) -> tuple[float, str] | None:
-    """Return the unit of positions that are ``ratio`` times another signal, and why; None where nothing is told."""
+def _unit_from(by: Signal, ratio: float) -> tuple[float, str] | None:
+    """Return the unit of positions that are ``ratio`` times another signal, and the reason; None if it is open."""
     known = _UNITS.get(by.meaning.unit)
     if known is None:
-        # One of both is in degrees; where they are alike, nothing is told.
+        # One of both is in degrees; equal units leave the unit open.
         return None if ratio == 1.0 else (max(ratio, 1.0), f"{by.name!r} is {1 / ratio:.3g} of it: one is in degrees")
     unit = known * ratio
     fits = [u for u in _UNITS.values() if np.isclose(u, unit)]

@@ -1,4 +1,4 @@
-"""Proposes the mapping of a file of another recorder: from names and from the data, with the evidence for it."""
+"""Proposes the mapping of a file of another recorder, from names and data, with the evidence."""
 
 from __future__ import annotations
 
@@ -18,26 +18,25 @@ from sim2real.log.importing.mapping import FieldMapping, ImportMapping, NodeMapp
 from sim2real.log.importing.pairing import Pair, find_pair
 from sim2real.log.importing.plausibility import TURN_RAD
 from sim2real.log.importing.positions import CheckedPositions, checked_positions, turned_commands
-from sim2real.log.importing.quantities import Asked, clean, extras, field_of, matched, taken, velocity_of
+from sim2real.log.importing.quantities import ImportHints, clean, extras, field_of, matched, taken, velocity_of
 from sim2real.log.importing.signal_names import meaning, same_joint
 from sim2real.log.importing.signals import Signal, Stamps, collect, find_stamps
 
 _FIELDS = {"position": "goal", "velocity": "goal_velocity", "torque": "torque", "duty": "duty", "voltage": "duty"}
-_CLOSE = 0.9
-"""Correlation of two streams whose clocks differ."""
-_SAME_ANGLE = 0.1
-"""Means that differ by whole turns but for this share of one are of the same angle."""
+_MIN_FAR_R = 0.9
+"""Least correlation at a lag that only differing clocks explain."""
+_TURN_ERROR = 0.1
+"""Means are of the same angle if they differ from whole turns by a smaller share of a turn."""
 _GAP = 5.0
-"""A pause of this many periods is a gap."""
+"""A longer pause is a gap [periods]."""
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A mapping, and why.
+    """A mapping, and the evidence for it.
 
     Attributes:
-        mapping: The mapping.
-        joints: Names of the columns of measured positions, in the order of the log; numbers where there are no names.
+        joints: Names of the columns of measured positions, in the order of the log; numbers without names.
         evidence: Sentences.
     """
 
@@ -46,27 +45,29 @@ class Proposal:
     evidence: tuple[str, ...]
 
 
-@np.errstate(over="ignore", invalid="ignore")  # damaged files hold numbers of any size
-def propose(file: ForeignFile, asked: Asked) -> Proposal:
-    """Return the mapping that names and data speak for.
+@np.errstate(over="ignore", invalid="ignore")  # damaged files can hold numbers of any size
+def propose(file: ForeignFile, hints: ImportHints) -> Proposal:
+    """Return the mapping that fits names and data.
 
     Raises:
-        UsageError: When something is ambiguous: the candidates are named.
+        UsageError: When a choice is ambiguous; the message lists the candidates.
     """
+    # Find measurements and commands, their stamps, and the order of the joints.
     signals, unread = collect(file)
-    pair, stamps, said = _streams(file, signals, unread, asked)
+    pair, stamps, notes = _streams(file, signals, unread, hints)
     path, command = str(file.path), pair.command
-    places, labels, ordered = _joint_order(pair.measured, asked, path)
-    places, labels, empty = _with_numbers(pair.measured, places, labels, asked, path)
-    # Positions that no joint can have had are no evidence, and would be motion to an identification.
-    checked = checked_positions(file, signals, replace(pair, measured=taken(pair.measured, places)), stamps, asked)
-    measured, said = checked.signal, [*said, *ordered, *empty, *checked.said]
+    places, labels, ordered = _joint_order(pair.measured, hints, path)
+    places, labels, empty = _with_numbers(pair.measured, places, labels, hints, path)
+    # Check positions first: impossible readings are no evidence, and would be motion for an identification.
+    checked = checked_positions(file, signals, replace(pair, measured=taken(pair.measured, places)), stamps, hints)
+    measured, notes = checked.signal, [*notes, *ordered, *empty, *checked.notes]
     command, turn = turned_commands(command, checked)
+    # Compare both on one clock and one time grid.
     clocks, offset_s, shift = _clocks(signals, stamps, measured, command, path)
     rows = clean(clocks[0], measured), clean(clocks[1], command)
     q, c = measured.values[rows[0]], command.values[rows[1]]
     held, joined, period_s = _compared(
-        [own[r] for own, r in zip(clocks, rows, strict=True)],
+        [stamps_s[r] for stamps_s, r in zip(clocks, rows, strict=True)],
         c,
         q,
         _acting(signals, rows[1]),
@@ -74,12 +75,13 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
         path,
     )
     circle = TURN_RAD * checked.to_rad if checked.hinges.any() else 0.0
-    found = replace(following(held, joined, period_s), turn=circle)
-    extra, others = extras(signals, command, measured, places, path, bool((np.abs(found.r) > SURE).any()))
-    command, goals, more = _commanded(pair, command, checked, turn, found, (clocks, rows), places, path, asked)
+    relation = replace(following(held, joined, period_s), turn=circle)
+    # Map commands, further commands and velocity to fields.
+    extra, others = extras(signals, command, measured, places, path, bool((np.abs(relation.r) > SURE).any()))
+    command, goals, more = _commanded(pair, command, checked, turn, relation, (clocks, rows), places, path, hints)
     velocity, on_velocity, lacking = velocity_of(signals, measured, clocks[0], checked.to_rad, places)
     position = field_of(measured, "rad", [1 / checked.to_rad] * measured.width, checked.turn)
-    said += [*more, *shift]
+    notes += [*more, *shift]
     nodes = {}
     for name, fields, at, lacks, offset, leapt in (
         ("actuator", goals | extra, stamps[1], ~command.finite, offset_s, np.zeros(len(command.values), bool)),
@@ -87,34 +89,34 @@ def propose(file: ForeignFile, asked: Asked) -> Proposal:
          checked.leapt),
     ):  # fmt: skip
         nodes[name], policy = _node(name, fields, at, lacks, offset, leapt)
-        said += policy
-    said += [*on_velocity, *others, *unread, *file.notes]
-    return Proposal(ImportMapping(asked.pipeline, nodes), labels, tuple(said))
+        notes += policy
+    notes += [*on_velocity, *others, *unread, *file.notes]
+    return Proposal(ImportMapping(hints.pipeline, nodes), labels, tuple(notes))
 
 
 def _streams(
-    file: ForeignFile, signals: Sequence[Signal], unread: Sequence[str], asked: Asked
+    file: ForeignFile, signals: Sequence[Signal], unread: Sequence[str], hints: ImportHints
 ) -> tuple[Pair, list[Stamps], list[str]]:
-    """Return what was measured and what was commanded, the stamps of both, and what to say of them.
+    """Return measurements and commands, the stamps of both, and notes.
 
     Raises:
-        UsageError: When there is none, or more than one.
+        UsageError: When there are no candidates, or several.
     """
     path = str(file.path)
     try:
-        pair = find_pair(signals, path, asked.rate_hz, asked.joints)
+        pair = find_pair(signals, path, hints.rate_hz, hints.joints)
     except UsageError as error:
         raise UsageError("; ".join([error.args[0], *unread]), hint=error.hint) from None
     sides = (pair.measured, "measured"), (pair.command, "command")
     try:
-        stamps = [find_stamps(signals, signal, side, path, asked.rate_hz) for signal, side in sides]
+        stamps = [find_stamps(signals, signal, side, path, hints.rate_hz) for signal, side in sides]
     except UsageError:
         _require_readable_stamps(file)
         raise
-    said = [*pair.said, *_on_stamps(pair.measured, stamps[0])]
+    notes = [*pair.notes, *_on_stamps(pair.measured, stamps[0])]
     if stamps[1].source != stamps[0].source:
-        said += _on_stamps(pair.command, stamps[1])
-    return pair, stamps, said
+        notes += _on_stamps(pair.command, stamps[1])
+    return pair, stamps, notes
 
 
 def _commanded(
@@ -122,62 +124,61 @@ def _commanded(
     command: Signal,
     checked: CheckedPositions,
     turn: float,
-    found: Following,
+    relation: Following,
     samples: tuple[Sequence[np.ndarray], Sequence[np.ndarray]],
     places: np.ndarray,
     path: str,
-    asked: Asked,
+    hints: ImportHints,
 ) -> tuple[Signal, dict[str, FieldMapping], list[str]]:
-    """Return commands in the order of the joints, the field that they become, and what to say of them.
+    """Return commands in the order of the joints, their field, and notes.
 
     Args:
         command: The commands, with turns counted.
-        turn: A turn in the unit of the commands, where turns are counted; else 0.
-        samples: Stamps [s] and rows that are compared, of positions and of commands.
-        places: Which column is which joint.
-        path: The file, for errors.
+        turn: A turn in the unit of the commands if turns are counted; else 0.
+        samples: Stamps [s] and compared rows, of positions and of commands.
+        places: Column of each joint.
     """
     measured, (clocks, rows) = checked.signal, samples
     kind = pair.kind or (
-        "position" if command.meaning.unit in ("rad", "deg") or follows(found, command, path) else "duty"
+        "position" if command.meaning.unit in ("rad", "deg") or follows(relation, command, path) else "duty"
     )
     if kind != "position":
         command = _other_command(command, measured, places)
         unit = {"velocity": "rad/s", "torque": "N m"}.get(kind, "")
-        said = f"it goes by its name, no position follows it (|r| at most {np.abs(found.r).max():.2f})"
+        notes = f"its name decides, as no position follows it (|r| at most {np.abs(relation.r).max():.2f})"
         fields = {_FIELDS[kind]: field_of(command, unit, [1.0] * command.width)}
-        return command, fields, [f"{command.name!r} commands {kind}: {said}"]
-    command, scales, more = goal(measured, command, found, checked.to_rad, path, asked.as_told)
+        return command, fields, [f"{command.name!r} commands {kind}: {notes}"]
+    command, scales, more = goal(measured, command, relation, checked.to_rad, path, hints.as_told)
     in_rad = command.values[rows[1]] * scales, measured.values[rows[0]] / checked.to_rad
-    turn, circle = _circle(command, turn, *in_rad, abs(scales[0]), checked.hinges)
+    turn, on_turns = _circle(command, turn, *in_rad, abs(scales[0]), checked.hinges)
     copies = evidence.copied(clocks[1][rows[1]], clocks[0][rows[0]], *in_rad)
-    said = circle + refuse_copies(measured, command, copies, path, asked.as_told)
-    return command, {"goal": field_of(command, "rad", scales, turn)}, [*more, *said]
+    notes = on_turns + refuse_copies(measured, command, copies, path, hints.as_told)
+    return command, {"goal": field_of(command, "rad", scales, turn)}, [*more, *notes]
 
 
 def _require_readable_stamps(file: ForeignFile) -> None:
-    """Raise the error of a signal that is named like a time stamp, but cannot be read."""
+    """Raise the error of a signal with the name of a time stamp that cannot be read."""
     for key in file.keys:
         if meaning(key).quantity == "stamp":
             file.signal(key)
 
 
 def _acting(signals: Sequence[Signal], rows: np.ndarray) -> np.ndarray | None:
-    """Return whether torque was on in these rows of the commands; None where it is not known."""
-    found = [
+    """Return whether torque is on in these rows of the commands; None if unknown."""
+    enabled = [
         s for s in signals if s.meaning.quantity == "enabled" and len(s.values) == len(rows) and s.values.ndim == 2
     ]
-    return (found[0].values[rows] > 0).min(axis=1) if len(found) == 1 else None
+    return (enabled[0].values[rows] > 0).min(axis=1) if len(enabled) == 1 else None
 
 
 def _circle(
     command: Signal, turn: float, goal_rad: np.ndarray, q_rad: np.ndarray, scale: float, hinges: np.ndarray
 ) -> tuple[float, list[str]]:
-    """Return a turn in the unit of the goals, where turns are counted or differ, else 0, and what to say of it."""
+    """Return a turn in the unit of the goals if turns are counted or differ, else 0; and notes."""
     if turn:
         return turn, [f"{command.name!r} jumps at the end of a turn: turns are counted"]
     apart = (goal_rad.mean(axis=0) - q_rad.mean(axis=0)) / TURN_RAD
-    other = hinges & (np.abs(apart) > 0.5) & (np.abs(apart - np.round(apart)) < _SAME_ANGLE)
+    other = hinges & (np.abs(apart) > 0.5) & (np.abs(apart - np.round(apart)) < _TURN_ERROR)
     if not other.any():
         return 0.0, []
     who = ", ".join(np.array(command.sources)[other])
@@ -185,15 +186,15 @@ def _circle(
 
 
 def _other_command(command: Signal, measured: Signal, places: np.ndarray) -> Signal:
-    """Return commands that are no goals, in the order of the joints.
+    """Return commands other than goals, in the order of the joints.
 
     Raises:
-        UsageError: When they are not as many as the joints, and have no names to choose by.
+        UsageError: When their number differs from that of the joints, and they have no names.
     """
     if command.width != measured.width and not set(measured.labels) <= set(command.labels) - {""}:
         raise UsageError(
             f"{command.name!r} has {command.width} columns, {measured.name!r} {measured.width}",
-            hint="name which belong together in a mapping",
+            hint="write a mapping with the columns that belong together",
         )
     return matched(command, measured, places)
 
@@ -209,71 +210,75 @@ def _compared(
     """Return commands and positions on one grid of time, and its period [s].
 
     Raises:
-        UsageError: When they have too little time in common.
+        UsageError: When they overlap in fewer than 50 samples.
     """
     held, joined, period_s = (
         on_grid(t_s[1], command, t_s[0], q, acting) if min(map(len, t_s)) > 2 else (q[:0], q[:0], 1.0)
     )
     if len(held) < 50:
         raise UsageError(
-            f"{path} has {len(held)} samples at which both {pair[0].name!r} and {pair[1].name!r} are known",
-            hint="that is too few to tell what follows what: write a mapping",
+            f"{path} has {len(held)} samples with both {pair[0].name!r} and {pair[1].name!r}",
+            hint="these are too few for a correlation: write a mapping",
         )
     return held, joined, period_s
 
 
 def _with_numbers(
-    measured: Signal, places: np.ndarray, labels: tuple[str, ...], asked: Asked, path: str
+    measured: Signal, places: np.ndarray, labels: tuple[str, ...], hints: ImportHints, path: str
 ) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
-    """Return the joints that have numbers, and what to say of the others.
+    """Return the joints that have numbers, and notes on the others.
 
     Raises:
-        UsageError: When a joint that was asked for has none.
+        UsageError: When a joint of the robot has no number.
     """
-    kept = np.asarray(np.isfinite(measured.values[:, places]).any(axis=0))
-    if kept.all():
+    with_numbers = np.asarray(np.isfinite(measured.values[:, places]).any(axis=0))
+    if with_numbers.all():
         return places, labels, []
-    empty = ", ".join(measured.sources[i] for i in places[~kept])
-    if asked.joints or not kept.any():
+    empty = ", ".join(measured.sources[i] for i in places[~with_numbers])
+    if hints.joints or not with_numbers.any():
         raise UsageError(
             f"{empty} in {path} has no number in any sample",
-            hint="leave that joint out: --joints names those that count",
+            hint="name only the other joints with --joints",
         )
-    names = tuple(label for label, k in zip(labels, kept.tolist(), strict=True) if k)
-    return places[kept], names, [f"left out: {empty} has no number in any sample"]
+    names = tuple(label for label, k in zip(labels, with_numbers.tolist(), strict=True) if k)
+    return places[with_numbers], names, [f"skipped: {empty} has no number in any sample"]
 
 
-def _joint_order(measured: Signal, asked: Asked, path: str) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
-    """Return which column is which joint of the robot, the joints' names, and what to say of it."""
-    own = np.arange(measured.width)
+def _joint_order(measured: Signal, hints: ImportHints, path: str) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
+    """Return the column of each joint of the robot, the joints' names, and notes."""
+    given = np.arange(measured.width)
     labels = tuple(label or str(i) for i, label in enumerate(measured.labels))
-    if not asked.joints:
-        return own, labels, []
-    places = [next((i for i, label in enumerate(measured.labels) if same_joint(label, j)), None) for j in asked.joints]
+    if not hints.joints:
+        return given, labels, []
+    places = [next((i for i, label in enumerate(measured.labels) if same_joint(label, j)), None) for j in hints.joints]
     if all(p is not None for p in places):
-        kept = np.array(places)
-        moved = "in the robot's order" if (kept == own[: len(kept)]).all() else f"columns {', '.join(map(str, kept))}"
-        return kept, asked.joints, [f"joints by the names of columns: {moved}"]
-    if any(p is not None for p in places) or len(asked.joints) != measured.width:
-        found = ", ".join(label or "no name" for label in measured.labels)
-        raise UsageError(
-            f"the {measured.width} columns of {measured.name!r} in {path} ({found}) are not the robot's "
-            f"{len(asked.joints)} joints: {', '.join(asked.joints)}",
-            hint="name the joints that were recorded with --joints, in the order of the columns",
+        selected = np.array(places)
+        moved = (
+            "in the robot's order"
+            if (selected == given[: len(selected)]).all()
+            else f"columns {', '.join(map(str, selected))}"
         )
-    return own, asked.joints, [
-        "columns have no names of joints: they are taken to be in the robot's order, "
-        f"{', '.join(asked.joints[:4])}{' ...' if measured.width > 4 else ''}; --joints says another"
+        return selected, hints.joints, [f"joints by the names of columns: {moved}"]
+    if any(p is not None for p in places) or len(hints.joints) != measured.width:
+        labels_text = ", ".join(label or "no name" for label in measured.labels)
+        raise UsageError(
+            f"the {measured.width} columns of {measured.name!r} in {path} ({labels_text}) are not the robot's "
+            f"{len(hints.joints)} joints: {', '.join(hints.joints)}",
+            hint="name the recorded joints with --joints, in the order of the columns",
+        )
+    return given, hints.joints, [
+        "columns have no names of joints, so the robot's order is assumed: "
+        f"{', '.join(hints.joints[:4])}{' ...' if measured.width > 4 else ''}; --joints sets another"
     ]  # fmt: skip
 
 
 def _clocks(
     signals: Sequence[Signal], stamps: Sequence[Stamps], measured: Signal, command: Signal, path: str
 ) -> tuple[list[np.ndarray], float, list[str]]:
-    """Return both streams' times, the offset of the commands' clock, and what to say of it.
+    """Return both streams' times, the offset of the commands' clock [s], and notes.
 
     Raises:
-        UsageError: When the clocks differ, and a command that repeats leaves open by how much.
+        UsageError: When the clocks differ by an ambiguous offset, as commands repeat.
     """
     t, c = (s.t_s for s in stamps)
     if stamps[0].source == stamps[1].source and len(t) == len(c):
@@ -290,66 +295,64 @@ def _clocks(
     far = following(held, joined, period_s, 0.4 * len(joined) * period_s)
     best, farthest = (np.abs(f.r).max(initial=0.0) for f in (near, far))
     if max(best, farthest) < SURE:
-        return [t, c], 0.0, ["no measurement follows a command: whether the clocks agree is not known"]
-    # Far away a likeness may be chance: it must be close, and much closer than what is near.
-    found = far if apart or (farthest > _CLOSE and best < _CLOSE * farthest) else near
-    sure = np.abs(found.r) >= 0.98 * np.abs(found.r).max()
-    lag_s = float(np.median(found.lag_s[sure]))
-    # One recorder's clock is one clock: what moves first on it is said where signs and lags are.
-    one = all((s.source or "").endswith(".log_time") for s in stamps)
-    if not apart and (one or (found is near and lag_s > -0.5 * period_s)):
+        return [t, c], 0.0, ["no measurement follows a command, so the agreement of the clocks is unknown"]
+    # A correlation at a large lag can be chance: it must be high, and much higher than at small lags.
+    relation = far if apart or (farthest > _MIN_FAR_R and best < _MIN_FAR_R * farthest) else near
+    sure = np.abs(relation.r) >= 0.98 * np.abs(relation.r).max()
+    lag_s = float(np.median(relation.lag_s[sure]))
+    # Stamps of one recorder are of one clock: `goal` reports positions that move first on it.
+    one_clock = all((s.source or "").endswith(".log_time") for s in stamps)
+    if not apart and (one_clock or (relation is near and lag_s > -0.5 * period_s)):
         return (
             [t, c],
             0.0,
-            [f"clocks of both streams agree: measurements follow {1e3 * lag_s:.0f} ms later"] * (not one),
+            [f"clocks of both streams agree: measurements follow {1e3 * lag_s:.0f} ms later"] * (not one_clock),
         )
     if not apart and _leads_on_recorder(signals, (measured, command), rows):
-        return [t, c], 0.0, []  # no clock explains it
-    if (np.isfinite(found.against_s) | np.isfinite(found.repeats_s) | found.either)[sure].all():
+        return [t, c], 0.0, []  # a difference of clocks does not explain the lead
+    if (np.isfinite(relation.against_s) | np.isfinite(relation.repeats_s) | relation.either)[sure].all():
         raise UsageError(
-            f"the clocks of {measured.name!r} and {command.name!r} in {path} do not agree, and commands that repeat "
-            "leave open by how much",
-            hint="say it in a mapping: stamp_offset, or record a motion that does not repeat",
+            f"the clocks of {measured.name!r} and {command.name!r} in {path} do not agree, and their "
+            "offset is ambiguous, as the commands repeat",
+            hint="write it into a mapping as stamp_offset, or record a motion that does not repeat",
         )
-    # Nothing moves before it is told to: one period is left as the least delay that a computer can have.
+    # A measurement follows its command: keep one period, the least delay of a computer.
     offset = coarse + lag_s - period_s
-    said = (
-        f"the commands' clock is {-offset:.4f} s ahead of the measurements' (r {np.abs(found.r).max():.2f}), unless "
-        "their names are exchanged: stamp_offset aligns them; what is left of the true delay cannot be told by clocks"
+    notes = (
+        f"the commands' clock is {-offset:.4f} s ahead of the measurements' (r {np.abs(relation.r).max():.2f}), unless "
+        "their names are exchanged: stamp_offset aligns them; the clocks do not determine the true delay"
     )
-    return [t, c + offset], offset, [said]
+    return [t, c + offset], offset, [notes]
 
 
 def _leads_on_recorder(
     signals: Sequence[Signal], pair: tuple[Signal, Signal], rows: tuple[np.ndarray, np.ndarray]
 ) -> bool:
-    """Return whether positions move before their commands by the recorder's clock, too, which is one for both."""
+    """Return whether positions move before their commands also on the recorder's clock, which both share."""
     names = [s.sources[0].partition(".")[0] + ".log_time" for s in pair]
-    found = [s.values[:, 0] * 1e-9 for name in names for s in signals if s.name == name]
-    if [len(x) for x in found] != [len(r) for r in rows]:
+    log_times = [s.values[:, 0] * 1e-9 for name in names for s in signals if s.name == name]
+    if [len(x) for x in log_times] != [len(r) for r in rows]:
         return False
     q, c = (s.values[r] for s, r in zip(pair, rows, strict=True))
-    held, joined, period_s = on_grid(found[1][rows[1]], c, found[0][rows[0]], q)
-    own = following(held, joined, period_s)
-    sure = np.abs(own.r) > SURE
-    return bool(sure.any() and np.median(own.lag_s[sure]) < -1.5 * period_s)
+    held, joined, period_s = on_grid(log_times[1][rows[1]], c, log_times[0][rows[0]], q)
+    relation = following(held, joined, period_s)
+    sure = np.abs(relation.r) > SURE
+    return bool(sure.any() and np.median(relation.lag_s[sure]) < -1.5 * period_s)
 
 
 def _node(
     name: str, fields: dict[str, FieldMapping], stamps: Stamps, lacks: np.ndarray, offset_s: float, leapt: np.ndarray
 ) -> tuple[NodeMapping, list[str]]:
-    """Return a node's mapping, with policies only where the data needs them, and what to say of those."""
-    said = []
+    """Return a node's mapping, with the policies that its data needs, and notes on them."""
+    notes = []
     missing, repeated = "refuse", "refuse"
     good = ~lacks & np.isfinite(stamps.t_s)
     if not good.all():
         missing = "drop"
-        said.append(
-            f'{name}: {int((~good).sum())} of {len(good)} samples lack a number: missing = "drop" leaves them out'
-        )
+        notes.append(f'{name}: {int((~good).sum())} of {len(good)} samples lack a number: missing = "drop" skips them')
     if stamps.repeated:
         repeated = "first"
-        said.append(f'{name}: {stamps.repeated} stamps repeat: repeated = "first" keeps the first sample of each')
+        notes.append(f'{name}: {stamps.repeated} stamps repeat: repeated = "first" keeps the first sample of each')
     steps = np.diff(stamps.t_s[good])
     if stamps.backward:
         k = int(np.argmax(steps < 0))
@@ -361,22 +364,20 @@ def _node(
         )
     long = steps > _GAP * np.median(steps)
     if long.any():
-        said.append(
-            f"{name}: {int(long.sum())} gaps, the longest {steps.max():.3g} s: they stay gaps, nothing is invented"
-        )
+        notes.append(f"{name}: {int(long.sum())} gaps, the longest {steps.max():.3g} s: they stay gaps")
     order = int(name == "actuator")
     node = NodeMapping(
         fields, stamps.rate_hz, stamps.source, stamps.unit, order,
         missing=missing, repeated=repeated, stamp_offset=offset_s,
         implausible="drop" if leapt.any() else "refuse",
     )  # fmt: skip
-    return node, said
+    return node, notes
 
 
 def _on_stamps(signal: Signal, stamps: Stamps) -> list[str]:
     if stamps.source is None:
-        return [f"{signal.name!r} has no stamps: generated at {stamps.rate_hz:g} Hz ({stamps.said})"]
-    return [f"stamps of {signal.name!r} are {stamps.source!r}, in {stamps.unit}: {stamps.said}"]
+        return [f"{signal.name!r} has no stamps: generated at {stamps.rate_hz:g} Hz ({stamps.reason})"]
+    return [f"stamps of {signal.name!r} are {stamps.source!r}, in {stamps.unit}: {stamps.reason}"]
 
 
 def pipeline_name(path: Path) -> str:

@@ -21,20 +21,20 @@ _EXTRA = {
     "goal_velocity": ("velocity", "command", "rad/s"),
     "torque": ("torque", "command", "N m"),
 }
-"""What else may be commanded beside a goal: field -> quantity, side where it matters, and unit."""
+"""Commands beside a goal: field -> quantity, side or None for any, and unit."""
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What the user knows.
+class ImportHints:
+    """The user's information on a file.
 
     Attributes:
-        pipeline: Name of the pipeline that the log is for.
-        rate_hz: Rate of the samples, where the file has no stamps [Hz].
-        joints: Names of the robot's joints, in its order; empty: not known.
-        ranges: Shape ``(joints, 2)``: from where to where they move [rad]; empty: not known.
-        as_told: Keep names, order and signs as the file has them where the data leaves them open or contradicts them.
-        slides: Those of the joints that are slides, whose positions are lengths.
+        pipeline: Name of the log's pipeline.
+        rate_hz: Rate of the samples if the file has no stamps [Hz].
+        joints: Names of the robot's joints, in its order; empty if unknown.
+        ranges: Shape ``(joints, 2)``: limits of the joints [rad]; None if unknown.
+        as_told: Keep names, order and signs of the file, even if they are ambiguous or contradict the data.
+        slides: Names of the sliding joints, whose positions are lengths.
     """
 
     pipeline: str
@@ -45,7 +45,7 @@ class Asked:
     slides: tuple[str, ...] = ()
 
     def hinges(self, width: int) -> np.ndarray:
-        """Return which of so many columns are joints that turn, ``(width,)``: all but those that are known to slide."""
+        """Return whether a column is a joint that turns, ``(width,)``: True unless it is known to slide."""
         known = len(self.joints) == width
         return np.array([not (known and self.joints[i] in self.slides) for i in range(width)], bool)
 
@@ -58,11 +58,11 @@ def taken(signal: Signal, places: np.ndarray) -> Signal:
 
 
 def matched(signal: Signal, measured: Signal, places: np.ndarray) -> Signal:
-    """Return the columns of a signal that belong to the measured joints: by names where both have some, else by place.
+    """Return the columns of a signal for the measured joints: by names if both have names, else by place.
 
     Args:
         measured: Positions, in the order of the joints.
-        places: Which column is which joint, where names do not say so.
+        places: Column of each joint, for signals without names.
     """
     labels = measured.labels
     if all(labels) and set(labels) <= set(signal.labels):
@@ -71,26 +71,26 @@ def matched(signal: Signal, measured: Signal, places: np.ndarray) -> Signal:
 
 
 def clean(t_s: np.ndarray, signal: Signal) -> np.ndarray:
-    """Return which rows have numbers and a stamp after all before them, ``(N,)``."""
+    """Return whether a row has numbers and a stamp later than all before, ``(N,)``."""
     good = signal.finite & np.isfinite(t_s)
     latest = np.maximum.accumulate(np.where(good, t_s, -np.inf))
     return good & (t_s > np.concatenate([[-np.inf], latest[:-1]]))
 
 
 def field_of(signal: Signal, unit: str, scales: Sequence[float], turn: float = 0.0) -> FieldMapping:
-    """Return how a signal becomes a field of the log.
+    """Return the mapping of a signal to a field of the log.
 
     Args:
-        turn: A turn in the signal's unit, where turns are to be counted.
+        turn: A turn in the signal's unit if turns are counted; else 0.
     """
     scale = float(scales[0]) if len(set(scales)) == 1 else tuple(scales)
-    # A single column of a file is a vector of one joint, so that all robots look alike.
+    # Map a single column to a vector of one joint, so that all robots have vectors.
     sources = (signal.whole,) if signal.whole else signal.sources
     return FieldMapping(sources, unit, scale, 0.0, (signal.width,), turn=turn)
 
 
 def velocities(signals: Sequence[Signal], measured: Signal) -> list[Signal]:
-    """Return what may be the measured velocity."""
+    """Return the candidates for the measured velocity."""
     return [
         s for s in signals
         if s.meaning.quantity == "velocity" and s.meaning.side != "command"
@@ -101,65 +101,67 @@ def velocities(signals: Sequence[Signal], measured: Signal) -> list[Signal]:
 def velocity_of(
     signals: Sequence[Signal], measured: Signal, t_s: np.ndarray, to_rad: float, places: np.ndarray
 ) -> tuple[dict[str, FieldMapping], list[str], np.ndarray]:
-    """Return the measured velocity, where it is that of the positions, what to say, and which samples lack numbers.
+    """Return the field of the measured velocity if it fits the positions, notes, and whether a sample lacks numbers.
 
     Args:
         measured: Positions, in the order of the joints.
         t_s: Their stamps ``(N,)`` [s].
-        places: Which column is which joint.
+        places: Column of each joint.
     """
     fitting = velocities(signals, measured)
-    whole = np.zeros(len(measured.values), bool)
+    complete = np.zeros(len(measured.values), bool)
     if len(fitting) != 1:
         return (
             {},
             [f"several velocities, none is taken: {', '.join(s.name for s in fitting)}"] * (len(fitting) > 1),
-            whole,
+            complete,
         )
     velocity = matched(fitting[0], measured, places)
     rows = np.flatnonzero(clean(t_s, measured) & velocity.finite)
     if len(rows) < 0.5 * clean(t_s, measured).sum() or len(rows) < 3:
-        return {}, [f"left out: {velocity.name!r} lacks numbers"], whole
+        return {}, [f"skipped: {velocity.name!r} lacks numbers"], complete
     period = float(np.median(np.diff(t_s[rows])))
     rate = np.gradient(measured.values[rows], t_s[rows], axis=0) / to_rad
-    found = following(rate, velocity.values[rows], period, 0.1)
-    r, slope, lag, against = (np.diag(a) for a in (found.r, found.slope, found.lag_s, found.against_s))
-    # A rate and its velocity are of one time: of two signs that fit, that of the smaller lag is the right one.
+    relation = following(rate, velocity.values[rows], period, 0.1)
+    r, slope, lag, against = (np.diag(a) for a in (relation.r, relation.slope, relation.lag_s, relation.against_s))
+    # A rate and its velocity have the same time, so the sign with the smaller lag is right.
     with np.errstate(invalid="ignore"):
         r, slope = (np.where(np.abs(against) < np.abs(lag), -a, a) for a in (r, slope))
-    still = (rate.std(axis=0) > 0.05 * rate.std()) & (velocity.values[rows].std(axis=0) == 0)
+    resting = (rate.std(axis=0) > 0.05 * rate.std()) & (velocity.values[rows].std(axis=0) == 0)
     ratio = evidence.unit_ratio(slope[np.abs(r) > SURE])
-    off = np.abs(slope / (ratio or 1.0)) if ratio else slope
-    odd = still | (np.abs(r) > 0.05) & ((np.abs(r) < SURE) | (off < 0.6) | (off > 1.7))
+    error = np.abs(slope / (ratio or 1.0)) if ratio else slope
+    wrong = resting | (np.abs(r) > 0.05) & ((np.abs(r) < SURE) | (error < 0.6) | (error > 1.7))
     typical = float(np.median(slope))
-    own = {1.0: "rad", evidence.DEGREES: "deg"}.get(ratio or 0.0, "")
-    if ratio is None or odd.any() or velocity.meaning.unit not in ("", own):
-        listed = ", ".join(f"{velocity.sources[i]} r {r[i]:.2f}, slope {slope[i]:.3g}" for i in np.flatnonzero(odd)[:3])
+    unit = {1.0: "rad", evidence.DEGREES: "deg"}.get(ratio or 0.0, "")
+    if ratio is None or wrong.any() or velocity.meaning.unit not in ("", unit):
+        listed = ", ".join(
+            f"{velocity.sources[i]} r {r[i]:.2f}, slope {slope[i]:.3g}" for i in np.flatnonzero(wrong)[:3]
+        )
         why = listed or f"slope {typical:.3g}: no unit fits"
-        return {}, [f"{velocity.name!r} is not the rate of {measured.name!r} ({why}): left out"], whole
+        return {}, [f"{velocity.name!r} is not the rate of {measured.name!r} ({why}): skipped"], complete
     scales = [float((-1 if x < -SURE else 1) / ratio) for x in r]
-    said = [
+    notes = [
         f"{velocity.name!r} is the rate of {measured.name!r}: r {np.abs(r).max():.2f}, slope {np.median(slope):.3g}"
     ]
     turned = [s for s, x in zip(velocity.sources, r, strict=True) if x < -SURE]
-    said += [f"opposite signs, velocities are turned: {', '.join(turned)}"] * bool(turned)
-    return {"velocity": field_of(velocity, "rad/s", scales)}, said, ~velocity.finite
+    notes += [f"opposite signs, velocities are turned: {', '.join(turned)}"] * bool(turned)
+    return {"velocity": field_of(velocity, "rad/s", scales)}, notes, ~velocity.finite
 
 
 def extras(
     signals: Sequence[Signal], command: Signal, measured: Signal, places: np.ndarray, path: str, followed: bool
 ) -> tuple[dict[str, FieldMapping], list[str]]:
-    """Return what else was commanded: gains, torque on or off, and what goes with a goal; all of it by name.
+    """Return the fields of further commands, found by name: gains, torque on or off, velocity and torque beside a goal.
 
     Args:
         measured: Positions, in the order of the joints.
-        places: Which column is which joint, where names do not say so.
-        path: The file, for errors.
+        places: Column of each joint, for signals without names.
+        followed: Whether positions follow the command.
 
     Raises:
-        UsageError: When several signals may be the same quantity.
+        UsageError: When several signals can be the same quantity.
     """
-    fields, said = {}, []
+    fields, notes = {}, []
     for name, (quantity, side, unit) in _EXTRA.items():
         named = [s for s in signals if s.meaning.quantity == quantity and side in (None, s.meaning.side)]
         fitting = [
@@ -170,11 +172,11 @@ def extras(
             and s.width in (1, command.width)
             and (s.values.ndim == 1 or len(s.values) == len(command.values))
         ]
-        said += [f"left out: {s.name!r} lacks numbers" for s in named if s is not command and not s.finite.all()]
+        notes += [f"skipped: {s.name!r} lacks numbers" for s in named if s is not command and not s.finite.all()]
         idle = [s for s in fitting if not s.values.any() and followed]
         if idle:
-            # A factor of 0 leaves its parameter open, and a recorder that does not know a gain writes 0.
-            said.append(f"left out: {', '.join(repr(s.name) for s in idle)} is 0 throughout, so it is not {name}")
+            # Skip zeros: a factor of 0 leaves its parameter open, and recorders write 0 for an unknown gain.
+            notes.append(f"skipped: {', '.join(repr(s.name) for s in idle)} is 0 throughout, so it is not {name}")
             fitting = [s for s in fitting if s.values.any()]
         if len(fitting) > 1:
             raise UsageError(
@@ -182,10 +184,10 @@ def extras(
                 hint="write a mapping: the guide 'Import' has one with every key",
             )
         if fitting and not (name == "enabled" and not set(np.unique(fitting[0].values)) <= {0.0, 1.0}):
-            whole = fitting[0].width == 1 or fitting[0].values.ndim == 1
-            own = fitting[0] if whole else matched(fitting[0], measured, places)
-            fields[name] = field_of(own, unit, [1.0] * own.width)
+            single = fitting[0].width == 1 or fitting[0].values.ndim == 1
+            columns = fitting[0] if single else matched(fitting[0], measured, places)
+            fields[name] = field_of(columns, unit, [1.0] * columns.width)
             values = np.unique(fitting[0].values)
             listed = ", ".join(f"{v:g}" for v in values[:4]) + (" ..." if len(values) > 4 else "")
-            said.append(f"{fitting[0].name!r} is {name}: {listed}")
-    return fields, said
+            notes.append(f"{fitting[0].name!r} is {name}: {listed}")
+    return fields, notes

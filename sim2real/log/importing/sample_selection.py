@@ -1,9 +1,8 @@
-"""Which samples of a node are imported: those that are whole, and whose positions a joint can have had."""
+"""Selects the samples of a node to import: complete ones, with positions that are possible for a joint."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -13,47 +12,49 @@ from sim2real.log.importing.mapping import ImportMapping, NodeMapping
 from sim2real.log.importing.signal_names import meaning
 
 
-def kept_samples(
+def selected_samples(
     node: NodeMapping, signals: Mapping[str, np.ndarray], stamps: np.ndarray | None, first: int, stop: int
 ) -> np.ndarray:
-    """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies keep.
+    """Return the numbers of the samples from ``first`` to just before ``stop`` that the node's policies select.
 
     Args:
         signals: Field -> values, shape ``(N, ...)``, or ``()`` for a constant.
         stamps: Shape ``(N,)``; None without any.
     """
-    kept = np.arange(first, stop)
+    selected = np.arange(first, stop)
     series = [v for v in (*signals.values(), stamps) if v is not None and v.ndim]
     if node.missing == "drop":
         good = np.logical_and.reduce([np.isfinite(v[first:stop]).reshape(stop - first, -1).all(axis=1) for v in series])
-        kept = kept[good]
-    if node.repeated == "first" and stamps is not None and len(kept):
-        own = stamps[kept]
-        kept = kept[np.concatenate([[True], own[1:] != own[:-1]])]
-    return kept
+        selected = selected[good]
+    if node.repeated == "first" and stamps is not None and len(selected):
+        own_stamps = stamps[selected]
+        selected = selected[np.concatenate([[True], own_stamps[1:] != own_stamps[:-1]])]
+    return selected
 
 
 def plausible_samples(
-    where: str, node: NodeMapping, signals: Mapping[str, np.ndarray], t_s: np.ndarray, kept: np.ndarray
+    where: str, node: NodeMapping, signals: Mapping[str, np.ndarray], t_s: np.ndarray, selected: np.ndarray
 ) -> np.ndarray:
-    """Return the numbers of those samples whose positions a joint can have had.
+    """Return the numbers of the samples with possible positions.
 
     Args:
         where: The node and the file, for errors.
         signals: Field -> values, shape ``(N, ...)``, unscaled.
-        t_s: Stamps of the samples that are kept so far [s].
+        t_s: Stamps of the samples in ``selected`` [s].
 
     Raises:
-        UsageError: When positions leap away and back, and the mapping does not say to drop such samples; jump at the
-            end of a turn that is not to be counted; or change by more than a joint can move.
+        UsageError: When positions leap away and back and the mapping has no ``implausible = "drop"``, jump at the end
+            of a turn without counting, or change faster than a joint can move.
     """
-    if len(kept) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
-        return kept  # the errors of stamps say more
+    if len(selected) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
+        return selected  # the check of stamps raises the better error
     for field, how in node.fields.items():
         if how.unit != "rad" or meaning(field).side == "command" or meaning(field).quantity != "position":
             continue
         values = signals[field]
-        angle = np.atleast_2d(values[kept].reshape(len(kept), -1) * np.asarray(how.scale)) if values.ndim else None
+        angle = (
+            np.atleast_2d(values[selected].reshape(len(selected), -1) * np.asarray(how.scale)) if values.ndim else None
+        )
         if angle is None or not np.isfinite(angle).all():
             continue
         what = f"field {field} of {where}"
@@ -66,25 +67,26 @@ def plausible_samples(
         if leapt.any() and node.implausible == "refuse":
             k, i = (int(x[0]) for x in np.nonzero(leapt))
             raise UsageError(
-                f"column {i} of {what} reads {angle[k, i]:.4g} rad in sample {kept[k]}: it leaps away and back, as no "
-                f"joint can, in {int(leapt.any(axis=1).sum())} samples",
-                hint='implausible = "drop" in the mapping leaves such samples out',
+                f"column {i} of {what} reads {angle[k, i]:.4g} rad in sample {selected[k]}: it leaps away and back, "
+                f"faster than a joint can, in {int(leapt.any(axis=1).sum())} samples",
+                hint='implausible = "drop" in the mapping skips such samples',
             )
-        kept, angle, t_s = (x[~leapt.any(axis=1)] for x in (kept, angle, t_s))
+        selected, angle, t_s = (x[~leapt.any(axis=1)] for x in (selected, angle, t_s))
         if (jump := plausibility.leap(t_s, angle)) is not None:
             raise UsageError(
-                f"column {jump[1]} of {what} changes by {jump[2]:.4g} rad before sample {kept[jump[0]]}, within "
-                f"{t_s[jump[0]] - t_s[jump[0] - 1]:.3g} s: no joint can, so its zero or its unit has changed",
-                hint="cut the file there with --samples A:B, or leave this joint out",
+                f"column {jump[1]} of {what} changes by {jump[2]:.4g} rad before sample {selected[jump[0]]}, within "
+                f"{t_s[jump[0]] - t_s[jump[0] - 1]:.3g} s: a joint cannot, so its zero or its unit has changed",
+                hint="cut the file there with --samples A:B, or omit this joint",
             )
-    return kept
+    return selected
 
 
-def align_turns(mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, Any]) -> None:
-    """Bring positions and commands whose turns were counted, each from its own beginning, to the same turn.
+def align_turns(
+    mapping: ImportMapping, outputs: Mapping[str, dict[str, np.ndarray]], ticks: Mapping[str, np.ndarray]
+) -> None:
+    """Shift commands to the turn of their positions, as turns are counted from the start of each signal.
 
     Args:
-        mapping: Says where turns were counted.
         outputs: Node -> field -> values, changed in place.
         ticks: Node -> stamps.
     """

@@ -1,4 +1,4 @@
-"""What the name of a signal in a file of another recorder says: who sent it, which quantity it is, of which joint."""
+"""The meaning of a signal's name in a file of another recorder: side, quantity, unit and joint."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _UNITS = {
     "ns": "ns nsec nanos nanoseconds nanosec",
     "raw": "raw counts ticks",
 }
-_WEAK = {"state", "states"}
+_WEAK_WORDS = {"state", "states"}
 _SIDE = {word: side for side, words in _SIDES.items() for word in words.split()}
 _QUANTITY = {word: quantity for quantity, words in _QUANTITIES.items() for word in words.split()}
 _UNIT = {word: unit for unit, words in _UNITS.items() for word in words.split()}
-# What says nothing: parts of messages, and what lists of records are called.
+# Words without meaning: parts of messages, and names of lists of records.
 _FILLERS = {
     "data",
     "entries",
@@ -60,14 +60,14 @@ _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
 @dataclass(frozen=True)
 class Meaning:
-    """What a name says; empty where it says nothing.
+    """The meaning of a name; a part is empty if the name lacks it.
 
     Attributes:
         side: ``command`` or ``measured``.
         quantity: ``stamp``, ``position``, ``velocity``, ``torque``, ``duty``, ``voltage``, ``kp``, ``kd``,
             ``enabled``, ``rate``, ``period``, or ``error`` (a difference of two signals).
         unit: ``rad``, ``deg``, ``s``, ``ms``, ``us``, ``ns`` or ``raw``.
-        label: The rest: the joint.
+        label: The remaining words, which name the joint.
     """
 
     side: str = ""
@@ -77,17 +77,17 @@ class Meaning:
 
 
 def meaning(name: str) -> Meaning:
-    """Return what a name says, such as ``cmd_deg/FL_hip`` (a command in degrees, of joint ``fl_hip``)."""
+    """Return the meaning of a name; ``cmd_deg/FL_hip`` is a command in degrees, of joint ``fl_hip``."""
     quantity = unit = ""
     rest = []
     words = [word.lower() for word in _WORDS.findall(name)]
     for place, word in enumerate(words):
-        # A letter is a unit only behind something, as in `t_s`; `s` alone is a name.
+        # A letter is a unit only after another word, as in `t_s`; `s` alone is a name.
         known_unit = _UNIT.get(word, "") if place else ""
         if word in _SIDE:
             continue
         if word in _QUANTITY and not (quantity == "stamp" and known_unit):
-            # `torque_enable` enables, `goal_time` is a time: what stands last counts, but of an error.
+            # The last quantity counts, unless it is an error: `torque_enable` enables, `goal_time` is a time.
             quantity = quantity if quantity == "error" else _QUANTITY[word]
         elif known_unit:
             unit = known_unit
@@ -100,20 +100,20 @@ def meaning(name: str) -> Meaning:
 
 
 def _side(name: str) -> str:
-    """Return who sent a signal: the innermost part of its path that says so.
+    """Return the side of a signal, from the innermost part of its path with a side.
 
     ``/controller_state.reference.positions`` is a command, although its topic is a state.
     """
     for part in re.split(r"[./]", name)[::-1]:
         words = [word for word in map(str.lower, _WORDS.findall(part)) if word in _SIDE]
-        # `target_joint_state` and `state_desired` are commands: a state is what anything has.
-        strong = [word for word in words if word not in _WEAK] or words
+        # `target_joint_state` and `state_desired` are commands, so "state" counts only without another word.
+        strong = [word for word in words if word not in _WEAK_WORDS] or words
         if strong:
             return _SIDE[strong[0]]
     return ""
 
 
 def same_joint(label: str, joint: str) -> bool:
-    """Return whether a column's label names a joint of a model, as ``fl_hip`` names ``FL_hip_joint``."""
+    """Return whether a column's label is the name of a model's joint, as ``fl_hip`` is of ``FL_hip_joint``."""
     words = [w.lower() for w in _WORDS.findall(joint)]
     return bool(label) and label in ("_".join(words), "_".join(w for w in words if w not in _FILLERS))

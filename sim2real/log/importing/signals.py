@@ -1,4 +1,4 @@
-"""The signals in a file of another recorder, grouped by what their names say, with their time stamps."""
+"""The signals in a file of another recorder, grouped by the meaning of their names, with their time stamps."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.importing.files.cells import NoNumbers
+from sim2real.log.importing.files.cells import NoNumbersError
 from sim2real.log.importing.files.foreign import ForeignFile
 from sim2real.log.importing.mapping import STAMP_UNITS
 from sim2real.log.importing.signal_names import Meaning, meaning
 
 _RATES_HZ = (5.0, 12_000.0)
-"""Between these, a recorder samples."""
+"""Usual sampling rates of recorders."""
 _WALL_S = (1e9, 4e9)
 """Wall clocks read this many seconds since 1970 (2001 to 2096)."""
 
@@ -24,11 +24,11 @@ class Signal:
     """Columns that belong together.
 
     Attributes:
-        sources: Of each column, as a mapping names it.
-        labels: Of each column: its joint, as far as names say; empty where they do not.
-        meaning: What the name says.
+        sources: Source of each column, as in a mapping.
+        labels: Joint of each column; empty if its name has none.
+        meaning: Meaning of the name.
         values: Shape ``(N, columns)``; ``(columns,)`` for constants.
-        whole: The source of all columns together; None where they are separate signals of the file.
+        whole: Source of all columns together; None if they are separate signals of the file.
     """
 
     sources: tuple[str, ...]
@@ -39,7 +39,7 @@ class Signal:
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Name for messages."""
         return self.whole or ", ".join(self.sources[:3]) + (" ..." if len(self.sources) > 3 else "")
 
     @property
@@ -55,115 +55,114 @@ class Signal:
 
 @dataclass(frozen=True)
 class Stamps:
-    """When samples were taken.
+    """The time stamps of samples.
 
     Attributes:
-        source: Of the recorded stamps, as a mapping names it; None: generated from the rate.
+        source: Source of the recorded stamps, as in a mapping; None: generated from the rate.
         unit: One of ``STAMP_UNITS``.
         t_s: Shape ``(N,)`` [s].
-        said: How the unit is known.
-        rate_hz: Where stamps are generated [Hz].
-        backward: How many stamps are earlier than the one before.
-        repeated: How many are the same as the one before.
+        reason: Reason for the unit.
+        rate_hz: Rate of generated stamps [Hz].
+        backward: Number of stamps that are earlier than the one before.
+        repeated: Number of stamps that equal the one before.
     """
 
     source: str | None
     unit: str
     t_s: np.ndarray
-    said: str
+    reason: str
     rate_hz: float | None = None
     backward: int = 0
     repeated: int = 0
 
 
 def collect(file: ForeignFile) -> tuple[list[Signal], list[str]]:
-    """Return all signals of numbers, of at most two dimensions, and sentences on those that were left out.
+    """Return all signals of numbers with at most two dimensions, and notes on skipped signals.
 
-    Columns that differ by the joint alone are one signal.
+    Columns whose names differ only by the joint are one signal.
 
     Raises:
-        UsageError: When a signal that is named like a position or a command has numbers, but cannot be read.
+        UsageError: When a signal with the name of a position or a command has numbers, but cannot be read.
     """
     single: dict[tuple[Meaning, int], list[Signal]] = {}
-    found: list[Signal] = []
-    said: list[str] = []
+    signals: list[Signal] = []
+    notes: list[str] = []
     text: list[str] = []
     for key in file.keys:
-        about = meaning(key)
+        named = meaning(key)
         try:
             values = file.signal(key).astype(np.float64)
-        except NoNumbers:
+        except NoNumbersError:
             text.append(key)
             continue
         except UsageError as error:
-            # Without such a column another one might be taken for the positions, or a joint be missing.
-            if about.quantity == "position" or (about.side and not about.quantity):
+            # Raise for such a column: without it, another one could be taken for the positions.
+            if named.quantity == "position" or (named.side and not named.quantity):
                 raise
-            said.append(f"left out: {error.args[0]}")
+            notes.append(f"skipped: {error.args[0]}")
             continue
         if values.size and values.ndim <= 2 and not np.isfinite(values).any():
-            said.append(f"left out: {key!r} has no number in any sample")
+            notes.append(f"skipped: {key!r} has no number in any sample")
         elif values.ndim <= 1:
-            row = Signal((key,), (about.label,), about, values[..., None])
-            single.setdefault((replace(about, label=""), values.size if values.ndim else 0), []).append(row)
+            row = Signal((key,), (named.label,), named, values[..., None])
+            single.setdefault((replace(named, label=""), values.size if values.ndim else 0), []).append(row)
         elif values.ndim == 2:
             n = values.shape[1]
             names = [meaning(name).label for name in file.columns.get(key, ("",) * n)]
-            found.append(Signal(tuple(f"{key}[:,{i}]" for i in range(n)), tuple(names), about, values, key))
+            signals.append(Signal(tuple(f"{key}[:,{i}]" for i in range(n)), tuple(names), named, values, key))
         else:
-            said.append(f"left out: {key!r} has samples of shape {values.shape[1:]}, as images have")
-    for (about, _), rows in single.items():
+            notes.append(f"skipped: {key!r} has samples of shape {values.shape[1:]}, as images have")
+    for (named, _), rows in single.items():
         labels = [row.labels[0] for row in rows]
-        together = len(rows) > 1 and len(set(labels)) == len(labels) and about.quantity != "stamp"
-        together = together and ("" not in labels) and bool(about.side or about.quantity)
+        together = len(rows) > 1 and len(set(labels)) == len(labels) and named.quantity != "stamp"
+        together = together and ("" not in labels) and bool(named.side or named.quantity)
         if together:
             values = np.concatenate([row.values for row in rows], axis=-1)
-            found.append(Signal(tuple(row.sources[0] for row in rows), tuple(labels), about, values))
+            signals.append(Signal(tuple(row.sources[0] for row in rows), tuple(labels), named, values))
         else:
-            found += rows
-    return found, [*said, *([f"left out, as they hold no numbers: {', '.join(text)}"] if text else [])]
+            signals += rows
+    return signals, [*notes, *([f"skipped, as they hold no numbers: {', '.join(text)}"] if text else [])]
 
 
 def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rate_hz: float | None) -> Stamps:
     """Return the stamps of the rows of a signal.
 
     Args:
-        side: ``command`` or ``measured``: whose stamps are preferred.
-        path: The file, for errors.
-        rate_hz: What the user says the rate is [Hz].
+        side: ``command`` or ``measured``: stamps of this side are preferred.
+        rate_hz: The user's rate [Hz].
 
     Raises:
-        UsageError: When there are none, or several that serve as well, or their unit is not clear.
+        UsageError: When there are no stamps, several equally good ones, or their unit is unclear.
     """
     length = len(of.values)
     if rate_hz is None:
         fitting = [s for s in signals if s.width == 1 and s.values.shape == (length, 1) and _increases(s)]
         named = [s for s in fitting if s.meaning.quantity == "stamp"]
         chosen = [s for s in named if s.meaning.side == side] or [s for s in named if not s.meaning.side] or named
-        # Of a bag, or of several files: stamps of the same topic, and the sender's rather than the recorder's.
+        # Of a bag, or of several files, prefer stamps of the same topic, and the sender's stamps.
         chosen = [s for s in named if _group(of) and _group(s) == _group(of)] or chosen
         chosen = [s for s in chosen if s.name.endswith("stamp")] or chosen
         chosen = chosen or [s for s in fitting if s.meaning.quantity in ("", "stamp") and not _counts(s)]
         if len(chosen) > 1:
             raise UsageError(
-                f"which stamps of {path} belong to what was {'commanded' if side == 'command' else 'measured'}? "
+                f"which stamps of {path} belong to the {'commands' if side == 'command' else 'measurements'}? "
                 f"Candidates: {', '.join(s.name for s in chosen)}",
-                hint="leave the others out, or write a mapping: the guide 'Import' has one with every key",
+                hint="remove the others, or write a mapping: the guide 'Import' has one with every key",
             )
         if chosen:
             return _stamps(chosen[0], path)
-        rate_hz, said = _told_rate(signals), "the file says so"
+        rate_hz, reason = _rate_constant(signals), "a constant in the file"
         clocks = [s for s in signals if s.values.shape == (length, 1) and s.meaning.quantity == "stamp"]
         clocks = [s for s in clocks if s.finite.sum() > 2 and np.ptp(s.values[s.finite]) > 0]
         if rate_hz is None and clocks:
-            raise UsageError(_unusable(clocks[0], path), hint="say the rate of its samples with --rate-hz")
+            raise UsageError(_unusable(clocks[0], path), hint="give the rate of its samples with --rate-hz")
     else:
-        said = "--rate-hz"
+        reason = "--rate-hz"
     if rate_hz is None:
         raise UsageError(
-            f"{path} has no time stamps for {length} rows", hint="say the rate of its samples with --rate-hz"
+            f"{path} has no time stamps for {length} rows", hint="give the rate of its samples with --rate-hz"
         )
-    return Stamps(None, "s", np.arange(length) / rate_hz, said, rate_hz)
+    return Stamps(None, "s", np.arange(length) / rate_hz, reason, rate_hz)
 
 
 def _group(signal: Signal) -> str:
@@ -173,14 +172,14 @@ def _group(signal: Signal) -> str:
 
 
 def _increases(signal: Signal) -> bool:
-    """Return whether a signal counts up; a few stamps that repeat or step back do not matter here."""
+    """Return whether a signal increases in more than 90 % of its steps."""
     values = signal.values[signal.finite, 0]
     steps = np.diff(values)
     return values.size > 2 and bool(steps.size and (steps > 0).mean() > 0.9)
 
 
 def _unusable(signal: Signal, path: str) -> str:
-    """Return why stamps are no clock of the samples."""
+    """Return why stamps cannot be the clock of the samples."""
     steps = np.diff(signal.values[signal.finite, 0])
     repeated, back = float((steps == 0).mean()), float((steps < 0).mean())
     if back:
@@ -193,18 +192,19 @@ def _unusable(signal: Signal, path: str) -> str:
 
 
 def _counts(signal: Signal) -> bool:
-    """Return whether a signal is a mere number of the sample."""
+    """Return whether a signal is the number of the sample."""
     steps = np.diff(signal.values[signal.finite, 0])
     return bool((steps == 1).all())
 
 
-def _told_rate(signals: Sequence[Signal]) -> float | None:
+def _rate_constant(signals: Sequence[Signal]) -> float | None:
+    """Return the rate of the samples from a constant rate or period in the file [Hz]; None without one."""
     for s in signals:
         if s.values.shape == (1,) and s.values[0] > 0:
             if s.meaning.quantity == "rate":
                 return float(s.values[0])
             if s.meaning.quantity == "period":
-                # A period of more than a second is in milliseconds: nobody samples so slowly.
+                # A period above 1 is in milliseconds, as recorders sample faster than once a second.
                 return 1.0 / float(s.values[0] if s.values[0] < 1.0 else 1e-3 * s.values[0])
     return None
 
@@ -216,19 +216,19 @@ def _stamps(signal: Signal, path: str) -> Stamps:
     seconds = {unit: nanoseconds * 1e-9 for unit, nanoseconds in STAMP_UNITS.items()}
     wall = [u for u, s in seconds.items() if _WALL_S[0] < begin * s < _WALL_S[1]]
     likely = [u for u, s in seconds.items() if _RATES_HZ[0] <= 1 / (period * s) <= _RATES_HZ[1]]
-    told = signal.meaning.unit if signal.meaning.unit in STAMP_UNITS else ""
-    if told:
-        unit, said = told, "by its name"
+    named_unit = signal.meaning.unit if signal.meaning.unit in STAMP_UNITS else ""
+    if named_unit:
+        unit, reason = named_unit, "by its name"
     elif len(both := [u for u in wall if u in likely]) == 1:
-        unit, said = both[0], f"{begin:.6g} is a date since 1970"
+        unit, reason = both[0], f"{begin:.6g} is a date since 1970"
     elif len(likely) == 1:
-        unit, said = likely[0], f"{1 / (period * seconds[likely[0]]):.4g} samples a second"
+        unit, reason = likely[0], f"{1 / (period * seconds[likely[0]]):.4g} samples a second"
     else:
         raise UsageError(
             f"in which unit are the stamps {signal.name!r} of {path}? They are {period:.6g} apart. "
             f"Candidates: {', '.join(likely) or 'none'}",
             hint="end their name with the unit, as in t_ms, or write a mapping with stamp_unit",
         )
-    own = values * seconds[unit]
+    t_s = values * seconds[unit]
     counts = int((steps < 0).sum()), int((steps == 0).sum())
-    return Stamps(signal.sources[0], unit, own, said, None, *counts)
+    return Stamps(signal.sources[0], unit, t_s, reason, None, *counts)

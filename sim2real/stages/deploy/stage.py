@@ -38,7 +38,7 @@ from sim2real.stages.pipeline.python_arguments import (
     identification_of,
     robot_first,
 )
-from sim2real.stages.terminal.console import note, table
+from sim2real.stages.terminal.console import artifact_table, note, table
 
 
 def deploy(
@@ -136,8 +136,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
 
         stage.output("page", deploy_page(stage.folder).name)
         if found.gap:
-            headers = ["quantity", "robot", "simulation", "gap"]
-            print(table([[g.quantity, g.real, g.simulation, g.gap] for g in found.gap], headers))
+            print(artifact_table(found.rows()))
         from sim2real.stages.deploy.verdict import show
 
         show(found)

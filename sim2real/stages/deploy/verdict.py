@@ -19,7 +19,7 @@ from sim2real.stages.deploy.next_command import LATER, commands
 from sim2real.stages.deploy.trajectories import off_course
 from sim2real.stages.estimation.replay import AS_HERE, tested
 from sim2real.stages.pipeline.pipeline import Pipeline
-from sim2real.stages.terminal.console import note, progress, table
+from sim2real.stages.terminal.console import artifact_table, note, progress
 from sim2real.stages.terminal.interruption import patiently
 
 _OFF = 3.0
@@ -122,19 +122,11 @@ def verdict_of(replay: Sequence[Replay], drifted: Drift | None) -> Advice | None
 def show(deployed: Deployment) -> None:
     """Print the tests and the verdict of a deployment."""
     if deployed.trained:
-        rows = [[g.quantity, g.real, g.simulation, g.gap] for g in deployed.trained]
-        print(table(rows, ["times", "robot", "in training", "gap"]))
+        print(artifact_table(deployed.times_table()))
     if deployed.replay:
-        models = list(deployed.replay[0].rmse)
-        rows = [[r.name, *(r.rmse.get(m) for m in models), r.promised, r.unit] for r in deployed.replay]
-        print(table(rows, [f"commands played again, {deployed.replay[0].horizon_s:g} s", *models, "promised", "unit"]))
+        print(artifact_table(deployed.replay_table()))
     if deployed.drift is not None:
-        alarms = set(deployed.drift.alarms)
-        rows = [
-            [c.name, c.before, c.now, f"[{c.low95:.4g}, {c.high95:.4g}]", c.unit, c.explains, c.name in alarms]
-            for c in deployed.drift.changes
-        ]
-        print(table(rows, ["changed alone", "identified", "now", "95 % interval", "unit", "explains", "alarm"]))
+        print(artifact_table(deployed.drift.rows()))
     if deployed.advice is not None:
         note(f"verdict: {deployed.advice.status}")
         for reason in deployed.advice.reasons:

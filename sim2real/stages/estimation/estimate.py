@@ -12,9 +12,9 @@ from sim2real.artifacts.identification import (
     ROUND_TRIP,
     Determined,
     Estimate,
+    HeldOutPart,
     Identification,
     Judgement,
-    Left,
     Matrix,
 )
 from sim2real.identify.fit import Fit
@@ -52,7 +52,7 @@ class Findings:
         return self.at.x
 
     @staticmethod
-    def of(fit: Fit, without: Sequence[Left] = ()) -> Findings:
+    def of(fit: Fit, without: Sequence[HeldOutPart] = ()) -> Findings:
         """Compute how uncertain a fit is.
 
         Args:

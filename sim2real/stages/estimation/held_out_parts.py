@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.special import stdtrit
 
-from sim2real.artifacts.identification import Left
+from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
 from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
@@ -106,7 +106,7 @@ def _mean_square(errors: Mapping[str, float | None], sigma: Mapping[str, float])
 
 def examined(
     found: Fit, config: IdentifyConfig, names: Sequence[str], choice: optional_terms.Selection | None = None
-) -> tuple[Left, ...]:
+) -> tuple[HeldOutPart, ...]:
     """Return what is identified without each part of the recordings, and how far it is off there.
 
     Args:
@@ -124,7 +124,7 @@ def examined(
     return tuple(leave_out(found, parts, config.settle_s, choice is not None, config.free_run_s, among))
 
 
-def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[Left]) -> Uncertainty:
+def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[HeldOutPart]) -> Uncertainty:
     """Return an uncertainty that holds how much estimates differ without one part or another.
 
     Args:
@@ -138,7 +138,7 @@ def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Seq
     return between_parts(spread, table, x, moved, share)
 
 
-def sentences(rows: Sequence[Left], positions: Sequence[Position], horizon_s: float) -> list[str]:
+def sentences(rows: Sequence[HeldOutPart], positions: Sequence[Position], horizon_s: float) -> list[str]:
     """Return how far each position is off on parts that were left out: mean, worst, and what one more would be.
 
     Args:
@@ -174,7 +174,7 @@ def further(errors: np.ndarray) -> float:
     return float(math.exp(logs.mean() + stdtrit(k - 1, 0.95) * logs.std(ddof=1) * math.sqrt(1.0 + 1.0 / k)))
 
 
-def promises(rows: Sequence[Left]) -> dict[str, float]:
+def promises(rows: Sequence[HeldOutPart]) -> dict[str, float]:
     """Return below which error 95 % of further parts stay, up to the horizon: field -> error, where there are parts.
 
     The error on the one part that was held out is no such promise: half of all further parts are further off.
@@ -183,7 +183,7 @@ def promises(rows: Sequence[Left]) -> dict[str, float]:
     return {field: further(errors) for field, errors in found.items() if errors.size >= _LEAST_PARTS}
 
 
-def _of(rows: Sequence[Left], position: Position, kind: str) -> np.ndarray:
+def _of(rows: Sequence[HeldOutPart], position: Position, kind: str) -> np.ndarray:
     return _finite([getattr(row, kind).get(position.column) for row in rows])
 
 

@@ -16,7 +16,7 @@ from sim2real.log.importing import evidence, importer
 from sim2real.log.importing.files.foreign import ForeignFile, joined, open_foreign
 from sim2real.log.importing.mapping import FieldMapping, ImportMapping, load_mapping, to_toml
 from sim2real.log.importing.proposal import pipeline_name, propose
-from sim2real.log.importing.quantities import Asked
+from sim2real.log.importing.quantities import ImportHints
 from sim2real.log.importing.signal_names import meaning
 from sim2real.robots.from_model.mjcf import joints_of, read_model, slides_of, unit_for
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
@@ -82,7 +82,7 @@ def described(home: pipeline.Pipeline) -> bool:
     return isinstance(home.load(), MjcfRobot)
 
 
-def asked(config: ImportConfig) -> Asked:
+def asked(config: ImportConfig) -> ImportHints:
     """Return what the user says of files without a mapping."""
     if config.mjcf is not None:
         name = config.pipeline or pipeline_name(config.mjcf)
@@ -91,10 +91,10 @@ def asked(config: ImportConfig) -> Asked:
     if home is not None:
         own: RobotConfig = home.load().config  # pyright: ignore[reportAttributeAccessIssue] - `described` said so
         return replace(asked_of_model(own.model, home.name, own.joints, config.rate_hz), as_told=config.as_told)
-    return Asked("robot", config.rate_hz, config.joints, as_told=config.as_told)
+    return ImportHints("robot", config.rate_hz, config.joints, as_told=config.as_told)
 
 
-def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz: float | None = None) -> Asked:
+def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz: float | None = None) -> ImportHints:
     """Return what a model says of files without a mapping.
 
     Args:
@@ -109,10 +109,10 @@ def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz:
     if unknown := [j for j in joints if j not in own]:
         raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
     ranges = np.array([model.joint(j).range for j in joints or own])
-    return Asked(name, rate_hz, joints or own, ranges, slides=slides_of(model, joints or own))
+    return ImportHints(name, rate_hz, joints or own, ranges, slides=slides_of(model, joints or own))
 
 
-def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
+def proposed(file: ForeignFile, told: ImportHints) -> tuple[ImportMapping, str]:
     """Return the mapping that a file's names and data speak for, and its text; the evidence is printed.
 
     Raises:
@@ -136,7 +136,7 @@ def proposed(file: ForeignFile, told: Asked) -> tuple[ImportMapping, str]:
     return mapping, to_toml(mapping, [f"Proposed by `sim2real import {file.path.name}`:", *lines, names])
 
 
-def in_lengths(mapping: ImportMapping, told: Asked, path: Path) -> tuple[ImportMapping, str]:
+def in_lengths(mapping: ImportMapping, told: ImportHints, path: Path) -> tuple[ImportMapping, str]:
     """Return a proposed mapping with the units of slides; it was proposed as if their positions were angles.
 
     Raises:

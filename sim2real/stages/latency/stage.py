@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from sim2real.artifacts.estimation.links import links_table
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
@@ -18,7 +19,7 @@ from sim2real.stages.on_robot.open_robot import show_withheld, warn
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.record.stage import record
-from sim2real.stages.terminal.console import note, progress, table
+from sim2real.stages.terminal.console import artifact_table, note, progress, table
 
 _PICTURE = "latency.png"
 
@@ -52,7 +53,7 @@ def run(pipeline: Pipeline, config: LatencyConfig, root: Path, run_dir: Path | N
             picture(stage.output("picture", _PICTURE), latency, recording, chain, found.links if found else ())
         print(table(*rows(latency)))
         if found is not None and found.links:
-            print(link_table(found.links))
+            print(artifact_table(links_table(found.links)))
         stage.summary(_summary(latency, found, recording))
     return stage.result
 

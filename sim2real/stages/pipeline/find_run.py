@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sim2real.artifacts.run.manifest import read_manifest
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished, run_folders
-from sim2real.artifacts.run.stage_status import standing, why_stale
+from sim2real.artifacts.run.stage_status import stage_status, why_stale
 from sim2real.errors import UsageError
 from sim2real.stages.pipeline.pipeline import available
 from sim2real.stages.terminal.console import note
@@ -41,7 +41,7 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
 
 def warn_of_stale(found: StageFolder) -> StageFolder:
     """Return a finished stage that is taken up; print a warning where its run has a newer input of it."""
-    if why := why_stale(found, standing(found.run_dir)):
+    if why := why_stale(found, stage_status(found.run_dir)):
         note(f"warning: {why}; `sim2real run {found.manifest['pipeline']} --resume {found.run_dir}` makes it again")
     return found
 

@@ -11,9 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from sim2real.artifacts.paths import shown as shown
+
+if TYPE_CHECKING:
+    from sim2real.artifacts.summary import Table
 
 _TICK_S = 1.0
 """How often a terminal's progress is drawn again, whatever is computed [s]."""
@@ -97,6 +100,11 @@ def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -
         "  ".join(cell.rjust(w) if r else cell.ljust(w) for cell, w, r in zip(row, widths, right, strict=True)).rstrip()
         for row in body
     )
+
+
+def artifact_table(content: Table) -> str:
+    """Return a table of an artifact as aligned plain text."""
+    return table(content.rows, content.headers)
 
 
 def pairs(values: Mapping[str, Any]) -> str:

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
 from sim2real.stages.pipeline.pipeline import Pipeline
-from sim2real.stages.terminal.console import table
+from sim2real.stages.terminal.console import artifact_table
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.training_setup import prepare
 
@@ -39,9 +36,9 @@ def explain(
         from sim2real.view.page.episodes import picture  # matplotlib takes 0.5 s to import
 
         picture(stage.output("picture", "episodes.png"), episodes)
-        print(table(*parameter_rows(episodes)))
+        print(artifact_table(episodes.rows()))
         if episodes.noise:
-            print(table(*noise_rows(episodes)))
+            print(artifact_table(episodes.noise_table()))
         stage.summary(
             {
                 "posterior": f"deviations times {episodes.widening:.1f}, for what the model leaves unexplained",
@@ -55,17 +52,6 @@ def explain(
     return stage.result
 
 
-def parameter_rows(episodes: Episodes) -> tuple[list[list[Any]], list[str]]:
-    """Return the table of what is drawn of each parameter: rows and headers."""
-    rows = []
-    for p in episodes.parameters:
-        drawn = episodes.draws[p.name]
-        low, high = np.quantile(drawn, [0.025, 0.975])
-        known = "" if p.low95 is None or p.high95 is None else f"[{p.low95:.4g}, {p.high95:.4g}]"
-        rows.append([p.name, p.value, known, f"[{low:.4g}, {high:.4g}]", p.unit, "left open by the log" * p.open])
-    return rows, ["parameter", "value", "95 % identified", "95 % drawn", "unit", ""]
-
-
 def disturbance_rows(episodes: Episodes) -> dict[str, str]:
     """Return how often joints are pushed, and how differences grow, in words; empty where they do not."""
     told = {"pushes": f"{episodes.push_hz:g} a second for each joint"} if episodes.push_hz else {}
@@ -73,9 +59,3 @@ def disturbance_rows(episodes: Episodes) -> dict[str, str]:
         first, last = episodes.curriculum
         told["curriculum"] = f"{first:g} of these differences at the first update, {last:g} at the last one"
     return told
-
-
-def noise_rows(episodes: Episodes) -> tuple[list[list[Any]], list[str]]:
-    """Return the table of what readings have on top of the motion: rows and headers."""
-    rows = [[n.column, n.deviation, n.quantum, n.bias, n.unit] for n in episodes.noise]
-    return rows, ["reading", "deviation", "step", "bias", "unit"]

@@ -120,7 +120,7 @@ def train(
         seen["log"] = observations_of(made.robot, log, make_runner(weights, contract, None, policy.spec, graph))
     references = {name: reference_of(policy, observations) for name, observations in seen.items()}
     about = {"model": config.model} | _told(result, ppo, sweep, made.episodes)
-    about |= {} if weak is None else {"what breaks it": weak.said}
+    about |= {} if weak is None else {"what breaks it": weak.advice}
     return Bundle(contract, weights, _history(result), made.episodes, None, weak, policy.spec, graph, references, about)
 
 

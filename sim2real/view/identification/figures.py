@@ -14,29 +14,29 @@ from sim2real.view import style
 from sim2real.view.panels import Line, Panel, over_time, with_gaps, with_unit
 from sim2real.view.style import BLUE, GREEN, INK, MUTED, ORANGE, new_figure, styled, to_svg
 
-MOST_PANELS = 6
-_VOICES = {
+MAX_PANELS = 6
+_LABELS = {
     "measured": "measured",
     "identified": "identified model",
-    "no delay": "the same, fitted without delays",
+    "no delay": "model fitted without delays",
     "nominal": "nominal model",
 }
-_SAID = {"hold": "hold: nothing changes", "told": "told: where it was told to be"}
+_BASELINES = {"hold": "hold: the last measurement", "told": "told: the goal"}
 
 
 def predictions(found: Identification, name: str) -> str:
-    """Draw measured against predicted, segment by segment; held-out data is shaded, and enlarged beside it."""
+    """Draw measurements and predictions of all segments; held-out data is shaded, and enlarged on the right."""
     panels = []
     for recording, quantity in shown(found, found.recordings):
-        own = found.samples["recording"] == recording
-        rows = found.disjoint() & own
+        of_recording = found.samples["recording"] == recording
+        rows = found.disjoint() & of_recording
         t_s, segment = found.samples["t"][rows], found.samples["segment"][rows]
-        lines = [Line(*_measured(found, quantity, own), _VOICES["measured"], "measured")]
+        lines = [Line(*_measured(found, quantity, of_recording), _LABELS["measured"], "measured")]
         for model in found.models(quantity):
-            if model != "no delay":  # it would lie between the other two: the free run shows it
+            if model != "no delay":  # its curve lies between the other two; the free run shows it
                 values = found.samples[f"{quantity}_{model}"][rows]
-                lines.append(Line(*with_gaps(t_s, values, segment), _VOICES[model], model))
-        ordered = np.flatnonzero(own)[np.argsort(found.samples["t"][own], kind="stable")]
+                lines.append(Line(*with_gaps(t_s, values, segment), _LABELS[model], model))
+        ordered = np.flatnonzero(of_recording)[np.argsort(found.samples["t"][of_recording], kind="stable")]
         spans = _spans(found.samples["t"][ordered], found.samples["held_out"][ordered].astype(bool))
         begin = spans[0][0] if spans else float(t_s[0])
         zoom = (round(begin, 1), round(min(begin + 4.0, float(t_s[-1])), 1))
@@ -55,26 +55,26 @@ def predictions(found: Identification, name: str) -> str:
 
 
 def free_runs(found: Identification, name: str) -> str:
-    """Draw the held-out part of each recording beside one simulation of all of it, with its errors."""
+    """Draw the held-out part of each recording, and one simulation of all of it with its errors."""
     panels = []
     for recording, quantity in shown(found, np.unique(found.free["recording"]).tolist()):
         rows = found.free["recording"] == recording
         segments, counts = np.unique(found.free["segment"][rows], return_counts=True)
-        rows &= found.free["segment"] == segments[counts.argmax()]  # the longest, of equal ones the first
+        rows &= found.free["segment"] == segments[counts.argmax()]  # the longest segment
         t_s = found.free["t"][rows]
         models = [m for m in ("measured", "no delay", "identified") if f"{quantity}_{m}" in found.free]
-        lines = [Line(t_s, found.free[f"{quantity}_{m}"][rows].astype(float), _VOICES[m], m) for m in models]
+        lines = [Line(t_s, found.free[f"{quantity}_{m}"][rows].astype(float), _LABELS[m], m) for m in models]
         settled = t_s[found.free["into"][rows] <= found.settle_s]
         spans = [(float(settled[0]), float(settled[-1]))] if len(settled) else []
-        said = _errors_of(found, recording, quantity)
-        title = ": ".join(filter(None, [title_of(found, recording), said]))
+        errors = _errors_of(found, recording, quantity)
+        title = ": ".join(filter(None, [title_of(found, recording), errors]))
         panels.append(Panel(with_unit(quantity, found.units), lines, title, spans, framed=("measured", "identified")))
-    label = "What is held out of each recording, measured and simulated from one initial state"
+    label = "The held-out part of each recording, measured and simulated from one initial state"
     return over_time(panels, name, label, shade="initial state fitted here")
 
 
 def title_of(found: Identification, recording: int) -> str:
-    """Return what a recording is called; empty where there is but one."""
+    """Return the name of a recording; empty for a single recording."""
     if len(found.recordings) < 2:
         return ""
     names = log_names(found)
@@ -87,15 +87,15 @@ def log_names(found: Identification) -> list[str]:
 
 
 def shown(found: Identification, recordings: Sequence[int]) -> list[tuple[int, str]]:
-    """Return recording and field of the panels that a figure has room for: first fields first."""
-    pairs = [(r, quantity) for quantity in found.fields for r in recordings][:MOST_PANELS]
+    """Return recording and field of the panels that fit into a figure."""
+    pairs = [(r, quantity) for quantity in found.fields for r in recordings][:MAX_PANELS]
     return sorted(pairs, key=lambda pair: (pair[0], found.fields.index(pair[1])))
 
 
 def prediction_errors(found: Identification, name: str) -> str:
-    """Draw each model's error over the horizon: a row for each field, held-out data beside the fitted."""
-    told = {f for row in found.prediction for f, error in row.rmse.items() if error is not None}
-    fields = [*[f for f in found.fields if f in told], *sorted(told - set(found.fields))][:MOST_PANELS]
+    """Draw each model's error over the horizon: a row for each field, a column for held-out and one for fitted data."""
+    with_errors = {f for row in found.prediction for f, error in row.rmse.items() if error is not None}
+    fields = [*[f for f in found.fields if f in with_errors], *sorted(with_errors - set(found.fields))][:MAX_PANELS]
     models = list(dict.fromkeys(row.model for row in found.prediction))
     kinds = [k for k in (True, False) if any(row.held_out == k for row in found.prediction)]
     with styled():
@@ -116,14 +116,14 @@ def prediction_errors(found: Identification, name: str) -> str:
         entries = []
         for place, model in enumerate(models):
             color, dash, mark = _model_look(model, place)
-            label = _SAID.get(model, model)
+            label = _BASELINES.get(model, model)
             entries.append(Line2D([], [], color=color, ls=dash, marker=mark, ms=5, label=label))
         style.legend_above(figure, entries)
         return to_svg(figure, name, f"Prediction error of {', '.join(models)} over the horizon")
 
 
 def search(found: Identification, name: str) -> str:
-    """Draw the best loss of each generation, and where the refinement ended."""
+    """Draw the best loss of each generation, and the loss after the refinement."""
     refined = [r.after for r in found.search.refined if r.after is not None]
     with styled():
         figure = new_figure(2.6, 4.4)
@@ -172,22 +172,22 @@ def correlation(names: Sequence[str], matrix: np.ndarray, name: str) -> str:
 
 
 def _errors_of(found: Identification, recording: int, quantity: str) -> str:
-    """Return the errors of a free run beside those of holding still."""
+    """Return the errors of a free run and of its baselines."""
     rows = [r for r in found.free_run if r.recording == recording and r.field == quantity and r.held_out]
     best: dict[str, FreeRun] = {}
     for row in sorted(rows, key=lambda r: -r.seconds):
         best.setdefault(row.model, row)
-    said = [
+    texts = [
         f"{m} RMSE {best[m].rmse:.3g}, MAE {best[m].mae:.3g}" for m in ("identified", "no delay", "hold") if m in best
     ]
-    return " · ".join(said)
+    return " · ".join(texts)
 
 
-def _measured(found: Identification, quantity: str, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all measurements of a field once, in order of time: segments that overlap repeat them."""
-    t_s, first = np.unique(found.samples["t"][own], return_index=True)
+def _measured(found: Identification, quantity: str, of_recording: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return each measurement of a field once, in order of time, as overlapping segments repeat them."""
+    t_s, first = np.unique(found.samples["t"][of_recording], return_index=True)
     pieces = np.cumsum(np.diff(t_s, prepend=t_s[:1]) > 3 * np.median(np.diff(t_s)))
-    return with_gaps(t_s, found.samples[f"{quantity}_measured"][own][first], pieces)
+    return with_gaps(t_s, found.samples[f"{quantity}_measured"][of_recording][first], pieces)
 
 
 def _spans(t_s: np.ndarray, chosen: np.ndarray) -> list[tuple[float, float]]:
@@ -197,15 +197,15 @@ def _spans(t_s: np.ndarray, chosen: np.ndarray) -> list[tuple[float, float]]:
 
 
 def _model_look(model: str, number: int) -> tuple[str, style.Dash, str]:
-    """Return colour, dash and mark of a model: those that it has in all figures, if it has any."""
-    known = {
+    """Return colour, dash and mark of a model, which are the same in all figures."""
+    looks = {
         "identified": (BLUE, style.DASHES[0], "o"),
         "no delay": (INK, style.DASHES[3], "D"),
         "nominal": (ORANGE, style.DASHES[1], "s"),
         "hold": (MUTED, style.DASHES[2], "^"),
         "told": (GREEN, style.DASHES[1], "v"),
     }
-    return known.get(model, ((GREEN, style.PURPLE)[number % 2], style.DASHES[1], "v"))
+    return looks.get(model, ((GREEN, style.PURPLE)[number % 2], style.DASHES[1], "v"))
 
 
 def _error_line(

@@ -1,4 +1,4 @@
-"""Figures of the identified parameters: where each estimate lies, how sure it is, and how recordings agree."""
+"""Figures of the estimates: intervals within the bounds, and the agreement of recordings."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from sim2real.view.style import BLUE, GREEN, GRID, INK, MUTED, ORANGE, SHADE, ne
 
 _FAR = 6.0
 """Standard errors beyond which a mark is drawn as an arrow at the edge."""
-_KINDS = ("relative to nominal", "place between the bounds [%]", "time [ms]")
-_MOST_QUANTITIES = 12
+_KINDS = ("relative to nominal", "position between the bounds [%]", "time [ms]")
+_MAX_QUANTITIES = 12
 
 
 def intervals(estimates: Sequence[Estimate], name: str) -> str:
-    """Draw each parameter within its bounds; beside it, in standard errors, how far truth and nominal value are off."""
+    """Draw each estimate within its bounds, and the distance of truth and nominal value in standard errors."""
     groups = [(kind, g) for kind in _KINDS if (g := [e for e in estimates if _kind(e) == kind])]
     with styled():
         figure = new_figure(0.9 + 0.36 * len(estimates) + 0.4 * len(groups))
@@ -52,7 +52,7 @@ def intervals(estimates: Sequence[Estimate], name: str) -> str:
 
 def aggregate(quantities: Sequence[Quantity], name: str) -> str:
     """Draw each recording's estimate with its 95 % interval, their mean, and the interval for a further recording."""
-    shown = quantities[:_MOST_QUANTITIES]
+    shown = quantities[:_MAX_QUANTITIES]
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
     with styled():
@@ -80,7 +80,7 @@ def _recordings(axes: Axes, quantity: Quantity) -> None:
     axes.axhspan(low, high, color=SHADE, lw=0, zorder=0)
     axes.axhline(scale * quantity.mean, color=INK, lw=1.4, zorder=1)
     axes.errorbar(at, values, yerr=reach, color=BLUE, fmt="o", ms=4.5, lw=1.6, zorder=3)
-    # The axis fits the estimates: the interval for a further recording may be very wide where recordings are few.
+    # Fit the axis to the estimates, as the interval for a further recording can be very wide.
     bottom, top = float((values - reach).min()), float((values + reach).max())
     room = 0.6 * (top - bottom) or 1.0
     axes.set_ylim(max(bottom - room, min(low, bottom) - 0.1 * room), min(top + room, max(high, top) + 0.1 * room))
@@ -128,7 +128,7 @@ def _inside_bounds(axes: Axes, group: Sequence[Estimate], kind: str) -> None:
 
 
 def _placed(e: Estimate, kind: str) -> Callable[[float], float]:
-    """Return where a value of a parameter stands on its group's axis."""
+    """Return the function from a parameter's value to its place on the group's axis."""
     if kind == _KINDS[2]:
         return lambda v: 1e3 * v
     if kind == _KINDS[0]:

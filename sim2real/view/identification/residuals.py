@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from sim2real.artifacts.identification import Identification
 from sim2real.view import style
-from sim2real.view.identification.figures import MOST_PANELS
+from sim2real.view.identification.figures import MAX_PANELS
 from sim2real.view.panels import with_unit
 from sim2real.view.style import BLUE, GRID, INK, MUTED, ORANGE, SHADE, new_figure, styled, to_svg
 
@@ -21,7 +21,7 @@ _BINS = 41
 
 @dataclass(frozen=True)
 class Residuals:
-    """Measured minus predicted of one field, without the part that initial states were fitted to.
+    """Measured minus predicted of one field, without the part to which initial states are fitted.
 
     Attributes:
         t_s: Shape ``(N,)``: time along all recordings [s], one after the other.
@@ -76,7 +76,7 @@ def autocorrelation(values: np.ndarray, segment: np.ndarray) -> np.ndarray:
 
 def figure(found: Identification, name: str) -> str:
     """Draw a row for each field: residuals over time, their histogram, and their autocorrelation."""
-    fields = [f for f in found.fields if "identified" in found.models(f)][:MOST_PANELS]
+    fields = [f for f in found.fields if "identified" in found.models(f)][:MAX_PANELS]
     with styled():
         drawing = new_figure(0.8 + 1.65 * len(fields))
         grid = drawing.subplots(len(fields), 3, squeeze=False, width_ratios=[2.0, 1, 1])
@@ -95,9 +95,13 @@ def figure(found: Identification, name: str) -> str:
         ):
             axes.set_xlabel(label)
         entries: list[Line2D | Patch] = [Line2D([], [], color=BLUE, label="measured \u2212 identified")]
-        entries.append(Line2D([], [], color=INK, ls=style.DASHES[1], lw=1.1, label="normal, of the same deviation"))
+        entries.append(
+            Line2D([], [], color=INK, ls=style.DASHES[1], lw=1.1, label="normal distribution of the same deviation")
+        )
         if found.sigma:
-            entries.append(Line2D([], [], color=ORANGE, ls=style.DASHES[0], lw=1.4, label="assumed of the measurement"))
+            entries.append(
+                Line2D([], [], color=ORANGE, ls=style.DASHES[0], lw=1.4, label="assumed noise of the measurement")
+            )
         entries.append(Patch(facecolor=SHADE, edgecolor=GRID, label="95 % of white noise"))
         style.legend_above(drawing, entries)
         return to_svg(drawing, name, f"Residuals of {', '.join(fields)} on held-out data")
@@ -112,7 +116,7 @@ def _over_time(axes: Axes, rest: Residuals, sigma: float | None) -> None:
 
 
 def _histogram(axes: Axes, values: np.ndarray, sigma: float | None) -> None:
-    """Draw the density over the range of most residuals; the outer bins hold what lies beyond."""
+    """Draw the density over the range of most residuals; the outer bins hold the rest."""
     if not values.size:
         return
     own = float(np.sqrt(np.mean(values**2))) or 1e-12
@@ -127,7 +131,7 @@ def _histogram(axes: Axes, values: np.ndarray, sigma: float | None) -> None:
         axes.set_ylim(0, min(axes.get_ylim()[1], 2.2 * top))
     axes.set_yticks([])
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-    text = f"RMS {own:.3g}" + (f", {own / sigma:.2g} times the assumed" if sigma else "")
+    text = f"RMS {own:.3g}" + (f", {own / sigma:.2g} times the assumed noise" if sigma else "")
     axes.set_title(text, fontweight="normal", fontsize=8)
 
 

@@ -1,4 +1,4 @@
-"""The section of an identification: its verdict first, then parameters, predictions, and what is left unexplained."""
+"""The section of an identification: verdict, parameters, predictions, residuals, correlations."""
 
 from __future__ import annotations
 
@@ -34,16 +34,17 @@ from sim2real.view.readable_units import in_readable_unit
 
 _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),
-    "hit a bound": ("doubt", "Hit a bound: an estimate lies where the search was not allowed to go further"),
+    "hit a bound": ("doubt", "Hit a bound: an estimate is at a bound of the search"),
     "not identifiable": ("doubt", "Not identifiable: the data does not determine every parameter"),
-    "lacks a term": ("doubt", "Lacks a term: free runs are far off, and one more term mends them"),
+    "lacks a term": ("doubt", "Lacks a term: free runs have large errors, and one more term of the model reduces them"),
     "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
 }
 _STRONG = 0.9
+"""Correlations above this are listed."""
 
 
 def identify_section(artifact: StageFolder) -> PageSection:
-    """Return the verdict, the parameters and how sure they are, and how well the model predicts."""
+    """Return the section of an identify stage."""
     found = Identification.load(artifact.folder)
     blocks = [
         *_parameters(found),
@@ -57,11 +58,15 @@ def identify_section(artifact: StageFolder) -> PageSection:
     ]
     if np.isfinite(found.search.history).any():
         refined = found.search.refined
-        gain = f" Dashed: refined in {sum(r.steps for r in refined)} steps." if refined else ""
+        gain = f" Dashed: the loss after {sum(r.steps for r in refined)} steps of refinement." if refined else ""
         blocks.append(
-            FigureBlock(figures.search(found, "identify-search"), f"The best loss of the search.{gain}", narrow=True)
+            FigureBlock(
+                figures.search(found, "identify-search"),
+                f"The best loss of each generation of the search.{gain}",
+                narrow=True,
+            )
         )
-    lead = "Dynamics and delays from the log, with how far each can be trusted."
+    lead = "Dynamics and delays from the log, each with its 95 % interval."
     tiles = list(_tiles(found))
     return PageSection("identify", "Identify", lead, tiles, [*blocks, *about(artifact)], _banner(found))
 
@@ -81,23 +86,23 @@ def _sentence(text: str) -> str:
 
 
 def _parameters(found: Identification) -> list[Block]:
-    """Return table and figure of the parameters, what lies at a bound, and what the data determines."""
+    """Return table and figure of the parameters, and their determinacy."""
     bounded = [e for e in found.parameters if e.verdict == "at a bound"]
-    active = f"At a bound: {', '.join(_at_bound(e) for e in bounded)}." if bounded else "No estimate lies at a bound."
+    active = f"At a bound: {', '.join(_at_bound(e) for e in bounded)}." if bounded else "No estimate is at a bound."
     blocks: list[Block] = [
         _parameter_table(found.parameters),
         FigureBlock(
             intervals.intervals(found.parameters, "identify-intervals"),
-            f"Left: each estimate within the bounds of the search. {active} Right: the same in standard errors; what "
-            "lies inside the shaded 95 % band agrees with the estimate. Arrows point to marks beyond the edge.",
+            f"Left: each estimate within the bounds of the search. {active} Right: the same in standard errors; values "
+            "inside the shaded 95 % band agree with the estimate. Arrows point to marks beyond the edge.",
         ),
     ]
     if found.check:
-        known = found.check
-        items = [_sentence(m) for m in known.messages] or ["Every parameter is determined by itself."]
-        items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(known.condition, 2)}.")
-        blocks.append(ListBlock("What the data determines", items))
-        errors = known.standard_error_per_minute
+        check = found.check
+        items = [_sentence(m) for m in check.messages] or ["The data determines each parameter."]
+        items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(check.condition, 2)}.")
+        blocks.append(ListBlock("Determined by the data", items))
+        errors = check.standard_error_per_minute
         rows = [_minute(e, value) for e in found.parameters if (value := errors.get(e.name)) is not None]
         if rows:
             caption = "Standard error from one minute of such data"
@@ -155,54 +160,48 @@ def _aggregate(found: Identification) -> list[Block]:
     count = len(quantities[0].estimates)
     names = figures.log_names(found)[:count]
     logs = "".join(f" {i}: {log}." for i, log in enumerate(names)) if len(names) == count else ""
-    rows = []
-    for q in quantities:
-        scale, unit = (1e3, "ms") if q.unit == "s" else (1.0, pretty_unit(q.unit))
-        places = decimals_for(scale * q.standard_error, scale * q.mean)
-        numbers = [fixed(scale * v, places) for v in (q.mean, q.standard_error, q.between)]
-        ends = f"{fixed(scale * q.low95, places)} to {fixed(scale * q.high95, places)}"
-        rows.append([q.name, *numbers, ends, unit, "yes" if q.agree else "no"])
-    heads = ("quantity", "mean", "s.e. of the mean", "spread", "95 % for a further recording", "unit", "agree")
     loose = ", ".join(q.name for q in quantities if not q.agree)
-    said = f" Beyond what their errors explain they differ in {loose}." if loose else " They agree in everything."
+    agreement = (
+        f" Their differences in {loose} exceed the standard errors." if loose else " They agree in all quantities."
+    )
     return [
         FigureBlock(
             intervals.aggregate(quantities, "identify-aggregate"),
-            f"Each recording identified by itself.{said} The shaded interval is what to expect of a further one; "
+            f"Estimates from each recording alone.{agreement} The shaded 95 % interval is for a further recording; "
             f"with few recordings it is wide.{logs}",
         ),
-        TableBlock(f"Over {count} recordings", heads, rows, text_columns=(5, 6)),
+        TableBlock.of(f"Over {count} recordings", found.recordings_table()),
     ]
 
 
 def _parts(found: Identification) -> list[Block]:
-    """Return the errors on parts of the recordings that were left out of the fit, with their mean and the worst."""
+    """Return the errors on held-out parts of the recordings, with their mean and the largest."""
     rows = found.left_out
     if not rows:
         return []
     kinds = [(kind, column) for kind in ("ahead", "free") for column in getattr(rows[0], kind)]
     units = {column: unit_of(column, found.units) for _, column in kinds}
-    heads = [f"{column} {'ahead' if kind == 'ahead' else 'in one go'} [{units[column]}]" for kind, column in kinds]
+    heads = [f"{column} {'ahead' if kind == 'ahead' else 'in a free run'} [{units[column]}]" for kind, column in kinds]
     errors = np.array([[getattr(r, kind).get(column, np.nan) for kind, column in kinds] for r in rows], np.float64)
     with_terms = bool(found.terms) or any(r.terms for r in rows)
     table = []
-    moved = [own[np.isfinite(own)] for own in errors.T]  # of a part in which a joint rests there is no error
+    finite = [column[np.isfinite(column)] for column in errors.T]  # a part in which a joint rests has no error
     summed = [
-        (name, [of(own) if own.size else np.nan for own in moved])
-        for name, of in (("mean", np.mean), ("worst", np.max))
+        (name, [reduce(column) if column.size else np.nan for column in finite])
+        for name, reduce in (("mean", np.mean), ("worst", np.max))
     ]
-    for name, own, terms in [
+    for name, values, terms in [
         *((r.name, e, ", ".join(r.terms) or "none") for r, e in zip(rows, errors, strict=True)),
         *((name, e, "") for name, e in summed),
     ]:
-        table.append([name, *([terms] if with_terms else []), *(number(e, 3) for e in own)])
-    caption = "Identified without this part, and off on it by (root mean square)"
-    columns = ["left out", *(["terms"] if with_terms else []), *heads]
+        table.append([name, *([terms] if with_terms else []), *(number(e, 3) for e in values)])
+    caption = "Root mean square errors on each held-out part, of a fit without it"
+    columns = ["held-out part", *(["terms"] if with_terms else []), *heads]
     return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,))]
 
 
 def _alternatives(found: Identification) -> list[Block]:
-    """Return the models that explain the recordings as well as the estimate, with their parameters and shares."""
+    """Return the models that fit the recordings as well as the estimate, with their parameters and shares."""
     if found.posterior is None or not found.posterior.others:
         return []
     named = [("estimate", found.posterior), *((o.about, o.posterior) for o in found.posterior.others)]
@@ -215,21 +214,22 @@ def _alternatives(found: Identification) -> list[Block]:
         [name, *(number(own.get(name), 3) for own in values)] for name in dict.fromkeys(n for v in values for n in v)
     ]
     rows.insert(0, ["share of the draws", *(f"{100 * s:.0f} %" for s in shares)])
-    caption = "Models that explain the recordings as well: training draws robots of all"
+    caption = "Models that fit the recordings equally well; training draws robots from all of them"
     return [TableBlock(caption, ("parameter", *(name for name, _ in named)), rows)]
 
 
 def _predictions(found: Identification) -> list[Block]:
-    """Return curves of errors, free runs, and the segments."""
+    """Return the curves of errors, the free runs, and the segments."""
     blocks: list[Block] = []
     if len(found.held_out) > 1:
-        blocks.append(_positions_table(found))
+        caption = f"Held-out RMSE of every position after {found.held_out[0].horizon_s:g} s, the largest first"
+        blocks.append(TableBlock.of(caption, found.held_out_table()))
     if found.prediction:
         blocks.append(
             FigureBlock(
                 figures.prediction_errors(found, "identify-errors"),
-                "How the error grows with the horizon, from initial states fitted to the samples before it. On "
-                "held-out data the identified model must stay below all others.",
+                "Errors over the horizon, from initial states that are fitted to the samples before it. On held-out "
+                "data the identified model must have the smallest error.",
             )
         )
         blocks.append(_prediction_table(found))
@@ -239,7 +239,7 @@ def _predictions(found: Identification) -> list[Block]:
             FigureBlock(
                 figures.free_runs(found, "identify-free"),
                 "All held-out data in one simulation, from one initial state, with the recorded commands and timing."
-                f"{_left_out(found, recordings)}",
+                f"{_hidden_panels(found, recordings)}",
             )
         )
         if found.free_run:
@@ -249,31 +249,31 @@ def _predictions(found: Identification) -> list[Block]:
     blocks.append(
         FigureBlock(
             figures.predictions(found, "identify-predictions"),
-            "Every segment is simulated from its own initial state. Shaded data took no part in the fit."
-            f"{_left_out(found, found.recordings)}",
+            "Each segment is simulated from its own initial state. Shaded data is held out of the fit."
+            f"{_hidden_panels(found, found.recordings)}",
         )
     )
     return blocks
 
 
-def _left_out(found: Identification, recordings: Sequence[int]) -> str:
-    left = len(found.fields) * len(recordings) - len(figures.shown(found, recordings))
-    return f" {left} further panels are left out." if left else ""
+def _hidden_panels(found: Identification, recordings: Sequence[int]) -> str:
+    hidden = len(found.fields) * len(recordings) - len(figures.shown(found, recordings))
+    return f" {hidden} further panels are not shown." if hidden else ""
 
 
 def _residuals(found: Identification) -> list[Block]:
     s = found.samples
     if not s:
         return []
-    there = s["held_out"].astype(bool) & (s["into"] > found.settle_s)
-    if not there.any() or not any("identified" in found.models(f) for f in found.fields):
+    scored = s["held_out"].astype(bool) & (s["into"] > found.settle_s)
+    if not scored.any() or not any("identified" in found.models(f) for f in found.fields):
         return []
-    assumed = " Orange: the noise that was assumed of the measurement." if found.sigma else ""
+    assumed = " Orange: the assumed noise of the measurement." if found.sigma else ""
     return [
         FigureBlock(
             residuals.figure(found, "identify-residuals"),
-            f"What the identified model leaves unexplained on held-out data.{assumed} A slow wave, or an "
-            "autocorrelation that lasts, is something the model lacks; what stays inside the shaded band is noise.",
+            f"Residuals of the identified model on held-out data.{assumed} A slow wave, or a long autocorrelation, "
+            "shows an error of the model; an autocorrelation inside the shaded band is noise.",
         )
     ]
 
@@ -286,31 +286,15 @@ def _correlation(found: Identification) -> list[Block]:
         (names[i], names[j], matrix[i, j]) for i in range(len(names)) for j in range(i) if abs(matrix[i, j]) > _STRONG
     ]
     pairs.sort(key=lambda pair: -abs(pair[2]))
-    said = "; ".join(f"{b} and {a} {v:+.2f}".replace("-", "\u2212") for a, b, v in pairs[:6])
-    strong = f" Beyond ±{_STRONG:g}: {said}." if said else f" None is beyond ±{_STRONG:g}."
+    listed = "; ".join(f"{b} and {a} {v:+.2f}".replace("-", "\u2212") for a, b, v in pairs[:6])
+    strong = f" Beyond ±{_STRONG:g}: {listed}." if listed else f" None is beyond ±{_STRONG:g}."
     return [
         FigureBlock(
             figures.correlation(names, matrix, "identify-correlation"),
-            f"Correlations of the estimates. Of a pair near ±1 only a combination is determined.{strong}",
+            f"Correlations of the estimates. The data determines only a combination of a pair near ±1.{strong}",
             narrow=True,
         )
     ]
-
-
-def _positions_table(found: Identification) -> TableBlock:
-    models = list(dict.fromkeys(m for row in found.held_out for m in row.rmse))
-    rows = [
-        [
-            row.name,
-            *(number(row.rmse.get(m)) for m in models),
-            pretty_unit(row.unit),
-            ", ".join(row.beaten_by) or "none",
-        ]
-        for row in found.held_out
-    ]
-    caption = f"Held-out RMSE of every position after {found.held_out[0].horizon_s:g} s, the worst first"
-    heads = ("position", *models, "unit", "no better than")
-    return TableBlock(caption, heads, rows, (len(models) + 1, len(models) + 2))
 
 
 def _prediction_table(found: Identification) -> TableBlock:
@@ -359,7 +343,7 @@ def _tiles(found: Identification) -> Iterator[Tile]:
             truth = "" if e.truth is None else f"truth {1e3 * e.truth:.1f} ms"
             yield Tile(e.name.replace("_", " "), f"{1e3 * e.estimate:.1f}{error} ms", truth)
     if found.misfit is not None:
-        yield Tile("residuals of the fit", f"{number(found.misfit, 2)} times", "the deviation assumed of a measurement")
+        yield Tile("residuals of the fit", f"{number(found.misfit, 2)} times", "the assumed deviation of a measurement")
     seconds, evaluations = found.search.seconds, found.search.evaluations
     if seconds is not None:
         simulated = [found.search.engine, f"{number(evaluations)} evaluations" if evaluations else ""]

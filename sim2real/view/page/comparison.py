@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 
 from sim2real.artifacts.comparison import ComparedParameter, Comparison
 from sim2real.view import style
-from sim2real.view.blocks import Banner, FigureBlock, PageSection, TableBlock, pretty_unit
+from sim2real.view.blocks import Banner, Block, FigureBlock, PageSection, TableBlock, pretty_unit
 from sim2real.view.page.page import write_page
 from sim2real.view.style import BLUE, GREEN, INK, MUTED, ORANGE, new_figure, styled, to_svg
 
@@ -22,26 +22,15 @@ def comparison_page(comparison: Comparison, path: Path) -> Path:
     different = ", ".join(comparison.different)
     title = f"different beyond chance: {different}" if different else "no parameter differs beyond chance"
     banner = Banner("doubt" if different else "good", title)
-    blocks = []
+    blocks: list[Block] = []
     if comparison.parameters:
         caption = "Estimates with 95 % intervals. A parameter with an orange title differs beyond chance."
         blocks.append(FigureBlock(parameters_figure(comparison, "comparison"), caption))
-    for caption, (headers, rows) in (
-        ("Verdicts, errors and scores", comparison.figures()),
-        ("Parameters: estimate and half-width of the 95 % interval", comparison.rows()),
-    ):
-        cells = [[style_cell(cell) for cell in row] for row in rows]
-        blocks.append(TableBlock(caption, headers, cells, text_columns=range(1, len(headers))))
+    blocks.append(TableBlock.of("Verdicts, errors and scores", comparison.figures()))
+    blocks.append(TableBlock.of("Parameters: estimate and half-width of the 95 % interval", comparison.rows()))
     names = ", ".join(run.name for run in comparison.runs)
     section = PageSection("compare", "Comparison", f"{len(comparison.runs)} runs: {names}.", (), blocks, banner)
     return write_page(path, "comparison", [section])
-
-
-def style_cell(value: object) -> str:
-    """Return a cell as text: four digits of a number, a dash for nothing."""
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def parameters_figure(comparison: Comparison, name: str) -> str:

@@ -1,4 +1,4 @@
-"""The picture of what the episodes of training are drawn from, beside what was recorded."""
+"""The figure of the distributions of the training's episodes, with the recorded values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def episodes_svg(episodes: Episodes, name: str) -> str:
         name: Of the figure, unique on its page.
     """
     with styled():
-        return to_svg(_figure(episodes), name, "What episodes are drawn from, beside what was recorded")
+        return to_svg(_figure(episodes), name, "Distributions of the episodes, and recorded values")
 
 
 def picture(path: Path, episodes: Episodes) -> None:
@@ -59,27 +59,27 @@ def _figure(episodes: Episodes) -> Any:
 
 
 def _parameter(ax: Any, parameter: Varied, drawn: np.ndarray) -> None:
-    """Draw what is drawn of a parameter, its value, and the 95 % interval that was identified."""
+    """Draw the histogram of a parameter's draws, its value, and its 95 % interval."""
     scale, unit = (1e3, "ms") if parameter.unit == "s" else (1.0, parameter.unit)
     ax.hist(scale * drawn, bins=_BINS, color=BLUE, alpha=0.8)
     if parameter.low95 is not None and parameter.high95 is not None:
         ax.axvspan(scale * parameter.low95, scale * parameter.high95, color=ORANGE, alpha=0.35, lw=0)
     ax.axvline(scale * parameter.value, color=INK, lw=1.0)
     ax.set_title(f"{parameter.name} [{unit or '1'}]", fontsize="small")
-    ax.set_xlabel("drawn" if parameter.low95 is None else "drawn; band: 95 % identified", fontsize="x-small")
+    ax.set_xlabel("drawn" if parameter.low95 is None else "drawn; band: 95 % interval", fontsize="x-small")
 
 
 def _curriculum(ax: Any, shares: tuple[float, float]) -> None:
-    """Draw which share of all differences episodes have, from the first to the last update."""
+    """Draw the share of all differences between episodes over the training."""
     ax.plot([0.0, 1.0], shares, color=BLUE)
     ax.set_ylim(-0.05, 1.05)
     ax.set_yticks([0.0, 1.0])
     ax.set_title("share of all differences", fontsize="small")
-    ax.set_xlabel("share of the training; the others: at its end", fontsize="x-small")
+    ax.set_xlabel("share of the training; other plots: at its end", fontsize="x-small")
 
 
 def _times(ax: Any, node: str, recorded: np.ndarray, drawn: np.ndarray) -> None:
-    """Draw how long a node's steps took and take, in logarithmic counts: hiccups are rare."""
+    """Draw recorded and drawn computation times, in logarithmic counts, as hiccups are rare."""
     recorded, drawn = recorded[np.isfinite(recorded)], drawn[np.isfinite(drawn)]
     if not (recorded.size and drawn.size):
         return
@@ -97,7 +97,7 @@ def _times(ax: Any, node: str, recorded: np.ndarray, drawn: np.ndarray) -> None:
 
 
 def _noise(ax: Any, noise: Noise, off: np.ndarray) -> None:
-    """Draw how far measurements lay off the model, and what a reading in simulation has on top of the motion."""
+    """Draw the differences between measurements and model, and the noise of a reading in simulation."""
     wide = max(float(np.quantile(np.abs(off), 0.995)), 1e-12)
     bins = np.linspace(-wide, wide, _BINS)
     ax.hist(off, bins=bins, density=True, histtype="step", color=ORANGE, lw=1.2)
@@ -107,5 +107,5 @@ def _noise(ax: Any, noise: Noise, off: np.ndarray) -> None:
         density = np.exp(-0.5 * (x / size) ** 2) / (size * math.sqrt(2.0 * math.pi))
         ax.fill_between(x, density, color=BLUE, alpha=0.8, lw=0)
     ax.axvline(0.0, color=MUTED, lw=0.8)
-    ax.set_title(f"{noise.column}, off the model [{noise.unit or '1'}]", fontsize="small")
+    ax.set_title(f"{noise.column}: difference from the model [{noise.unit or '1'}]", fontsize="small")
     ax.set_xlabel("noise drawn; line: recorded", fontsize="x-small")

@@ -1,4 +1,4 @@
-"""Figures of what record, train and deploy found. Each is one ``<svg>`` element; colours follow the page's."""
+"""Figures of record, train and deploy. Each is one ``<svg>`` element with the colours of the page."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from sim2real.view.style import BLUE, INK, new_figure, styled, to_svg
 
 
 def recording(log: Signals, name: str) -> str:
-    """Draw what a log measured, with the truth where it is known, and what was commanded last."""
+    """Draw the measurements of a log, with the truth if it is known, and the commands to the motors."""
     middle, length = log.episode.duration_s / 2, min(2.0, log.episode.duration_s / 4)
     zoom = (round(middle, 1), round(middle + length, 1))
     panels = []
     for series in log.measured:
         lines = [Line(series.t_s, series.values, "measured", "measured")]
         if series.name in log.truth:
-            true = log.truth[series.name]
-            lines.append(Line(true.t_s, true.values, "true state", "truth"))
+            truth = log.truth[series.name]
+            lines.append(Line(truth.t_s, truth.values, "true state", "truth"))
         panels.append(Panel(with_unit(series.name, log.units), lines, zoom=zoom))
-    commanded = "would have been commanded" if log.dry else "commanded"
+    commanded = "command, not sent" if log.dry else "command"
     for series in log.last_command():
         label = with_unit(f"{series.source}.{series.name}", log.units, series.name)
         panels.append(Panel(label, [Line(series.t_s, series.values, commanded, "command", held=True)], zoom=zoom))
@@ -35,16 +35,16 @@ def recording(log: Signals, name: str) -> str:
 
 
 def training(curves: History, name: str) -> str:
-    """Draw return and success of each seed over the steps, and their median."""
+    """Draw return and success of each seed over the steps of training, and their median."""
     seeds = curves.returns.shape[1]
     with styled():
         figure = new_figure(2.7)
         left, right = figure.subplots(1, 2, sharex=True)
         for axes, values, label in ((left, curves.returns, "return"), (right, curves.success, "success")):
             for seed in range(seeds):
-                kept = seed == curves.best_seed
-                dash = style.DASHES[0 if kept else 1 + seed % 3]
-                look: dict[str, Any] = {"marker": "o", "ms": 3.5, "lw": 1.8} if kept else {"lw": 0.9, "alpha": 0.7}
+                selected = seed == curves.best_seed
+                dash = style.DASHES[0 if selected else 1 + seed % 3]
+                look: dict[str, Any] = {"marker": "o", "ms": 3.5, "lw": 1.8} if selected else {"lw": 0.9, "alpha": 0.7}
                 axes.plot(curves.steps, values[:, seed], color=BLUE, ls=dash, **look)
             if seeds > 1:
                 axes.plot(curves.steps, np.nanmedian(values, axis=1), color=INK, lw=2.2)
@@ -57,17 +57,17 @@ def training(curves: History, name: str) -> str:
                 Line2D([], [], color=INK, lw=2.2, label=f"median of {seeds} seeds"),
             ]
             if curves.best_seed is not None:
-                kept = f"seed {curves.best_seed}, whose policy was kept"
-                entries.insert(1, Line2D([], [], color=BLUE, lw=1.8, marker="o", ms=3.5, label=kept))
+                selected = f"seed {curves.best_seed}, in the bundle"
+                entries.insert(1, Line2D([], [], color=BLUE, lw=1.8, marker="o", ms=3.5, label=selected))
             style.legend_above(figure, entries)
         return to_svg(figure, name, f"Return and success of {seeds} seeds over the steps of training")
 
 
 def deployment(log: Signals, simulation: Sequence[Series], units: Mapping[str, str], number: int, name: str) -> str:
-    """Draw one episode on the robot against the same policy in simulation.
+    """Draw one episode on the robot, and the same policy in simulation.
 
     Args:
-        simulation: Series of the simulation; empty where nothing was simulated.
+        simulation: Series of the simulation; empty without a simulation.
         units: Field -> unit.
         name: Of the figure, unique on its page.
     """

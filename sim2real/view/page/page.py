@@ -9,7 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished_stages, open_folder
-from sim2real.artifacts.run.stage_status import standing
+from sim2real.artifacts.run.stage_status import stage_status
 from sim2real.view.blocks import NoteBlock, PageSection
 from sim2real.view.page.iterations import iterations_sections
 from sim2real.view.page.sections import SECTIONS, headline
@@ -24,7 +24,7 @@ def report(run_dir: Path) -> Path:
         Path of the page, ``report.html`` in the run's folder.
 
     Raises:
-        Sim2RealError: When no stage is finished, or what a stage wrote is missing or malformed.
+        Sim2RealError: When no stage is finished, or a file of the stage is missing or malformed.
     """
     run_dir = Path(run_dir)
     artifacts = finished_stages(run_dir)
@@ -37,7 +37,7 @@ def identify_page(identify_folder: Path) -> Path:
     """Write the page of an identification into its folder.
 
     Raises:
-        Sim2RealError: When what identify wrote is missing or malformed.
+        Sim2RealError: When a file of the stage is missing or malformed.
     """
     return _stage_page(identify_folder, "identify")
 
@@ -46,7 +46,7 @@ def deploy_page(deploy_folder: Path) -> Path:
     """Write the page of a deployment into its folder.
 
     Raises:
-        Sim2RealError: When what deploy wrote is missing or malformed.
+        Sim2RealError: When a file of the stage is missing or malformed.
     """
     return _stage_page(deploy_folder, "deploy")
 
@@ -86,7 +86,7 @@ def write_page(
     stages: Sequence[tuple[str, bool]] = (),
     notes: Sequence[NoteBlock] = (),
 ) -> Path:
-    """Render sections as a page and write it; a browser that has the old one open never reads half of the new one.
+    """Render sections as a page and write it at once, so that no browser reads a half of it.
 
     Args:
         stages: Stages in the head of the page, and whether each has a section.
@@ -115,7 +115,7 @@ def write_page(
 
 
 def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:
-    """Return notes about newer attempts that did not finish, whose place an older one takes, and about stale stages."""
+    """Return notes on newer unfinished attempts, which an older one replaces, and on stale stages."""
     notes = []
     for stage in STAGES:
         tried = attempts(run_dir, stage)
@@ -123,10 +123,14 @@ def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[Note
             status = tried[0].manifest.get("status", "without a manifest")
             status = "a dry run" if status == "dry run" else status
             error = tried[0].manifest.get("error")
-            shown = f"this page shows {artifacts[stage].folder.name}" if stage in artifacts else "it is left out"
+            shown = (
+                f"this page shows {artifacts[stage].folder.name}"
+                if stage in artifacts
+                else "the page has no section for it"
+            )
             notes.append(
                 NoteBlock(f"The newest attempt at {stage} is {status}{f' ({error})' if error else ''}: {shown}.")
             )
-    stale = {stage: s.stale for stage, s in standing(run_dir).items() if s.stale}
+    stale = {stage: s.stale for stage, s in stage_status(run_dir).items() if s.stale}
     notes += [NoteBlock(f"Out of date: {why}. `sim2real run --resume` makes it again.") for why in stale.values()]
     return notes

@@ -13,10 +13,10 @@ from sim2real.artifacts.deployment import Deployment, Scores
 from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.artifacts.summary import words_and_unit
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
 from sim2real.log.ages import oldest_input
-from sim2real.log.schema import unit_of
 from sim2real.view import timing
 from sim2real.view.blocks import (
     MISSING,
@@ -28,7 +28,6 @@ from sim2real.view.blocks import (
     Tile,
     fixed,
     number,
-    spoken,
 )
 from sim2real.view.identification.section import identify_section
 from sim2real.view.page import deployment_verdict, figures
@@ -40,23 +39,21 @@ from sim2real.view.signals import Signals, signals_of, simulated_beside
 
 
 def record_section(artifact: StageFolder) -> PageSection:
-    """Return what was recorded, and how well the nodes kept their times."""
+    """Return the recorded signals, and the timing of the nodes."""
     log = signals_of(Recording.load(artifact.folder))
     blocks: list[Block] = [NoteBlock(text) for text in log.warnings]
-    commanded = "what would have been commanded" if log.dry else "what was commanded"
-    truth = " The true state is what the embedded robot knew of itself." if log.truth else ""
+    commanded = "the commands that were not sent" if log.dry else "the commands"
+    truth = " The true state comes from the embedded robot." if log.truth else ""
     blocks.append(
         FigureBlock(
             figures.recording(log, "record-signals"),
-            f"What was measured, at the time of each sample, and {commanded}.{truth} Right: a closer look.",
+            f"Measurements, at the time of each sample, and {commanded}.{truth} Right: a part of the left plots.",
         )
     )
     blocks += [*_timing_blocks(log.episode, "record"), *servo_blocks([log.episode])]
     steps = max((len(s) for s in log.episode.steps.values()), default=0)
     tiles = [Tile("length", f"{log.episode.duration_s:.1f} s", f"{steps} steps"), *_timing_tiles([log.episode])]
-    lead = "The robot under an excitation" + (
-        ", with torque withheld." if log.dry else "; the log is what everything after it rests on."
-    )
+    lead = "The robot under an excitation" + (", without torque." if log.dry else "; all later stages use this log.")
     return PageSection("record", "Record", lead, tiles, [*blocks, *about(artifact)], DRY if log.dry else None)
 
 
@@ -75,46 +72,34 @@ def train_section(artifact: StageFolder) -> PageSection:
     ]
     figure = FigureBlock(figures.training(curves, "train-curves"), "Evaluations during training, in simulation.")
     lead = "A policy for the identified model, with the timing of the robot."
-    blocks = [figure, _seeds(curves), *_drawn_blocks(artifact), *sensitivity_blocks(artifact.folder), *about(artifact)]
+    seeds_table = TableBlock.of("Each seed at the end", curves.rows())
+    blocks = [figure, seeds_table, *_drawn_blocks(artifact), *sensitivity_blocks(artifact.folder), *about(artifact)]
     return PageSection("train", "Train", lead, tiles, blocks)
 
 
-def _seeds(curves: History) -> TableBlock:
-    """Return how each seed does at the end, with the settings that it tried, and what each term of the reward added."""
-    tried = ("settings",) if curves.settings else ()
-    rows = [
-        [str(seed), *curves.settings[seed : seed + 1], *map(number, values), f"{curves.success[-1, seed]:.1%}"]
-        for seed, values in enumerate(
-            zip(*(c[-1].tolist() for c in (curves.returns, *curves.terms.values())), strict=True)
-        )
-    ]
-    header = ("seed", *tried, "return", *(f"of it {name}" for name in curves.terms), "success")
-    return TableBlock("Each seed at the end", header, rows, text_columns=(1,) if tried else ())
-
-
 def _drawn_blocks(artifact: StageFolder) -> list[Block]:
-    """Return what episodes were drawn from; nothing where an older version trained."""
+    """Return the distributions of the episodes; empty for trainings of older versions."""
     if "episodes" not in artifact.outputs:
         return []
     drawn = Episodes.load(artifact.folder)
     if not drawn.parameters and not drawn.drawn_s:
         return [NoteBlock("All episodes had the same parameters, without delays.")]
     caption = (
-        "What episodes were drawn from: parameters beside the 95 % interval that was identified, times beside those of "
-        "the recording, noise beside how far it lay off the model. For what the model leaves unexplained, the "
-        f"posterior's deviations are {drawn.widening:.1f} times as wide."
+        "Distributions of the episodes: parameters with the 95 % interval of the estimate, computation times with "
+        "those of the recording, noise with the differences between measurements and model. The posterior's deviations "
+        f"are multiplied by {drawn.widening:.1f}, to cover errors of the model."
     )
     if drawn.cut or drawn.again:
         caption += (
-            f" {drawn.cut} of {drawn.timelines} timelines end before a pause of the computer that training cannot "
-            f"hold; {drawn.again} were drawn again, as it came in their first half."
+            f" {drawn.cut} of {drawn.timelines} timelines end before a pause of the computer that is too long for the "
+            f"training; {drawn.again} were drawn again, as the pause was in their first half."
         )
     if drawn.push_hz:
         caption += f" Each joint is pushed {drawn.push_hz:g} times a second, at random times."
     if drawn.curriculum != (1.0, 1.0):
         first, last = drawn.curriculum
         caption += (
-            f" The share of all differences grows from {first:g} to {last:g} over the training; drawn: the latter."
+            f" The share of all differences grows from {first:g} to {last:g} in training; the plots show {last:g}."
         )
     return [FigureBlock(episodes_svg(drawn, "train-episodes"), caption)]
 
@@ -127,17 +112,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
         return _dry_section(artifact, logs)
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
     blocks += deployment_verdict.verdict_blocks(deployed)
-    rows = [
-        [
-            spoken(row.quantity)[0],
-            row.unit or unit_of(row.quantity, deployed.units) or spoken(row.quantity)[1],
-            *[number(value) for value in (row.real, row.simulation, row.gap)],
-        ]
-        for row in deployed.gap
-    ]
-    blocks.append(
-        TableBlock("Robot and simulation", ("quantity", "unit", "robot", "simulation", "gap"), rows, text_columns=(1,))
-    )
+    blocks.append(TableBlock.of("Robot and simulation", deployed.rows()))
     blocks += deployment_verdict.tables(deployed)
     for index, (log, columns) in enumerate(zip(logs, deployed.simulated, strict=True)):
         caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
@@ -162,17 +137,17 @@ def deploy_section(artifact: StageFolder) -> PageSection:
 
 
 def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> PageSection:
-    """Return what a policy would have done; there is no gap, as nothing was moved."""
+    """Return the commands that a dry run computed; it has no gap."""
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
-    blocks.append(NoteBlock("There is no gap report: a simulation has nothing to be compared with."))
+    blocks.append(NoteBlock("A dry run has no gap report, as the robot does not move."))
     for index, log in enumerate(logs):
-        caption = f"Episode {index}: what was measured, and what the policy would have sent."
+        caption = f"Episode {index}: measurements, and the policy's commands, which were not sent."
         blocks.append(FigureBlock(figures.recording(log, f"deploy-{index}"), caption))
     episodes = [log.episode for log in logs]
     for index, episode in enumerate(episodes):
         blocks += _timing_blocks(episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
     tiles = [Tile("episodes", str(len(episodes)), "dry run"), *_timing_tiles(episodes)]
-    lead = "The policy on the robot, with torque withheld."
+    lead = "The policy on the robot, without torque."
     return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], DRY)
 
 
@@ -185,7 +160,7 @@ SECTIONS = {
 
 
 def headline(sections: Sequence[PageSection]) -> list[Tile]:
-    """Return the first number of each stage: what a reader wants to know before anything else."""
+    """Return the first tile of each stage, for the head of the page."""
     return [Tile(f"{s.title}: {s.tiles[0].label}", s.tiles[0].value, s.tiles[0].note) for s in sections if s.tiles]
 
 
@@ -202,7 +177,7 @@ def _timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
     ends: list[Mapping[str, Any]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
     overruns = [t.get("overruns", 0) for end in ends for t in end.get("timing", {}).values()]
     if overruns:
-        lost = ends[-1].get("lost_replies")  # counted over all episodes of a session
+        lost = ends[-1].get("lost_replies")  # the count covers all episodes of a session
         yield Tile("overruns", str(sum(overruns)), f"{lost} lost replies" if lost is not None else "")
 
 
@@ -235,12 +210,13 @@ def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = 
     return [
         FigureBlock(
             timing.schedule(episode, f"{name}-schedule"),
-            f"Who computed when.{which} Arrows are messages, from the end of a step to the start of its reader's.",
+            f"Computation of each node over time.{which} An arrow is a message, from the end of the sender's step to "
+            "the start of the reader's step.",
         ),
         FigureBlock(
             timing.histograms(episode, f"{name}-timing"),
-            f"How well the nodes kept their times, in ms.{which} Age: how long before a step's start the newest "
-            "message that it used was sent, of its oldest input. Dashed: the 99 % quantile. Counts are logarithmic.",
+            f"Times of the nodes, in ms.{which} Age: time from the sending of a message to the step that uses it, for "
+            "the oldest input. Dashed: the 99 % quantile. Counts are logarithmic.",
         ),
         table,
     ]
@@ -254,7 +230,7 @@ def _scores(score: Scores) -> str:
         + (f", simulation {number(simulation.get(n), 3)}" if n in simulation else "")
         + ("" if unit == "1" else f" {unit}")
         for n in names
-        for label, unit in [spoken(n)]
+        for label, unit in [words_and_unit(n)]
     ]
     text = "; ".join(both)
     return text[:1].upper() + text[1:] + "." if both else ""

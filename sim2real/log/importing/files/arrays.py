@@ -1,4 +1,4 @@
-"""Reads arrays in npz files: by their headers first, so that an archive unpacks no more than the budget."""
+"""Reads arrays in npz files; their headers are read first, so that an archive unpacks no more than the limit."""
 
 from __future__ import annotations
 
@@ -6,28 +6,27 @@ import math
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.log.importing.files.budget import WHOLE, require_memory, require_signals, why_left_out
+from sim2real.log.importing.files.budget import WHOLE, reason_to_skip, require_memory, require_signals
 from sim2real.log.importing.files.raw_file import RawSignals
 
 DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError, zipfile.BadZipFile, zlib.error)
-"""What the libraries raise for damaged content."""
+"""Exceptions of the libraries for damaged content."""
 
 
 def read_npz(path: Path) -> RawSignals:
     """Read an archive of arrays.
 
     Raises:
-        UsageError: When it is no ZIP archive, or no array in it is one of numbers within the budget.
+        UsageError: When the file is no ZIP archive, or has no array of numbers within the limit.
     """
-    # numpy would try to read anything but a ZIP archive as a pickle.
+    # NumPy would read any other file as a pickle.
     if not zipfile.is_zipfile(path):
         raise UsageError(f"{path} is no npz file, or is cut off", hint=WHOLE)
-    shapes: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {}
+    shapes: dict[str, tuple[tuple[int, ...], np.dtype[np.generic]]] = {}
     notes, total = [], 0.0
     try:
         with zipfile.ZipFile(path) as archive:
@@ -38,15 +37,15 @@ def read_npz(path: Path) -> RawSignals:
                 try:
                     shapes[key] = _shape(archive, name)
                 except (*DAMAGED, UnicodeError) as error:
-                    notes.append(f"left out: {key!r}: its header is damaged ({str(error)[:80]})")
+                    notes.append(f"skipped: {key!r}: its header is damaged ({str(error)[:80]})")
     except DAMAGED as error:
         if isinstance(error, UsageError):
             raise
         raise UsageError(f"{path} is no npz file, or is damaged: {error}", hint=WHOLE) from None
     keys = []
     for key, (shape, dtype) in shapes.items():
-        if why := why_left_out(shape, dtype.kind, dtype.itemsize):
-            notes.append(f"left out: {key!r}: {why}")
+        if why := reason_to_skip(shape, dtype.kind, dtype.itemsize):
+            notes.append(f"skipped: {key!r}: {why}")
         else:
             keys.append(key)
             total += 8.0 * math.prod(shape)
@@ -54,7 +53,7 @@ def read_npz(path: Path) -> RawSignals:
         raise UsageError(f"nothing in {path} can be read: {'; '.join(notes) or 'no arrays'}", hint=WHOLE)
     require_memory(total, str(path))
 
-    def load(name: str) -> Any:
+    def load(name: str) -> np.ndarray:
         if name not in (key.removesuffix(".npy") for key in names):
             raise KeyError(name)
         shape, dtype = shapes.get(name, ((), np.dtype(float)))
@@ -64,18 +63,18 @@ def read_npz(path: Path) -> RawSignals:
                 hint="save it again as an array of numbers",
             )
         require_memory(float(math.prod(shape)) * dtype.itemsize, f"{name!r} in {path}")
-        # Opened again for each signal, so that one that is damaged does not prevent reading the others.
+        # Open the file for each signal, so that a damaged signal does not prevent the reading of others.
         with np.load(path, allow_pickle=False) as data:
             return data[name]
 
     return RawSignals(keys, load, notes=tuple(notes))
 
 
-def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Return shape and type of an array in an archive, by its header alone.
+def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
+    """Return shape and type of an array in an archive, from its header.
 
     Raises:
-        ValueError: When it has no such header.
+        ValueError: When the header is missing or malformed.
     """
     with archive.open(name) as stream:
         version = np.lib.format.read_magic(stream)

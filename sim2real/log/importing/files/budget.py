@@ -1,4 +1,4 @@
-"""What a file of another recorder may cost: limits that every reader of such files keeps."""
+"""Limits on the memory and time that a file of another recorder takes; all readers of such files apply them."""
 
 from __future__ import annotations
 
@@ -8,28 +8,24 @@ from pathlib import Path
 
 from sim2real.errors import UsageError
 
-WHOLE = "check that the file is complete, and of the format that its name or --format says"
+WHOLE = "check that the file is complete, and that its name or --format gives the right format"
 """The hint for damaged content."""
-MOST_BYTES = 1 << 30
-"""A file's numbers take at most this much memory [bytes]: 37 minutes of 60 columns at 1 kHz."""
-MOST_TEXT_BYTES = 1 << 28
-"""A JSON document has at most this size [bytes]; in memory it takes some ten times as much."""
-MOST_SIGNALS = 10_000
+MAX_BYTES = 1 << 30
+"""Limit of the memory of a file's numbers [bytes]: 37 minutes of 60 columns at 1 kHz."""
+MAX_TEXT_BYTES = 1 << 28
+"""Largest JSON document [bytes]; in memory it takes about ten times as much."""
+MAX_SIGNALS = 10_000
 """A file has at most this many signals."""
-MOST_COLUMNS = 1000
+MAX_COLUMNS = 1000
 """A signal of joints has at most this many columns; one with more is an image."""
-MOST_LEVELS = 64
-"""A document is nested at most this deep."""
+MAX_LEVELS = 64
+"""Deepest nesting of a document."""
 _WORD_BYTES = 64
-"""What a word takes in memory until its number is known [bytes]."""
+"""Memory of a word before it becomes a number [bytes]."""
 
 
-def require_size(path: Path, most: int = MOST_BYTES) -> None:
-    """Refuse a file of text that is larger than the budget.
-
-    Raises:
-        UsageError: When it is.
-    """
+def require_size(path: Path, most: int = MAX_BYTES) -> None:
+    """Raise a UsageError if a text file is larger than the limit."""
     size = path.stat().st_size
     if size > most:
         raise UsageError(
@@ -39,48 +35,40 @@ def require_size(path: Path, most: int = MOST_BYTES) -> None:
 
 
 def require_memory(size: float, what: str) -> None:
-    """Refuse to load numbers that take more memory than the budget.
+    """Raise a UsageError if numbers take more memory than the limit.
 
     Args:
-        size: What they take [bytes].
-        what: The numbers, for the error.
-
-    Raises:
-        UsageError: When they take more.
+        size: Their memory [bytes].
+        what: Name of the numbers, for the error.
     """
-    if size > MOST_BYTES:
+    if size > MAX_BYTES:
         raise UsageError(
-            f"{what} takes {size / 2**20:.0f} MiB of memory; at most {MOST_BYTES / 2**20:.0f} MiB are read",
+            f"{what} takes {size / 2**20:.0f} MiB of memory; at most {MAX_BYTES / 2**20:.0f} MiB are read",
             hint="cut the recording into parts",
         )
 
 
 def require_signals(count: int, path: Path) -> None:
-    """Refuse a file with more signals than the budget.
-
-    Raises:
-        UsageError: When it has more.
-    """
-    if count > MOST_SIGNALS:
+    """Raise a UsageError if a file has more signals than the limit."""
+    if count > MAX_SIGNALS:
         raise UsageError(
-            f"{path} has {count} signals; at most {MOST_SIGNALS} are read", hint="save the joints' signals alone"
+            f"{path} has {count} signals; at most {MAX_SIGNALS} are read", hint="save the joints' signals alone"
         )
 
 
-def why_left_out(shape: Sequence[int], kind: str, itemsize: int) -> str:
-    """Return why an array is no signal that a mapping is proposed from; empty where it may be one.
+def reason_to_skip(shape: Sequence[int], kind: str, itemsize: int) -> str:
+    """Return why an array cannot be a signal of a robot; empty if it can.
 
     Args:
-        shape: Its shape.
-        kind: Of its elements, as numpy's ``dtype.kind``.
+        kind: NumPy's ``dtype.kind``.
         itemsize: Size of an element [bytes].
     """
-    if kind not in "fiubMmUS":  # words may be dates, or numbers that were saved as words
+    if kind not in "fiubMmUS":  # words can be dates, or numbers
         return "no numbers"
     if len(shape) > 2:
         return f"{len(shape)} dimensions, as of images"
-    if len(shape) == 2 and shape[1] > MOST_COLUMNS:
+    if len(shape) == 2 and shape[1] > MAX_COLUMNS:
         return f"{shape[1]} columns, as of images"
-    if math.prod(shape) * max(itemsize, _WORD_BYTES if kind in "US" else 8) > MOST_BYTES:
-        return f"larger than {MOST_BYTES / 2**20:.0f} MiB"
+    if math.prod(shape) * max(itemsize, _WORD_BYTES if kind in "US" else 8) > MAX_BYTES:
+        return f"larger than {MAX_BYTES / 2**20:.0f} MiB"
     return ""

@@ -1,4 +1,4 @@
-"""Numbers that are written as words: in the cells of a table, or in an array of words."""
+"""Numbers in the form of words: in the cells of a table, or in an array of words."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ MISSING = {"", "-", "--", "?", "na", "n/a", "#n/a", "nan", "null", "nil", "none"
 """Words that stand for a missing number."""
 
 
-class NoNumbers(UsageError):  # noqa: N818 - it says what a signal is
-    """A signal is text, or something else without a single number."""
+class NoNumbersError(UsageError):
+    """A signal holds text, or other values without a number."""
 
 
 def from_words(values: np.ndarray, what: str) -> np.ndarray:
-    """Return numbers that were saved as words; NaN for a word that stands for a missing one.
+    """Return the numbers in an array of words; NaN for a word for a missing number.
 
     Raises:
-        NoNumbers: When not one word is a number.
-        UsageError: When some words are no numbers, and do not stand for a missing one.
+        NoNumbersError: When no word is a number.
+        UsageError: When some words are neither numbers nor words for a missing number.
     """
     words = [str(word).strip() for word in values.astype(str).reshape(-1)]
     if not any(map(is_number, words)):
-        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=OTHER)
+        raise NoNumbersError(f"{what} holds no numbers, but {values.dtype}", hint=OTHER)
     numbers = [number_in(word, f"sample {i} of {what}") for i, word in enumerate(words)]
     return np.array(numbers).reshape(values.shape)
 
@@ -42,7 +42,7 @@ def number_in(text: str, where: str) -> float:
     """Return the number in a cell; NaN if it is empty, or holds a word for a missing number.
 
     Raises:
-        UsageError: When it holds anything else; ``where`` says where it was found.
+        UsageError: When the cell holds another text; the message names the place ``where``.
     """
     if text.lower() in MISSING:
         return float("nan")

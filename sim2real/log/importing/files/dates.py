@@ -21,7 +21,7 @@ def are_dates(texts: Sequence[str]) -> bool:
 
 
 def is_other(text: str) -> bool:
-    """Return whether a text looks like a date in another form, whose day and month may be either."""
+    """Return whether a text looks like a date in another form, with an unclear order of day and month."""
     return bool(_OTHER.fullmatch(text))
 
 
@@ -29,20 +29,20 @@ def parsed(texts: Sequence[str], unit: str = "") -> np.ndarray:
     """Return dates as whole nanoseconds since 1970, times of day as seconds since midnight.
 
     Args:
-        texts: All of one form: ``2024-05-01T12:00:00.25+02:00``, or ``12:00:00.25``. Dates without a zone are in UTC.
-        unit: Unit of the result: ``s``, ``ms``, ``us`` or ``ns``; empty: the one above.
+        texts: All in the form ``2024-05-01T12:00:00.25+02:00``, or ``12:00:00.25``. Dates without a zone are in UTC.
+        unit: Unit of the result: ``s``, ``ms``, ``us`` or ``ns``; default: the unit above.
 
     Raises:
-        ValueError: When one of them has no such form; its second argument is its place.
+        ValueError: When a text has another form; the second argument is its place.
     """
     dates = bool(_DATE.fullmatch(texts[0].strip()))
-    found = []
+    numbers = []
     for i, text in enumerate(texts):
         try:
-            found.append(_date_ns(text.strip()) if dates else _time_ns(text.strip()))
+            numbers.append(_date_ns(text.strip()) if dates else _time_ns(text.strip()))
         except (ValueError, TypeError):
             raise ValueError(f"{text!r} is no {'date' if dates else 'time'} as those before it", i) from None
-    values = np.array(found, np.int64)
+    values = np.array(numbers, np.int64)
     unit = unit or ("ns" if dates else "s")
     return values if unit == "ns" else values / _NANOSECONDS[unit]
 

@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,17 +17,18 @@ from sim2real.log.importing.files import dates, lerobot
 from sim2real.log.importing.files.arrays import DAMAGED, read_npz
 from sim2real.log.importing.files.bags import bag_files, read_bag
 from sim2real.log.importing.files.budget import (
-    MOST_COLUMNS,
-    MOST_LEVELS,
-    MOST_TEXT_BYTES,
+    MAX_COLUMNS,
+    MAX_LEVELS,
+    MAX_TEXT_BYTES,
     WHOLE,
     require_signals,
     require_size,
 )
-from sim2real.log.importing.files.cells import OTHER, NoNumbers, from_words
+from sim2real.log.importing.files.cells import OTHER, NoNumbersError, from_words
 from sim2real.log.importing.files.raw_file import RawSignals
 from sim2real.log.importing.files.tables import encoding_of, read_csv
 from sim2real.log.importing.signal_names import meaning
+from sim2real.types import Json
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -44,24 +45,24 @@ class ForeignFile:
     Attributes:
         path: The file.
         format: One of the values of ``SUFFIXES``.
-        keys: Names of its signals that a mapping is proposed from.
-        load: Returns a signal by name; raises KeyError if there is none.
-        columns: Names of a signal's columns, where the file has some.
+        keys: Names of the signals that a proposal uses.
+        load: Returns a signal by name; raises KeyError for an unknown name.
+        columns: Signal -> names of its columns.
         beside: Further files of the same recording.
-        notes: What was left out and why: sentences.
+        notes: Sentences about skipped signals.
         nominal: Names of stamps that were generated from a rate, not recorded.
-        facts: What the file says about itself: of a LeRobot data set ``meta/info.json``.
+        facts: Metadata of the file: ``meta/info.json`` of a LeRobot data set.
     """
 
     path: Path
     format: str
     keys: Sequence[str]
-    load: Callable[[str], Any]
+    load: Callable[[str], Json]
     columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
     beside: tuple[Path, ...] = ()
     notes: tuple[str, ...] = ()
     nominal: frozenset[str] = frozenset()
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    facts: Mapping[str, Json] = field(default_factory=dict)
 
     def signal(self, source: str, column: int | None = None) -> np.ndarray:
         """Return a signal.
@@ -75,7 +76,7 @@ class ForeignFile:
             Shape ``(N,)`` or ``(N, ...)``, or ``()`` for a single number: float64, float32, or int64 for integers.
 
         Raises:
-            UsageError: When there is no such signal or column, or it does not consist of numbers.
+            UsageError: When the signal or column does not exist, or holds other values than numbers.
         """
         chosen: int | slice | None = column
         match = None if source in self.keys else _COLUMNS.fullmatch(source)
@@ -96,9 +97,9 @@ class ForeignFile:
             raise UsageError(f"{name!r} in {self.path} is damaged: {error}", hint=WHOLE) from None
         values = _numbers(raw, f"{name!r} in {self.path}", meaning(name).unit)
         if chosen is None:
-            if values.ndim == 2 and values.shape[1] > MOST_COLUMNS:
+            if values.ndim == 2 and values.shape[1] > MAX_COLUMNS:
                 raise UsageError(
-                    f"{name!r} in {self.path} has {values.shape[1]} columns, as images have; at most {MOST_COLUMNS} "
+                    f"{name!r} in {self.path} has {values.shape[1]} columns, as images have; at most {MAX_COLUMNS} "
                     "are read",
                     hint=f"choose some: {name}[:,0:6]",
                 )
@@ -121,7 +122,7 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
         episode: Number of the episode of a LeRobot data set; None: the only one.
 
     Raises:
-        UsageError: When the file does not exist, is empty, or does not have this format.
+        UsageError: When the file does not exist, is empty, or has another format.
     """
     formats = ", ".join(_FORMATS)
     files = [path]
@@ -139,7 +140,7 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
     if format not in _FORMATS:
         raise UsageError(f"unknown format {format!r}. Available: {formats}", hint="save the file as one of these")
     if episode is not None and format != "lerobot":
-        raise UsageError(f"{path} is no data set of LeRobot: it has no episodes", hint="leave --episode out")
+        raise UsageError(f"{path} is no data set of LeRobot: it has no episodes", hint="remove --episode")
     try:
         if not path.is_dir() and not path.is_file():
             why = "it is a pipe or a device" if path.exists() else "there is no such file"
@@ -147,26 +148,26 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
         if not all(part.stat().st_size for part in files):
             raise UsageError(f"{next(p for p in files if not p.stat().st_size)} is empty", hint=WHOLE)
         if format == "lerobot":
-            found = lerobot.read_lerobot(path, episode)
+            raw = lerobot.read_lerobot(path, episode)
         else:
-            found = read_bag(files) if format == "mcap" else _READERS[format](path)
+            raw = read_bag(files) if format == "mcap" else _READERS[format](path)
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror or error}", hint="check its name") from None
     return ForeignFile(
         files[0],
         format,
-        found.keys,
-        found.load,
-        found.columns,
+        raw.keys,
+        raw.load,
+        raw.columns,
         tuple(files[1:]),
-        found.notes,
-        found.nominal,
-        found.facts,
+        raw.notes,
+        raw.nominal,
+        raw.facts,
     )
 
 
 def _read_json(path: Path) -> RawSignals:
-    require_size(path, MOST_TEXT_BYTES)
+    require_size(path, MAX_TEXT_BYTES)
     encoding = encoding_of(path, "JSON")
     try:
         document = json.loads(path.read_text(encoding=encoding))
@@ -174,14 +175,14 @@ def _read_json(path: Path) -> RawSignals:
     except (ValueError, RecursionError) as error:  # a decoder's errors are ValueErrors
         if isinstance(error, UsageError):
             raise
-        deep = f"it is nested deeper than {MOST_LEVELS} levels"
+        deep = f"it is nested deeper than {MAX_LEVELS} levels"
         why = deep if isinstance(error, RecursionError) else error
         raise UsageError(f"{path} is no JSON, or is cut off: {why}", hint=WHOLE) from None
     if not isinstance(document, dict | list):
         raise UsageError(f"{path} holds a single value, no signals", hint=WHOLE)
     require_signals(len(keys), path)
 
-    def load(name: str) -> Any:
+    def load(name: str) -> Json:
         if isinstance(document, dict) and name in document:
             return document[name]
         return _walk(document, [p for p in re.split(r"\.|(?=\[\])", name) if p], path)
@@ -195,25 +196,27 @@ def joined(files: Sequence[ForeignFile]) -> ForeignFile:
     Raises:
         UsageError: When two files have the same name.
     """
-    own = {f.path.stem: f for f in files}
-    if len(own) < len(files):
-        raise UsageError("files of one log need different names: their signals go by them", hint="rename one")
+    by_stem = {f.path.stem: f for f in files}
+    if len(by_stem) < len(files):
+        raise UsageError(
+            "the files of one log need different names, which are part of the signals' names", hint="rename one"
+        )
 
     def split(name: str) -> tuple[ForeignFile, str]:
         stem, _, rest = name.partition("/")
-        if stem not in own:
+        if stem not in by_stem:
             raise KeyError(name)
-        return own[stem], rest
+        return by_stem[stem], rest
 
-    def load(name: str) -> Any:
+    def load(name: str) -> Json:
         file, rest = split(name)
         return file.load(rest)
 
-    keys = [f"{stem}/{key}" for stem, file in own.items() for key in file.keys]
-    columns = {f"{stem}/{key}": names for stem, file in own.items() for key, names in file.columns.items()}
+    keys = [f"{stem}/{key}" for stem, file in by_stem.items() for key in file.keys]
+    columns = {f"{stem}/{key}": names for stem, file in by_stem.items() for key, names in file.columns.items()}
     beside = tuple(path for f in files for path in (f.path, *f.beside))[1:]
     notes = tuple(note for f in files for note in f.notes)
-    nominal = frozenset(f"{stem}/{name}" for stem, file in own.items() for name in file.nominal)
+    nominal = frozenset(f"{stem}/{name}" for stem, file in by_stem.items() for name in file.nominal)
     return ForeignFile(files[0].path, files[0].format, keys, load, columns, beside, notes, nominal, files[0].facts)
 
 
@@ -222,7 +225,7 @@ _FORMATS = (*_READERS, "lerobot", "mcap")
 
 
 def _numbers(raw: npt.ArrayLike, what: str, unit: str) -> np.ndarray:
-    """Return a value as an array of float64, float32 or int64; dates as nanoseconds since 1970, or in their unit."""
+    """Return a value as an array of float64, float32 or int64; dates as nanoseconds since 1970, or in ``unit``."""
     try:
         values = np.asarray(raw)
         if (
@@ -245,7 +248,7 @@ def _numbers(raw: npt.ArrayLike, what: str, unit: str) -> np.ndarray:
     if values.dtype.kind in "iu" and not (values.size and values.max() > np.iinfo(np.int64).max):
         return values.astype(np.int64)
     if values.dtype.kind not in "fiub":
-        raise NoNumbers(f"{what} holds no numbers, but {values.dtype}", hint=OTHER)
+        raise NoNumbersError(f"{what} holds no numbers, but {values.dtype}", hint=OTHER)
     return values if values.dtype == np.float32 else values.astype(np.float64)
 
 
@@ -255,32 +258,32 @@ def _index(text: str) -> int | slice:
     return slice(*(int(part) if part.strip() else None for part in text.split(":")))
 
 
-def _walk(value: object, parts: Sequence[str], path: Path) -> Any:
-    """Return the value at a path in a JSON document; ``[]`` collects it from all elements of a list."""
+def _walk(value: object, parts: Sequence[str], path: Path) -> Json:
+    """Return the value at a path in a JSON document; ``[]`` collects the value of each element of a list."""
     if not parts:
         return value
     head, rest = parts[0], parts[1:]
     if head == "[]" and isinstance(value, list):
-        found = []
+        values = []
         for i, item in enumerate(value):
             try:
-                found.append(_walk(item, rest, path))
+                values.append(_walk(item, rest, path))
             except KeyError:
                 if not i:
                     raise
                 raise UsageError(
                     f"element {i} of a list in {path} has no {'.'.join(rest)!r}, unlike those before it", hint=WHOLE
                 ) from None
-        return found
+        return values
     if isinstance(value, dict) and head in value:
         return _walk(value[head], rest, path)
     raise KeyError(head)
 
 
 def _paths(value: object, trail: str = "", level: int = 0) -> list[str]:
-    """Return the paths to all values of a JSON document; for a list of objects, those of the first object."""
-    if level > MOST_LEVELS:
-        raise ValueError(f"it is nested deeper than {MOST_LEVELS} levels")
+    """Return the paths to all values of a JSON document; of a list of objects, the paths in the first object."""
+    if level > MAX_LEVELS:
+        raise ValueError(f"it is nested deeper than {MAX_LEVELS} levels")
     if isinstance(value, dict):
         return [p for key, item in value.items() for p in _paths(item, f"{trail}.{key}".lstrip("."), level + 1)]
     if isinstance(value, list) and value and isinstance(value[0], dict):

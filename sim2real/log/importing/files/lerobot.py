@@ -1,37 +1,42 @@
-"""Reads episodes of LeRobot data sets (Parquet), and what their ``meta/info.json`` says of the robot."""
+"""Reads episodes of LeRobot data sets (Parquet), and the robot's description in ``meta/info.json``."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log.importing.files.budget import (
-    MOST_TEXT_BYTES,
+    MAX_TEXT_BYTES,
     WHOLE,
+    reason_to_skip,
     require_memory,
     require_signals,
     require_size,
-    why_left_out,
 )
 from sim2real.log.importing.files.raw_file import RawSignals
+from sim2real.types import Json
+
+if TYPE_CHECKING:
+    import pyarrow
+    import pyarrow.parquet
 
 INFO = Path("meta") / "info.json"
 _EPISODE = "episode_index"
 _COUNTERS = ("frame_index", _EPISODE, "index", "task_index")
 _DAMAGED = (OSError, ValueError, EOFError, RuntimeError, MemoryError)
 _MOTORS = ("so100", "so101", "so_", "bi_so", "koch", "bi_koch", "lekiwi", "moss", "omx", "hope_jr")
-"""The robots whose motors LeRobot normalises; their names begin so."""
+"""Prefixes of the names of robots whose motors LeRobot normalises."""
 _JAWS = ("gripper", "jaw")
-_MOST_HUNDREDTHS = 100.5
-_NO_RADIANS = 2.2 * math.pi
-_NOMINAL = 1e-3
-"""Stamps that differ from ``frame_index / fps`` by a smaller share of a period were computed, not measured."""
+_MAX_HUNDREDTHS = 100.5
+_MAX_RAD = 2.2 * math.pi
+_NOMINAL_SHARE = 1e-3
+"""Stamps are nominal if they differ from ``frame_index / fps`` by a smaller share of a period."""
 
 
 def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
@@ -42,7 +47,7 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         episode: Number of the episode; None: the only one.
 
     Raises:
-        UsageError: When it is no Parquet, or holds several episodes and none is chosen, or not the chosen one.
+        UsageError: When the file is no Parquet, lacks the episode, or holds several episodes and none is chosen.
     """
     try:
         import pyarrow
@@ -59,9 +64,9 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         schema = files[0].schema_arrow
         notes, keys = [], []
         for name in schema.names:
-            why = _why_left_out(schema.field(name).type) or _too_wide(files, name)
+            why = _reason_to_skip(schema.field(name).type) or _too_wide(files, name)
             keys += [name] * (not why and name not in _COUNTERS)
-            notes += [f"left out: {name!r}: {why}"] * bool(why)
+            notes += [f"skipped: {name!r}: {why}"] * bool(why)
         require_signals(len(schema.names), path)
         if not keys:
             raise UsageError(f"nothing in {path} can be read: {'; '.join(notes) or 'no columns'}", hint=WHOLE)
@@ -70,9 +75,9 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
     except (pyarrow.ArrowException, *_DAMAGED) as error:
         raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=WHOLE) from None
     if not info and "observation.state" in schema.names:
-        info = {"robot_type": ""}  # a file of a data set, without what the set says of its robot
+        info = {"robot_type": ""}  # a file of a data set, without the description of its robot
 
-    def load(name: str) -> Any:
+    def load(name: str) -> Json:
         if name not in schema.names:
             return _fact(info, name)
         try:
@@ -98,44 +103,45 @@ def files_of(path: Path, episode: int | None = None) -> list[Path]:
     """Return the Parquet files of a data set's folder, in the order of their episodes; of a file, the file.
 
     Args:
-        path: The folder or the file.
-        episode: The episode, where one is chosen: it may have a file of its own.
+        episode: Number of the chosen episode, which can have a file of its own.
 
     Raises:
-        UsageError: When there is none.
+        UsageError: When the folder has no Parquet file.
     """
-    found = sorted((path / "data").glob("**/*.parquet")) if path.is_dir() else [path]
-    if not found:
+    files = sorted((path / "data").glob("**/*.parquet")) if path.is_dir() else [path]
+    if not files:
         raise UsageError(f"{path} has no data/chunk-*/*.parquet", hint="download the data set's folder `data`, too")
-    own = [p for p in found if episode is not None and p.stem == f"episode_{episode:06d}"]
-    return own or found
+    episode_files = [p for p in files if episode is not None and p.stem == f"episode_{episode:06d}"]
+    return episode_files or files
 
 
 def _chosen(path: Path, episode: int | None) -> dict[Path, np.ndarray | None]:
-    """Return the files that hold the episode, with its rows; None: all of a file without episodes."""
+    """Return the files of the episode, with its rows; None for all rows of a file without episodes."""
     import pyarrow.parquet
 
-    there: dict[Path, np.ndarray] = {}
+    numbers_of: dict[Path, np.ndarray] = {}
     for part in files_of(path, episode):
         with pyarrow.parquet.ParquetFile(part) as file:
             if _EPISODE not in file.schema_arrow.names:
                 if episode is not None:
-                    raise UsageError(f"{part} has no {_EPISODE}, so it holds no episodes", hint="leave --episode out")
+                    raise UsageError(f"{part} has no {_EPISODE}, so it holds no episodes", hint="remove --episode")
                 return {part: None}
             require_memory(8.0 * file.metadata.num_rows, str(part))
-            there[part] = file.read(columns=[_EPISODE]).column(0).to_numpy()
-    numbers = np.unique(np.concatenate(list(there.values())))
+            numbers_of[part] = file.read(columns=[_EPISODE]).column(0).to_numpy()
+    numbers = np.unique(np.concatenate(list(numbers_of.values())))
     listed = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else ", ".join(map(str, numbers)) or "none"
     if episode is None and len(numbers) > 1:
         raise UsageError(f"{path} holds {len(numbers)} episodes: {listed}", hint="choose one with --episode N")
     if not len(numbers) or (episode is not None and episode not in numbers):
         raise UsageError(f"{path} has no episode {episode or 0}. Available: {listed}", hint="choose another --episode")
     wanted = numbers[0] if episode is None else episode
-    return {part: rows for part, own in there.items() if len(rows := np.flatnonzero(own == wanted))}
+    return {
+        part: rows for part, file_numbers in numbers_of.items() if len(rows := np.flatnonzero(file_numbers == wanted))
+    }
 
 
-def _why_left_out(kind: Any) -> str:
-    """Return why a column of an Arrow type holds no signal; empty where it may."""
+def _reason_to_skip(kind: pyarrow.DataType) -> str:
+    """Return why a column of an Arrow type is no signal of a robot; empty if it can be one."""
     import pyarrow.types as is_
 
     inner, levels = kind, 1
@@ -149,14 +155,14 @@ def _why_left_out(kind: Any) -> str:
     return "" if numbers or is_.is_duration(inner) else f"no numbers, but {inner}"
 
 
-def _too_wide(files: Sequence[Any], name: str) -> str:
-    """Return why a column of lists is an image; empty where it is none."""
+def _too_wide(files: Sequence[pyarrow.parquet.ParquetFile], name: str) -> str:
+    """Return why a column of lists is an image; empty if it is none."""
     rows = sum(file.metadata.num_rows for file in files)
-    return why_left_out((rows, math.ceil(_count(files, name) / max(rows, 1))), "f", 8)
+    return reason_to_skip((rows, math.ceil(_count(files, name) / max(rows, 1))), "f", 8)
 
 
-def _count(files: Sequence[Any], name: str) -> int:
-    """Return how many numbers a column has."""
+def _count(files: Sequence[pyarrow.parquet.ParquetFile], name: str) -> int:
+    """Return the number of values in a column."""
     places = [i for i in range(files[0].metadata.num_columns) if _path(files[0], i).split(".")[0] == name]
     return sum(
         file.metadata.row_group(group).column(i).num_values
@@ -164,12 +170,12 @@ def _count(files: Sequence[Any], name: str) -> int:
     )  # fmt: skip
 
 
-def _path(file: Any, column: int) -> str:
+def _path(file: pyarrow.parquet.ParquetFile, column: int) -> str:
     return file.metadata.schema.column(column).path
 
 
-def _loaded(file: Any, rows: np.ndarray | None, name: str) -> Any:
-    """Return a column of a file, or those rows of it."""
+def _loaded(file: pyarrow.parquet.ParquetFile, rows: np.ndarray | None, name: str) -> Json:
+    """Return a column of a file, or some rows of it."""
     import pyarrow
 
     require_memory(8.0 * _count([file], name), f"{name!r} of {file.metadata.num_rows} rows")
@@ -190,51 +196,51 @@ def _loaded(file: Any, rows: np.ndarray | None, name: str) -> Any:
     return column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), int(lengths[0]))
 
 
-def are_degrees(facts: Mapping[str, Any], names: Sequence[str], q: np.ndarray, path: str) -> bool:
-    """Return whether positions are proven to be degrees, not hundredths of each joint's calibrated range.
+def are_degrees(facts: Mapping[str, Json], names: Sequence[str], q: np.ndarray, path: str) -> bool:
+    """Return whether positions are surely degrees, not hundredths of each joint's calibrated range.
 
-    LeRobot writes hundredths by default, which look like degrees. Degrees are proven by the steps of the servos'
-    encoders; hundredths are ruled out by a joint beyond 100.
+    LeRobot writes hundredths by default, which look like degrees. The steps of the servos' encoders prove degrees; a
+    joint beyond 100 excludes hundredths.
 
     Args:
         facts: ``meta/info.json``; empty for other files.
-        names: Names of the columns, as the data set has them.
+        names: Names of the columns in the data set.
         q: Positions, ``(N, columns)``.
-        path: The file, for errors.
 
     Raises:
-        UsageError: When neither the data nor ``info.json`` says which unit it is.
+        UsageError: When the unit is unclear from data and ``info.json``.
     """
     robot = str(facts.get("robot_type") or "an unknown robot")
     motors = robot.startswith(_MOTORS) or any(name.endswith(".pos") for name in names)
-    if not facts or not (motors or np.abs(q).max() > _NO_RADIANS):
+    if not facts or not (motors or np.abs(q).max() > _MAX_RAD):
         return False
     jaws = [i for i, name in enumerate(names) if any(word in name.lower() for word in _JAWS)]
     arm = [i for i in range(q.shape[1]) if i not in jaws]
-    beyond = bool((np.abs(q[:, arm]) > _MOST_HUNDREDTHS).any())
+    beyond = bool((np.abs(q[:, arm]) > _MAX_HUNDREDTHS).any())
     moving = [i for i in arm if np.ptp(q[:, i]) > 0]
     proofs = [_is_degrees(q[:, i]) for i in moving]
     proven = None not in proofs and True in proofs
     if arm and not beyond and not proven:
-        most = ", ".join(f"{names[i]} {np.abs(q[:, i]).max():.4g}" for i in arm[:3])
+        largest = ", ".join(f"{names[i]} {np.abs(q[:, i]).max():.4g}" for i in arm[:3])
         raise UsageError(
             f"the positions of {robot} in {path} are degrees, or hundredths of each joint's calibrated range "
-            f"(-100..100), which LeRobot writes by default: {most} at most, and no meta/info.json says which",
+            f"(-100..100), which LeRobot writes by default: {largest} at most, and meta/info.json has no unit",
             hint="write a mapping with their scale: the guide 'Import' has that of degrees and that of hundredths",
         )
-    if odd := [i for i in jaws if q[:, i].min() >= -0.5 and q[:, i].max() <= _MOST_HUNDREDTHS and q[:, i].any()]:
+    if hundredths := [i for i in jaws if q[:, i].min() >= -0.5 and q[:, i].max() <= _MAX_HUNDREDTHS and q[:, i].any()]:
         raise UsageError(
-            f"{names[odd[0]]} of {robot} in {path} is in hundredths of its calibrated range (0..100), not in degrees",
-            hint="leave it out with --joints, or write a mapping with its scale: see the guide 'Import'",
+            f"{names[hundredths[0]]} of {robot} in {path} is in hundredths of its calibrated range (0..100), "
+            "not in degrees",
+            hint="omit it from --joints, or write a mapping with its scale: see the guide 'Import'",
         )
     return proven
 
 
 def _is_degrees(column: np.ndarray) -> bool | None:
-    """Return whether a joint moves by whole counts of an encoder of 4096 a turn, in degrees; None: it does not.
+    """Return whether a joint moves by whole counts of an encoder of 4096 per turn, in degrees; None if it does not.
 
-    False says that it moves too little: hundredths of a range of 2276 counts have nearly the same step, and only a long
-    way tells them apart.
+    False for a joint that moves too little: hundredths of a range of 2276 counts have nearly the same step, and only a
+    long motion shows the difference.
     """
     levels = np.unique(column)
     counts = (levels - levels[0]) * 4096 / 360
@@ -243,8 +249,8 @@ def _is_degrees(column: np.ndarray) -> bool | None:
     return bool(counts[-1] >= 200 and levels.size >= 20)
 
 
-def _fps(load: Any, names: Sequence[str]) -> float | None:
-    """Return the rate by which frames are numbered in time [Hz]; None where they are not."""
+def _fps(load: Callable[[str], Json], names: Sequence[str]) -> float | None:
+    """Return the rate at which frame numbers increase with time [Hz]; None without numbers or stamps."""
     if not {"timestamp", "frame_index"} <= set(names):
         return None
     stamps, frames = (np.asarray(load(name), np.float64) for name in ("timestamp", "frame_index"))
@@ -254,7 +260,7 @@ def _fps(load: Any, names: Sequence[str]) -> float | None:
     return fps if _is_nominal(load, names, fps) else None
 
 
-def _is_nominal(load: Any, names: Sequence[str], fps: float) -> bool:
+def _is_nominal(load: Callable[[str], Json], names: Sequence[str], fps: float) -> bool:
     """Return whether time stamps are ``frame_index / fps``."""
     stamps = np.asarray(load("timestamp"), np.float64)
     if stamps.ndim != 1 or not len(stamps) or not fps > 0:
@@ -263,30 +269,30 @@ def _is_nominal(load: Any, names: Sequence[str], fps: float) -> bool:
     if frames.shape != stamps.shape:
         return False
     rounding = float(np.spacing(np.float32(np.abs(stamps).max())))  # data sets hold float32
-    return bool((np.abs(stamps - frames / fps) <= _NOMINAL / fps + rounding).all())
+    return bool((np.abs(stamps - frames / fps) <= _NOMINAL_SHARE / fps + rounding).all())
 
 
-def _info(path: Path) -> Mapping[str, Any]:
-    """Return what a data set says of itself.
+def _info(path: Path) -> Mapping[str, Json]:
+    """Return the metadata of a data set.
 
     Raises:
         UsageError: When the file is no JSON object.
     """
     try:
-        require_size(path, MOST_TEXT_BYTES)
-        found = json.loads(path.read_bytes())
+        require_size(path, MAX_TEXT_BYTES)
+        document = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, UsageError):
             raise
         raise UsageError(f"{path} is no JSON: {error}", hint=WHOLE) from None
-    if not isinstance(found, dict):
+    if not isinstance(document, dict):
         raise UsageError(f"{path} holds no object", hint=WHOLE)
-    return found
+    return document
 
 
-def _fact(info: Mapping[str, Any], name: str) -> Any:
+def _fact(info: Mapping[str, Json], name: str) -> Json:
     """Return a value of ``info.json`` by its path, as ``fps``."""
-    value: Any = info
+    value: Json = info
     for part in name.split("."):
         if not isinstance(value, Mapping) or part not in value:
             raise KeyError(name)
@@ -294,13 +300,13 @@ def _fact(info: Mapping[str, Any], name: str) -> Any:
     return value
 
 
-def _feature_names(info: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the names of the entries of columns, as ``info.json`` has them."""
-    found = {}
+def _feature_names(info: Mapping[str, Json]) -> dict[str, list[str]]:
+    """Return column -> names of its entries in ``info.json``."""
+    names_of = {}
     features = info.get("features")
     for key, feature in features.items() if isinstance(features, dict) else ():
         names = feature.get("names") if isinstance(feature, dict) else None
         names = next(iter(names.values())) if isinstance(names, dict) and len(names) == 1 else names
         if isinstance(names, list) and all(isinstance(n, str) for n in names):
-            found[key] = names
-    return found
+            names_of[key] = names
+    return names_of

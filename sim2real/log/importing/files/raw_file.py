@@ -1,10 +1,11 @@
-"""What a reader of another recorder's file returns: names of signals, what loads one, and what it has to say."""
+"""The signals that a reader of another recorder's file returns: names, a loader, and notes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+
+from sim2real.types import Json
 
 
 @dataclass(frozen=True)
@@ -12,17 +13,17 @@ class RawSignals:
     """The signals of a file.
 
     Attributes:
-        keys: Names of the signals that a mapping is proposed from; ``load`` may know more.
-        load: Returns a signal by name; raises KeyError if there is none.
-        columns: Names of a signal's columns, where the file has some.
-        notes: What was left out and why, and whose clock is used: sentences.
+        keys: Names of the signals that a proposal uses; ``load`` can accept more names.
+        load: Returns a signal by name; raises KeyError for an unknown name.
+        columns: Signal -> names of its columns.
+        notes: Sentences about skipped signals and the chosen clock.
         nominal: Names of stamps that were generated from a rate, not recorded.
-        facts: What the file says about itself.
+        facts: Metadata of the file.
     """
 
     keys: Sequence[str]
-    load: Callable[[str], Any]
+    load: Callable[[str], Json]
     columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     nominal: frozenset[str] = frozenset()
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    facts: Mapping[str, Json] = field(default_factory=dict)

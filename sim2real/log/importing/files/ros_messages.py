@@ -1,16 +1,16 @@
-"""Decodes ROS 2 messages in CDR by the definition that stands in the bag."""
+"""Decodes ROS 2 messages in CDR by their definition in the bag; docs/reference/choices.md compares other readers."""
 
 from __future__ import annotations
 
 import re
 import struct
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
 from sim2real.log.cdr import ENCAPSULATION
-from sim2real.log.importing.files.budget import MOST_COLUMNS, MOST_LEVELS
+from sim2real.log.importing.files.budget import MAX_COLUMNS, MAX_LEVELS
+from sim2real.types import Json
 
 _SIZES = {"bool": "?", "byte": "B", "char": "B", "float32": "f", "float64": "d"} | {
     f"{sign}int{bits}": code if not sign else code.upper()
@@ -20,21 +20,21 @@ _FIELD = re.compile(r"^\s*([\w/]+)(<=\d+)?(\[(?:<=)?\d*\])?\s+(\w+)\s*(=)?")
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _PLAIN = {*_SIZES, "string", "wstring"}
 _Types = Mapping[str, list[tuple[str, str, str]]]
-Decode = Callable[[bytes], Any]
+Decode = Callable[[bytes], Json]
 
 
-class Undecodable(Exception):  # noqa: N818 - it is a finding, and ends in a list
-    """Why messages of a type cannot be decoded."""
+class UndecodableError(Exception):
+    """The reason why messages of a type cannot be decoded."""
 
 
 def decoder(name: str, definition: str) -> Decode:
-    """Return what decodes the messages of a type.
+    """Return the decoder of a message type.
 
     Args:
-        definition: Its definition, followed by those of the types that it uses (``ros2msg``).
+        definition: Definition of the type, then those of the types inside it (``ros2msg``).
 
     Raises:
-        Undecodable: When a definition is missing, uses itself, or has a ``wstring``.
+        UndecodableError: When a definition is missing, uses itself, or has a ``wstring``.
     """
     types = _parse(name, definition)
     _require_whole(_short(name), types, ())
@@ -42,7 +42,7 @@ def decoder(name: str, definition: str) -> Decode:
 
 
 def _parse(name: str, text: str) -> _Types:
-    """Return type -> fields (type, array, name) of a ``ros2msg`` schema with the types that it uses."""
+    """Return type -> fields (type, array, name) of a ``ros2msg`` schema."""
     types = {}
     for part in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.split("#")[0] for line in part.strip().splitlines()]
@@ -63,15 +63,15 @@ def _parse(name: str, text: str) -> _Types:
 
 
 def _require_whole(name: str, types: _Types, inside: tuple[str, ...]) -> None:
-    """Check that every type that a type uses is defined."""
+    """Check that all types inside a type are defined."""
     if name not in types:
-        raise Undecodable(f"its definition lacks the type {name}")
-    if name in inside or len(inside) > MOST_LEVELS:
-        raise Undecodable(f"its definition of {name} uses itself")
+        raise UndecodableError(f"its definition lacks the type {name}")
+    if name in inside or len(inside) > MAX_LEVELS:
+        raise UndecodableError(f"its definition of {name} uses itself")
     for kind in {kind for kind, _, _ in types[name]}:
         if kind == "wstring":
             # Fast CDR writes 4 bytes a character, its second version 2 bytes, and the message does not say which.
-            raise Undecodable("it has a wstring, whose size in CDR differs between middlewares")
+            raise UndecodableError("it has a wstring, whose size in CDR differs between middlewares")
         if kind not in _PLAIN:
             _require_whole(_short(kind), types, (*inside, name))
 
@@ -92,17 +92,17 @@ class _Reader:
         self._data, self._types, self._at = data, types, len(ENCAPSULATION)
         self._order = "<" if data[1] & 1 else ">"
 
-    def record(self, name: str) -> dict[str, Any]:
+    def record(self, name: str) -> dict[str, Json]:
         """Read the fields of a type."""
-        found = {}
+        values = {}
         fields = self._types[_short(name)]
         self._at += not fields  # a type without fields takes one byte
         for kind, array, field in fields:
-            found[field] = self._array(kind, array) if array else self._value(kind)
-        return found
+            values[field] = self._array(kind, array) if array else self._value(kind)
+        return values
 
-    def _array(self, kind: str, array: str) -> list[Any]:
-        """Read an array; one that is too long for joints is passed over, and empty."""
+    def _array(self, kind: str, array: str) -> list[Json]:
+        """Read an array; an array that is too long for joints is skipped, and returned empty."""
         bounds = array.strip("[]")
         count = int(bounds) if bounds.isdigit() else self._number("I")
         if count > len(self._data) - self._at:  # each element takes a byte or more
@@ -112,10 +112,10 @@ class _Reader:
             self._align(code.itemsize)
             values = np.frombuffer(self._data, code, count, self._at)
             self._at += count * code.itemsize
-            return values.tolist() if count <= MOST_COLUMNS else []
+            return values.tolist() if count <= MAX_COLUMNS else []
         return [self._value(kind) for _ in range(count)]
 
-    def _value(self, kind: str) -> Any:
+    def _value(self, kind: str) -> Json:
         if kind in _SIZES:
             return self._number(_SIZES[kind])
         if kind == "string":
@@ -126,7 +126,7 @@ class _Reader:
             return self._data[self._at - count : self._at - 1].decode(errors="replace")
         return self.record(kind)
 
-    def _number(self, code: str) -> Any:
+    def _number(self, code: str) -> Json:
         size = struct.calcsize(code)
         self._align(size)
         (value,) = struct.unpack_from(self._order + code, self._data, self._at)

@@ -10,16 +10,16 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log.importing.files import dates
-from sim2real.log.importing.files.budget import MOST_BYTES, MOST_COLUMNS, WHOLE, require_signals, require_size
-from sim2real.log.importing.files.cells import MISSING, OTHER, NoNumbers, is_number, number_in
+from sim2real.log.importing.files.budget import MAX_BYTES, MAX_COLUMNS, WHOLE, require_signals, require_size
+from sim2real.log.importing.files.cells import MISSING, OTHER, NoNumbersError, is_number, number_in
 from sim2real.log.importing.files.raw_file import RawSignals
 from sim2real.log.importing.signal_names import meaning
+from sim2real.types import Json
 
 _COMMENTS = ("#", "%", "//")
 _BLOCK = 4096
@@ -32,10 +32,10 @@ def encoding_of(path: Path, kind: str) -> str:
     """Return the encoding of a file of text: UTF-8, UTF-16 with a mark, else latin-1.
 
     Args:
-        kind: What it should be, for the error.
+        kind: Expected format, for the error.
 
     Raises:
-        UsageError: When it holds zero bytes: it is no text.
+        UsageError: When the file holds zero bytes, which text has not.
     """
     with path.open("rb") as stream:
         mark = stream.read(4)
@@ -47,27 +47,27 @@ def encoding_of(path: Path, kind: str) -> str:
             if mark.startswith(bom):
                 return name
         stream.seek(0)
-        decoder, found = codecs.getincrementaldecoder("utf-8")(), "utf-8"
+        decoder, encoding = codecs.getincrementaldecoder("utf-8")(), "utf-8"
         while block := stream.read(1 << 20):
             if b"\0" in block:
                 raise UsageError(f"{path} is no {kind}: it holds zero bytes, as no text does", hint=WHOLE)
-            if found == "utf-8":
+            if encoding == "utf-8":
                 try:
                     decoder.decode(block)
                 except UnicodeDecodeError:
-                    found = "latin-1"
-    return found
+                    encoding = "latin-1"
+    return encoding
 
 
 def read_csv(path: Path) -> RawSignals:
-    """Read a table, whose first line has the names of its columns.
+    """Read a table with the names of its columns in the first line.
 
-    Lines of comments (``#``, ``%``, ``//``) are passed over; the last one before the numbers may hold the names.
+    Comment lines (``#``, ``%``, ``//``) are skipped; the last one before the numbers can hold the names.
 
     Raises:
-        UsageError: When it has no names, or lines differ in their number of cells, or it is too large.
+        UsageError: When the table has no names, lines of different lengths, or is too large.
     """
-    require_size(path, MOST_BYTES)
+    require_size(path, MAX_BYTES)
     encoding = encoding_of(path, "CSV")
     table = _Table(path)
     try:
@@ -76,14 +76,14 @@ def read_csv(path: Path) -> RawSignals:
     except (UnicodeError, csv.Error) as error:
         raise UsageError(f"{path} is no CSV: {error}", hint=WHOLE) from None
     notes = (f"{path.name} is no UTF-8: it is read as latin-1",) if encoding == "latin-1" else ()
-    return RawSignals([name for name in table.header if name], table.load, notes=(*notes, *table.left_out()))
+    return RawSignals([name for name in table.header if name], table.load, notes=(*notes, *table.notes()))
 
 
 class _Table:
-    """The columns of a table, read in blocks of lines: numbers take 8 bytes each, other cells stay texts.
+    """The columns of a table, read in blocks of lines: numbers take 8 bytes each, other cells stay text.
 
     Attributes:
-        header: Names of the columns; empty for those without one.
+        header: Names of the columns; empty for a column without a name.
     """
 
     def __init__(self, path: Path) -> None:
@@ -142,24 +142,24 @@ class _Table:
             )
 
     def _lines(self, stream: Iterator[str], comments: list[str]) -> Iterator[tuple[int, str]]:
-        """Yield number and text of the lines that are no comments; the first comments are kept."""
+        """Yield number and text of the lines that are no comments, and collect the first comments."""
         for number, text in enumerate(stream, 1):
-            own = text.strip()
-            if own.startswith(_COMMENTS):
+            stripped = text.strip()
+            if stripped.startswith(_COMMENTS):
                 if len(comments) < 100:
-                    comments.append(own.lstrip("#%/ \t"))
-            elif own:
-                yield number, text.strip("\r\n") if self._delimiter != " " else own
+                    comments.append(stripped.lstrip("#%/ \t"))
+            elif stripped:
+                yield number, text.strip("\r\n") if self._delimiter != " " else stripped
 
     def _cells(self, text: str) -> list[str]:
         rows = list(csv.reader([text.strip()], delimiter=self._delimiter, skipinitialspace=True))
         return [name.strip() for name in rows[0]] if rows else []
 
     def _row(self, row: list[str]) -> list[str]:
-        """Return a line's cells; empty ones at its end belong to no column, or to one without a name.
+        """Return a line's cells, without empty cells after the last column with a name.
 
         Raises:
-            UsageError: When they are not as many as the names, or are the names again.
+            UsageError: When the number of cells differs from that of the names, or the cells repeat the names.
         """
         width = len(self.header)
         named = max((i + 1 for i, name in enumerate(self.header) if name), default=0)
@@ -184,7 +184,7 @@ class _Table:
         """Refuse a line of words below the names, such as units.
 
         Raises:
-            UsageError: When no cell of the first line may be a number, and the second has one below a word.
+            UsageError: When the first line has no number, and the second has a number below a word.
         """
         if len(rows) < 2:
             return
@@ -199,7 +199,7 @@ class _Table:
             raise UsageError(
                 f"line {line} of {self._path} holds words below the names of the columns, no numbers: "
                 f"{', '.join(words[:6])}",
-                hint="delete the line; a unit belongs into the name, as in q_rad or t_ms",
+                hint="delete the line, and write units into the names, as in q_rad or t_ms",
             )
 
     def _take(self, block: list[tuple[int, list[str]]]) -> None:
@@ -222,19 +222,19 @@ class _Table:
                     elif "." in cell and is_number(cell):
                         self._point = self._point or (n, cell)
 
-    def left_out(self) -> list[str]:
-        """Return what to say of columns without a name."""
+    def notes(self) -> list[str]:
+        """Return a sentence on columns without a name."""
         unnamed = [blocks for name, blocks in zip(self.header, self._blocks, strict=True) if not name]
-        filled = [
+        nonempty = [
             blocks for blocks in unnamed if any(isinstance(b, list) or np.isfinite(b).any() for b in blocks)
         ]  # fmt: skip
-        return [f"left out: columns without a name: {len(filled)}"] * bool(filled)
+        return [f"skipped: columns without a name: {len(nonempty)}"] * bool(nonempty)
 
-    def load(self, name: str) -> Any:
+    def load(self, name: str) -> np.ndarray | list[Json]:
         """Return a column.
 
         Raises:
-            KeyError: When there is none of this name.
+            KeyError: When no column has this name.
             UsageError: When a cell holds no number.
         """
         if not name or name not in self.header:
@@ -248,7 +248,7 @@ class _Table:
         if len(texts) and dates.are_dates([texts[0][1]]):
             return self._dates(blocks, texts, name)
         if len(texts) == sum(map(len, blocks)) and not any(self._may_be_number(cell) for _, cell in texts):
-            raise NoNumbers(f"column {name!r} of {self._path} holds no numbers: {texts[0][1][:60]!r}", hint=OTHER)
+            raise NoNumbersError(f"column {name!r} of {self._path} holds no numbers: {texts[0][1][:60]!r}", hint=OTHER)
         parts = [
             block if isinstance(block, np.ndarray) else np.array([self._number(n, cell, name) for n, cell in block])
             for block in blocks
@@ -259,7 +259,7 @@ class _Table:
         unit = meaning(name).unit
         try:
             if not all(isinstance(block, list) for block in blocks):
-                raise ValueError("numbers stand between its dates", 0)
+                raise ValueError("it mixes dates and numbers", 0)
             return dates.parsed([cell for _, cell in texts], unit if unit in _STAMP_UNITS else "")
         except ValueError as error:
             line = texts[error.args[1]][0]
@@ -267,40 +267,40 @@ class _Table:
                 f"line {line} of {self._path}, column {name!r}: {error.args[0]}", hint="dates as 2024-05-01T12:00:00.25"
             ) from None
 
-    def _lists(self, texts: _Cells, name: str) -> list[Any]:
+    def _lists(self, texts: _Cells, name: str) -> list[Json]:
         """Return the lists in cells, as ``[0.1, 0.2]`` or ``[0.1 0.2]``."""
-        found = []
+        lists = []
         for line, text in texts:
             try:
-                found.append(json.loads(text) if "," in text else [float(x) for x in text.strip("[] ").split()])
+                lists.append(json.loads(text) if "," in text else [float(x) for x in text.strip("[] ").split()])
             except (ValueError, RecursionError):
                 raise UsageError(
                     f"line {line} of {self._path}, column {name!r} holds {text[:60]!r}, no list of numbers", hint=WHOLE
                 ) from None
-            if len(found[-1]) > MOST_COLUMNS:
-                raise UsageError(f"line {line} of {self._path}, column {name!r} holds {len(found[-1])} numbers")
-        return found
+            if len(lists[-1]) > MAX_COLUMNS:
+                raise UsageError(f"line {line} of {self._path}, column {name!r} holds {len(lists[-1])} numbers")
+        return lists
 
     def _number(self, line: int, text: str, name: str) -> float:
-        """Return the number in a cell, whose decimals may stand behind a comma; NaN for one that is missing."""
-        own, where = text.strip(), f"line {line} of {self._path}, column {name!r}"
-        comma = is_number(own.replace(",", ".")) and own.count(",") == 1
+        """Return the number in a cell, with a decimal point or comma; NaN for a missing number."""
+        stripped, where = text.strip(), f"line {line} of {self._path}, column {name!r}"
+        comma = is_number(stripped.replace(",", ".")) and stripped.count(",") == 1
         if comma and self._delimiter != ",":
-            return float(own.replace(",", "."))
-        hint = "write dates as 2024-05-01T12:00:00.25" if dates.is_other(own) else ""
+            return float(stripped.replace(",", "."))
+        hint = "write dates as 2024-05-01T12:00:00.25" if dates.is_other(stripped) else ""
         hint = "decimal commas need semicolons or tabs between the cells" if comma else hint
         if hint:
             raise UsageError(f"{where} holds {text[:60]!r}, no number", hint=hint)
-        return number_in(own, where)
+        return number_in(stripped, where)
 
     def _may_be_number(self, text: str) -> bool:
-        """Return whether a cell holds a number or stands for one, or is meant as one that cannot be read."""
-        own = text.strip()
-        return is_number(own.replace(",", ".")) or own.lower() in MISSING or dates.is_other(own)
+        """Return whether a cell holds a number, a word for a missing number, or a date in another form."""
+        stripped = text.strip()
+        return is_number(stripped.replace(",", ".")) or stripped.lower() in MISSING or dates.is_other(stripped)
 
 
 def _delimiter(first: str, second: str) -> str:
-    """Return what stands between the cells of a table, by its first two lines."""
+    """Return the separator of a table's cells, from its first two lines."""
     best = max(",;\t|", key=first.count)
     if best in first:
         return best
