@@ -106,7 +106,6 @@ class Bundle(Summed):
         episodes: Distributions of the training's episodes; None if only the policy was copied.
         path: The bundle's folder; None before ``save``.
         sensitivity: Success with one wrong parameter; None if it was not simulated.
-        spec: Layout of the network.
         graph: The policy as an ONNX model if the network is a custom one; ``load`` does not read it.
         references: Observations of log and training with JAX's actions, with which ``save`` compares the runner.
         summary: Text and numbers about the training; empty for a loaded bundle.

@@ -115,10 +115,8 @@ class Deployment(Summed):
 
     Attributes:
         gap: Quantities on the robot and in simulation.
-        units: Field -> unit.
         simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; a field with its own
             times has them as ``t_FIELD``. Empty without a simulation.
-        recordings: The logs of the episodes.
         probe: Log of the small steps that measure the delay; None if the delay was not measured.
         trained: Times on the robot, and the times that the policy was trained with.
         replay: Prediction errors of the identified and of the nominal model on the recorded commands.
@@ -127,7 +125,6 @@ class Deployment(Summed):
         advice: The verdict; None in older files and after a dry run.
         dry_run: Whether commands were not sent: then there are no scores, no simulation and no gap.
         summary: Summary of each episode's session; empty for a loaded artifact.
-        format: Version of the file.
     """
 
     episodes: tuple[Scores, ...]

@@ -26,7 +26,6 @@ class Varied:
     Attributes:
         value: The estimate, or the nominal value.
         low95: Lower end of the estimate's 95 % interval; None without an interval.
-        high95: Upper end.
         open: Whether the recordings do not determine it; it is then drawn from its bounds.
     """
 
@@ -45,8 +44,6 @@ class Episodes:
     Attributes:
         parameters: Parameters that differ between episodes, with pushes and starts, in the order of the table.
         widening: Factor on the posterior's deviations that covers errors of the model.
-        noise: Noise of the sensor's readings.
-        timelines: Number of timelines that the episodes share.
         cut: Number of timelines that end before a pause that the program cannot hold.
         again: Number of timelines that were drawn again, as such a pause was in their first half.
         longest_pause_s: Longest time between two policy steps [s].
@@ -56,7 +53,6 @@ class Episodes:
         recorded_s: Node -> durations of its steps on the robot ``(N,)`` [s].
         drawn_s: Node -> durations of its steps in the timelines ``(M,)`` [s].
         off: Column of ``noise`` -> differences between measurements and the identified model ``(N,)``, in its unit.
-        format: Version of the files.
     """
 
     parameters: tuple[Varied, ...]

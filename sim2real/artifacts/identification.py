@@ -45,9 +45,7 @@ class Estimate:
         about: Description in one line.
         nominal: The data sheet's value.
         low95: Lower end of the 95 % interval.
-        high95: Upper end.
         lower: Lower bound of the search.
-        upper: Upper bound of the search.
         verdict: ``accepted``, ``negligible``, ``not reached``, ``fixed``, ``at a bound``, ``not identifiable`` or
             ``not converged``, or ``interrupted``.
         truth: The value in the embedded robot.
@@ -121,11 +119,8 @@ class Search:
     """The search for the estimate.
 
     Attributes:
-        strategy: The search algorithm; None without a search.
         history: Best loss of each generation ``(G,)``.
         evaluations: Number of simulated candidates.
-        refined: The refinements after the search.
-        seconds: Duration of search and refinements [s].
         loss: Best loss of an interrupted search.
         done: Completed shares of an interrupted search and refinement.
         engine: The simulator, and the reason for its choice.
@@ -194,7 +189,6 @@ class HeldOutPart:
     """A fit without one part of the recordings, and its errors on that part.
 
     Attributes:
-        name: Name of the held-out part.
         terms: Optional terms of the model in this fit.
         values: Parameter -> estimate of this fit.
         share: Parameter -> share of the information in all recordings that the part holds.
@@ -216,8 +210,6 @@ class Identification(Shown):
 
     Attributes:
         logs: The fitted recordings, then the recordings that are held out whole.
-        covariance: Covariance of the estimates.
-        correlation: Correlation of the estimates.
         residual_inflation: Factor on the variance of the estimates, as residuals are correlated in time.
         misfit: Root mean square of the residuals, in deviations of the measurement.
         prediction: Errors over horizons.
@@ -225,21 +217,18 @@ class Identification(Shown):
         aggregate: Quantities estimated from each recording alone; empty unless configured.
         left_out: A fit for each held-out part; empty without folds.
         terms: Optional terms of the model in the fit; None if the model has no optional terms.
-        links: Distributions of delays; empty unless configured.
         noise: Noise of the sensor; empty in older files.
         widening: Factor on the posterior's deviations that covers errors of the model; None in older files.
         segments: Number of simulated segments.
         held_out_from_s: Start of the first held-out segment [s].
         settle_s: Length of the first part of a held-out segment, to which its initial state is fitted [s].
         sigma: Field -> assumed deviation of a measurement.
-        units: Field -> unit.
         world: Name of the simulated world; None for the robot's own.
         posterior: Distribution from which training draws robots; None after an interrupted search.
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
             ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field.
         free: The same columns of the free runs; empty without free runs.
         timing: Timing of the first recording, from which training draws its delays; None if only the estimates exist.
-        format: Version of the file.
     """
 
     pipeline: str

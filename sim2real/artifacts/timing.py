@@ -52,7 +52,6 @@ class NodeTiming:
     """The timing of one node.
 
     Attributes:
-        steps: Number of steps.
         period: Time between the wake-ups of two steps.
         lateness: Time from a step's start to the wake-up of its thread.
         computation: Time from a step's start to its end, with wake-up and bus.
@@ -78,9 +77,6 @@ class ConnectionTiming:
     """The messages of one connection.
 
     Attributes:
-        reader: The node that reads.
-        input: Name of its input.
-        messages: Number of sent messages.
         unread: Number of messages that no step used, as newer ones came or the episode ended.
         transport: Time from sending to receipt.
     """
@@ -122,7 +118,6 @@ class Timing(Shown):
         steps_s: Node -> duration of each step ``(N,)`` [s], in order.
         bus_s: Node -> duration of each bus transaction ``(T,)`` [s], in order.
         transport_s: ``reader/input`` -> transport time of each message ``(M,)`` [s], in order.
-        format: Version of the files.
     """
 
     nodes: Mapping[str, NodeTiming]

@@ -140,6 +140,7 @@ def walk(path: str | Path, span: Range | None = None) -> Contents:
     """
     contents = Contents()
     with readable_errors(path), opened(path) as data:
+        # Count indices, open chunks in the range, and read metadata and attachments.
         for record in records(data, contents.damage):
             if record.opcode == Opcode.MESSAGE_INDEX:
                 channel = data[record.start] | data[record.start + 1] << 8
@@ -148,6 +149,7 @@ def walk(path: str | Path, span: Range | None = None) -> Contents:
                 _take_chunk(contents, data, record, span)
             else:
                 _take_other(contents, data, record)
+    # Without the session's metadata, find the reason.
     if contents.session is None:
         if contents.library not in ("", LIBRARY):
             raise Sim2RealError(

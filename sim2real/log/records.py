@@ -264,6 +264,7 @@ def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
 
 def _decompressed(chunk: Chunk) -> bytes:
     """Return a chunk's content, without decompressing more than its claimed size; check size and checksum."""
+    # Refuse a false size before decompressing.
     size = chunk.uncompressed_size
     limit = _MAX_RATIO * len(chunk.data) + _SMALL_BYTES
     if size > (max(limit, _MAX_ZSTD_BYTES) if chunk.compression == "zstd" else limit):
@@ -278,6 +279,7 @@ def _decompressed(chunk: Chunk) -> bytes:
         content = chunk.data
     else:
         raise ValueError(f"its compression {chunk.compression!r} is unknown")
+    # Check size and checksum of the content.
     if len(content) != size:
         raise ValueError(f"it holds other than the {size} bytes that it claims")
     if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:

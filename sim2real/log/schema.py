@@ -82,6 +82,7 @@ def output_topic(node: str, example: PyTree, units: Mapping[str, str] | None = N
     Raises:
         Sim2RealError: When two leaves get the same name, or one has a dtype that ROS lacks.
     """
+    # Describe each leaf by name, type, shape and unit.
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(example).items()}
     names = unique_names(arrays, f"the output of node {node!r}", "field")
     described = [
@@ -91,6 +92,7 @@ def output_topic(node: str, example: PyTree, units: Mapping[str, str] | None = N
     for entry, array in zip(described, arrays.values(), strict=True):
         if unit := _unit(entry["original"], array.size, units or {}):
             entry["unit"] = unit
+    # Write the same as a ROS message definition; units and shapes are comments.
     lines = []
     for entry in described:
         part = _field(entry)
@@ -164,6 +166,7 @@ def joint_source(
             raise Sim2RealError(
                 f"joint {joint!r} of node {node!r} has no {sorted(unknown)[0]!r}. Available: {', '.join(quantities)}"
             )
+    # A message starts with the header and the joints' names, which are constants.
     picks: list[tuple[tuple[int, int], ...]] = []
     described: list[dict[str, Json]] = []
     parts: list[CdrConstant | CdrField] = [
@@ -172,17 +175,18 @@ def joint_source(
         text(""),
     ]
     parts += [length(len(joints)), *(text(joint) for joint in joints)]
+    # Add an array for each quantity that some joint has.
     for quantity in quantities:
-        given = any(quantity in sources for sources in joints.values())
-        chosen = [_pick(node, joint, s.get(quantity), leaves) for joint, s in joints.items()] if given else []
-        picks.append(tuple(chosen))
-        parts.append(length(len(chosen)))
-        if chosen:
-            parts.append(CdrField(quantity, np.dtype("<f8"), (len(chosen),)))
-            entry = {"name": quantity, "original": quantity, "dtype": "<f8", "shape": [len(chosen)]}
+        present = any(quantity in sources for sources in joints.values())
+        elements = [_pick(node, joint, s.get(quantity), leaves) for joint, s in joints.items()] if present else []
+        picks.append(tuple(elements))
+        parts.append(length(len(elements)))
+        if elements:
+            parts.append(CdrField(quantity, np.dtype("<f8"), (len(elements),)))
+            entry = {"name": quantity, "original": quantity, "dtype": "<f8", "shape": [len(elements)]}
             sources = (s.get(quantity, "") for s in joints.values())
-            own = {f"{quantity}[{i}]": unit_of(source, units or {}) for i, source in enumerate(sources)}
-            unit = _unit(quantity, len(chosen), own)
+            joint_units = {f"{quantity}[{i}]": unit_of(source, units or {}) for i, source in enumerate(sources)}
+            unit = _unit(quantity, len(elements), joint_units)
             described.append({**entry, "unit": unit} if unit else entry)
     metadata = {"role": "joint_states", "fields": json.dumps(described)}
     topic = Topic("/joint_states", "sensor_msgs/msg/JointState", _JOINT_STATE_TEXT, Layout(parts), metadata)

@@ -98,6 +98,7 @@ class SessionFile:
         self._epoch_ns = 0
         self._start_monotonic_ns = 0
         self._early_events: list[tuple[int, int | None, int, str, str]] = []
+        # Encode the metadata before the file exists, so that an error leaves no file.
         session = document.encode(document.SESSION, metadata)
         try:
             self._stream = open(path, "xb")  # noqa: SIM115 - finish and abandon close it
@@ -107,6 +108,7 @@ class SessionFile:
             ) from error
         except OSError as error:
             raise Sim2RealError(f"the log {path} cannot be created: {error.strerror}") from error
+        # Write metadata and attachments first: a log without them cannot be read.
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True)
         try:
             self._writer.start(profile="ros2", library=LIBRARY)
@@ -157,6 +159,7 @@ class SessionFile:
             raise Sim2RealError(
                 f"the output of node {record.node!r} has {len(leaves)} leaves, its init_output had {node.leaves}"
             )
+        # Write output, step record and joint states with the step's number.
         seq, sent = record.seq, self._epoch_ns + 1000 * record.end
         if node.filled:
             values = _to_host([leaves[i] for i in node.filled])

@@ -156,11 +156,13 @@ class McapRecorder:
         Raises:
             Sim2RealError: When a record could not be written, or the disk has taken no data for a minute.
         """
+        # Close once: the interpreter's exit can call this at the same time.
         with self._lock:
             if self._closed:
                 return
             self._closed = True
         atexit.unregister(self._close_at_exit)
+        # Wait for the queue, then write the end of the session.
         self._queue.put(None)
         self._drain(report)
         if self._error is None:

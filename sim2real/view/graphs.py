@@ -70,6 +70,7 @@ def plot_timeline(
     with styled():
         figure = new_figure(0.6 + 0.55 * len(names))
         axes = figure.subplots()
+        # Draw the steps of each node as bars.
         for name, y in lanes.items():
             v = timeline.vertices[name]
             start, end = (t[episode, : v.count[episode]] / TICKS_PER_S for t in (v.start, v.end))
@@ -79,6 +80,7 @@ def plot_timeline(
                 (s, max(e - s, 1e-3 * (end_s - begin_s))) for s, e in zip(start[visible], end[visible], strict=True)
             ]
             axes.broken_barh(spans, (y - _BAR / 2, _BAR), facecolors=BLUE, edgecolors=INK, linewidth=0.4)
+        # Draw the messages between the drawn nodes.
         for (reader, _), edge in timeline.edges.items():
             if reader in lanes and edge.sender in lanes:
                 _draw_messages(axes, timeline, episode, (reader, edge), lanes, (begin_s, end_s))
@@ -103,6 +105,7 @@ def plot_graph(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> Picture:
     with styled():
         figure = new_figure(3.2, max(4.0, 1.9 * len(names)))
         axes = figure.subplots()
+        # Draw the nodes as boxes, then the connections as arcs.
         for name, x in places.items():
             configured = by_node[name].color
             color = configured if configured is not None and is_color_like(configured) else BLUE

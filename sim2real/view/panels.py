@@ -57,6 +57,7 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
         name: Name of the figure, unique on its page.
         label: Description of the figure, for screen readers.
     """
+    # Panels share a time axis unless they have titles or zooms of their own.
     zooms = {panel.zoom for panel in panels}
     closer = zooms != {None}
     titled = sum(bool(panel.title) for panel in panels)
@@ -70,6 +71,7 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
             squeeze=False,
             width_ratios=[2.1, 1][: 1 + closer],
         )
+        # Draw each panel, and its enlarged part beside it.
         for panel, row in zip(panels, grid, strict=True):
             for axes in row:
                 _fill(axes, panel)
@@ -84,6 +86,7 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
         zoom = panels[0].zoom
         if zoom and len(zooms) == 1:
             grid[0, 1].set_title(f"{zoom[0]:g} to {zoom[1]:g} s", fontweight="normal", color=MUTED)
+        # Add one legend with each label once.
         by_label = {line.label: line for panel in panels for line in panel.lines}
         entries: list[Artist] = [_legend_entry(line) for line in by_label.values()]
         entries += [Patch(facecolor=SHADE, edgecolor=GRID, label=shade)] if any(p.spans for p in panels) else []

@@ -19,5 +19,5 @@ def about(artifact: StageFolder) -> list[Block]:
         "Outputs, by SHA-256": files,
         "Versions": m.get("versions"),
     }
-    found = [pairs_table(caption, tree) for caption, tree in tables.items() if tree]
-    return [FoldBlock("Configuration, files and versions", found)] if found else []
+    blocks = [pairs_table(caption, tree) for caption, tree in tables.items() if tree]
+    return [FoldBlock("Configuration, files and versions", blocks)] if blocks else []

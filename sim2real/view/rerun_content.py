@@ -76,9 +76,9 @@ def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
         log = signals_of(Recording.load(artifacts["record"].folder))
         tabs.append(_episode_tab(_dry("Record", log), "record", log, []))
     if "identify" in artifacts:
-        found = Identification.load(artifacts["identify"].folder)
-        several = len(found.recordings) > 1
-        tabs += [_identify_tab(found, r, f" {r}" if several else "") for r in found.recordings]
+        identification = Identification.load(artifacts["identify"].folder)
+        several = len(identification.recordings) > 1
+        tabs += [_identify_tab(identification, r, f" {r}" if several else "") for r in identification.recordings]
     if "deploy" in artifacts:
         deployed = Deployment.load(artifacts["deploy"].folder)
         for i, (recording, simulated) in enumerate(zip(deployed.recordings, deployed.simulated, strict=True)):
@@ -118,20 +118,20 @@ def _episode_tab(title: str, entity: str, log: Signals, simulated: list[Series])
     return Tab(title, entity, plots, motions, log.episode)
 
 
-def _identify_tab(found: Identification, recording: int, which: str) -> Tab:
-    chosen = found.disjoint() & (found.samples["recording"] == recording)
+def _identify_tab(identification: Identification, recording: int, which: str) -> Tab:
+    chosen = identification.disjoint() & (identification.samples["recording"] == recording)
     entity = f"identify/{recording}" if which else "identify"
-    samples = {name: values[chosen] for name, values in found.samples.items()}
+    samples = {name: values[chosen] for name, values in identification.samples.items()}
     t_s, segment = samples["t"], samples["segment"]
     plots, columns = {}, {}
-    for quantity in found.fields:
+    for quantity in identification.fields:
         curves = []
-        for model in ("measured", *(m for m in found.models(quantity) if m != "no delay")):
+        for model in ("measured", *(m for m in identification.models(quantity) if m != "no delay")):
             values = samples[f"{quantity}_{model}"].astype(np.float64)
             columns.setdefault(model, {})[quantity] = values
             series = Series(quantity, model, *_interrupted(t_s, values, segment))
             curves.append(_curve(f"{entity}/{model}", series, model, model))
-        plots[_titled(quantity, found.units)] = curves
+        plots[_titled(quantity, identification.units)] = curves
     motions = [SceneMotion(f"{entity}/scene/robot", t_s, columns["measured"], ghost=False)] if columns else []
     if "identified" in columns:
         motions.append(SceneMotion(f"{entity}/scene/identified", t_s, columns["identified"], ghost=True))

@@ -81,10 +81,12 @@ def histograms(episode: Episode, name: str) -> str:
     with styled():
         figure = new_figure(0.6 + 1.35 * len(nodes))
         grid = figure.subplots(len(nodes), 4, squeeze=False, sharex="col", sharey="row")
+        # Use common limits in each column, so that nodes can be compared.
         limits = []
         for column, quantity in enumerate(("period", "lateness", "computation")):
             values = np.concatenate([getattr(times(episode.steps[n]), quantity) for n in nodes])
             limits.append((min(0.0, values.min()) if column else values.min(), max(values.max(), 1e-3)))
+        # Draw a row of histograms for each node.
         for node, row in zip(nodes, grid, strict=True):
             measured = times(episode.steps[node])
             row[0].set_ylabel(f"{node}\nsteps")
@@ -110,6 +112,7 @@ def schedule(episode: Episode, name: str) -> str:
     """Draw when nodes computed and waited, in the middle of the episode and around the latest wake-up."""
     nodes = [n for n in in_order(episode) if len(episode.steps[n])]
     length = _PERIODS_SHOWN * 1e6 * slowest_period_s(episode)
+    # Find the latest wake-up, which the right plot shows.
     late = {n: episode.steps[n].woken - episode.steps[n].start for n in nodes}
     worst = max(nodes, key=lambda n: late[n].max())
     moment = int(episode.steps[worst].start[late[worst].argmax()])
@@ -118,6 +121,7 @@ def schedule(episode: Episode, name: str) -> str:
         figure = new_figure(1.15 + 0.42 * len(nodes))
         titles = (f"At {middle / 1e6:.1f} s", f"Around the latest wake-up: {worst}, {late[worst].max() / 1e3:.1f} ms")
         grid = figure.subplots(1, 2, sharey=True)
+        # Draw steps as bars and messages as arrows, in the middle and around the latest wake-up.
         for axes, begin, title in zip(grid, (middle, max(0, moment - int(0.4 * length))), titles, strict=True):
             for row, node in enumerate(nodes):
                 look = color_of(episode, node, BLUE)
@@ -170,8 +174,8 @@ def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: s
 def _arrows(axes: Axes, episode: Episode, nodes: list[str], begin: float, end: float) -> None:
     """Draw the messages in an interval as arrows, from the sender's end to the reader's start."""
     graph = episode.metadata.get("graph", {})
-    for (node, given), messages in episode.messages.items():
-        sender = graph.get(node, {}).get("inputs", {}).get(given, {}).get("from")
+    for (node, input_name), messages in episode.messages.items():
+        sender = graph.get(node, {}).get("inputs", {}).get(input_name, {}).get("from")
         if sender not in nodes or node not in nodes:
             continue
         read = (messages.sent >= begin) & (messages.received <= end) & (messages.seq_in >= 0)
@@ -179,6 +183,7 @@ def _arrows(axes: Axes, episode: Episode, nodes: list[str], begin: float, end: f
         down = 1 if rows[1] > rows[0] else -1
         first = int(episode.metadata.get("log", {}).get("first_seq", {}).get(node, 0))
         starts = episode.steps[node].start
+        # Draw an arrow from the sender's end to the start of the step that uses the message.
         for sent, seq_in in zip(messages.sent[read], messages.seq_in[read] - first, strict=True):
             if not 0 <= seq_in < len(starts) or starts[seq_in] > end:
                 continue

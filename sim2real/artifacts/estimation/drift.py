@@ -21,7 +21,6 @@ class Changed:
         before: The estimate.
         now: The value that fits the later log best if only this has changed.
         low95: Lower end of the 95 % interval of ``now``; it includes the uncertainty of the estimate.
-        high95: Upper end.
         explains: Share of the error that the change removes, beyond the uncertainty of the estimate.
         p: Probability of such a share by chance, or by a factor below 1/20; not corrected for several tests.
     """

@@ -63,7 +63,6 @@ class Posterior:
         mean: Shape ``(P,)``, on the scales.
         covariance: Shape ``(P, P)``, on the scales.
         low: Shape ``(P,)``: lower bounds on the scales.
-        high: Shape ``(P,)``: upper bounds on the scales.
         without: Parameter of an alternative that this model lacks -> the value that it stands for here.
         others: The alternatives; this model gets the rest of the draws.
 

@@ -19,7 +19,6 @@ class Quantity:
         standard_error: Of the mean.
         between: Deviation between recordings, beyond their standard errors.
         low95: Lower end of the 95 % interval for a further recording.
-        high95: Upper end.
         agree: Whether the standard errors explain the differences between the estimates.
     """
 

@@ -16,7 +16,6 @@ class Iteration:
     """One time around the loop.
 
     Attributes:
-        number: Number of the iteration, from 1.
         stages: Folders of the stages that ran, in order, relative to the run.
         real: Mean success of the episodes on the robot; None if the task has no success.
         simulation: Mean success in simulation.

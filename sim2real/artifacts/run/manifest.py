@@ -118,6 +118,7 @@ def plain(value: object) -> Json:
     Raises:
         TypeError: When the value, or one inside it, is of another type.
     """
+    # Test scalars first, then containers; arrays come last, as they need NumPy.
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, Enum):

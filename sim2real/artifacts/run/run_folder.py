@@ -165,10 +165,12 @@ def open_stage(
         UsageError: When the name of the stage or the pipeline is no valid folder name.
         Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
     """
+    # Hash the inputs first, as the stage can take hours and files can change.
     _check_names(pipeline, stage)
     hashes = {name: sha256(Path(path)) for name, path in (inputs or {}).items()}
     folder = _stage_folder(run_dir or new_run(root, pipeline), stage)
     hashed = {n: {"path": portable(Path(p), folder.parent), "sha256": hashes[n]} for n, p in (inputs or {}).items()}
+    # Write the first manifest with a lock, then run the stage and write the last manifest.
     running = OpenStage(folder)
     manifest = _first_manifest(pipeline, stage, config, hashed, dry_run)
     start, lock = time.monotonic(), None

@@ -158,8 +158,8 @@ def following(command: np.ndarray, measured: np.ndarray, period_s: float, most_s
     rows = len(measured)
     size = 1 << (2 * rows - 1).bit_length()
     spread = tuple(x.std(axis=0) for x in (measured, command))
-    (levelled, sense), (given, way) = (_level(x) for x in (measured, command))
-    centred = [levelled, given]
+    (levelled, sense), (levelled_command, way) = (_level(x) for x in (measured, command))
+    centred = [levelled, levelled_command]
     spectra = [np.fft.rfft(x, size, axis=0) for x in centred]
     most = max(1, min(int(most_s / period_s), rows // 2))
     lags = np.arange(-most, most + 1)
@@ -190,9 +190,9 @@ def following(command: np.ndarray, measured: np.ndarray, period_s: float, most_s
                 slope[i, j] = cross[peak.at, j] / powers[1][peak.at, j]
     mean = measured.mean(axis=0), command.mean(axis=0)
     seconds = (period_s * x for x in (lag, against, repeats))
-    found = Following(r, next(seconds), slope, (spread[0], spread[1]), mean, next(seconds), next(seconds), either,
+    relation = Following(r, next(seconds), slope, (spread[0], spread[1]), mean, next(seconds), next(seconds), either,
                       period_s)  # fmt: skip
-    return replace(found, r=np.where(found.moved, r, 0.0))
+    return replace(relation, r=np.where(relation.moved, r, 0.0))
 
 
 def _level(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

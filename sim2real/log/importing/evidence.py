@@ -139,13 +139,15 @@ def contradictions(
     if len(held) < 50:
         return []
     relation = following(held, joined, period_s).by_level()
-    best, given = order(relation), np.arange(measured.shape[1])
+    best, in_order = order(relation), np.arange(measured.shape[1])
+    # Report columns that follow another command than their own.
     notes = [
         f"joint {i} follows the command of joint {best[i]} (r {relation.r[i, best[i]]:.2f}), not its own "
         f"(r {relation.r[i, i]:.2f})"
-        for i in np.flatnonzero(best != given)
+        for i in np.flatnonzero(best != in_order)
     ]
-    right = given[best == given]
+    right = in_order[best == in_order]
+    # Check the others for copies, signs, units and lags.
     copies = copied(*t_s, command, measured)
     r, slope, lag = (a[right, right] for a in (relation.r, relation.slope, relation.lag_s))
     for i, x, s, late in zip(right, r, slope, lag, strict=True):

@@ -25,14 +25,14 @@ KEEP_ORDER_HINT = (
 )
 
 
-def follows(found: Following, command: Signal, path: str) -> bool:
+def follows(relation: Following, command: Signal, path: str) -> bool:
     """Return whether positions follow a command whose name has no quantity.
 
     Raises:
         UsageError: When they follow it weakly, so that it is neither a goal nor unrelated.
     """
-    best, moved = np.abs(found.r).max(axis=1), found.moved.any(axis=1)
-    if not moved.any() or evidence.unit_ratio(_slopes(found)[best > SURE]) is None:
+    best, moved = np.abs(relation.r).max(axis=1), relation.moved.any(axis=1)
+    if not moved.any() or evidence.unit_ratio(_slopes(relation)[best > SURE]) is None:
         return False
     if np.mean(best[moved] > _MIN_GOAL_R) > 0.5:
         return True
@@ -46,7 +46,7 @@ def follows(found: Following, command: Signal, path: str) -> bool:
 
 
 def goal(
-    measured: Signal, command: Signal, found: Following, to_rad: float, path: str, as_told: bool
+    measured: Signal, command: Signal, relation: Following, to_rad: float, path: str, as_told: bool
 ) -> tuple[Signal, list[float], list[str]]:
     """Return goals in the order of the joints, their scales, and notes on them.
 
@@ -56,8 +56,9 @@ def goal(
     Raises:
         UsageError: When names and data contradict each other, or order or sign are ambiguous.
     """
-    slopes = _slopes(found)
-    ratio = evidence.unit_ratio(slopes[np.abs(found.r).max(axis=1) > SURE])
+    # Determine the unit from the slope, or from the name if the slope is too weak.
+    slopes = _slopes(relation)
+    ratio = evidence.unit_ratio(slopes[np.abs(relation.r).max(axis=1) > SURE])
     named_unit = {"rad": 1.0, "deg": DEGREES}.get(command.meaning.unit)
     if ratio is None and named_unit is None:
         raise UsageError(
@@ -78,14 +79,16 @@ def goal(
             f"{'degrees' if to_rad != 1 else 'radians'}, follows it with slopes of {slopes[:3].round(3)}",
             hint="write a mapping with the scales that hold",
         )
-    places, notes = _command_order(measured, command, found, to_rad / unit, path, as_told)
-    ordered = found.columns(places).by_level(to_rad / unit)
+    # Order the commands by joints, and determine their signs.
+    places, notes = _command_order(measured, command, relation, to_rad / unit, path, as_told)
+    ordered = relation.columns(places).by_level(to_rad / unit)
     r, slope, lag = (np.diag(a) for a in (ordered.r, ordered.slope, ordered.lag_s))
     sure = (np.abs(r) > SURE) & (np.abs(slope) * unit / to_rad > _MIN_SLOPE)
     flipped = sure & (r < 0)
     names = [label or str(i) for i, label in enumerate(measured.labels)]
     notes += _signs(names, ordered, sure, path, as_told)
     notes += _too_early(names, ordered, sure, unit / to_rad, path, as_told)
+    # Scale to radians with the sign, and describe the evidence.
     scales = [float(-1 / unit if f else 1 / unit) for f in flipped]
     if sure.any():
         notes.append(
@@ -110,6 +113,7 @@ def _signs(names: Sequence[str], ordered: Following, sure: np.ndarray, path: str
     lag, against, repeats = (np.diag(a) for a in (ordered.lag_s, ordered.against_s, ordered.repeats_s))
     with np.errstate(invalid="ignore"):
         ambiguous = sure & ((against < lag) | _others_agree(ordered, sure))
+    # Refuse an ambiguous sign, unless the user accepts the file.
     if ambiguous.any():
         listed = "; ".join(
             f"{names[i]} follows {_ms(lag[i])} ms later, or with the opposite sign {_ms(against[i])} ms later"
@@ -120,6 +124,7 @@ def _signs(names: Sequence[str], ordered: Following, sure: np.ndarray, path: str
                 f"the commands of {path} repeat, so their signs are ambiguous: {listed}", hint=KEEP_ORDER_HINT
             )
         return [f"the commands repeat, so their signs are ambiguous: {listed}; the signs of the file are kept"]
+    # Mention other lags that fit equally well.
     repeated = sure & (np.isfinite(against) | np.isfinite(repeats))
     for i in np.flatnonzero(repeated)[:1].tolist():
         alternatives = ((repeats[i], ""), (against[i], " with the opposite sign"))
@@ -195,17 +200,17 @@ def _ms(seconds: float | np.ndarray) -> str:
     return f"{round(1e3 * float(seconds))}"
 
 
-def _slopes(found: Following) -> np.ndarray:
+def _slopes(relation: Following) -> np.ndarray:
     """Return the slope of each position over the goal that it follows best; its own goal wins a tie."""
-    size = np.abs(found.r)
+    size = np.abs(relation.r)
     if size.shape[0] <= size.shape[1]:
         size = size + 0.05 * np.eye(*size.shape)
     best = np.argmax(size, axis=1)
-    return found.slope[np.arange(len(best)), best]
+    return relation.slope[np.arange(len(best)), best]
 
 
 def _command_order(
-    measured: Signal, command: Signal, found: Following, scale: float, path: str, as_told: bool
+    measured: Signal, command: Signal, relation: Following, scale: float, path: str, as_told: bool
 ) -> tuple[np.ndarray, list[str]]:
     """Return the command of each joint."""
     if command.width < measured.width:
@@ -213,7 +218,8 @@ def _command_order(
             f"{command.name!r} in {path} has {command.width} columns for {measured.width} joints",
             hint="name the commanded joints with --joints, or write a mapping",
         )
-    given, labelled = np.arange(measured.width), [label for label in measured.labels if label]
+    # Choose by names if both have names.
+    places, labelled = np.arange(measured.width), [label for label in measured.labels if label]
     by_name = [command.labels.index(label) if label in command.labels else None for label in labelled]
     named = len(labelled) == measured.width and all(p is not None for p in by_name)
     if command.width != measured.width and not named:
@@ -222,14 +228,16 @@ def _command_order(
             "choose by",
             hint="choose them in a mapping: goal = { source = [...] }",
         )
-    first = np.array(by_name) if named else given
-    best = first[evidence.order(found.columns(first), scale)]
+    first = np.array(by_name) if named else places
+    # Compare with the order that fits the data best.
+    best = first[evidence.order(relation.columns(first), scale)]
     if not named:
-        _refuse_open_order(found, best, scale, [measured.sources, command.sources], path, as_told)
+        _refuse_open_order(relation, best, scale, [measured.sources, command.sources], path, as_told)
     if (best == first).all():
         return first, []
     wrong = np.flatnonzero(best != first)
     pairs = ", ".join(f"{measured.sources[i]} follows {command.sources[best[i]]}" for i in wrong)
+    # The data contradicts the order: keep it on request, or refuse a contradiction with names.
     if as_told:
         return first, [f"the data shows another order, the file's order is kept: {pairs}"]
     if named:
@@ -237,7 +245,7 @@ def _command_order(
             f"names and data of {path} contradict each other: by the data, {pairs}",
             hint="correct the names, or write a mapping with the right columns",
         )
-    resting = [i for i in wrong if not found.moved[i].any()]
+    resting = [i for i in wrong if not relation.moved[i].any()]
     if resting:
         raise UsageError(
             f"the order of {command.name!r} in {path} is not that of {measured.name!r}, and for joints that did not "
@@ -248,10 +256,10 @@ def _command_order(
 
 
 def _refuse_open_order(
-    found: Following, best: np.ndarray, scale: float, sources: Sequence[Sequence[str]], path: str, as_told: bool
+    relation: Following, best: np.ndarray, scale: float, sources: Sequence[Sequence[str]], path: str, as_told: bool
 ) -> None:
     """Raise a UsageError if commands without names fit two different joints equally well, unless ``as_told``."""
-    ambiguous = [] if as_told else evidence.open_pairs(found.columns(best), scale)
+    ambiguous = [] if as_told else evidence.open_pairs(relation.columns(best), scale)
     if ambiguous:
         i, k = ambiguous[0]
         raise UsageError(

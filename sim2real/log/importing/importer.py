@@ -191,6 +191,7 @@ def facts(episode: Episode) -> dict[str, Json]:
 
 def _signals(file: ForeignFile, name: str, node: NodeMapping) -> _Signals:
     """Read a node's signals, all of the same length."""
+    # Read the fields, the stamps and the rate.
     fields = {field: _field(file, f"{name}.{field}", how) for field, how in node.fields.items()}
     stamps = None if node.stamps is None else file.signal(node.stamps)
     if stamps is not None and stamps.ndim != 1:
@@ -207,6 +208,7 @@ def _signals(file: ForeignFile, name: str, node: NodeMapping) -> _Signals:
                 hint="if the signal has the stamps, write stamps instead of rate_hz",
             )
         rate_hz = positive(float(rate), f"{rate_hz!r} in {file.path}")
+    # All signals of a node need one length.
     lengths = {field: len(values) for field, values in fields.items() if values.ndim}
     if stamps is not None:
         lengths[f"stamps {node.stamps!r}"] = len(stamps)

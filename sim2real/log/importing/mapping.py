@@ -200,7 +200,7 @@ def positive(value: float, where: str) -> float:
     """Return ``value``, after checking that it is a finite number above 0.
 
     Raises:
-        UsageError: When it is not; ``where`` says where it was found.
+        UsageError: When it is not; the message names the place ``where``.
     """
     if not 0.0 < value < math.inf:
         raise UsageError(f"{where} must be above 0, got {value}", hint="it is in samples per second")
@@ -208,11 +208,13 @@ def positive(value: float, where: str) -> float:
 
 
 def _field(table: Mapping[str, Json], where: str) -> FieldMapping:
+    # Read the sources.
     _known(table, ("source", "unit", "scale", "offset", "shape", "column", "turn"), where)
     source = _value(table, "source", (str, list), where)
     sources = [source] if isinstance(source, str) else source or []
     if not sources or not all(isinstance(s, str) and s for s in sources):
         raise UsageError(f"{where} needs a source: the name of a signal, or a list of names", hint=_HINT)
+    # Check the numbers of scale, offset, turn and shape.
     scale, offset = _value(table, "scale", (int, float, list), where), _value(table, "offset", (int, float), where)
     scales = scale if isinstance(scale, list) else [1.0 if scale is None else scale]
     for key, numbers in (("scale", scales), ("offset", [offset or 0.0])):
@@ -280,6 +282,7 @@ def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
         *(f"# {part}" for line in comments for part in _printable(line)),
         f"pipeline = {toml_value(mapping.pipeline)}",
     ]
+    # Write only the keys that differ from their defaults.
     for name, node in mapping.nodes.items():
         keys: dict[str, Json] = {"stamps": node.stamps} if node.stamps is not None else {"rate_hz": node.rate_hz}
         keys |= {"stamp_unit": node.stamp_unit} if node.stamps is not None and node.stamp_unit != "s" else {}

@@ -208,6 +208,7 @@ def _halves(
     held, joined, period = on_grid(t[good], signal.values[good], t[good], signal.values[good])
     relation = following(held, joined, period)
     distance = relation.distance() + np.diag(np.full(signal.width, np.inf))
+    # Each column needs a partner, and half of the columns must follow theirs.
     partner = distance.argmin(axis=1)
     places = np.arange(signal.width)
     r = np.abs(relation.r[places, partner])

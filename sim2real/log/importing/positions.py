@@ -70,22 +70,22 @@ def checked_positions(
     small = np.quantile(np.abs(q[:, hinges]), 0.99) <= _MAX_RAD if hinges.any() else True
     guess = named or next(iter(jumping), 1.0 if small else DEGREES)
     leaps = plausibility.glitches(t, _counted(q, guess, hinges), guess)
-    kept = ~leaps.any(axis=1)
-    _refuse_no_metres(measured, q[kept], hinges, hints, path)
+    good = ~leaps.any(axis=1)
+    _refuse_no_metres(measured, q[good], hinges, hints, path)
     # Determine the unit from all evidence, and count turns in it.
     others: list[tuple[float, str]] = []
     if named is None and not jumping and hinges.all():
-        others = units_from_signals(signals, measured, pair.command, [s.t_s for s in stamps], rows[kept])
-    samples = q[kept], t[kept]
+        others = units_from_signals(signals, measured, pair.command, [s.t_s for s in stamps], rows[good])
+    samples = q[good], t[good]
     to_rad, why = _radian(file, measured, samples, hinges, hints, jumping, others) if hinges.any() else (1.0, "")
     over, values = _over_the_end(q, to_rad, hinges), _counted(measured.values, to_rad, hinges)
     turn, angle = plausibility.TURN_RAD * to_rad, values[rows]
     _refuse_turns(measured, over, angle / to_rad, hints, path)
     if to_rad != guess:
-        kept = ~(leaps := plausibility.glitches(t, angle, to_rad)).any(axis=1)
+        good = ~(leaps := plausibility.glitches(t, angle, to_rad)).any(axis=1)
     # Refuse a jump without return: the zero has changed, or samples are missing.
-    if (jump := plausibility.leap(t[kept], angle[kept], to_rad)) is not None:
-        at, size = rows[kept][jump[0]], f"{jump[2]:.4g} {'rad' if hinges[jump[1]] else 'm'}"
+    if (jump := plausibility.leap(t[good], angle[good], to_rad)) is not None:
+        at, size = rows[good][jump[0]], f"{jump[2]:.4g} {'rad' if hinges[jump[1]] else 'm'}"
         raise UsageError(
             f"{measured.sources[jump[1]]!r} in {path} changes by {size} before sample {at}, at {t_s[at]:.6g} s, faster "
             "than a joint can: its zero has changed, samples are missing, or it is no position",
@@ -96,9 +96,9 @@ def checked_positions(
         who = ", ".join(np.array(measured.sources)[over])
         notes.append(f"{who} jumps by a turn ({turn:.4g}) at its end: turns are counted")
     leapt = np.zeros(len(t_s), bool)
-    leapt[rows[~kept]] = True
+    leapt[rows[~good]] = True
     if leapt.any():
-        notes.append(_on_leaps(measured, rows[~kept], leaps[~kept]))
+        notes.append(_on_leaps(measured, rows[~good], leaps[~good]))
         values[leapt] = np.nan
     return CheckedPositions(replace(measured, values=values), to_rad, turn * bool(over.any()), hinges, leapt, notes)
 

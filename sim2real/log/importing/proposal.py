@@ -246,16 +246,17 @@ def _with_numbers(
 
 def _joint_order(measured: Signal, hints: ImportHints, path: str) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
     """Return the column of each joint of the robot, the joints' names, and notes."""
-    given = np.arange(measured.width)
+    in_order = np.arange(measured.width)
     labels = tuple(label or str(i) for i, label in enumerate(measured.labels))
     if not hints.joints:
-        return given, labels, []
+        return in_order, labels, []
+    # Find each joint of the robot among the names of the columns.
     places = [next((i for i, label in enumerate(measured.labels) if same_joint(label, j)), None) for j in hints.joints]
     if all(p is not None for p in places):
         selected = np.array(places)
         moved = (
             "in the robot's order"
-            if (selected == given[: len(selected)]).all()
+            if (selected == in_order[: len(selected)]).all()
             else f"columns {', '.join(map(str, selected))}"
         )
         return selected, hints.joints, [f"joints by the names of columns: {moved}"]
@@ -266,7 +267,7 @@ def _joint_order(measured: Signal, hints: ImportHints, path: str) -> tuple[np.nd
             f"{len(hints.joints)} joints: {', '.join(hints.joints)}",
             hint="name the recorded joints with --joints, in the order of the columns",
         )
-    return given, hints.joints, [
+    return in_order, hints.joints, [
         "columns have no names of joints, so the robot's order is assumed: "
         f"{', '.join(hints.joints[:4])}{' ...' if measured.width > 4 else ''}; --joints sets another"
     ]  # fmt: skip
@@ -346,6 +347,7 @@ def _node(
     """Return a node's mapping, with the policies that its data needs, and notes on them."""
     notes = []
     missing, repeated = "refuse", "refuse"
+    # Choose policies for samples without numbers and with repeated stamps.
     good = ~lacks & np.isfinite(stamps.t_s)
     if not good.all():
         missing = "drop"
@@ -354,6 +356,7 @@ def _node(
         repeated = "first"
         notes.append(f'{name}: {stamps.repeated} stamps repeat: repeated = "first" keeps the first sample of each')
     steps = np.diff(stamps.t_s[good])
+    # A clock that steps back leaves the order of the samples open.
     if stamps.backward:
         k = int(np.argmax(steps < 0))
         raise UsageError(

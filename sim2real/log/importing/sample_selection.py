@@ -48,6 +48,7 @@ def plausible_samples(
     """
     if len(selected) < 3 or not (np.isfinite(t_s).all() and (np.diff(t_s) > 0).all()):
         return selected  # the check of stamps raises the better error
+    # Check each field of measured angles.
     for field, how in node.fields.items():
         if how.unit != "rad" or meaning(field).side == "command" or meaning(field).quantity != "position":
             continue
@@ -63,6 +64,7 @@ def plausible_samples(
                 f"column {int(over.argmax())} of {what} jumps by 2 pi at the end of a turn",
                 hint="turn = 6.283185307179586 (360 for degrees) beside the field's source in the mapping counts them",
             )
+        # Drop or refuse samples that leap away and back.
         leapt = plausibility.glitches(t_s, angle)
         if leapt.any() and node.implausible == "refuse":
             k, i = (int(x[0]) for x in np.nonzero(leapt))
@@ -72,6 +74,7 @@ def plausible_samples(
                 hint='implausible = "drop" in the mapping skips such samples',
             )
         selected, angle, t_s = (x[~leapt.any(axis=1)] for x in (selected, angle, t_s))
+        # A jump without return means another zero, another unit or missing samples.
         if (jump := plausibility.leap(t_s, angle)) is not None:
             raise UsageError(
                 f"column {jump[1]} of {what} changes by {jump[2]:.4g} rad before sample {selected[jump[0]]}, within "

@@ -214,6 +214,7 @@ def _stamps(signal: Signal, path: str) -> Stamps:
     steps = np.diff(values[np.isfinite(values)])
     period, begin = float(np.median(steps[steps > 0])), float(values[np.isfinite(values)][0])
     seconds = {unit: nanoseconds * 1e-9 for unit, nanoseconds in STAMP_UNITS.items()}
+    # Use the unit in the name, or the only unit in which the values are dates or usual rates.
     wall = [u for u, s in seconds.items() if _WALL_S[0] < begin * s < _WALL_S[1]]
     likely = [u for u, s in seconds.items() if _RATES_HZ[0] <= 1 / (period * s) <= _RATES_HZ[1]]
     named_unit = signal.meaning.unit if signal.meaning.unit in STAMP_UNITS else ""

@@ -29,6 +29,7 @@ def intervals(estimates: Sequence[Estimate], name: str) -> str:
         grid = figure.subplots(
             len(groups), 2, squeeze=False, width_ratios=[2.1, 1], height_ratios=[len(g) + 0.6 for _, g in groups]
         )
+        # Draw each group of parameters on an axis of its kind.
         for (kind, group), (left, right) in zip(groups, grid, strict=True):
             _inside_bounds(left, group, kind)
             _in_errors(right, group)
@@ -115,6 +116,7 @@ def _inside_bounds(axes: Axes, group: Sequence[Estimate], kind: str) -> None:
             axes.plot(at(e.nominal), row, color=ORANGE, marker="s", mfc="none", ms=5.5, zorder=5)
         if e.truth is not None:
             axes.plot(at(e.truth), row, color=GREEN, marker="D", ms=4, zorder=6)
+    # Use a logarithmic axis for positive values relative to nominal.
     values = [v for e in group for v in (e.lower, e.estimate, e.truth, e.nominal) if v is not None]
     if kind == _KINDS[0] and min(values, default=0.0) > 0:
         axes.set_xscale("log")

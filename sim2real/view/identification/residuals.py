@@ -40,20 +40,20 @@ class Residuals:
     autocorrelation: np.ndarray
 
 
-def residuals(found: Identification, quantity: str) -> Residuals:
+def residuals(result: Identification, quantity: str) -> Residuals:
     """Return the residuals of the identified model on held-out data."""
-    s = found.samples
+    s = result.samples
     rest = s[f"{quantity}_measured"].astype(float) - s[f"{quantity}_identified"]
-    held_out = s["held_out"].astype(bool) & (s["into"] > found.settle_s)
+    held_out = s["held_out"].astype(bool) & (s["into"] > result.settle_s)
     steps = np.diff(s["t"][held_out])[np.diff(s["segment"][held_out]) == 0]
     period_s = float(np.median(steps)) if steps.size else 0.0
     t_s, reached = s["t"].astype(float).copy(), 0.0
-    for number, recording in enumerate(found.recordings):
-        own = held_out & (s["recording"] == recording)
-        if number and own.any():
-            t_s[own] += reached + period_s - float(s["t"][own].min())
-        reached = max(reached, float(t_s[own].max(initial=0.0)))
-    chosen = held_out & found.disjoint()
+    for number, recording in enumerate(result.recordings):
+        of_recording = held_out & (s["recording"] == recording)
+        if number and of_recording.any():
+            t_s[of_recording] += reached + period_s - float(s["t"][of_recording].min())
+        reached = max(reached, float(t_s[of_recording].max(initial=0.0)))
+    chosen = held_out & result.disjoint()
     lags = autocorrelation(rest[held_out], s["segment"][held_out])
     return Residuals(
         t_s[chosen], rest[chosen], s["segment"][chosen], rest[held_out], period_s * np.arange(len(lags)), lags
@@ -74,22 +74,24 @@ def autocorrelation(values: np.ndarray, segment: np.ndarray) -> np.ndarray:
     return np.array(lags)
 
 
-def figure(found: Identification, name: str) -> str:
+def figure(result: Identification, name: str) -> str:
     """Draw a row for each field: residuals over time, their histogram, and their autocorrelation."""
-    fields = [f for f in found.fields if "identified" in found.models(f)][:MAX_PANELS]
+    fields = [f for f in result.fields if "identified" in result.models(f)][:MAX_PANELS]
     with styled():
         drawing = new_figure(0.8 + 1.65 * len(fields))
         grid = drawing.subplots(len(fields), 3, squeeze=False, width_ratios=[2.0, 1, 1])
+        # Draw the row of each field.
         for quantity, row in zip(fields, grid, strict=True):
-            rest, sigma = residuals(found, quantity), found.sigma.get(quantity)
+            rest, sigma = residuals(result, quantity), result.sigma.get(quantity)
             _over_time(row[0], rest, sigma)
-            row[0].set_ylabel(with_unit(quantity, found.units))
+            row[0].set_ylabel(with_unit(quantity, result.units))
             _histogram(row[1], rest.every, sigma)
             _lags(row[2], rest)
+        # Add titles, labels and the legend.
         titles = ("Residual on held-out data", "Distribution", "Autocorrelation")
         for axes, title in zip(grid[0], titles, strict=True):
             axes.annotate(title, (0, 1.16), xycoords="axes fraction", fontweight="bold", fontsize=9, color=INK)
-        several = len(found.recordings) > 1
+        several = len(result.recordings) > 1
         for axes, label in zip(
             grid[-1], ("time, log after log [s]" if several else "time [s]", "residual", "lag [s]"), strict=True
         ):
@@ -98,7 +100,7 @@ def figure(found: Identification, name: str) -> str:
         entries.append(
             Line2D([], [], color=INK, ls=style.DASHES[1], lw=1.1, label="normal distribution of the same deviation")
         )
-        if found.sigma:
+        if result.sigma:
             entries.append(
                 Line2D([], [], color=ORANGE, ls=style.DASHES[0], lw=1.4, label="assumed noise of the measurement")
             )
@@ -119,19 +121,19 @@ def _histogram(axes: Axes, values: np.ndarray, sigma: float | None) -> None:
     """Draw the density over the range of most residuals; the outer bins hold the rest."""
     if not values.size:
         return
-    own = float(np.sqrt(np.mean(values**2))) or 1e-12
+    deviation = float(np.sqrt(np.mean(values**2))) or 1e-12
     reach = max(2.0 * float(np.quantile(np.abs(values), 0.9)), 4 * (sigma or 0.0), 1e-12)
     bins = np.linspace(-reach, reach, _BINS)
     axes.hist(np.clip(values, -reach, reach), bins=bins.tolist(), density=True, facecolor=BLUE, alpha=0.35)
     x = np.linspace(-reach, reach, 241)
-    axes.plot(x, _normal(x, own), color=INK, ls=style.DASHES[1], lw=1.1)
+    axes.plot(x, _normal(x, deviation), color=INK, ls=style.DASHES[1], lw=1.1)
     top = axes.get_ylim()[1]
     if sigma:
         axes.plot(x, _normal(x, sigma), color=ORANGE, lw=1.4)
         axes.set_ylim(0, min(axes.get_ylim()[1], 2.2 * top))
     axes.set_yticks([])
     axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-    text = f"RMS {own:.3g}" + (f", {own / sigma:.2g} times the assumed noise" if sigma else "")
+    text = f"RMS {deviation:.3g}" + (f", {deviation / sigma:.2g} times the assumed noise" if sigma else "")
     axes.set_title(text, fontweight="normal", fontsize=8)
 
 

@@ -45,38 +45,39 @@ _STRONG = 0.9
 
 def identify_section(artifact: StageFolder) -> PageSection:
     """Return the section of an identify stage."""
-    found = Identification.load(artifact.folder)
+    result = Identification.load(artifact.folder)
+    # Order the blocks from the results to the details.
     blocks = [
-        *_parameters(found),
-        *_aggregate(found),
-        *_parts(found),
-        *_alternatives(found),
-        *link_blocks(found.links),
-        *_predictions(found),
-        *_residuals(found),
-        *_correlation(found),
+        *_parameters(result),
+        *_aggregate(result),
+        *_parts(result),
+        *_alternatives(result),
+        *link_blocks(result.links),
+        *_predictions(result),
+        *_residuals(result),
+        *_correlation(result),
     ]
-    if np.isfinite(found.search.history).any():
-        refined = found.search.refined
+    if np.isfinite(result.search.history).any():
+        refined = result.search.refined
         gain = f" Dashed: the loss after {sum(r.steps for r in refined)} steps of refinement." if refined else ""
         blocks.append(
             FigureBlock(
-                figures.search(found, "identify-search"),
+                figures.search(result, "identify-search"),
                 f"The best loss of each generation of the search.{gain}",
                 narrow=True,
             )
         )
     lead = "Dynamics and delays from the log, each with its 95 % interval."
-    tiles = list(_tiles(found))
-    return PageSection("identify", "Identify", lead, tiles, [*blocks, *about(artifact)], _banner(found))
+    tiles = list(_tiles(result))
+    return PageSection("identify", "Identify", lead, tiles, [*blocks, *about(artifact)], _banner(result))
 
 
-def _banner(found: Identification) -> Banner | None:
-    status = found.verdict.status
+def _banner(result: Identification) -> Banner | None:
+    status = result.verdict.status
     if not status:
         return None
     tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
-    return Banner(tone, title, [_sentence(r) for r in found.verdict.reasons])
+    return Banner(tone, title, [_sentence(r) for r in result.verdict.reasons])
 
 
 def _sentence(text: str) -> str:
@@ -85,25 +86,25 @@ def _sentence(text: str) -> str:
     return (text if "_" in first else text[:1].upper() + text[1:]).rstrip(".") + "."
 
 
-def _parameters(found: Identification) -> list[Block]:
+def _parameters(result: Identification) -> list[Block]:
     """Return table and figure of the parameters, and their determinacy."""
-    bounded = [e for e in found.parameters if e.verdict == "at a bound"]
+    bounded = [e for e in result.parameters if e.verdict == "at a bound"]
     active = f"At a bound: {', '.join(_at_bound(e) for e in bounded)}." if bounded else "No estimate is at a bound."
     blocks: list[Block] = [
-        _parameter_table(found.parameters),
+        _parameter_table(result.parameters),
         FigureBlock(
-            intervals.intervals(found.parameters, "identify-intervals"),
+            intervals.intervals(result.parameters, "identify-intervals"),
             f"Left: each estimate within the bounds of the search. {active} Right: the same in standard errors; values "
             "inside the shaded 95 % band agree with the estimate. Arrows point to marks beyond the edge.",
         ),
     ]
-    if found.check:
-        check = found.check
+    if result.check:
+        check = result.check
         items = [_sentence(m) for m in check.messages] or ["The data determines each parameter."]
         items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(check.condition, 2)}.")
         blocks.append(ListBlock("Determined by the data", items))
         errors = check.standard_error_per_minute
-        rows = [_minute(e, value) for e in found.parameters if (value := errors.get(e.name)) is not None]
+        rows = [_minute(e, value) for e in result.parameters if (value := errors.get(e.name)) is not None]
         if rows:
             caption = "Standard error from one minute of such data"
             heads = ("parameter", "standard error", "unit", "share of the estimate")
@@ -153,12 +154,12 @@ def _error(e: Estimate) -> str:
     return f"{100 * (e.estimate - e.truth) / abs(e.truth):+.1f} %".replace("-", "\u2212")
 
 
-def _aggregate(found: Identification) -> list[Block]:
-    quantities: Sequence[Quantity] = found.aggregate
+def _aggregate(result: Identification) -> list[Block]:
+    quantities: Sequence[Quantity] = result.aggregate
     if not quantities:
         return []
     count = len(quantities[0].estimates)
-    names = figures.log_names(found)[:count]
+    names = figures.log_names(result)[:count]
     logs = "".join(f" {i}: {log}." for i, log in enumerate(names)) if len(names) == count else ""
     loose = ", ".join(q.name for q in quantities if not q.agree)
     agreement = (
@@ -170,21 +171,23 @@ def _aggregate(found: Identification) -> list[Block]:
             f"Estimates from each recording alone.{agreement} The shaded 95 % interval is for a further recording; "
             f"with few recordings it is wide.{logs}",
         ),
-        TableBlock.of(f"Over {count} recordings", found.recordings_table()),
+        TableBlock.of(f"Over {count} recordings", result.recordings_table()),
     ]
 
 
-def _parts(found: Identification) -> list[Block]:
+def _parts(result: Identification) -> list[Block]:
     """Return the errors on held-out parts of the recordings, with their mean and the largest."""
-    rows = found.left_out
+    rows = result.left_out
     if not rows:
         return []
+    # Make a column for each field, ahead and in a free run.
     kinds = [(kind, column) for kind in ("ahead", "free") for column in getattr(rows[0], kind)]
-    units = {column: unit_of(column, found.units) for _, column in kinds}
+    units = {column: unit_of(column, result.units) for _, column in kinds}
     heads = [f"{column} {'ahead' if kind == 'ahead' else 'in a free run'} [{units[column]}]" for kind, column in kinds]
     errors = np.array([[getattr(r, kind).get(column, np.nan) for kind, column in kinds] for r in rows], np.float64)
-    with_terms = bool(found.terms) or any(r.terms for r in rows)
+    with_terms = bool(result.terms) or any(r.terms for r in rows)
     table = []
+    # Add the mean and the largest error of each column.
     finite = [column[np.isfinite(column)] for column in errors.T]  # a part in which a joint rests has no error
     summed = [
         (name, [reduce(column) if column.size else np.nan for column in finite])
@@ -200,88 +203,90 @@ def _parts(found: Identification) -> list[Block]:
     return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,))]
 
 
-def _alternatives(found: Identification) -> list[Block]:
+def _alternatives(result: Identification) -> list[Block]:
     """Return the models that fit the recordings as well as the estimate, with their parameters and shares."""
-    if found.posterior is None or not found.posterior.others:
+    if result.posterior is None or not result.posterior.others:
         return []
-    named = [("estimate", found.posterior), *((o.about, o.posterior) for o in found.posterior.others)]
-    left = 1.0 - sum(o.weight for o in found.posterior.others)
-    shares = [left, *(o.weight for o in found.posterior.others)]
+    named = [("estimate", result.posterior), *((o.about, o.posterior) for o in result.posterior.others)]
+    left = 1.0 - sum(o.weight for o in result.posterior.others)
+    shares = [left, *(o.weight for o in result.posterior.others)]
     values = [
         {n: float(from_scale(t, x)) for n, t, x in zip(p.names, p.transform, p.mean, strict=True)} for _, p in named
     ]
     rows = [
-        [name, *(number(own.get(name), 3) for own in values)] for name in dict.fromkeys(n for v in values for n in v)
+        [name, *(number(model_values.get(name), 3) for model_values in values)]
+        for name in dict.fromkeys(n for v in values for n in v)
     ]
     rows.insert(0, ["share of the draws", *(f"{100 * s:.0f} %" for s in shares)])
     caption = "Models that fit the recordings equally well; training draws robots from all of them"
     return [TableBlock(caption, ("parameter", *(name for name, _ in named)), rows)]
 
 
-def _predictions(found: Identification) -> list[Block]:
+def _predictions(result: Identification) -> list[Block]:
     """Return the curves of errors, the free runs, and the segments."""
     blocks: list[Block] = []
-    if len(found.held_out) > 1:
-        caption = f"Held-out RMSE of every position after {found.held_out[0].horizon_s:g} s, the largest first"
-        blocks.append(TableBlock.of(caption, found.held_out_table()))
-    if found.prediction:
+    if len(result.held_out) > 1:
+        caption = f"Held-out RMSE of every position after {result.held_out[0].horizon_s:g} s, the largest first"
+        blocks.append(TableBlock.of(caption, result.held_out_table()))
+    if result.prediction:
         blocks.append(
             FigureBlock(
-                figures.prediction_errors(found, "identify-errors"),
+                figures.prediction_errors(result, "identify-errors"),
                 "Errors over the horizon, from initial states that are fitted to the samples before it. On held-out "
                 "data the identified model must have the smallest error.",
             )
         )
-        blocks.append(_prediction_table(found))
-    if found.free:
-        recordings = np.unique(found.free["recording"]).tolist()
+        blocks.append(_prediction_table(result))
+    # Free runs show errors that grow over minutes.
+    if result.free:
+        recordings = np.unique(result.free["recording"]).tolist()
         blocks.append(
             FigureBlock(
-                figures.free_runs(found, "identify-free"),
+                figures.free_runs(result, "identify-free"),
                 "All held-out data in one simulation, from one initial state, with the recorded commands and timing."
-                f"{_hidden_panels(found, recordings)}",
+                f"{_hidden_panels(result, recordings)}",
             )
         )
-        if found.free_run:
-            blocks.append(_free_run_table(found))
-    if not found.samples:
+        if result.free_run:
+            blocks.append(_free_run_table(result))
+    if not result.samples:
         return blocks
     blocks.append(
         FigureBlock(
-            figures.predictions(found, "identify-predictions"),
+            figures.predictions(result, "identify-predictions"),
             "Each segment is simulated from its own initial state. Shaded data is held out of the fit."
-            f"{_hidden_panels(found, found.recordings)}",
+            f"{_hidden_panels(result, result.recordings)}",
         )
     )
     return blocks
 
 
-def _hidden_panels(found: Identification, recordings: Sequence[int]) -> str:
-    hidden = len(found.fields) * len(recordings) - len(figures.shown(found, recordings))
+def _hidden_panels(result: Identification, recordings: Sequence[int]) -> str:
+    hidden = len(result.fields) * len(recordings) - len(figures.shown(result, recordings))
     return f" {hidden} further panels are not shown." if hidden else ""
 
 
-def _residuals(found: Identification) -> list[Block]:
-    s = found.samples
+def _residuals(result: Identification) -> list[Block]:
+    s = result.samples
     if not s:
         return []
-    scored = s["held_out"].astype(bool) & (s["into"] > found.settle_s)
-    if not scored.any() or not any("identified" in found.models(f) for f in found.fields):
+    scored = s["held_out"].astype(bool) & (s["into"] > result.settle_s)
+    if not scored.any() or not any("identified" in result.models(f) for f in result.fields):
         return []
-    assumed = " Orange: the assumed noise of the measurement." if found.sigma else ""
+    assumed = " Orange: the assumed noise of the measurement." if result.sigma else ""
     return [
         FigureBlock(
-            residuals.figure(found, "identify-residuals"),
+            residuals.figure(result, "identify-residuals"),
             f"Residuals of the identified model on held-out data.{assumed} A slow wave, or a long autocorrelation, "
             "shows an error of the model; an autocorrelation inside the shaded band is noise.",
         )
     ]
 
 
-def _correlation(found: Identification) -> list[Block]:
-    if not found.correlation:
+def _correlation(result: Identification) -> list[Block]:
+    if not result.correlation:
         return []
-    names, matrix = found.correlation.names, found.correlation.matrix
+    names, matrix = result.correlation.names, result.correlation.matrix
     pairs = [
         (names[i], names[j], matrix[i, j]) for i in range(len(names)) for j in range(i) if abs(matrix[i, j]) > _STRONG
     ]
@@ -297,9 +302,9 @@ def _correlation(found: Identification) -> list[Block]:
     ]
 
 
-def _prediction_table(found: Identification) -> TableBlock:
-    fields = list(dict.fromkeys(f for row in found.prediction for f in row.rmse))
-    heads = [f"RMSE of {f}" + (f" [{unit}]" if (unit := unit_of(f, found.units)) else "") for f in fields]
+def _prediction_table(result: Identification) -> TableBlock:
+    fields = list(dict.fromkeys(f for row in result.prediction for f in row.rmse))
+    heads = [f"RMSE of {f}" + (f" [{unit}]" if (unit := unit_of(f, result.units)) else "") for f in fields]
     rows = [
         [
             r.model,
@@ -307,44 +312,46 @@ def _prediction_table(found: Identification) -> TableBlock:
             "held out" if r.held_out else "fitted",
             *[number(r.rmse.get(f)) for f in fields],
         ]
-        for r in found.prediction
+        for r in result.prediction
     ]
     return TableBlock("Prediction errors", ("model", "horizon [s]", "data", *heads), rows, (2,), folded=True)
 
 
-def _free_run_table(found: Identification) -> TableBlock:
-    several = len(found.recordings) > 1
+def _free_run_table(result: Identification) -> TableBlock:
+    several = len(result.recordings) > 1
     rows = [
         [
             r.model,
-            *([figures.title_of(found, r.recording)] if several else []),
+            *([figures.title_of(result, r.recording)] if several else []),
             r.field,
             number(r.seconds, 3),
             number(r.rmse),
             number(r.mae),
-            unit_of(r.field, found.units) or MISSING,
+            unit_of(r.field, result.units) or MISSING,
         ]
-        for r in found.free_run
+        for r in result.free_run
     ]
     heads = ["model", *(["recording"] if several else []), "field", "length [s]", "RMSE", "MAE", "unit"]
     text = (1, 2, 6) if several else (1, 5)
     return TableBlock("Free runs", heads, rows, text, folded=True)
 
 
-def _tiles(found: Identification) -> Iterator[Tile]:
-    for row in found.held_out[:1]:
-        which = f"{row.name}, the worst of {len(found.held_out)}," if len(found.held_out) > 1 else row.name
+def _tiles(result: Identification) -> Iterator[Tile]:
+    for row in result.held_out[:1]:
+        which = f"{row.name}, the worst of {len(result.held_out)}," if len(result.held_out) > 1 else row.name
         note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.rmse.items() if m != "identified")
         error = f"{number(row.rmse['identified'], 3)} {pretty_unit(row.unit)}".strip()
         yield Tile(f"held-out RMSE of {which} after {row.horizon_s:g} s", error, note)
-    for e in found.parameters:
+    for e in result.parameters:
         if e.kind == "derived" and e.unit == "s":
             error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
             truth = "" if e.truth is None else f"truth {1e3 * e.truth:.1f} ms"
             yield Tile(e.name.replace("_", " "), f"{1e3 * e.estimate:.1f}{error} ms", truth)
-    if found.misfit is not None:
-        yield Tile("residuals of the fit", f"{number(found.misfit, 2)} times", "the assumed deviation of a measurement")
-    seconds, evaluations = found.search.seconds, found.search.evaluations
+    if result.misfit is not None:
+        yield Tile(
+            "residuals of the fit", f"{number(result.misfit, 2)} times", "the assumed deviation of a measurement"
+        )
+    seconds, evaluations = result.search.seconds, result.search.evaluations
     if seconds is not None:
-        simulated = [found.search.engine, f"{number(evaluations)} evaluations" if evaluations else ""]
+        simulated = [result.search.engine, f"{number(evaluations)} evaluations" if evaluations else ""]
         yield Tile("search", f"{float(seconds):.0f} s", "; ".join(filter(None, reversed(simulated))))

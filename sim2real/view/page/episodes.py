@@ -44,6 +44,7 @@ def _figure(episodes: Episodes) -> Any:
     for ax in axes:
         ax.set_yticks([])
         ax.tick_params(labelsize="small")
+    # Draw parameters, computation times, noise and curriculum, one panel each.
     used = iter(axes)
     for parameter in episodes.parameters:
         _parameter(next(used), parameter, episodes.draws[parameter.name])

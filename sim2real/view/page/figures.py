@@ -40,6 +40,7 @@ def training(curves: History, name: str) -> str:
     with styled():
         figure = new_figure(2.7)
         left, right = figure.subplots(1, 2, sharex=True)
+        # Draw one curve for each seed, and their median.
         for axes, values, label in ((left, curves.returns, "return"), (right, curves.success, "success")):
             for seed in range(seeds):
                 selected = seed == curves.best_seed

@@ -108,6 +108,7 @@ def write_page(
         stages=stages,
         notes=notes,
     )
+    # Write a draft and rename it, as a rename is atomic.
     draft = path.with_name(f".{path.name}.tmp")
     draft.write_text(text, encoding="utf-8")
     os.replace(draft, path)

@@ -111,9 +111,11 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     if deployed.dry_run:
         return _dry_section(artifact, logs)
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
+    # Put the verdict first, then the gap and the tests behind the verdict.
     blocks += deployment_verdict.verdict_blocks(deployed)
     blocks.append(TableBlock.of("Robot and simulation", deployed.rows()))
     blocks += deployment_verdict.tables(deployed)
+    # Show each episode; fold the timing of all but the first.
     for index, (log, columns) in enumerate(zip(logs, deployed.simulated, strict=True)):
         caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
         beside = simulated_beside(columns, log, deployed.units)
@@ -122,6 +124,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     for index, log in enumerate(logs):
         blocks += _timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
     blocks += servo_blocks([log.episode for log in logs])
+    # The tiles have the success on the robot and in simulation.
     real, simulated = (
         [float(value) for s in scores if (value := (s or {}).get("success")) is not None]
         for scores in ([e.real for e in deployed.episodes], [e.simulation for e in deployed.episodes])
@@ -185,6 +188,7 @@ def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = 
     """Return figures and table about an episode's timing."""
     end: Mapping[str, Any] = episode.metadata.get("log", {}).get("session_end") or {}
     rows, measured = [], Timing.of(episode)
+    # Make a row for each node: quantiles of period, lateness, computation, bus and age.
     for node in timing.in_order(episode):
         steps = episode.steps[node]
         if len(steps) < 2:
@@ -205,6 +209,7 @@ def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = 
         rows,
         folded=folded,
     )
+    # Draw figures only for the first episode.
     if folded or not rows:
         return [table]
     return [

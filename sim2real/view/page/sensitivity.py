@@ -36,6 +36,7 @@ def sensitivity_blocks(folder: Path) -> list[Block]:
 def sensitivity_figure(sensitivity: Sensitivity, name: str) -> str:
     """Draw success over the multiples, a line for each of the worst parameters."""
     shown = sensitivity.parameters[:_MAX_CURVES]
+    # The estimate has a place of its own between the negative and positive changes.
     below = int((sensitivity.multiples < 0).sum())
     places = [i if i < below else i + 1 for i in range(len(sensitivity.multiples))]
     with styled():
@@ -43,6 +44,7 @@ def sensitivity_figure(sensitivity: Sensitivity, name: str) -> str:
         axes = figure.subplots()
         axes.axhline(BROKEN * sensitivity.success, color=MUTED, lw=1.0, ls=DASHES[1])
         entries = []
+        # Draw a curve for each of the most harmful parameters.
         for i, p in enumerate(shown):
             success = [*p.success[:below], sensitivity.success, *p.success[below:]]
             look = {"color": CYCLE[i % len(CYCLE)], "marker": MARKERS[i % len(MARKERS)], "ls": DASHES[i // len(CYCLE)]}

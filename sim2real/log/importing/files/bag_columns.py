@@ -105,12 +105,14 @@ class Columns:
         Args:
             log_ns: Time at which the recorder received it [ns].
         """
+        # Sort vectors with names by the names of the first message.
         flat = _flat(message)
         names = flat.get("name") or flat.get("joint_names")
         message_names = [str(n) for n in names] if isinstance(names, list) else None
         self.joints.append(self._joints(message_names or [], flat))
         self._names = self._names or message_names
         order = self._order(message_names) if message_names is not None and message_names != self._names else None
+        # Append each leaf with numbers to its column.
         for key, value in {**flat, LOG_TIME: log_ns}.items():
             vector = isinstance(value, list)
             if isinstance(value[0] if vector else value, str | list) or value is None:

@@ -142,6 +142,7 @@ def bag_files(folder: Path) -> list[Path]:
     """
     files = {p.name: p for p in folder.glob("*.mcap")}
     metadata_file = folder / "metadata.yaml"
+    # Explain a folder without MCAP files by its other content.
     if not files:
         compressed, other = sorted(folder.glob("*.mcap.zst*")), sorted(folder.glob("*.db3"))
         if not (compressed or other or metadata_file.is_file()):
@@ -150,6 +151,7 @@ def bag_files(folder: Path) -> list[Path]:
         hint = "`ros2 bag convert` makes MCAP of it" if other else "name one of its files"
         hint = f"unpack it first: zstd -d {compressed[0].name}" if compressed else hint
         raise UsageError(f"{folder} holds 0 MCAP files, and {len(other)} of SQLite", hint=hint)
+    # Take the order from metadata.yaml, which the recorder wrote.
     listed: list[str] = []
     if metadata_file.is_file():
         text = metadata_file.read_text(encoding="utf-8", errors="replace")[:MAX_TEXT_BYTES]
@@ -162,6 +164,7 @@ def bag_files(folder: Path) -> list[Path]:
         )
     if listed:
         return [files[name] for name in listed]
+    # Without it, the numbers in the names must be consecutive.
     parts = {name: re.fullmatch(r"(.*?)_?(\d+)\.mcap", name) for name in files}
     order = sorted(files, key=lambda name: int(part[2]) if (part := parts[name]) else -1)
     numbers = [int(part[2]) for name in order if (part := parts[name])]
@@ -186,6 +189,7 @@ def _scan(paths: Sequence[Path], only: str | None = None) -> tuple[dict[str, _To
     for path in paths:
         damage = Damage()
         try:
+            # Collect the messages of topics that can hold joints, within the limits of memory.
             for topic, log_ns, source, start, end in _messages(path, topics, damage):
                 topic.count += 1
                 if topic.why if only is None else topic.name != only:
@@ -203,6 +207,7 @@ def _scan(paths: Sequence[Path], only: str | None = None) -> tuple[dict[str, _To
             raise UsageError(
                 f"{path} is no MCAP file, or is damaged: {error}", hint="`mcap doctor` says where"
             ) from None
+        # Refuse a damaged file, as its messages could be wrong, but accept a file that was cut.
         if damage.skipped:
             raise UsageError(
                 f"{path} is damaged: {damage.skipped[0]} cannot be read",
@@ -229,13 +234,13 @@ def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator
         if record.opcode == Opcode.SCHEMA and (schema := parsed(Schema, source, record, damage)) is not None:
             schemas[schema.id] = schema
         elif record.opcode == Opcode.CHANNEL and (channel := parsed(Channel, source, record, damage)) is not None:
-            found = _topic(channel, schemas.get(channel.schema_id))
-            first = topics.setdefault(channel.topic, found)
+            topic = _topic(channel, schemas.get(channel.schema_id))
+            first = topics.setdefault(channel.topic, topic)
             # Two types on one topic are two signals; the second signal is skipped.
-            second_type = first.kind != found.kind
-            channels[channel.id] = topics.setdefault(f"{channel.topic} ({found.kind})", found) if second_type else first
+            second_type = first.kind != topic.kind
+            channels[channel.id] = topics.setdefault(f"{channel.topic} ({topic.kind})", topic) if second_type else first
             if second_type:
-                found.skip(f"other messages of this topic are {first.kind}")
+                topic.skip(f"other messages of this topic are {first.kind}")
         return None
 
     unpacked_bytes, released, has_records = 0, 0, False
@@ -252,8 +257,8 @@ def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator
                 if entry is not None and entry.name == SESSION:
                     raise UsageError(f"{path} is a log of sim2real already", hint="use it as it is: --log FILE")
             elif record.opcode != Opcode.CHUNK:
-                if (found := read_record(data, record)) is not None:
-                    yield found
+                if (place := read_record(data, record)) is not None:
+                    yield place
             else:
                 content = chunk_content(data, record, damage)
                 unpacked_bytes += len(content)
@@ -261,8 +266,8 @@ def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator
                     raise UsageError(f"{path} unpacks to more than {max_unpacked >> 20} MiB, which no recorder writes")
                 try:
                     for part in chunk_records(content):
-                        if (found := read_record(content, Record(*part))) is not None:
-                            yield found
+                        if (place := read_record(content, Record(*part))) is not None:
+                            yield place
                 except ValueError as error:
                     damage.skip(str(error))
         if not has_records:

@@ -78,6 +78,7 @@ class ForeignFile:
         Raises:
             UsageError: When the signal or column does not exist, or holds other values than numbers.
         """
+        # Split the name into signal and columns, unless the file has a signal of the whole name.
         chosen: int | slice | None = column
         match = None if source in self.keys else _COLUMNS.fullmatch(source)
         name = source
@@ -95,6 +96,7 @@ class ForeignFile:
             raise
         except DAMAGED as error:
             raise UsageError(f"{name!r} in {self.path} is damaged: {error}", hint=WHOLE) from None
+        # Convert to numbers, then select the columns.
         values = _numbers(raw, f"{name!r} in {self.path}", meaning(name).unit)
         if chosen is None:
             if values.ndim == 2 and values.shape[1] > MAX_COLUMNS:
@@ -126,6 +128,7 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
     """
     formats = ", ".join(_FORMATS)
     files = [path]
+    # Choose the format: a folder by its content, a file by its suffix.
     if path.is_dir() and (path / lerobot.INFO).is_file():
         files, format = lerobot.files_of(path, episode), "lerobot"
     elif path.is_dir():
@@ -141,6 +144,7 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
         raise UsageError(f"unknown format {format!r}. Available: {formats}", hint="save the file as one of these")
     if episode is not None and format != "lerobot":
         raise UsageError(f"{path} is no data set of LeRobot: it has no episodes", hint="remove --episode")
+    # Check the files before their readers open them, so that errors name the cause.
     try:
         if not path.is_dir() and not path.is_file():
             why = "it is a pipe or a device" if path.exists() else "there is no such file"
@@ -212,6 +216,7 @@ def joined(files: Sequence[ForeignFile]) -> ForeignFile:
         file, rest = split(name)
         return file.load(rest)
 
+    # The joined file has the signals of all files, with the stem before each name.
     keys = [f"{stem}/{key}" for stem, file in by_stem.items() for key in file.keys]
     columns = {f"{stem}/{key}": names for stem, file in by_stem.items() for key, names in file.columns.items()}
     beside = tuple(path for f in files for path in (f.path, *f.beside))[1:]
@@ -227,6 +232,7 @@ _FORMATS = (*_READERS, "lerobot", "mcap")
 def _numbers(raw: npt.ArrayLike, what: str, unit: str) -> np.ndarray:
     """Return a value as an array of float64, float32 or int64; dates as nanoseconds since 1970, or in ``unit``."""
     try:
+        # Dates become nanoseconds; words and missing values become numbers or NaN.
         values = np.asarray(raw)
         if (
             values.dtype.kind in "UO"
@@ -245,6 +251,7 @@ def _numbers(raw: npt.ArrayLike, what: str, unit: str) -> np.ndarray:
         raise UsageError(f"{what} is no array of numbers", hint="all samples must be numbers, in one shape") from None
     if values.dtype.kind in "US":
         values = from_words(values, what)
+    # Keep integers exact, as float64 would round stamps in nanoseconds.
     if values.dtype.kind in "iu" and not (values.size and values.max() > np.iinfo(np.int64).max):
         return values.astype(np.int64)
     if values.dtype.kind not in "fiub":

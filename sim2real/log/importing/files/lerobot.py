@@ -56,9 +56,11 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         raise UsageError(
             f"{path} is a Parquet file, which needs pyarrow", hint="pip install 'sim2real[parquet]'"
         ) from None
+    # The description of the robot is in the data set, above the Parquet files.
     root = path if path.is_dir() else next((p for p in path.absolute().parents[:4] if (p / INFO).is_file()), None)
     info = _info(root / INFO) if root else {}
     try:
+        # Open the files of the episode, and select the columns that can be signals.
         chosen = _chosen(path, episode)
         files, rows = [pyarrow.parquet.ParquetFile(p) for p in chosen], list(chosen.values())
         schema = files[0].schema_arrow
@@ -77,6 +79,7 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
     if not info and "observation.state" in schema.names:
         info = {"robot_type": ""}  # a file of a data set, without the description of its robot
 
+    # Load a column only on request, as a data set can be larger than the memory.
     def load(name: str) -> Json:
         if name not in schema.names:
             return _fact(info, name)
@@ -87,6 +90,7 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         parts = [part for part in parts if len(part)] or parts[:1]
         return parts[0] if len(parts) == 1 else np.concatenate([np.asarray(part) for part in parts])
 
+    # Nominal stamps are no measurement: drop them as signals, and give the rate instead.
     fps = info.get("fps")
     fps = float(fps) if isinstance(fps, int | float) and fps > 0 else _fps(load, schema.names)
     info = {**info, "fps": fps} if fps else info
@@ -120,6 +124,7 @@ def _chosen(path: Path, episode: int | None) -> dict[Path, np.ndarray | None]:
     import pyarrow.parquet
 
     numbers_of: dict[Path, np.ndarray] = {}
+    # Read the column of episodes of each file.
     for part in files_of(path, episode):
         with pyarrow.parquet.ParquetFile(part) as file:
             if _EPISODE not in file.schema_arrow.names:
@@ -128,6 +133,7 @@ def _chosen(path: Path, episode: int | None) -> dict[Path, np.ndarray | None]:
                 return {part: None}
             require_memory(8.0 * file.metadata.num_rows, str(part))
             numbers_of[part] = file.read(columns=[_EPISODE]).column(0).to_numpy()
+    # Select the episode, which must be unique if none is chosen.
     numbers = np.unique(np.concatenate(list(numbers_of.values())))
     listed = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else ", ".join(map(str, numbers)) or "none"
     if episode is None and len(numbers) > 1:
@@ -214,12 +220,14 @@ def are_degrees(facts: Mapping[str, Json], names: Sequence[str], q: np.ndarray, 
     motors = robot.startswith(_MOTORS) or any(name.endswith(".pos") for name in names)
     if not facts or not (motors or np.abs(q).max() > _MAX_RAD):
         return False
+    # Grippers are in hundredths also if the arm is in degrees, so judge the arm alone.
     jaws = [i for i, name in enumerate(names) if any(word in name.lower() for word in _JAWS)]
     arm = [i for i in range(q.shape[1]) if i not in jaws]
     beyond = bool((np.abs(q[:, arm]) > _MAX_HUNDREDTHS).any())
     moving = [i for i in arm if np.ptp(q[:, i]) > 0]
     proofs = [_is_degrees(q[:, i]) for i in moving]
     proven = None not in proofs and True in proofs
+    # Refuse an arm that could be in either unit.
     if arm and not beyond and not proven:
         largest = ", ".join(f"{names[i]} {np.abs(q[:, i]).max():.4g}" for i in arm[:3])
         raise UsageError(

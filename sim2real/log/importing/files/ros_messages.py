@@ -47,16 +47,16 @@ def _parse(name: str, text: str) -> _Types:
     for part in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.split("#")[0] for line in part.strip().splitlines()]
         if lines and (title := re.match(r"\s*MSG:\s*(\S+)", lines[0])):
-            own, lines = title[1], lines[1:]
+            type_name, lines = title[1], lines[1:]
         else:
-            own = name
-        package, fields = own.split("/")[0], []
+            type_name = name
+        package, fields = type_name.split("/")[0], []
         for line in lines:
-            if (found := _FIELD.match(line)) and not found[5]:
-                kind = found[1]
+            if (field := _FIELD.match(line)) and not field[5]:
+                kind = field[1]
                 full = kind if kind in _PLAIN or "/" in kind else f"{package}/{kind}"
-                fields.append((full, found[3] or "", found[4]))
-        types[_short(own)] = fields
+                fields.append((full, field[3] or "", field[4]))
+        types[_short(type_name)] = fields
     types.setdefault("builtin_interfaces/Time", [("int32", "", "sec"), ("uint32", "", "nanosec")])
     types.setdefault("builtin_interfaces/Duration", [("int32", "", "sec"), ("uint32", "", "nanosec")])
     return types

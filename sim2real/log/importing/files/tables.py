@@ -46,6 +46,7 @@ def encoding_of(path: Path, kind: str) -> str:
         ):
             if mark.startswith(bom):
                 return name
+        # Without a mark, the text is UTF-8 if all of it decodes, else latin-1.
         stream.seek(0)
         decoder, encoding = codecs.getincrementaldecoder("utf-8")(), "utf-8"
         while block := stream.read(1 << 20):
@@ -98,6 +99,7 @@ class _Table:
     def read(self, stream: Iterator[str]) -> None:
         """Read all lines."""
         comments: list[str] = []
+        # Find the separator from the first two lines; a spreadsheet can name it in a line "sep=".
         lines = self._lines(stream, comments)
         head = list(islice(lines, 2))
         if head and head[0][1].lower().startswith("sep=") and len(head[0][1].strip()) == 5:
@@ -107,6 +109,7 @@ class _Table:
             self._delimiter = _delimiter(head[0][1], head[-1][1])
         if not head:
             raise UsageError(f"{self._path} is empty", hint=WHOLE)
+        # Take the names from the first line, or from the last comment if the first line holds numbers.
         first = self._cells(head[0][1])
         named = [c for c in map(self._cells, comments[::-1]) if len(c) == len(first)]
         if all(is_number(name) for name in first):
@@ -127,6 +130,7 @@ class _Table:
             for self._line, text in chain(rest, lines):
                 yield text
 
+        # Convert the lines in blocks, so that the text of a large file is never in the memory at once.
         rows = csv.reader(texts(), delimiter=self._delimiter, skipinitialspace=True)
         numbered = ((self._line, self._row(row)) for row in rows if any(cell.strip() for cell in row))
         head_rows = list(islice(numbered, 2))
@@ -134,6 +138,7 @@ class _Table:
         numbered = chain(head_rows, numbered)
         while block := list(islice(numbered, _BLOCK)):
             self._take(block)
+        # A file with both decimal points and commas is ambiguous.
         if self._point and self._comma:
             listed = "line {} {!r} with a comma, line {} {!r} with a point".format(*self._comma, *self._point)
             raise UsageError(
