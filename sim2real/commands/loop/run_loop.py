@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sim2real.artifacts.run.iterations import Iteration, Iterations, Plan
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts
-from sim2real.artifacts.run.stage_status import standing, why_stale
+from sim2real.artifacts.run.stage_status import stage_status, why_stale
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.stages.pipeline import find_run
 from sim2real.stages.terminal import console
@@ -45,7 +45,7 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None
     # Skip the stages with a current result. After a stage that runs, the results of all later stages are out of date.
     rerun = False
     for number, stage in enumerate(STAGES, 1):
-        status = None if rerun or run_dir is None else standing(run_dir).get(stage)
+        status = None if rerun or run_dir is None else stage_status(run_dir).get(stage)
         if status is not None and not status.stale:
             console.note(f"{stage} ({number}/{len(STAGES)}): finished before, skipped")
             continue
@@ -71,7 +71,7 @@ def _run_iterations(
     from sim2real.commands.loop import next_iteration
 
     # Of a finished run only the newest deployment is judged; in all other runs the four stages run first.
-    statuses = {} if run_dir is None else standing(run_dir)
+    statuses = {} if run_dir is None else stage_status(run_dir)
     current = set(statuses) == set(STAGES) and not any(s.stale for s in statuses.values())
     plan = plan or Plan(() if current else STAGES, next_iteration.ALL_STAGES)
     rows = () if run_dir is None else Iterations.load(run_dir).rows
@@ -107,8 +107,7 @@ def _run_iterations(
             break
     if refusal is not None:
         raise refusal
-    cells = [[r.number, ", ".join(r.stages), r.real, r.simulation, r.verdict, r.then] for r in rows]
-    print(console.table(cells, ["iteration", "ran", "success", "in simulation", "verdict", "then"]))
+    print(console.artifact_table(Iterations(rows).table().without("why")))
     return run_dir
 
 
@@ -222,7 +221,7 @@ class ResumedCalls:
         """Return the next finished attempt of the stage if it is current; otherwise run the stage."""
         while self.attempts.get(stage) and run_dir is not None:
             attempt = self.attempts[stage].pop(0)
-            if not (reason := why_stale(attempt, standing(run_dir))):
+            if not (reason := why_stale(attempt, stage_status(run_dir))):
                 console.note(f"{stage}: {attempt.folder.name} is finished, skipped")
                 return attempt
             console.note(f"{stage}: {reason}")

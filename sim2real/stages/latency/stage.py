@@ -11,7 +11,6 @@ from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
 from sim2real.robots.contract import Robot
 from sim2real.stages.excitation.signals import excitation
-from sim2real.stages.identify.show import link_table
 from sim2real.stages.identify.stage import identify
 from sim2real.stages.latency.config import LatencyConfig
 from sim2real.stages.latency.result import Latency
