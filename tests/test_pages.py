@@ -150,7 +150,7 @@ def test_wrong_rows_of_choices_are_seen(line, wrong):
 
 
 PRINTED = {
-    "guides/any_robot.md": ["proposed mapping for ", "was measured and ", " commanded, by their names"],
+    "guides/any_robot.md": ["proposed mapping for ", "is measured and ", " commanded, by their names"],
     "guides/check.md": [
         "accept what is determined",
         "nothing in this data determines ",

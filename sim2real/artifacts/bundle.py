@@ -12,7 +12,7 @@ from sim2real.artifacts.episodes import EPISODES, Episodes
 from sim2real.artifacts.files import check, make_folder, malformed, read_json, write_json
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
-from sim2real.artifacts.summary import Summed, Table
+from sim2real.artifacts.summary import ArtifactTable, Summed
 from sim2real.policy.bundle import PolicyReference, load_bundle, make_runner, read_contract, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.network import NetworkSpec
@@ -69,7 +69,7 @@ class History:
         """Reward term -> its part of the return ``(K, seeds)``; empty if terms have no names."""
         return {n.removeprefix(REWARD): curve for n, curve in self.others.items() if n.startswith(REWARD)}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return the last evaluation: a row for each seed, with its settings and the parts of its return."""
         settings = ("settings",) if self.settings else ()
         curves = zip(*(c[-1].tolist() for c in (self.returns, *self.terms.values())), strict=True)
@@ -77,7 +77,7 @@ class History:
             [str(seed), *self.settings[seed : seed + 1], *values, f"{self.success[-1, seed]:.1%}"]
             for seed, values in enumerate(curves)
         ]
-        return Table(("seed", *settings, "return", *(f"of it {name}" for name in self.terms), "success"), rows)
+        return ArtifactTable(("seed", *settings, "return", *(f"of it {name}" for name in self.terms), "success"), rows)
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""
@@ -129,9 +129,9 @@ class Bundle(Summed):
             facts["success in simulation"] = float(self.history.success.max())
         return facts if self.path is None else {**facts, "folder": shown(self.path)}
 
-    def rows(self) -> Table | None:
+    def rows(self) -> ArtifactTable | None:
         """Return the training's summary; None for a loaded bundle."""
-        return Table(("training", ""), list(self.summary.items())) if self.summary else None
+        return ArtifactTable(("training", ""), list(self.summary.items())) if self.summary else None
 
     def runner(self, backend: str | None = None) -> PolicyRunner:
         """Return the policy's runner, in numpy or, with ``"onnx"``, in onnxruntime.

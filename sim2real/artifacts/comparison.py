@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Estimate, Identification
-from sim2real.artifacts.summary import Shown, Table
+from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.types import Json
 
 LEVEL = 0.01
@@ -73,21 +73,21 @@ class Comparison(Shown):
         """Return name -> value for a short representation."""
         return {"runs": len(self.runs), "differ": ", ".join(self.different) or "no parameter"}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return the table of parameters: estimate and half-width of the 95 % interval of each run."""
         headers = ("parameter", "unit", *(run.name for run in self.runs), "differs beyond chance")
         rows = [
             [p.name, p.unit, *map(with_interval, p.estimates), "not tested" if p.p_value is None else _verdict(p)]
             for p in self.parameters
         ]
-        return Table(headers, rows)
+        return ArtifactTable(headers, rows)
 
-    def figures(self) -> Table:
+    def figures(self) -> ArtifactTable:
         """Return the table of verdicts, errors and scores: one row a figure, one column a run."""
         columns = [_figures_of(run) for run in self.runs]
         names = dict.fromkeys(name for column in columns for name in column)
         headers = ("figure", *(run.name for run in self.runs))
-        return Table(headers, [[name, *(column.get(name) for column in columns)] for name in names])
+        return ArtifactTable(headers, [[name, *(column.get(name) for column in columns)] for name in names])
 
 
 def with_interval(estimate: Estimate | None) -> str:

@@ -13,7 +13,7 @@ from sim2real.artifacts.estimation.drift import Drift
 from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import TRUTH, Recording
-from sim2real.artifacts.summary import Summed, Table, words_and_unit
+from sim2real.artifacts.summary import ArtifactTable, Summed, words_and_unit
 from sim2real.errors import Sim2RealError
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
@@ -154,20 +154,20 @@ class Deployment(Summed):
             facts |= {"verdict": advice.status, "why": "; ".join(advice.reasons), "next": advice.next}
         return {name: value for name, value in facts.items() if value}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return the gap: a row for each quantity."""
         return _gap_table(("quantity", "robot", "simulation", "gap", "unit"), self.gap, self.units)
 
-    def times_table(self) -> Table:
+    def times_table(self) -> ArtifactTable:
         """Return the times on the robot and in training: a row for each."""
         return _gap_table(("times", "robot", "in training", "gap", "unit"), self.trained, {})
 
-    def replay_table(self) -> Table:
+    def replay_table(self) -> ArtifactTable:
         """Return the prediction errors of each model on the recorded commands: a row for each position."""
         models = list(self.replay[0].rmse) if self.replay else []
         horizon = f"commands played again, {self.replay[0].horizon_s:g} s" if self.replay else ""
         rows = [[r.name, *(r.rmse.get(m) for m in models), r.promised, r.unit] for r in self.replay]
-        return Table((horizon, *models, "promised", "unit"), rows)
+        return ArtifactTable((horizon, *models, "promised", "unit"), rows)
 
     def save(self, folder: Path | str) -> dict[str, str]:
         """Write scores and simulation into a folder; the logs are in it already.
@@ -233,14 +233,14 @@ class Deployment(Summed):
         return replace(deployment, simulated=simulated, recordings=recordings, probe=probe)
 
 
-def _gap_table(headers: Sequence[str], gaps: Sequence[Gap], units: Mapping[str, str]) -> Table:
+def _gap_table(headers: Sequence[str], gaps: Sequence[Gap], units: Mapping[str, str]) -> ArtifactTable:
     """Return a row for each quantity; its unit is the gap's, the field's, or the end of its name."""
     rows = []
     for gap in gaps:
         words, unit = words_and_unit(gap.quantity)
         unit = gap.unit or unit_of(gap.quantity, units) or unit
         rows.append([words, gap.real, gap.simulation, gap.gap, unit])
-    return Table(headers, rows)
+    return ArtifactTable(headers, rows)
 
 
 def log_of(folder: Path, number: int) -> Path:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
-from sim2real.artifacts.summary import Interval, Table
+from sim2real.artifacts.summary import ArtifactTable, Interval
 from sim2real.errors import Sim2RealError
 
 FORMAT = 1
@@ -70,19 +70,19 @@ class Episodes:
     off: Mapping[str, np.ndarray] = field(default_factory=dict)
     format: int = FORMAT
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each parameter: value, interval of the estimate, and interval of the draws."""
         rows = []
         for p in self.parameters:
             low, high = np.quantile(self.draws[p.name], [0.025, 0.975]).tolist()
             drawn, identified = Interval(low, high), Interval(p.low95, p.high95)
             rows.append([p.name, p.value, identified, drawn, p.unit, "left open by the log" * p.open])
-        return Table(("parameter", "value", "95 % identified", "95 % drawn", "unit", ""), rows)
+        return ArtifactTable(("parameter", "value", "95 % identified", "95 % drawn", "unit", ""), rows)
 
-    def noise_table(self) -> Table:
+    def noise_table(self) -> ArtifactTable:
         """Return a row for each reading with noise."""
         rows = [[n.column, n.deviation, n.quantum, n.bias, n.unit] for n in self.noise]
-        return Table(("reading", "deviation", "step", "bias", "unit"), rows)
+        return ArtifactTable(("reading", "deviation", "step", "bias", "unit"), rows)
 
     def save(self, folder: Path) -> dict[str, str]:
         """Write it into a folder.

@@ -15,7 +15,7 @@ from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.run.run_folder import Source
-from sim2real.artifacts.summary import Interval, Shown, Table
+from sim2real.artifacts.summary import ArtifactTable, Interval, Shown
 from sim2real.artifacts.timing import TIMING, Timing
 from sim2real.errors import Sim2RealError
 from sim2real.types import Json
@@ -268,30 +268,30 @@ class Identification(Shown):
         facts |= {"next": self.verdict.next, "parameters": len(self.parameters)}
         return {name: value for name, value in facts.items() if value}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each parameter."""
         rows = [
             [p.name, p.estimate, Interval(p.low95, p.high95), p.unit, p.nominal, p.truth, _off(p), p.verdict]
             for p in self.parameters
         ]
         headers = ("parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict")
-        return Table(headers, rows)
+        return ArtifactTable(headers, rows)
 
-    def recordings_table(self) -> Table:
+    def recordings_table(self) -> ArtifactTable:
         """Return a row for each quantity that is estimated from each recording alone."""
         rows = [
             [q.name, q.mean, q.standard_error, Interval(q.low95, q.high95), q.unit, q.between, q.agree]
             for q in self.aggregate
         ]
-        return Table(("over recordings", "mean", "s.e.", "95 % of the next", "unit", "spread", "agree"), rows)
+        return ArtifactTable(("over recordings", "mean", "s.e.", "95 % of the next", "unit", "spread", "agree"), rows)
 
-    def alternatives_table(self) -> Table:
+    def alternatives_table(self) -> ArtifactTable:
         """Return a row for each other model that fits the recordings as well."""
         others = () if self.posterior is None else self.posterior.others
         rows = [[other.about, f"{100 * other.weight:.0f} %"] for other in others]
-        return Table(("explains the recordings as well", "share of the draws"), rows)
+        return ArtifactTable(("explains the recordings as well", "share of the draws"), rows)
 
-    def held_out_table(self) -> Table:
+    def held_out_table(self) -> ArtifactTable:
         """Return the errors on held-out data: a row for each position, a column for each model."""
         models = list(dict.fromkeys(model for row in self.held_out for model in row.rmse))
         rows = [
@@ -299,7 +299,7 @@ class Identification(Shown):
             for row in self.held_out
         ]
         horizon = f"off {self.held_out[0].horizon_s:g} s ahead, held out" if self.held_out else ""
-        return Table((horizon, *models, "unit", "no better than"), rows)
+        return ArtifactTable((horizon, *models, "unit", "no better than"), rows)
 
     @property
     def values(self) -> dict[str, float]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.summary import Summed, Table
+from sim2real.artifacts.summary import ArtifactTable, Summed
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
 from sim2real.hardware.emulation.truth import Truth, read_truth
@@ -89,7 +89,7 @@ class Recording(Summed):
         facts = {"pipeline": self.pipeline, "log": shown(self.path), "duration": f"{self.episode.duration_s:.1f} s"}
         return {**facts, "steps": steps, **({"warnings": "; ".join(self.warnings)} if self.warnings else {})}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return the timing of each node."""
         return self.timing.rows()
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.files import check, malformed, read_json, write_json
-from sim2real.artifacts.summary import Table
+from sim2real.artifacts.summary import ArtifactTable
 from sim2real.errors import Sim2RealError
 
 FORMAT = 1
@@ -98,7 +98,7 @@ class Sensitivity:
             f"{self.success:.2f} to {worst.success[i]:.2f}."
         )
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each parameter: estimate, half-width, the multiple that breaks the policy, success."""
         headers = ("parameter", "unit", "estimate", "half-width", "breaks at", *(f"{m:+g}" for m in self.multiples))
         rows = []
@@ -106,7 +106,7 @@ class Sensitivity:
             at = self.breaks_at(p)
             success = [f"{s:.2f}" for s in p.success]
             rows.append([p.name, p.unit, p.estimate, p.half_width, None if at is None else f"{at:+g}", *success])
-        return Table(headers, rows)
+        return ArtifactTable(headers, rows)
 
     def save(self, path: Path) -> None:
         """Write it as JSON."""

@@ -33,7 +33,7 @@ Cell: TypeAlias = str | float | bool | Interval | None
 
 
 @dataclass(frozen=True)
-class Table:
+class ArtifactTable:
     """A table of an artifact; each reader (console, page, notebook) formats its cells.
 
     Attributes:
@@ -48,10 +48,10 @@ class Table:
         """Return each row as header -> cell, for JSON."""
         return [dict(zip(self.headers, row, strict=True)) for row in self.rows]
 
-    def without(self, *headers: str) -> Table:
+    def without(self, *headers: str) -> ArtifactTable:
         """Return the table without some columns."""
         keep = [i for i, header in enumerate(self.headers) if header not in headers]
-        return Table([self.headers[i] for i in keep], [[row[i] for i in keep] for row in self.rows])
+        return ArtifactTable([self.headers[i] for i in keep], [[row[i] for i in keep] for row in self.rows])
 
 
 def words_and_unit(name: str) -> tuple[str, str]:
@@ -69,7 +69,7 @@ class Shown(ABC):
     def about(self) -> Mapping[str, Json]:
         """Return the facts: name -> value."""
 
-    def rows(self) -> Table | None:
+    def rows(self) -> ArtifactTable | None:
         """Return the artifact's main table; None if it has none."""
         return None
 

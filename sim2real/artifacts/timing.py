@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
-from sim2real.artifacts.summary import Shown, Table
+from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.episode import TICKS_PER_S, Episode
@@ -184,10 +184,10 @@ class Timing(Shown):
         """Return the nodes and their numbers of steps."""
         return {"nodes": ", ".join(f"{name} {node.steps} steps" for name, node in self.nodes.items())}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each node."""
         rows = [[n, t.steps, t.computation.p50, t.computation.p99, t.overruns] for n, t in self.nodes.items()]
-        return Table(("node", "steps", "computation p50 [s]", "p99 [s]", "overruns"), rows)
+        return ArtifactTable(("node", "steps", "computation p50 [s]", "p99 [s]", "overruns"), rows)
 
     def save(self, folder: Path | str, name: str = "timing") -> dict[str, str]:
         """Write it into a folder.

@@ -218,11 +218,7 @@ class McapRecorder:
             )
 
     def _drain(self, report: Callable[[str], None] | None) -> None:
-        """Wait until the writer has written the queue.
-
-        Raises:
-            Sim2RealError: When the disk is stuck.
-        """
+        """Wait until the writer has written the queue."""
         report_s = time.monotonic() + REPORT_PERIOD_S
         while self._thread.is_alive():
             self._thread.join(CHECK_PERIOD_S)

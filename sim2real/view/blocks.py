@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sim2real.artifacts.summary import Cell, Interval, Table
+from sim2real.artifacts.summary import ArtifactTable, Cell, Interval
 
 MISSING = "–"  # noqa: RUF001 - a dash, as is usual in tables
 
@@ -54,7 +54,7 @@ class TableBlock:
     kind: str = "table"
 
     @staticmethod
-    def of(caption: str, table: Table) -> TableBlock:
+    def of(caption: str, table: ArtifactTable) -> TableBlock:
         """Return an artifact's table as text: numbers with four digits, short times in ms, pretty units."""
         units = [header == "unit" for header in table.headers]
         readable = [_in_ms(row, units) for row in table.rows]

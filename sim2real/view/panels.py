@@ -54,7 +54,6 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
     """Draw panels one above the other; panels over the same time share an axis. Returns SVG.
 
     Args:
-        name: Name of the figure, unique on its page.
         label: Description of the figure, for screen readers.
     """
     # Panels share a time axis unless they have titles or zooms of their own.

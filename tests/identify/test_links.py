@@ -11,7 +11,7 @@ from sim2real.errors import UsageError
 from sim2real.identify.delays.likelihood import Seen
 from sim2real.identify.delays.links import describe, find, links, measured
 from sim2real.identify.delays.lost_messages import losses
-from sim2real.stages.estimation.estimate import show
+from sim2real.stages.identify.show import show
 
 GAIN, RATE = 5.0, 8.0  # speed [rad/s] of a volt in the end, and how fast it gets there [1/s]
 COMMAND_DELAY_S, NOISE_RAD, COUNT_RAD = 0.004, 1e-3, 1e-3

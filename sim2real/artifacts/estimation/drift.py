@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sim2real.artifacts.summary import Interval, Table
+from sim2real.artifacts.summary import ArtifactTable, Interval
 
 _MIN_SHARE = 0.5
 """A change can be the cause if it explains this share of the error that the best change explains."""
@@ -71,7 +71,7 @@ class Drift:
         best = self.changes[0]
         return best if best.explains > _MIN_SHARE and best.p < _MAX_CHANCE else None
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each possible change."""
         headers = ("changed alone", "identified", "now", "95 % interval", "unit", "explains", "alarm")
         rows = [
@@ -86,4 +86,4 @@ class Drift:
             ]
             for c in self.changes
         ]
-        return Table(headers, rows)
+        return ArtifactTable(headers, rows)

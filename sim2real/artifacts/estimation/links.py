@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.artifacts.summary import Interval, Table
+from sim2real.artifacts.summary import ArtifactTable, Interval
 
 _HEADERS = ("link", "estimate", "95 % interval", "unit")
 
@@ -57,7 +57,7 @@ class Link:
         """Whether the mean is this link's alone."""
         return len(self.parts) == 1
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each number that the log determines."""
         total, name = " + ".join(self.parts), self.name
         numbers = [
@@ -74,12 +74,12 @@ class Link:
             for label, r, factor, unit in numbers
             if r.value is not None
         ]
-        return Table(_HEADERS, rows)
+        return ArtifactTable(_HEADERS, rows)
 
 
-def links_table(links: Sequence[Link]) -> Table:
+def links_table(links: Sequence[Link]) -> ArtifactTable:
     """Return the rows of several links as one table."""
-    return Table(_HEADERS, [row for link in links for row in link.rows().rows])
+    return ArtifactTable(_HEADERS, [row for link in links for row in link.rows().rows])
 
 
 def _scaled(value: float | None, factor: float) -> float | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sim2real.artifacts.files import malformed, read_json, write_json
-from sim2real.artifacts.summary import Table
+from sim2real.artifacts.summary import ArtifactTable
 
 ITERATIONS = "iterations.json"
 
@@ -71,11 +71,11 @@ class Iterations:
     rows: tuple[Iteration, ...] = ()
     plan: Plan | None = None
 
-    def table(self) -> Table:
+    def table(self) -> ArtifactTable:
         """Return a row for each finished iteration."""
         headers = ("iteration", "ran", "success", "in simulation", "verdict", "why", "then")
         rows = [[str(r.number), ", ".join(r.stages), r.real, r.simulation, r.verdict, r.why, r.then] for r in self.rows]
-        return Table(headers, rows)
+        return ArtifactTable(headers, rows)
 
     def save(self, run_dir: Path) -> Path:
         """Write the iterations into the run folder, and return the file."""

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.artifacts.summary import Shown, Table
+from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
 from sim2real.identify.search.search import search
@@ -43,9 +43,11 @@ class Minimum(Shown):
         """Return what to say about it: name -> value."""
         return {"loss": self.loss, "start": self.start, "evaluations": self.evaluations}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each parameter."""
-        return Table(("parameter", "value"), [[n, np.array2string(v, precision=5)] for n, v in self.parameters.items()])
+        return ArtifactTable(
+            ("parameter", "value"), [[n, np.array2string(v, precision=5)] for n, v in self.parameters.items()]
+        )
 
 
 class _Scale:

@@ -105,11 +105,7 @@ def goal(
 
 
 def _signs(names: Sequence[str], ordered: Following, sure: np.ndarray, path: str, as_told: bool) -> list[str]:
-    """Return notes on commands that repeat.
-
-    Raises:
-        UsageError: When the opposite sign fits equally well with a smaller lag.
-    """
+    """Return notes on commands that repeat."""
     lag, against, repeats = (np.diag(a) for a in (ordered.lag_s, ordered.against_s, ordered.repeats_s))
     with np.errstate(invalid="ignore"):
         ambiguous = sure & ((against < lag) | _others_agree(ordered, sure))
@@ -153,11 +149,7 @@ def _others_agree(ordered: Following, sure: np.ndarray) -> np.ndarray:
 def _too_early(
     names: Sequence[str], ordered: Following, sure: np.ndarray, scale: float, path: str, as_told: bool
 ) -> list[str]:
-    """Return a warning of joints that move before their commands.
-
-    Raises:
-        UsageError: When such a joint equals its command: names are exchanged, or the clocks do not agree.
-    """
+    """Return a warning of joints that move before their commands."""
     lag = np.diag(ordered.lag_s)
     early = sure & (lag < -1.5 * ordered.period_s)
     if not early.any():

@@ -103,7 +103,6 @@ class ImportMapping:
 
         Args:
             pipeline: Pipeline of the log; default: the document's.
-            path: The document's file, for errors.
 
         Raises:
             UsageError: When a key is unknown, missing or of the wrong type.

@@ -38,7 +38,6 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None, joint
     """Return measured positions and their commands.
 
     Args:
-        path: The file, for errors.
         rate_hz: Rate of samples without stamps [Hz].
         joints: Names of the robot's joints; empty if unknown.
 

@@ -97,11 +97,7 @@ def propose(file: ForeignFile, hints: ImportHints) -> Proposal:
 def _streams(
     file: ForeignFile, signals: Sequence[Signal], unread: Sequence[str], hints: ImportHints
 ) -> tuple[Pair, list[Stamps], list[str]]:
-    """Return measurements and commands, the stamps of both, and notes.
-
-    Raises:
-        UsageError: When there are no candidates, or several.
-    """
+    """Return measurements and commands, the stamps of both, and notes."""
     path = str(file.path)
     try:
         pair = find_pair(signals, path, hints.rate_hz, hints.joints)
@@ -186,11 +182,7 @@ def _circle(
 
 
 def _other_command(command: Signal, measured: Signal, places: np.ndarray) -> Signal:
-    """Return commands other than goals, in the order of the joints.
-
-    Raises:
-        UsageError: When their number differs from that of the joints, and they have no names.
-    """
+    """Return commands other than goals, in the order of the joints."""
     if command.width != measured.width and not set(measured.labels) <= set(command.labels) - {""}:
         raise UsageError(
             f"{command.name!r} has {command.width} columns, {measured.name!r} {measured.width}",
@@ -207,11 +199,7 @@ def _compared(
     pair: Sequence[Signal],
     path: str,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return commands and positions on one grid of time, and its period [s].
-
-    Raises:
-        UsageError: When they overlap in fewer than 50 samples.
-    """
+    """Return commands and positions on one grid of time, and its period [s]."""
     held, joined, period_s = (
         on_grid(t_s[1], command, t_s[0], q, acting) if min(map(len, t_s)) > 2 else (q[:0], q[:0], 1.0)
     )
@@ -226,11 +214,7 @@ def _compared(
 def _with_numbers(
     measured: Signal, places: np.ndarray, labels: tuple[str, ...], hints: ImportHints, path: str
 ) -> tuple[np.ndarray, tuple[str, ...], list[str]]:
-    """Return the joints that have numbers, and notes on the others.
-
-    Raises:
-        UsageError: When a joint of the robot has no number.
-    """
+    """Return the joints that have numbers, and notes on the others."""
     with_numbers = np.asarray(np.isfinite(measured.values[:, places]).any(axis=0))
     if with_numbers.all():
         return places, labels, []
@@ -276,11 +260,7 @@ def _joint_order(measured: Signal, hints: ImportHints, path: str) -> tuple[np.nd
 def _clocks(
     signals: Sequence[Signal], stamps: Sequence[Stamps], measured: Signal, command: Signal, path: str
 ) -> tuple[list[np.ndarray], float, list[str]]:
-    """Return both streams' times, the offset of the commands' clock [s], and notes.
-
-    Raises:
-        UsageError: When the clocks differ by an ambiguous offset, as commands repeat.
-    """
+    """Return both streams' times, the offset of the commands' clock [s], and notes."""
     t, c = (s.t_s for s in stamps)
     if stamps[0].source == stamps[1].source and len(t) == len(c):
         return [t, t], 0.0, []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sim2real.artifacts.summary import Shown, Table
+from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.types import Json
 
 
@@ -44,8 +44,8 @@ class Checked(Shown):
         figures = {"pipeline": self.pipeline, "source": self.source, "determined": "yes" if self.determined else "no"}
         return figures | {"why": "; ".join(self.messages), "next": "; ".join(self.recommendation)}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each parameter."""
         names = ("name", "nominal", "standard_error_per_minute", "unit", "determined")
         headers = ("parameter", "nominal", "s.e. from a minute", "unit", "determined")
-        return Table(headers, [[p[name] for name in names] for p in self.parameters])
+        return ArtifactTable(headers, [[p[name] for name in names] for p in self.parameters])

@@ -16,7 +16,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 from sim2real.artifacts.paths import shown as shown
 
 if TYPE_CHECKING:
-    from sim2real.artifacts.summary import Table
+    from sim2real.artifacts.summary import ArtifactTable
+
+    pass
 
 _TICK_S = 1.0
 """How often a terminal's progress is drawn again, whatever is computed [s]."""
@@ -102,7 +104,7 @@ def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -
     )
 
 
-def artifact_table(content: Table) -> str:
+def artifact_table(content: ArtifactTable) -> str:
     """Return a table of an artifact as aligned plain text."""
     return table(content.rows, content.headers)
 

@@ -13,7 +13,7 @@ import numpy as np
 from sim2real.artifacts.identification import HeldOut, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.manifest import plain
-from sim2real.artifacts.summary import Shown, Table
+from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.model import IdentifiableModel
@@ -109,13 +109,13 @@ class Validation(Shown):
         found |= {"fitted": "; ".join(self.fitted)} if self.fitted else {}
         return found | {"promise kept": kept, f"rmse {self.horizon_s:g} s ahead": self.rmse}
 
-    def rows(self) -> Table:
+    def rows(self) -> ArtifactTable:
         """Return a row for each position."""
         own = [
             [name, row["rmse"]["identified"], row["promised"], row[_FREE], row["unit"]]
             for name, row in self.positions.items()
         ]
-        return Table(("position", "off", "promised", _FREE, "unit"), own)
+        return ArtifactTable(("position", "off", "promised", _FREE, "unit"), own)
 
 
 def validate(

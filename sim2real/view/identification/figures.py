@@ -152,7 +152,6 @@ def correlation(names: Sequence[str], matrix: np.ndarray, name: str) -> str:
 
     Args:
         matrix: Shape ``(P, P)``.
-        name: Of the figure, unique on its page.
     """
     count = len(names)
     size = 0.62 if count <= 14 else max(0.3, 8.4 / count)

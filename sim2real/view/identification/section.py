@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,7 +31,6 @@ from sim2real.view.blocks import (
 from sim2real.view.identification import figures, intervals, residuals
 from sim2real.view.identification.links import link_blocks
 from sim2real.view.provenance import about
-from sim2real.view.readable_units import in_readable_unit
 
 _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),
@@ -41,6 +41,7 @@ _TITLES: dict[str, tuple[Tone, str]] = {
 }
 _STRONG = 0.9
 """Correlations above this are listed."""
+_NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower", "upper", "truth")
 
 
 def identify_section(artifact: StageFolder) -> PageSection:
@@ -144,6 +145,15 @@ def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
         rows.append([*row, e.verdict or MISSING])
     remarks = [pretty_unit(e.about) if e.about else "" for e in estimates]
     return TableBlock("Parameters", columns, rows, text_columns=(4, len(columns) - 1), remarks=remarks)
+
+
+def in_readable_unit(e: Estimate) -> Estimate:
+    """Return an estimate in ms if it is a time below a second; others unchanged."""
+    largest = max(abs(v) for v in (e.estimate, e.upper, e.truth) if v is not None)
+    if e.unit != "s" or largest >= 1.0:
+        return e
+    scaled = {n: getattr(e, n) for n in _NUMBERS}
+    return replace(e, unit="ms", **{n: None if v is None else 1e3 * v for n, v in scaled.items()})
 
 
 def _error(e: Estimate) -> str:

@@ -18,11 +18,7 @@ _TAIL = 0.999
 
 
 def episodes_svg(episodes: Episodes, name: str) -> str:
-    """Draw parameters, computation times and noise as one ``<svg>`` element of a page.
-
-    Args:
-        name: Of the figure, unique on its page.
-    """
+    """Draw parameters, computation times and noise as one ``<svg>`` element of a page."""
     with styled():
         return to_svg(_figure(episodes), name, "Distributions of the episodes, and recorded values")
 

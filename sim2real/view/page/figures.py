@@ -70,7 +70,6 @@ def deployment(log: Signals, simulation: Sequence[Series], units: Mapping[str, s
     Args:
         simulation: Series of the simulation; empty without a simulation.
         units: Field -> unit.
-        name: Of the figure, unique on its page.
     """
     units = {**log.units, **units}
     simulated = {s.name: s for s in simulation}

@@ -71,11 +71,7 @@ def read_npz(path: Path) -> RawSignals:
 
 
 def _shape(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype[np.generic]]:
-    """Return shape and type of an array in an archive, from its header.
-
-    Raises:
-        ValueError: When the header is missing or malformed.
-    """
+    """Return shape and type of an array in an archive, from its header."""
     with archive.open(name) as stream:
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

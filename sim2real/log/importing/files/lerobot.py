@@ -281,11 +281,7 @@ def _is_nominal(load: Callable[[str], Json], names: Sequence[str], fps: float) -
 
 
 def _info(path: Path) -> Mapping[str, Json]:
-    """Return the metadata of a data set.
-
-    Raises:
-        UsageError: When the file is no JSON object.
-    """
+    """Return the metadata of a data set."""
     try:
         require_size(path, MAX_TEXT_BYTES)
         document = json.loads(path.read_bytes())

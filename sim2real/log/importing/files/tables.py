@@ -161,11 +161,7 @@ class _Table:
         return [name.strip() for name in rows[0]] if rows else []
 
     def _row(self, row: list[str]) -> list[str]:
-        """Return a line's cells, without empty cells after the last column with a name.
-
-        Raises:
-            UsageError: When the number of cells differs from that of the names, or the cells repeat the names.
-        """
+        """Return a line's cells, without empty cells after the last column with a name."""
         width = len(self.header)
         named = max((i + 1 for i, name in enumerate(self.header) if name), default=0)
         while len(row) > named and not row[-1].strip():
@@ -186,11 +182,7 @@ class _Table:
         return row
 
     def _refuse_words(self, rows: Sequence[tuple[int, list[str]]]) -> None:
-        """Refuse a line of words below the names, such as units.
-
-        Raises:
-            UsageError: When the first line has no number, and the second has a number below a word.
-        """
+        """Refuse a line of words below the names, such as units."""
         if len(rows) < 2:
             return
         (line, first), (_, second) = rows
