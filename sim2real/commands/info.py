@@ -55,7 +55,7 @@ def pipeline(name: str, root: Path, verbose: bool) -> str:
         "runs": f"{len(runs)} in {shown(root)}",
     }
     if runs:
-        stages = {stage: "out of date" if s.stale else "finished" for stage, s in standing(runs[-1]).items()}
+        stages = {stage: "out of date" if s.stale else "finished" for stage, s in stage_status(runs[-1]).items()}
         states = [f"{stage} {stages.get(stage, 'not finished')}" for stage in STAGES]
         head |= {"newest run": runs[-1].name, "its stages": ", ".join(states)}
     head["all four stages"] = f"sim2real run {name}"
