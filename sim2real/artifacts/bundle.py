@@ -37,7 +37,7 @@ class History:
         best_seed: The seed of the policy in the bundle.
         train_s: Time to train and evaluate [s].
         env_steps_per_s: Steps of all seeds per second.
-        settings: Settings of each curve in words; empty if all curves have the same settings.
+        settings: Description of each curve's settings; empty if all curves have the same settings.
         others: Further curves ``(K, seeds)`` by name.
     """
 

@@ -1,4 +1,4 @@
-"""Several runs of one robot side by side, and a test of which parameters differ beyond chance."""
+"""Several runs of one robot side by side, and a test for parameters that differ beyond chance."""
 
 from __future__ import annotations
 

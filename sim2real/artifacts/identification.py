@@ -31,7 +31,7 @@ _AGAIN = "run `sim2real identify` again"
 
 
 UNFINISHED = {"interrupted": "was interrupted", "not converged": "did not converge"}
-"""Verdict on an identification without intervals -> the reason in words."""
+"""Verdict on an identification without intervals -> the reason as text."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Determined:
 
     Attributes:
         condition: Condition number of the Jacobian; its columns are scaled by the widths of the bounds.
-        undetermined: Groups of parameters of which the data determines at most combinations.
+        undetermined: Groups of parameters; the data determines at most combinations of each group.
         messages: The same in sentences.
         standard_error_per_minute: Parameter -> expected standard error after one minute of such data.
     """

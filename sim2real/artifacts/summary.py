@@ -1,4 +1,4 @@
-"""What an artifact shows of itself: a few facts and tables, for the console, a page and a notebook."""
+"""Facts and tables of artifacts, for the console, pages, JSON and notebooks."""
 
 from __future__ import annotations
 

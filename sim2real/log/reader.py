@@ -157,9 +157,9 @@ def _steps_and_outputs(
             rows, values = rows[in_steps], values[in_values]
             for entry in described:
                 name, shape = entry["original"], (len(rows), *entry["shape"])
-                known = name in (values.dtype["data"].names or ())
+                in_payload = name in (values.dtype["data"].names or ())
                 outputs[node][name] = (
-                    np.ascontiguousarray(values["data"][name]) if known else np.zeros(shape, entry["dtype"])
+                    np.ascontiguousarray(values["data"][name]) if in_payload else np.zeros(shape, entry["dtype"])
                 )
         data = rows["data"]
         steps[node] = Steps(*(np.ascontiguousarray(data[f]) for f in Steps.__dataclass_fields__))
@@ -176,11 +176,11 @@ def _connections(
         node = channel.metadata["node"]
         rows = contents.columns(number, MESSAGE_LAYOUT, span)
         seq_in = rows["data"]["seq_in"]
-        known = np.isin(seq_in, sequences.get(node, []))
+        in_episode = np.isin(seq_in, sequences.get(node, []))
         sent, received = ((rows[f].astype(np.int64) - contents.epoch_ns) // 1000 for f in ("publish_time", "log_time"))
         connections[node, channel.metadata["input"]] = Messages(
             seq_out=np.ascontiguousarray(rows["data"]["seq_out"]),
-            seq_in=np.where(known, seq_in, -1),
+            seq_in=np.where(in_episode, seq_in, -1),
             sent=sent,
             received=received,
         )

@@ -42,7 +42,7 @@ _MAX_RATIO = 256
 # Zstandard has no such limit for equal bytes, as of a black image; this is the limit for such chunks.
 _MAX_ZSTD_BYTES = 1 << 28
 _BLOCK = 1 << 20
-# Up to this size, a chunk's uncompressed size is accepted whatever the ratio.
+# Up to this size, a chunk can have any ratio of compression.
 _SMALL_BYTES = 64 * 1024
 # Reading stops after this multiple of the file's size, as overlapping records could repeat without end.
 _MAX_READ_RATIO = 4

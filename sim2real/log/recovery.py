@@ -48,10 +48,10 @@ def recover(source: str | Path, target: str | Path) -> Recovery:
     if Path(target).exists():
         raise Sim2RealError(f"{target} exists already", hint="choose another name")
     with opened(source) as data:
-        known = _definitions(data)
+        definitions = _definitions(data)
         try:
             with open(target, "xb") as stream:
-                copier = _Copier(Writer(stream, chunk_size=64 * 1024, compression=CompressionType.LZ4), known)
+                copier = _Copier(Writer(stream, chunk_size=64 * 1024, compression=CompressionType.LZ4), definitions)
                 for record in records(data, damage):
                     copier.take(data, record, damage)
                 copier.finish()
@@ -113,10 +113,10 @@ def _whole(content: bytes, damage: Damage | None = None) -> list[Record]:
 class _Copier:
     """Copies the records of a file into another; schemas and channels get new numbers."""
 
-    def __init__(self, writer: Writer, known: _Definitions) -> None:
+    def __init__(self, writer: Writer, definitions: _Definitions) -> None:
         self.counts: dict[str, int] = {}
         self._writer = writer
-        self._known = known
+        self._definitions = definitions
         self._header = Header(profile="", library="")
         self._started = False
         self._schemas: dict[int, int] = {0: 0}
@@ -148,7 +148,7 @@ class _Copier:
         """Write the channels without messages, and the index."""
         self._begin()
         # If chunks define channels, one that is defined only elsewhere is a damaged copy of one of those.
-        for number in sorted(self._known.checked or self._known.channels):
+        for number in sorted(self._definitions.checked or self._definitions.channels):
             self._channel(number)
         self._writer.finish()
 
@@ -161,17 +161,17 @@ class _Copier:
         message = None
         if record.end - record.start >= _MESSAGE_BYTES:
             message = Message.read(stream_of(source, record), record.end - record.start)
-        if message is None or message.channel_id not in self._known.channels:
+        if message is None or message.channel_id not in self._definitions.channels:
             damage.skip(f"a message at {record.start}, of no known channel")
             return
         self._begin()
-        channel, topic = self._channel(message.channel_id), self._known.channels[message.channel_id].topic
+        channel, topic = self._channel(message.channel_id), self._definitions.channels[message.channel_id].topic
         self._writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
         self.counts[topic] = self.counts.get(topic, 0) + 1
 
     def _channel(self, number: int) -> int:
         if number not in self._channels:
-            channel = self._known.channels[number]
+            channel = self._definitions.channels[number]
             self._channels[number] = self._writer.register_channel(
                 channel.topic, channel.message_encoding, self._schema(channel.schema_id), channel.metadata
             )
@@ -180,7 +180,7 @@ class _Copier:
     def _schema(self, number: int) -> int:
         """Return a schema's new number; 0, MCAP's number for no schema, if it is lost."""
         if number not in self._schemas:
-            schema = self._known.schemas.get(number)
+            schema = self._definitions.schemas.get(number)
             new = 0 if schema is None else self._writer.register_schema(schema.name, schema.encoding, schema.data)
             self._schemas[number] = new
         return self._schemas[number]

@@ -94,7 +94,7 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
 
 
 def with_unit(label: str, units: Mapping[str, str], field: str | None = None) -> str:
-    """Return an axis label with the unit, if that is known.
+    """Return an axis label with the unit, if it has one.
 
     Args:
         units: Field -> unit.

@@ -37,5 +37,5 @@ class Noise:
     @property
     def place(self) -> tuple[str, int | None]:
         """The field of the message, and the index in it; None if the field is a number."""
-        name, index = _COLUMN.fullmatch(self.column).groups()  # type: ignore[union-attr]  # .+? takes whatever there is
+        name, index = _COLUMN.fullmatch(self.column).groups()  # type: ignore[union-attr]  # .+? matches any name
         return name, None if index is None else int(index)

@@ -98,14 +98,14 @@ class Posterior:
             widen: Factor on the standard deviations.
         """
         if not self.others:
-            return {**self._own(rng, count, widen), **{n: np.full(count, v) for n, v in self.without.items()}}
+            return {**self._draw(rng, count, widen), **{n: np.full(count, v) for n, v in self.without.items()}}
         parts = [replace(self, others=()), *(o.posterior for o in self.others)]
         shares = np.array([1.0 - sum(o.weight for o in self.others), *(o.weight for o in self.others)])
         which = rng.choice(len(parts), size=count, p=np.maximum(shares, 0.0) / np.maximum(shares, 0.0).sum())
         drawn = [part.sample(rng, count, widen) for part in parts]
         return {n: np.stack([draws[n] for draws in drawn])[which, np.arange(count)] for n in drawn[0]}
 
-    def _own(self, rng: np.random.Generator, count: int, widen: float) -> dict[str, np.ndarray]:
+    def _draw(self, rng: np.random.Generator, count: int, widen: float) -> dict[str, np.ndarray]:
         values, axes = np.linalg.eigh(self.covariance)
         root = axes * np.sqrt(np.maximum(values, 0.0))
         x = self.mean + widen * rng.standard_normal((count, len(self.mean))) @ root.T

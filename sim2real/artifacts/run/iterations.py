@@ -21,7 +21,7 @@ class Iteration:
         simulation: Mean success in simulation.
         verdict: Verdict of the deployment, or the remedy for its refusal.
         why: The first reason.
-        then: The next steps, in words.
+        then: The next steps, as text.
     """
 
     number: int
@@ -44,7 +44,7 @@ class Plan:
 
     Attributes:
         stages: The stages to run, in order; empty if the run stops.
-        words: The plan in words.
+        words: The plan as text.
         log: The logs to identify from, relative to the run folder; empty for the newest recording.
         terms: The optional terms to identify with; None for the flags' value.
         seed: The seed of the training; None for the flags' value.

@@ -105,7 +105,7 @@ def readable_error(error: BaseException, folder: Path) -> BaseException:
     where = f" (writing {os.fsdecode(error.filename)})" if isinstance(error.filename, str | bytes) else ""
     return Sim2RealError(
         f"the disk is full: {error.strerror}{where}",
-        hint=f"free some space, or name a folder elsewhere with --runs DIR; what was written is in {folder}",
+        hint=f"free some space, or name a folder elsewhere with --runs DIR; the files written so far are in {folder}",
     )
 
 

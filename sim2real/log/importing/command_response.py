@@ -225,7 +225,7 @@ def _peaks(
         measured: Shape ``(rows,)``.
         command: Shape ``(rows,)``.
         equal: Limits of the misfit of a peak that equals another, as ``_EQUAL``.
-        sign: The sign if it is known; else 0.
+        sign: The sign; 0 if it is open.
     """
     size = np.abs(alike) if sign == 0.0 else (sign * alike).clip(0.0)
     top, last, rows = size.max(initial=0.0), len(alike) - 1, len(measured)

@@ -152,7 +152,9 @@ def contradictions(
     r, slope, lag = (a[right, right] for a in (relation.r, relation.slope, relation.lag_s))
     for i, x, s, late in zip(right, r, slope, lag, strict=True):
         if copies[i]:
-            notes.append(f"joint {i}: its commands are its measurements, so nothing can be identified from them")
+            notes.append(
+                f"joint {i}: its commands are copies of its measurements, so they hold no information on the drive"
+            )
         elif x < -SURE:
             notes.append(f"joint {i} moves against its command (r {x:.2f}, slope {s:.3g}): one sign is wrong")
         elif x > SURE and unit_ratio(np.array([s])) not in (1.0, None):

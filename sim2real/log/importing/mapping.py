@@ -108,7 +108,7 @@ class ImportMapping:
             UsageError: When a key is unknown, missing or of the wrong type.
         """
         where = "the mapping" if path is None else str(path)
-        _known(tables, ("pipeline", "nodes"), where)
+        _check_keys(tables, ("pipeline", "nodes"), where)
         named = _value(tables, "pipeline", str, where)
         if named is None and pipeline is None:
             raise UsageError(f"{where} does not name the pipeline of the log", hint='add pipeline = "NAME"')
@@ -158,7 +158,7 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
 def _node(name: str, table: Mapping[str, Json], document: str) -> NodeMapping:
     where = f"{document}: nodes.{name}"
     keys = ("fields", "rate_hz", "stamps", "stamp_unit", "order", *_POLICIES, "stamp_offset")
-    _known(table, keys, where)
+    _check_keys(table, keys, where)
     fields = _value(table, "fields", dict, where) or {}
     if not fields:
         raise UsageError(f"{where} has no fields", hint=f'add fields.NAME = {{ source = "..." }}; {_HINT}')
@@ -208,7 +208,7 @@ def positive(value: float, where: str) -> float:
 
 def _field(table: Mapping[str, Json], where: str) -> FieldMapping:
     # Read the sources.
-    _known(table, ("source", "unit", "scale", "offset", "shape", "column", "turn"), where)
+    _check_keys(table, ("source", "unit", "scale", "offset", "shape", "column", "turn"), where)
     source = _value(table, "source", (str, list), where)
     sources = [source] if isinstance(source, str) else source or []
     if not sources or not all(isinstance(s, str) and s for s in sources):
@@ -256,7 +256,7 @@ def _value(table: Mapping[str, Json], key: str, kind: type | tuple[type, ...], w
     return value
 
 
-def _known(table: Mapping[str, Json], keys: tuple[str, ...], where: str) -> None:
+def _check_keys(table: Mapping[str, Json], keys: tuple[str, ...], where: str) -> None:
     for key in table:
         if key not in keys:
             close = difflib.get_close_matches(key, keys, n=1)

@@ -73,10 +73,10 @@ def _by_goal(
 
 def _unit_from(by: Signal, ratio: float) -> tuple[float, str] | None:
     """Return the unit of positions that are ``ratio`` times another signal, and the reason; None if it is open."""
-    known = _UNITS.get(by.meaning.unit)
-    if known is None:
+    named_unit = _UNITS.get(by.meaning.unit)
+    if named_unit is None:
         # One of both is in degrees; equal units leave the unit open.
         return None if ratio == 1.0 else (max(ratio, 1.0), f"{by.name!r} is {1 / ratio:.3g} of it: one is in degrees")
-    unit = known * ratio
+    unit = named_unit * ratio
     fits = [u for u in _UNITS.values() if np.isclose(u, unit)]
     return (fits[0], f"{by.name!r}, in {by.meaning.unit} by its name, is {1 / ratio:.3g} of it") if fits else None

@@ -114,10 +114,10 @@ def _on_leaps(measured: Signal, rows: np.ndarray, leaps: np.ndarray) -> str:
 
 def turned_commands(command: Signal, checked: CheckedPositions) -> tuple[Signal, float]:
     """Return commands with counted turns if they are angles on a circle, and a turn in their unit; else 0."""
-    known = {"rad": 1.0, "deg": DEGREES}.get(command.meaning.unit)
+    named_unit = {"rad": 1.0, "deg": DEGREES}.get(command.meaning.unit)
     whole = checked.signal.values[~np.isnan(checked.signal.values).any(axis=1)]
     reach = np.ptp(whole[:, checked.hinges], axis=0).max(initial=0.0) / checked.to_rad
-    for unit in (1.0, DEGREES) if known is None else (known,):
+    for unit in (1.0, DEGREES) if named_unit is None else (named_unit,):
         turn = plausibility.TURN_RAD * unit
         # Do not count turns for a joint that stays within a turn: a jump of its goal is a real motion.
         if plausibility.turns(command.values, turn).any() and (checked.turn or reach > 1.1 * plausibility.TURN_RAD):

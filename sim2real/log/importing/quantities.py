@@ -45,9 +45,9 @@ class ImportHints:
     slides: tuple[str, ...] = ()
 
     def hinges(self, width: int) -> np.ndarray:
-        """Return whether a column is a joint that turns, ``(width,)``: True unless it is known to slide."""
-        known = len(self.joints) == width
-        return np.array([not (known and self.joints[i] in self.slides) for i in range(width)], bool)
+        """Return whether a column is a joint that turns, ``(width,)``: False for a slide."""
+        have_names = len(self.joints) == width
+        return np.array([not (have_names and self.joints[i] in self.slides) for i in range(width)], bool)
 
 
 def taken(signal: Signal, places: np.ndarray) -> Signal:

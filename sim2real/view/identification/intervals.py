@@ -96,8 +96,8 @@ def _recordings(axes: Axes, quantity: Quantity) -> None:
 def _kind(e: Estimate) -> str:
     if e.unit == "s":
         return _KINDS[2]
-    known = [v for v in (e.nominal, e.estimate, e.lower, e.truth) if v is not None]
-    if e.nominal is None or e.lower is None or min(known) > 0:
+    values = [v for v in (e.nominal, e.estimate, e.lower, e.truth) if v is not None]
+    if e.nominal is None or e.lower is None or min(values) > 0:
         return _KINDS[0]
     return _KINDS[1]
 

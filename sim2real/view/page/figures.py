@@ -17,7 +17,7 @@ from sim2real.view.style import BLUE, INK, new_figure, styled, to_svg
 
 
 def recording(log: Signals, name: str) -> str:
-    """Draw the measurements of a log, with the truth if it is known, and the commands to the motors."""
+    """Draw the measurements of a log, with the true states of an embedded robot, and the commands to the motors."""
     middle, length = log.episode.duration_s / 2, min(2.0, log.episode.duration_s / 4)
     zoom = (round(middle, 1), round(middle + length, 1))
     panels = []

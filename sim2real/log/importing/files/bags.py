@@ -205,13 +205,13 @@ def _scan(paths: Sequence[Path], only: str | None = None) -> tuple[dict[str, _To
             raise
         except (Sim2RealError, OSError) as error:
             raise UsageError(
-                f"{path} is no MCAP file, or is damaged: {error}", hint="`mcap doctor` says where"
+                f"{path} is no MCAP file, or is damaged: {error}", hint="`mcap doctor` names the place"
             ) from None
         # Refuse a damaged file, as its messages could be wrong, but accept a file that was cut.
         if damage.skipped:
             raise UsageError(
                 f"{path} is damaged: {damage.skipped[0]} cannot be read",
-                hint="`sim2real log recover` copies what is readable into a new file, with gaps",
+                hint="`sim2real log recover` copies the readable part into a new file, with gaps",
             )
         if damage.cut:
             notes.append(f"{path.name} was cut: it is read up to its end")
@@ -272,7 +272,7 @@ def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator
                     damage.skip(str(error))
         if not has_records:
             raise UsageError(
-                f"{path} is no MCAP file, or is damaged from its beginning", hint="`mcap doctor` says where"
+                f"{path} is no MCAP file, or is damaged from its beginning", hint="`mcap doctor` names the place"
             )
 
 
