@@ -165,7 +165,7 @@ class Deployment(Summed):
     def replay_table(self) -> ArtifactTable:
         """Return the prediction errors of each model on the recorded commands: a row for each position."""
         models = list(self.replay[0].rmse) if self.replay else []
-        horizon = f"commands played again, {self.replay[0].horizon_s:g} s" if self.replay else ""
+        horizon = f"commands played again, RMSE {self.replay[0].horizon_s:g} s ahead" if self.replay else ""
         rows = [[r.name, *(r.rmse.get(m) for m in models), r.promised, r.unit] for r in self.replay]
         return ArtifactTable((horizon, *models, "promised", "unit"), rows)
 

@@ -298,7 +298,7 @@ class Identification(Shown):
             [row.name, *(row.rmse.get(m) for m in models), row.unit, ", ".join(row.beaten_by) or "none"]
             for row in self.held_out
         ]
-        horizon = f"off {self.held_out[0].horizon_s:g} s ahead, held out" if self.held_out else ""
+        horizon = f"held-out RMSE, {self.held_out[0].horizon_s:g} s ahead" if self.held_out else ""
         return ArtifactTable((horizon, *models, "unit", "no better than"), rows)
 
     @property

@@ -16,8 +16,9 @@ from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identificati
 from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, finished, newest, open_stage
 from sim2real.artifacts.run.stage_status import TAKES, stage_status
-from sim2real.commands import info, run_loop
+from sim2real.commands import info
 from sim2real.commands.flags import RunFlags
+from sim2real.commands.loop import run_loop
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.view.page import page
 
@@ -203,7 +204,7 @@ def test_info_and_the_report_say_what_is_out_of_date_and_why(tmp_path):
     stages = Stages(tmp_path / "runs", ("fine",))
     run_dir = stages.run(1)
     stages("identify", load_pipeline("pendulum").identify, run_dir)
-    why = "train was not made from identify.2, the newest identify: the hash of its parameters is another"
+    why = "train was not made from identify.2, the newest identify: the hashes of its parameters differ"
     said = info.run(run_dir)
     assert f"out of date: {why}" in said
     assert [line.split()[1] for line in said.splitlines() if line.startswith(("identify", "train ")) and "-" in line][

@@ -49,7 +49,7 @@ def why_stale(attempt: StageFolder, status: Mapping[str, StageStatus]) -> str:
     source = status[before]
     name, source_name = attempt.folder.name, source.newest.folder.name
     if not _made_from(attempt, source.newest, output):
-        return f"{name} was not made from {source_name}, the newest {before}: the hash of its {output} is another"
+        return f"{name} was not made from {source_name}, the newest {before}: the hashes of its {output} differ"
     return f"{name} was made from {source_name}, which is out of date" if source.stale else ""
 
 

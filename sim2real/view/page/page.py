@@ -133,5 +133,5 @@ def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[Note
                 NoteBlock(f"The newest attempt at {stage} is {status}{f' ({error})' if error else ''}: {shown}.")
             )
     stale = {stage: s.stale for stage, s in stage_status(run_dir).items() if s.stale}
-    notes += [NoteBlock(f"Out of date: {why}. `sim2real run --resume` makes it again.") for why in stale.values()]
+    notes += [NoteBlock(f"Out of date: {why}. `sim2real run --resume` repeats the stage.") for why in stale.values()]
     return notes
