@@ -26,19 +26,19 @@ from benches.catalogue import BENCHES, measures
 from benches.provenance import ROOT, state
 
 
-def machine() -> dict[str, Any]:
-    """Return what the figures depend on."""
+def machine() -> dict[str, object]:
+    """Return processor, cores, system and devices, on which the figures depend."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
         names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
         model = names[0] if names else model
-    found = {"cpu": model, "cores": os.cpu_count(), "system": platform.platform()}
+    description = {"cpu": model, "cores": os.cpu_count(), "system": platform.platform()}
     if "jax" in sys.modules:
         import jax
 
-        found["devices"] = sorted({d.device_kind for d in jax.devices()})
-    return found
+        description["devices"] = sorted({d.device_kind for d in jax.devices()})
+    return description
 
 
 def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
@@ -49,8 +49,10 @@ def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
     every = argparse.ArgumentParser(
         prog="bench.py", description=__doc__, epilog=f"benches:\n{listed}", formatter_class=raw
     )
-    every.add_argument("bench", choices=BENCHES, metavar="BENCH", help="one of those below")
-    every.add_argument("flags", nargs=argparse.REMAINDER, metavar="...", help="its flags: BENCH --help lists them")
+    every.add_argument("bench", choices=BENCHES, metavar="BENCH", help="a bench listed below")
+    every.add_argument(
+        "flags", nargs=argparse.REMAINDER, metavar="...", help="flags of the bench: BENCH --help lists them"
+    )
     chosen = every.parse_args(arguments)
     module = importlib.import_module(f"benches.{BENCHES[chosen.bench].module}")
     parser = argparse.ArgumentParser(
@@ -68,13 +70,13 @@ def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
     return module, parser.parse_args(chosen.flags)
 
 
-def told(flags: Mapping[str, Any]) -> dict[str, Any]:
-    """Return flags as a report has them: of a path the name alone."""
+def reported_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
+    """Return flags as in a report: paths without their folders."""
     return {name: value.name if isinstance(value, Path) else value for name, value in flags.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one bench."""
+    """Run one bench; return its exit code."""
     module, options = parse(arguments)
     from sim2real.artifacts.run.manifest import plain, versions
     from sim2real.errors import Sim2RealError
@@ -82,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     flags = {n: v for n, v in vars(options).items() if n not in ("bench", "quick", "json", "commit")}
     about = {"bench": options.bench, "quick": options.quick, "flags": flags}
-    # What is measured is what lies there now: a long run must not report files that were edited meanwhile.
+    # Take the state of the code before the run, as files may be edited during a long one.
     about |= state(measures(options.bench, flags), ROOT, options.commit)
     try:
         result = module.run(options)
@@ -95,7 +97,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("quick: tiny sizes, these figures measure nothing", file=sys.stderr)
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        document = plain({**about, "flags": told(flags), "machine": machine(), "versions": versions(), **result})
+        document = plain(
+            {**about, "flags": reported_flags(flags), "machine": machine(), "versions": versions(), **result}
+        )
         options.json.write_text(json.dumps(document, indent=1) + "\n")
         print(f"wrote {options.json}", file=sys.stderr)
     return 0

@@ -111,7 +111,7 @@ def real_motors(reports: Mapping[str, dict[str, Any]]) -> str:
 
 
 def league(report: Mapping[str, Any]) -> str:
-    """Return the table of the league: a line a set, ours with its worst fold, of the others the means [mrad]."""
+    """Return the table of the league, one line for each set: ours with its worst fold, the means of others [mrad]."""
     scale = {"rad": 1e3, "mrad": 1.0}
     v = {r["name"]: scale[r["unit"]] * r["value"] for r in report["rows"] if r["value"] is not None}
     folds = {name: {f["fold"] for f in report["folds"] if f["set"] == name} for name in LEAGUE_SETS}
@@ -120,7 +120,7 @@ def league(report: Mapping[str, Any]) -> str:
         for name in LEAGUE_SETS
     }
 
-    def told(name: str, entrant: str, what: str = "mean") -> str:
+    def figure(name: str, entrant: str, what: str = "mean") -> str:
         value = v.get(f"league/{name}/{entrant}/{what}")
         return "-" if value is None else f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
@@ -131,8 +131,9 @@ def league(report: Mapping[str, Any]) -> str:
     for name, about in LEAGUE_SETS.items():
         if folds[name]:
             took = f"{statistics.median(seconds[name]):.0f} s" if seconds[name] else "-"
-            own = (told(name, "ours"), told(name, "ours", "worst"), took)
-            lines.append((f"{about}, {len(folds[name])} folds", *own, *(told(name, e) for e in LEAGUE_ENTRANTS)))
+            ours = (figure(name, "ours"), figure(name, "ours", "worst"), took)
+            others = (figure(name, entrant) for entrant in LEAGUE_ENTRANTS)
+            lines.append((f"{about}, {len(folds[name])} folds", *ours, *others))
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
@@ -148,10 +149,10 @@ def randomise(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
         (f"trained on, {count} hidden robots with {trials} deployments each", "nearly ideal", "95 %", "worn", "95 %"),
         ("---", "---:", "---:", "---:", "---:"),
     ]
-    found = [{r["name"].removeprefix("randomise/"): r["value"] for r in report["rows"]} for report in (ideal, worn)]
+    figures = [{r["name"].removeprefix("randomise/"): r["value"] for r in report["rows"]} for report in (ideal, worn)]
     for way, about in TRAINED_ON.items():
         line = [about]
-        for v in found:
+        for v in figures:
             share, low, high = (100 * v[f"{way}/{n}"] for n in ("success", "low95", "high95"))
             line += [f"{share:.0f} %", f"{low:.0f} to {high:.0f} %"]
         lines.append(tuple(line))
@@ -248,7 +249,7 @@ def arm(what: str, cpu: dict[str, Any], gpu: dict[str, Any] | None = None) -> st
 
 
 def origin(reports: Mapping[str, dict[str, Any]]) -> str:
-    """Return the line below a table: which state of the code each of its reports is of."""
+    """Return the line below a table: the commit of each of its reports."""
     commits = {name: (report.get("commit") or "")[:7] for name, report in reports.items()}
     listed = ", ".join(f"{f'`{sha}`' if sha else 'not recorded'} ({name})" for name, sha in commits.items())
     return f"\nCommit that was measured: {listed}.\n"
@@ -265,13 +266,13 @@ def updated(page: str, tables: Mapping[str, str]) -> str:
 
 
 def read_reports() -> dict[str, dict[str, Any]]:
-    """Return the committed reports that the tables are made of, by name."""
+    """Return the committed reports of all tables, by name."""
     paths = {name: ROOT / "reports" / f"{name}.json" for table in TABLES.values() for name in table}
     return {name: json.loads(path.read_text()) for name, path in paths.items() if path.is_file()}
 
 
 def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
-    """Return the tables of which there are all reports."""
+    """Return the tables whose reports are all present."""
     write: dict[str, Callable[[dict[str, dict[str, Any]]], str]] = {
         "evidence": lambda own: evidence(own["randomise"], own["league"]),
         "demo": lambda own: demo(own["demo"]),
@@ -287,13 +288,13 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
 
 
 def stale(reports: Mapping[str, dict[str, Any]], root: Path = ROOT) -> dict[str, str]:
-    """Return why reports do not speak of the code as it is, by name."""
-    found = {}
+    """Return the reports that are not of the present state of the code: name -> reason."""
+    reasons = {}
     for name, report in reports.items():
         paths = measures(report["bench"], report["flags"]) if "bench" in report else ()
         if why := why_stale(report, paths, root):
-            found[name] = why
-    return found
+            reasons[name] = why
+    return reasons
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

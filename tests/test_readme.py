@@ -66,7 +66,7 @@ def test_a_report_without_its_state_is_refused_until_told(script, monkeypatch, t
     monkeypatch.setattr(script, "read_reports", lambda: reports)
     assert script.main([]) == 1
     told = capsys.readouterr().err
-    assert "reports/demo.json: it does not say which state of the code it is of" in told
+    assert "reports/demo.json: it has no digest of the state of the code" in told
     assert "hint: measure again, or --stale-ok randomise league demo arm_cpu arm_h200 so101_cpu identify_disk" in told
     assert {name: (tmp_path / name).read_text() for name in pages} == pages
     assert script.main(["--stale-ok", *reports]) == 0

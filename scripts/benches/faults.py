@@ -1,8 +1,8 @@
-"""Faults while a policy runs: how soon the motor is safe, whether the log can be read, and what the command says.
+"""Faults while a policy runs: time until the motor is safe, readable log, exit code and message of the command.
 
-A deployment of a policy that swings the pendulum runs in a process of its own, on an emulated servo in another; at a
-random moment of the motion one thing goes wrong. The emulator says when the motor stopped: its torque is off, or, where
-nothing that the host says arrives any more, the servo's own watchdog has stopped it: the servo is an XM430, which does.
+A deployment of a policy that swings the pendulum runs in one process, an emulated XM430 in another; one fault happens
+at a random moment of the motion. The emulator records the time at which the motor stopped: its torque is off, or its
+own watchdog has stopped it.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ KILLED, STOPPED, NAN = "killed", "stopped", "nan"
 QUICK = {"runs": 1, "faults": ["wild"]}
 _START_S, _END_S, _MOVING_V = 60.0, 30.0, 0.1
 _TRIES = 4
-"""How often a deployment is begun that ends before its fault."""
+"""Largest number of starts of a deployment that ends before its fault."""
 _ROUND_RAD_S = 15.0
-"""So fast the pendulum turns round and round. While it hardly moves nobody can tell that its encoder has frozen."""
+"""Speed from which the pendulum turns over [rad/s]; at low speeds a frozen encoder cannot be detected."""
 _SWINGS_S = (0.2, 1.2)
-"""The fault comes so long after it has been so fast."""
+"""Range of the time between that speed and the fault [s]."""
 
 
 class NotBegun(Sim2RealError):  # noqa: N818
@@ -57,19 +57,18 @@ class NotBegun(Sim2RealError):  # noqa: N818
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that goes wrong.
+    """A fault.
 
     Attributes:
-        name: What it is called in the rows.
-        emulator: Settings of the emulator, from the moment on.
-        codes: What the command may end with.
-        said: A part of its reason; empty: it cannot say any more.
+        emulator: Settings of the emulator, from the moment of the fault.
+        codes: Possible exit codes of the command.
+        message: A part of its error message; empty: not checked.
     """
 
     name: str
     emulator: dict[str, Any]
     codes: tuple[int, ...]
-    said: str
+    message: str
 
 
 FAULTS = {
@@ -89,24 +88,21 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one run.
+    """The outcome of one run.
 
     Attributes:
-        fault: The fault's name.
-        seed: The run's.
-        safe_s: From the fault to the motor's stop [s]; infinite: it did not stop.
-        code: What the command ended with.
-        said: The last of what it said.
-        readable: Whether the log could be read.
-        right: Whether code and reason are those of the fault.
-        again: How often it was begun anew, because the deployment had ended before its fault.
+        safe_s: Time from the fault to the motor's stop [s]; infinite: it did not stop.
+        code: Exit code of the command.
+        message: The end of its output.
+        right: Whether exit code and message are those of the fault.
+        again: Number of earlier starts in which the deployment ended before its fault.
     """
 
     fault: str
     seed: int
     safe_s: float
     code: int
-    said: str
+    message: str
     readable: bool
     right: bool
     again: int = 0
@@ -126,7 +122,7 @@ def swinging_bundle(folder: Path) -> Path:
 
 @functools.cache
 def _server() -> Any:
-    """Return what processes are forked from: it has imported what takes as long as a run, and computed nothing."""
+    """Return the server that forks the processes; it has imported the slow modules, and computed nothing."""
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(["sim2real.stages.deploy.stage", "sim2real.hardware.dynamixel.emulation", "mujoco"])
     return server
@@ -138,10 +134,10 @@ def emulated(config: Any, plant: str, truth: Path) -> Iterator[tuple[str, int]]:
     kind = f"{type(config).__module__}:{type(config).__qualname__}"
     flags = ["--plant", plant, "--truth", str(truth), "--emulation", kind]
     flags += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(config).items() if v is not None]
-    ready, said = _server().Pipe(duplex=False)
-    process = _server().Process(target=_emulate, args=(flags, said))
+    ready, sender = _server().Pipe(duplex=False)
+    process = _server().Process(target=_emulate, args=(flags, sender))
     process.start()
-    said.close()
+    sender.close()
     try:
         with os.fdopen(os.dup(ready.fileno())) as lines:
             yield json.loads(lines.readline())["port"], process.pid
@@ -150,13 +146,13 @@ def emulated(config: Any, plant: str, truth: Path) -> Iterator[tuple[str, int]]:
         process.join(timeout=_END_S)
 
 
-def _emulate(flags: list[str], said: Connection) -> None:
+def _emulate(flags: list[str], sender: Connection) -> None:
     os.setsid()
-    os.dup2(said.fileno(), 1)
+    os.dup2(sender.fileno(), 1)
     sys.exit(emulator.main(flags))
 
 
-def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float, *more: str) -> BaseProcess:
+def deployed(port: str, bundle: Path, runs: Path, messages: Path, watchdog_s: float, *more: str) -> BaseProcess:
     """Start a deployment in a process of its own; SIGUSR1 makes its sensor's readings NaN from then on.
 
     Args:
@@ -164,15 +160,15 @@ def deployed(port: str, bundle: Path, runs: Path, said: Path, watchdog_s: float,
     """
     flags = ["--port", port, "--bundle", str(bundle), "--runs", str(runs), "--duration-s", "8", "--episodes", "1"]
     flags += ["--no-measure-delay", f"--gate.servo-watchdog-s={watchdog_s}", *more]
-    process = _server().Process(target=_deploy, args=(flags, said))
+    process = _server().Process(target=_deploy, args=(flags, messages))
     process.start()
     return process
 
 
-def _deploy(flags: list[str], said: Path) -> None:
+def _deploy(flags: list[str], messages: Path) -> None:
     os.setsid()
-    sys.stdout = sys.stderr = said.open("w", buffering=1)
-    os.dup2(sys.stdout.fileno(), 1)  # the guardian, a process of its own, says there what it did
+    sys.stdout = sys.stderr = messages.open("w", buffering=1)
+    os.dup2(sys.stdout.fileno(), 1)  # the guardian's process reports there
     os.dup2(sys.stdout.fileno(), 2)
     _nan_on_signal(load_pipeline("pendulum").load())
     os._exit(cli.main(["deploy", "pendulum", *flags]))
@@ -191,7 +187,7 @@ def _nan_on_signal(robot: Any) -> None:
 
 
 def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: float) -> Outcome:
-    """Deploy, let the fault happen, and see what comes of it.
+    """Deploy, let the fault happen, and return the outcome.
 
     Raises:
         NotBegun: The deployment did not begin to move, or a busy machine stopped it before the fault.
@@ -199,11 +195,11 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
     draw = random.Random(f"{fault.name}/{seed}")
     robot = load_pipeline("pendulum").load()
     config = replace(robot.embedded.emulator, seed=seed, model_number=1020, on_signal=True, **fault.emulator)
-    truth, said = folder / "truth.bin", folder / "said.txt"
+    truth, messages = folder / "truth.bin", folder / "messages.txt"
     with emulated(config, robot.embedded.plant, truth) as (port, emulator_pid):
-        child = deployed(port, bundle, folder / "runs", said, watchdog_s)
+        child = deployed(port, bundle, folder / "runs", messages, watchdog_s)
         try:
-            wait_until_moving(truth, said, child, _ROUND_RAD_S)
+            wait_until_moving(truth, messages, child, _ROUND_RAD_S)
             time.sleep(draw.uniform(*_SWINGS_S))
             number = {KILLED: signal.SIGKILL, STOPPED: signal.SIGSTOP, NAN: signal.SIGUSR1}.get(fault.name)
             began_ns = time.monotonic_ns()
@@ -216,21 +212,21 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
             child.kill()
             child.join()
         time.sleep(0.3)  # the last commands take effect
-    words = said.read_text(errors="replace")
+    words = messages.read_text(errors="replace")
     (log,) = (folder / "runs").glob("pendulum/*/deploy/episode_0.mcap")
     account = read_truth(truth)
     if stopped_before(account, began_ns):
         raise NotBegun(f"the motor stopped before the fault: {words}")
     safe_s = safe_after(account, began_ns)
-    right = code in fault.codes and fault.said in words and (fault.name == KILLED or "error: " in words)
+    right = code in fault.codes and fault.message in words and (fault.name == KILLED or "error: " in words)
     return Outcome(fault.name, seed, safe_s, code, words.strip()[-300:], _readable(log), right)
 
 
 def begun(fault: Fault, seed: int, bundle: Path, root: Path, watchdog_s: float) -> Outcome:
-    """Return what comes of a run whose robot moved before the fault: a busy machine may have to begin again.
+    """Return the outcome of a run whose robot moved before the fault; on a busy machine it may start several times.
 
     Args:
-        seed: Says when.
+        seed: Seed of the time of the fault.
         watchdog_s: The gate's longest silence [s].
 
     Raises:
@@ -238,20 +234,16 @@ def begun(fault: Fault, seed: int, bundle: Path, root: Path, watchdog_s: float) 
     """
     for again in range(_TRIES - 1):
         with contextlib.suppress(NotBegun):
-            found = run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}_{again}"), watchdog_s)
-            return replace(found, again=again)
-    found = run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}"), watchdog_s)
-    return replace(found, again=_TRIES - 1)
+            outcome = run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}_{again}"), watchdog_s)
+            return replace(outcome, again=again)
+    outcome = run_once(fault, seed, bundle, _new(root / f"{fault.name}_{seed}"), watchdog_s)
+    return replace(outcome, again=_TRIES - 1)
 
 
 def outcomes(names: Sequence[str], seeds: Sequence[int], watchdog_s: float, jobs: int, root: Path) -> Iterator[Outcome]:
-    """Let each fault happen in some runs, several at a time, each on an emulated robot of its own.
+    """Let each fault happen in some runs, several at a time; yield their outcomes in order.
 
-    Args:
-        watchdog_s: The gate's longest silence [s].
-
-    Yields:
-        What came of each, in order; of a run that failed, that nothing was safe, with what it said.
+    A run that raises an error yields an infinite time, with its message.
     """
     bundle = swinging_bundle(root / "bundle")
     runs = [(FAULTS[name], seed) for name in names for seed in seeds]
@@ -260,7 +252,7 @@ def outcomes(names: Sequence[str], seeds: Sequence[int], watchdog_s: float, jobs
         for (fault, seed), one in zip(runs, begun_runs, strict=True):
             try:
                 yield one.result()
-            except ValueError as error:  # as all of ours are
+            except ValueError as error:  # the base class of all errors of sim2real
                 yield Outcome(fault.name, seed, float("inf"), ERROR, str(error)[-300:], False, False)
 
 
@@ -270,7 +262,7 @@ def _new(folder: Path) -> Path:
 
 
 def safe_after(truth: Truth, since_ns: int) -> float:
-    """Return how long after a moment [ns] the motor stopped for good [s]: torque off, or its own firmware's zero."""
+    """Return the time from a moment [ns] to the motor's final stop [s]: torque off, or its own firmware's zero."""
     effects = truth.of(Kind.EFFECT)
     off = (effects["values"][:, 0] == OperatingMode.OFF) | (effects["values"][:, 1] == 0.0)
     turning = np.flatnonzero(~off)
@@ -286,7 +278,7 @@ def stopped_before(truth: Truth, at_ns: int) -> bool:
     return not len(before) or before[-1] == OperatingMode.OFF
 
 
-def wait_until_moving(truth: Path, said: Path, child: BaseProcess, speed_rad_s: float = 0.0) -> None:
+def wait_until_moving(truth: Path, messages: Path, child: BaseProcess, speed_rad_s: float = 0.0) -> None:
     """Wait until the emulator's motor has been driven, and was measured to be as fast as this.
 
     Args:
@@ -304,7 +296,7 @@ def wait_until_moving(truth: Path, said: Path, child: BaseProcess, speed_rad_s: 
             speeds = np.abs(account.of(Kind.SAMPLE)["values"][:, 1])
             if driven.any() and speeds.max(initial=0.0) >= speed_rad_s:
                 return
-    raise NotBegun(f"the deployment did not begin to move: {said.read_text(errors='replace')}")
+    raise NotBegun(f"the deployment did not begin to move: {messages.read_text(errors='replace')}")
 
 
 def ended(process: BaseProcess) -> int:
@@ -341,13 +333,13 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
     """Let each fault happen in some runs."""
-    rows, found = [], {name: [] for name in options.faults}
+    rows, by_fault = [], {name: [] for name in options.faults}
     seeds = range(options.first_seed, options.first_seed + options.runs)
     with tempfile.TemporaryDirectory(prefix="sim2real-faults-") as name:
         for one in outcomes(options.faults, seeds, options.servo_watchdog_s, options.jobs, Path(name)):
-            found[one.fault].append(one)
+            by_fault[one.fault].append(one)
             print(f"{one.fault} {one.seed}: {one.safe_s:.3f} s, exit {one.code}", file=sys.stderr)
-    for kind, runs in found.items():
+    for kind, runs in by_fault.items():
         safe = np.array([o.safe_s for o in runs])
         what, of = f"faults/{kind}", f"of {len(runs)}"
         rows.append(row(f"{what}/safe", int((safe < SAFE_S).sum()), of, goal="all within 0.2 s"))
@@ -356,5 +348,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         rows.append(row(f"{what}/log_readable", sum(o.readable for o in runs), of, goal="all"))
         rows.append(row(f"{what}/code_and_reason", sum(o.right for o in runs), of, goal="all"))
         rows.append(row(f"{what}/begun_again", sum(o.again for o in runs), "times: it had ended before the fault"))
-    wrong = [asdict(o) for runs in found.values() for o in runs if not (o.safe_s < SAFE_S and o.readable and o.right)]
+    wrong = [
+        asdict(o) for runs in by_fault.values() for o in runs if not (o.safe_s < SAFE_S and o.readable and o.right)
+    ]
     return {"rows": rows, "wrong": wrong}

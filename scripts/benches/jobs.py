@@ -1,4 +1,4 @@
-"""Many fits or robots at once, each in a process of its own that has one processor: as fair as one after the other."""
+"""Several fits or robots at once, each in its own process on one processor: as fair as one after the other."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ ONE_THREAD = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
     "JAX_PLATFORMS": "cpu",
 }
-"""Environment of a process that computes by one thread; what stands in XLA_FLAGS already is kept."""
+"""Environment of a process that computes in one thread; other flags in XLA_FLAGS stay."""
 _PR_SET_PDEATHSIG = 1
 OVER = "not done when the bench's time was up"
-"""What an error says that ends what took too long."""
+"""Message of the error that ends a robot after the time limit."""
 
 
 def each(
@@ -36,11 +36,11 @@ def each(
     options: argparse.Namespace,
     lost: Callable[[Sequence[Any]], dict[str, Any]] | None = None,
 ) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Do ``work(*task, options)`` for each task, and yield its number and its result as they come.
+    """Call ``work(*task, options)`` for each task, and yield its number and its result in the order of their ends.
 
     Args:
-        options: The bench's flags; ``jobs`` of them run at once, in this process where that is 1.
-        lost: Takes a task whose process was killed, and returns what to yield for it; without it that is an error.
+        options: The bench's flags; ``jobs`` tasks run at once, in this process if that is 1.
+        lost: Returns the result of a task whose process was killed; without it, that is an error.
     """
     if options.jobs == 1:
         for i, task in enumerate(tasks):
@@ -53,7 +53,7 @@ def each(
     def alone(task: Sequence[Any]) -> dict[str, Any]:
         number = free.get()
         try:
-            # A process a task: none finds programs compiled that another had to compile.
+            # One process for each task: no task profits from programs that another has compiled.
             with ProcessPoolExecutor(1, context, _hold, (number,)) as pool:
                 return pool.submit(work, *task, options).result()
         except BrokenProcessPool:
@@ -75,15 +75,14 @@ def each(
 def robots(
     one: Callable[[int, Any], dict[str, Any]], numbers: Sequence[int], options: argparse.Namespace
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Call a function for every robot; what becomes of one is no other's business.
+    """Call ``one(number, options)`` for every robot; the failure of one does not end the others.
 
     Args:
-        one: Takes a robot's number and the flags, and returns what became of it.
-        options: The bench's flags: ``jobs`` as for :func:`each`; ``within_s``, if there is one, seconds after which
-            robots that are not done count as failed: what the others found is reported.
+        options: The bench's flags: ``jobs`` as for :func:`each`; ``within_s``, if there is one, is the time after which
+            robots that are not done count as failed [s].
 
     Returns:
-        What became of each, and number and error of those that failed, in order.
+        The results, and number and error of the robots that failed, in order.
     """
     within_s = getattr(options, "within_s", None)
     until = None if within_s is None else time.time() + within_s
@@ -100,14 +99,14 @@ def _outcome(
     try:
         with _until(until):
             return one(number, options)
-    except Exception as error:  # an hour's other robots must not be lost to it
+    except Exception as error:  # the results of the other robots must not be lost
         print(f"robot {number} failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
         return {"number": number, "failed": f"{type(error).__name__}: {error}"}
 
 
 @contextmanager
 def _until(until: float | None) -> Iterator[None]:
-    """Raise TimeoutError in what runs within when the time is up; one call into C ends first."""
+    """Raise TimeoutError in the block at a time; a call into C ends first."""
     if until is None:
         yield
         return
@@ -125,9 +124,9 @@ def _until(until: float | None) -> Iterator[None]:
 
 
 def _hold(number: int) -> None:
-    """Hold this process on one processor, and end it with the bench: one that was killed cannot tell it to.
+    """Hold this process on one processor, and let the kernel end it with the bench, also with a killed one.
 
-    C engines count the processors that they may use, and take a thread for each.
+    C engines start one thread for each processor that they may use.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
@@ -143,7 +142,7 @@ def _processors() -> list[int]:
 
 @contextmanager
 def _environment() -> Iterator[None]:
-    """Have processes that are started meanwhile compute by one thread: libraries read this when they are loaded."""
+    """Set the environment of new processes to one thread, which libraries read when they are loaded."""
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(ONE_THREAD | {"XLA_FLAGS": f"{before['XLA_FLAGS'] or ''} {ONE_THREAD['XLA_FLAGS']}".strip()})
     try:

@@ -1,8 +1,8 @@
-"""The log: what recording costs a control loop, what a cut file still tells, how long a range takes to read.
+"""The log: the cost of recording for a control loop, the content of a cut file, the time to read a range.
 
-The robot has three nodes with six joints; a tick is eight messages. Beside it stand mcap-ros2-support's own writer,
-called in a loop like it with the same messages, mcap's reader on the same cuts, and mcap-ros2-support's and rosbags'
-readers on the same range.
+The robot has three nodes with six joints; a tick is eight messages. The yardsticks are mcap-ros2-support's writer in
+the same loop with the same messages, mcap's reader on the same cuts, and the readers of mcap-ros2-support and rosbags
+on the same range.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sim2real.log.writer import McapRecorder
 
 JOINTS = 6
 LOSS_S = 0.25
-"""A crash may cost so much of the newest data [s]."""
+"""Longest loss of the newest data in a crash [s]."""
 RANGE_S = 1.0
 EPOCH_NS = 1_790_000_000_000_000_000
 NODES = {"sensor": None, "agent": "sensor", "actuator": "agent"}
@@ -52,7 +52,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Record in real time, ours first, then read what was recorded."""
+    """Record in real time, ours first, then read the log."""
     with tempfile.TemporaryDirectory() as scratch:
         log = Path(scratch) / "session.mcap"
         rows = loop(log, Path(scratch) / "theirs.mcap", options.rate, options.seconds)
@@ -60,13 +60,13 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def outputs(k: int) -> dict[str, dict[str, np.ndarray]]:
-    """Return what the nodes send at tick k."""
+    """Return the outputs of the nodes at tick k."""
     value = np.sin(0.01 * k + np.arange(JOINTS)).astype(np.float32)
     return {node: dict.fromkeys(fields, value) for node, fields in FIELDS.items()}
 
 
 def tick_records(k: int, period_us: int) -> tuple[list[Step], list[MessageRecord]]:
-    """Return what a runtime reports at tick k: steps with their outputs, and messages."""
+    """Return the records of tick k: steps with their outputs, and messages."""
     begin, sent = k * period_us, outputs(k)
     steps = [
         (StepRecord(node, k, begin, begin + 100 * i, begin + 100 * i + 20, -1, begin + 100 * i + 80, 0), sent[node])
@@ -81,7 +81,7 @@ def tick_records(k: int, period_us: int) -> tuple[list[Step], list[MessageRecord
 
 
 def paced(write: Callable[[int], None], rate_hz: float, count: int) -> np.ndarray:
-    """Call ``write`` once a period; return how long the calls took, ``(count,)`` [ms]."""
+    """Call ``write`` once a period; return the durations of the calls, ``(count,)`` [ms]."""
     took, begin = np.zeros(count), time.perf_counter()
     for k in range(count):
         time.sleep(max(0.0, begin + k / rate_hz - time.perf_counter()))
@@ -92,15 +92,16 @@ def paced(write: Callable[[int], None], rate_hz: float, count: int) -> np.ndarra
 
 
 def loop(log: Path, other: Path, rate_hz: float, seconds: float) -> list[dict[str, Any]]:
-    """Return how long a tick of the loop is held up by recording it."""
+    """Return the time of a tick of the loop that recording takes."""
+    # Ours first: the recorder in the loop.
     count, period_us = round(rate_hz * seconds), round(1e6 / rate_hz)
     inputs = [(node, source) for node, source in NODES.items() if source]
-    told = [tick_records(k, period_us) for k in range(count)]
+    records = [tick_records(k, period_us) for k in range(count)]
     with McapRecorder(log, {"pipeline": "bench"}, {}, outputs(0), inputs) as recorder:
         recorder.start(EPOCH_NS, time.monotonic_ns())
 
         def ours(k: int) -> None:
-            steps, messages = told[k]
+            steps, messages = records[k]
             for record, output in steps:
                 recorder.step(record, output)
             for record in messages:
@@ -108,20 +109,20 @@ def loop(log: Path, other: Path, rate_hz: float, seconds: float) -> list[dict[st
 
         took = paced(ours, rate_hz, count)
     with open(log, "rb") as stream:
-        found = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+        decoded = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
     ticks: list[list[Any]] = [[] for _ in range(count)]
-    for item in found:
+    for item in decoded:
         ticks[item.message.sequence].append(item)
     with open(other, "wb") as stream:
         writer = Writer(stream)
-        known = {
+        schemas = {
             s.id: writer.register_msgdef(s.name, s.data.decode())
-            for s in {i.schema.id: i.schema for i in found}.values()
+            for s in {i.schema.id: i.schema for i in decoded}.values()
         }
 
         def theirs(k: int) -> None:
             for item in ticks[k]:
-                schema, at = known[item.schema.id], item.message.log_time
+                schema, at = schemas[item.schema.id], item.message.log_time
                 writer.write_message(item.channel.topic, schema, item.decoded_message, at, at, k)
 
         beside = paced(theirs, rate_hz, count)
@@ -134,7 +135,7 @@ def loop(log: Path, other: Path, rate_hz: float, seconds: float) -> list[dict[st
 
 
 def truncations(log: Path, count: int) -> dict[str, Any]:
-    """Return how many cut files open, lose no more than the last quarter of a second, and are whole once recovered."""
+    """Return the number of cut files that open, lose at most the last 0.25 s, and are whole after `recover`."""
     content = log.read_bytes()
     summary = make_reader(io.BytesIO(content)).get_summary()
     chunks = [(c.chunk_start_offset, c.chunk_length, c.message_end_time) for c in summary.chunk_indexes]
@@ -143,7 +144,7 @@ def truncations(log: Path, count: int) -> dict[str, Any]:
     for position in np.random.default_rng(0).integers(chunks[0][0], chunks[-1][0] + chunks[-1][1], count):
         cut.write_bytes(content[:position])
         clean.unlink(missing_ok=True)
-        # Recorded up to the cut was what lies before the end of the chunk that the cut goes through.
+        # The recording up to the cut ends with the chunk that the cut goes through.
         recorded_s = min((t - EPOCH_NS) / 1e9 for begin, size, t in chunks if begin + size > position)
         with warnings.catch_warnings(), contextlib.suppress(Sim2RealError):
             warnings.simplefilter("ignore", TruncatedLogWarning)
@@ -157,7 +158,7 @@ def truncations(log: Path, count: int) -> dict[str, Any]:
 
 
 def range_read(log: Path, repeats: int) -> dict[str, Any]:
-    """Return how long it takes to read a second, or what there is of one, out of the middle of the log."""
+    """Return the time to read one second, or less in a short log, from the middle of the log."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -177,7 +178,7 @@ def range_read(log: Path, repeats: int) -> dict[str, Any]:
 
     programs = {"ours": lambda: read_log(log, start_s, end_s), "mcap_ros2": mcap_ros2, "rosbags": rosbags}
     ms = {name: 1e3 * s for name, s in medians(programs, repeats).items()}
-    told = (
+    about = (
         f"{ms['mcap_ros2']:.3g} ms mcap_ros2, {ms['rosbags']:.3g} ms rosbags; {end_s - start_s:.3g} s of {length:.3g} s"
     )
-    return row("log/range_read_ms", round(ms["ours"], 2), "ms", told)
+    return row("log/range_read_ms", round(ms["ours"], 2), "ms", about)

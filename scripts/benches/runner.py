@@ -1,4 +1,4 @@
-"""What runs a policy on the robot: a step of it by itself, and the loop of twelve joints on an emulated bus."""
+"""A policy on the robot: a single step of it, and the loop of twelve joints on an emulated bus."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def policy(observations: int, actions: int, rate_hz: float, hidden: tuple[int, .
 
 
 def a_step(steps: int) -> list[dict[str, Any]]:
-    """Measure single steps of a policy, checks of what goes in and out included."""
+    """Measure single steps of a policy, with the checks of observations and actions."""
     runner, rng = policy(32, 8, 50.0), np.random.default_rng(1)
     observations = rng.normal(size=(steps, 32)).astype(np.float32)
     runner.reset()
@@ -89,7 +89,8 @@ def nodes_of(rig: Rig, rate_hz: float) -> dict[str, BaseNode]:
 
 
 def loop(rate_hz: float, seconds: float, spin_s: float) -> list[dict[str, Any]]:
-    """Measure how late the nodes of twelve joints wake on the wall clock, an emulated bus beside them."""
+    """Measure the lateness of the nodes of twelve joints on the wall clock, beside an emulated bus."""
+    # The emulator, the device and the rig, then the graph on them.
     plant = f"{Path(__file__).with_name('twelve_joints.py')}:TwelveJoints"
     config = EmulatorConfig(baud_rate=BAUD, return_delay_us=0, plant_step_s=0.001)
     with (
@@ -121,12 +122,14 @@ def loop(rate_hz: float, seconds: float, spin_s: float) -> list[dict[str, Any]]:
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
-    parser.add_argument("--steps", type=int, default=20_000, help="steps of the policy by itself")
+    parser.add_argument("--steps", type=int, default=20_000, help="single steps of the policy")
     parser.add_argument("--rate", type=float, default=500.0, help="rate of sensor, policy and actuator [Hz]")
     parser.add_argument("--seconds", type=float, default=60.0, help="length of the loop")
-    parser.add_argument("--spin-s", type=float, default=0.0, help="how long before a step threads poll the clock [s]")
+    parser.add_argument(
+        "--spin-s", type=float, default=0.0, help="time before a step in which threads poll the clock [s]"
+    )
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Measure the policy by itself, and the loop."""
+    """Measure single steps of the policy, and the loop."""
     return {"rows": [*a_step(options.steps), *loop(options.rate, options.seconds, options.spin_s)]}

@@ -1,4 +1,4 @@
-"""How much faster several devices of a host are than one, with as much work on each: training, and identification."""
+"""Speed of several devices of a host over that of one, with the same work on each: training, and identification."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from sim2real.train.config import PPOConfig
 from sim2real.train.ppo.trainer import TrainResult, train
 
 EVALUATIONS = 6
-"""Speed is the median over what lies between them; the first has what happens once."""
+"""Number of evaluations; the speed is the median over the stretches between them, without the first."""
 GOAL = 0.9
-"""Share of as many times the speed as there are devices."""
+"""Share of the ideal speed, which is proportional to the number of devices."""
 LOG = Path(__file__).resolve().parents[2] / "datasets" / "pendulum" / "multisine.mcap"
 SEGMENTS, SEGMENT_S = 16, 1.0
-"""What each candidate is simulated on."""
+"""Number and length of the segments on which each candidate is simulated."""
 GENERATIONS = 60
 QUICK = {
     **{"envs": 8, "updates": 1, "timelines": 2, "episode_s": 0.5, "minibatches": 2},
@@ -53,7 +53,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--generations", type=int, default=GENERATIONS, help="most generations of a search, 20 at least"
     )
-    parser.add_argument("--segments", type=int, default=SEGMENTS, help="seconds of a log that each is simulated on")
+    parser.add_argument(
+        "--segments", type=int, default=SEGMENTS, help="segments of 1 s on which each candidate is simulated"
+    )
     parser.add_argument("--parts", nargs="+", choices=["train", "identify"], default=["train", "identify"])
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
 
@@ -70,11 +72,11 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         speeds = {}
         for devices in sorted({1, several}):
             speeds[devices], compile_s, size = measure[part](devices)
-            own = f"{name}/{part}/{devices}_devices"
+            base = f"{name}/{part}/{devices}_devices"
             rows += [
-                row(f"{own}/size", size, "copies" if part == "train" else "candidates"),
-                row(f"{own}/{unit}", round(speeds[devices]), "1/s"),
-                row(f"{own}/compile_s", round(compile_s, 1), "s"),
+                row(f"{base}/size", size, "copies" if part == "train" else "candidates"),
+                row(f"{base}/{unit}", round(speeds[devices]), "1/s"),
+                row(f"{base}/compile_s", round(compile_s, 1), "s"),
             ]
         if several > 1:
             ratio = round(speeds[several] / speeds[1], 2)
@@ -84,7 +86,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def train_on(options: argparse.Namespace) -> Measure:
-    """Return what measures PPO on the pendulum."""
+    """Return the measurement of PPO on the pendulum."""
     small = jax.default_backend() == "cpu"
     envs = options.envs or (64 if small else 8192)
     updates = options.updates or (4 if small else 40)
@@ -106,7 +108,7 @@ def train_on(options: argparse.Namespace) -> Measure:
 
 
 def identify_on(options: argparse.Namespace) -> Measure:
-    """Return what measures the search for the pendulum's parameters, from a log of it."""
+    """Return the measurement of the search for the pendulum's parameters in a log."""
     small = jax.default_backend() == "cpu"
     candidates = options.candidates or (16 if small else 4096)
     if options.generations < 20:
@@ -121,20 +123,20 @@ def identify_on(options: argparse.Namespace) -> Measure:
         done, compiling = [0.0], [0.0, 0.0]
         begin = time.perf_counter()
 
-        def told(count: int, best: float, z: np.ndarray) -> None:
+        def on_generations(count: int, best: float, z: np.ndarray) -> None:
             done.append(time.perf_counter() - begin)
 
         def on_compile(on: bool) -> None:
             compiling[0 if on else 1] = time.perf_counter()
 
         losses, start = problem.residuals.losses, problem.table.start()
-        search(losses, start, config, problem.data, on_generations=told, on_compile=on_compile)
-        took = np.diff(done[1:])  # without what happens before the first ten generations have ended
+        search(losses, start, config, problem.data, on_generations=on_generations, on_compile=on_compile)
+        took = np.diff(done[1:])  # without the first ten generations
         return 10 * size / float(np.median(took)), compiling[1] - compiling[0], size
 
     return measure
 
 
 def speed(result: TrainResult) -> float:
-    """Return rows a second, evaluations in their time but not in their number, without what happens once."""
+    """Return training rows a second, with the time of evaluations, without the first stretch."""
     return float(np.median(np.diff(result.env_steps) / np.diff(result.elapsed_s)))

@@ -1,4 +1,4 @@
-"""PPO on the pendulum with its delays, fully inside one program: how fast it steps, and how soon it succeeds."""
+"""PPO on the pendulum with its delays inside one program: steps a second, and time until success."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sim2real.train.environment.graph_environment import GraphEnvironment
 from sim2real.train.ppo.trainer import TrainResult, train
 
 SPREAD, SPREAD_S, DRAWS = 0.02, 0.002, 1024
-"""Copies differ in each of the dynamics by this share, in the delay by up to so many seconds, in so many draws."""
+"""Standard deviation of each parameter as a share, largest deviation of the delay [s], number of draws."""
 QUICK = {"steps": 256, "envs": 8, "timelines": 2, "episode_s": 0.5, "evaluations": 2, "minibatches": 2}
 
 
@@ -66,9 +66,9 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def rows(result: TrainResult, name: str) -> list[dict[str, Any]]:
-    """Return speed, success at the end, and when the best and the worst seed succeeded."""
+    """Return speed, success at the end, and the time at which the best and the worst seed succeeded."""
     success = np.asarray(result.history["success"])
-    found = [
+    lines = [
         row(f"{name}/env_steps_per_s", round(result.env_steps_per_s), "1/s"),
         row(f"{name}/compile_s", round(result.compile_s, 1), "s"),
         row(f"{name}/train_s", round(result.train_s, 1), "s"),
@@ -78,5 +78,5 @@ def rows(result: TrainResult, name: str) -> list[dict[str, Any]]:
         for who, reached in (("best", success.max(axis=1)), ("all", success.min(axis=1))):
             at = np.flatnonzero(reached >= level)
             seconds = round(float(result.elapsed_s[at[0]]), 1) if at.size else None
-            found.append(row(f"{name}/time_to_{level}_{who}_s", seconds, "s", goal="compile incl."))
-    return found
+            lines.append(row(f"{name}/time_to_{level}_{who}_s", seconds, "s", goal="compile incl."))
+    return lines

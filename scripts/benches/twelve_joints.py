@@ -1,4 +1,4 @@
-"""Twelve servos whose speed follows their voltage: a plant that costs an emulator next to nothing."""
+"""Twelve servos whose speed follows their voltage: a plant with almost no cost for the emulator."""
 
 from __future__ import annotations
 
@@ -40,5 +40,5 @@ class TwelveJoints:
         return {f"angle_{i}": angle for i, angle in self._angle.items()}
 
     def truth(self) -> dict[str, float]:
-        """Return what drives them."""
+        """Return the parameters of all motors."""
         return {"time_constant_s": TIME_CONSTANT_S, "top_rad_s": TOP_RAD_S}

@@ -56,7 +56,7 @@ def run(tmp_path, capsys):
 
 def test_a_report_names_files_without_the_folders_of_this_machine(tmp_path):
     flags = {"data": tmp_path / "data", "seeds": [0], "keep": None}
-    assert bench.told(flags) == {"data": "data", "seeds": [0], "keep": None}
+    assert bench.reported_flags(flags) == {"data": "data", "seeds": [0], "keep": None}
 
 
 @pytest.fixture
@@ -142,7 +142,7 @@ def test_compose_on_warp(run):
 def test_compose_without_warp_leaves_its_rows_out(monkeypatch, capsys):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert bench.main(["compose", "--quick", "--parts", "warp"]) == 0
-    assert "MuJoCo Warp is not installed, its rows are left out" in capsys.readouterr().err
+    assert "MuJoCo Warp is not installed, its rows are missing" in capsys.readouterr().err
 
 
 def test_runner(run):
@@ -257,9 +257,9 @@ def test_league(run, servo, tmp_path):
     ("data", "flags", "words"),
     [
         ("nothing.npz", [], "nothing.npz is no file *.npz and no folder with such files"),
-        ("disk.npz", ["--fit", "other.npz@0:10"], "'other.npz@0:10' selects nothing of disk.npz"),
+        ("disk.npz", ["--fit", "other.npz@0:10"], "'other.npz@0:10' selects no part of disk.npz"),
         ("disk.npz", ["--case", "xl330"], "is no file *.json and no folder with such files"),
-        ("disk.npz", ["--case", "so101_log", "--fit", "step_response"], "'step_response' selects nothing of disk.npz"),
+        ("disk.npz", ["--case", "so101_log", "--fit", "step_response"], "'step_response' selects no part of disk.npz"),
     ],
 )
 def test_data_that_is_not_there_is_said_in_words(disk, capsys, data, flags, words):

@@ -44,10 +44,10 @@ def test_cma_es_finds_a_bent_valley_in_a_box():
 
     run = cmaes.CmaEs(np.full(6, 0.3), 0.2, 12, np.random.default_rng(1))
     for _ in range(600):
-        candidates = run.ask()
+        candidates = run.sample()
         assert candidates.min() >= 0.0
         assert candidates.max() <= 1.0
-        run.tell(candidates, losses(candidates))
+        run.update(candidates, losses(candidates))
     np.testing.assert_allclose(run.mean, 0.75, atol=1e-3)
 
 

@@ -1,6 +1,6 @@
 """Control steps of a task, with a camera and without, against dm_control's and against MuJoCo's renderer alone.
 
-Each runs in a thread of its own: dm_control takes its OpenGL context for the thread's even after another was made that.
+Each runs in its own thread, as dm_control assumes that its OpenGL context is always current in its thread.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def robot(k: Any, links: int = LINKS, collide: bool = True) -> Any:
 
 
 def push(k: Any, camera: bool, shadows: bool = True) -> Any:
-    """Return a task with what tasks have: an arm on a floor, observables of which one is late, hooks, a reward."""
+    """Return a task with an arm on a floor, four observables, one of them late, hooks and a reward."""
     arm = robot(k)
     joints, tip = arm.mjcf_model.find_all("joint"), arm.mjcf_model.find("body", f"link{LINKS - 1}")
     actuators = arm.mjcf_model.find_all("actuator")
@@ -137,23 +137,23 @@ def step(repeats: int, steps_in_a_row: int) -> list[dict[str, Any]]:
         ("camera_without_shadows", max(1, steps_in_a_row // 10), True, False, ">= 1.2"),
     ):
         try:
-            found = {p: Apart(p, camera, shadows) for p in (*kits(), *(["mujoco"] if camera else []))}
+            threads = {p: Apart(p, camera, shadows) for p in (*kits(), *(["mujoco"] if camera else []))}
         except (mujoco.FatalError, ImportError, RuntimeError) as error:
             print(f"no images here: {error}", file=sys.stderr)
             break  # a second attempt would end the process
-        programs: dict[str, Callable[[], Any]] = {p: lambda one=one, n=count: one.run(n) for p, one in found.items()}
+        programs: dict[str, Callable[[], Any]] = {p: lambda one=one, n=count: one.run(n) for p, one in threads.items()}
         ms = {p: 1e3 * s / count for p, s in medians(programs, repeats, time.process_time).items()}
-        for one in found.values():
+        for one in threads.values():
             one.close()
-        told = "a control step of five physics steps, an arm with four observables, processor time"
-        told += f", and an image of {SIZE[0]} x {SIZE[1]}" if camera else ""
-        rows.append(row(f"compose/{name}_ms", round(ms["sim2real"], 3), "ms", told))
+        about = "a control step of five physics steps, an arm with four observables, processor time"
+        about += f", and an image of {SIZE[0]} x {SIZE[1]}" if camera else ""
+        rows.append(row(f"compose/{name}_ms", round(ms["sim2real"], 3), "ms", about))
         if "dm_control" in ms:
             over = round(ms["dm_control"] / ms["sim2real"], 2)
             rows.append(
                 row(f"compose/{name}/over_dm_control", over, "1", f"dm_control: {ms['dm_control']:.3g} ms", goal)
             )
         if camera:
-            alone = "what MuJoCo's renderer takes for the image alone: no step is faster"
+            alone = "MuJoCo's renderer for the image alone: the lower bound of a step"
             rows.append(row(f"compose/{name}/image_ms", round(ms["mujoco"], 3), "ms", alone))
     return rows

@@ -44,7 +44,7 @@ def quadruped() -> Any:
 
 
 def walk() -> Any:
-    """Return a task with what tasks have: observables of which two are late, a start by chance, a reward, an end."""
+    """Return a task with five observables, two of them late, a random start, a reward and a termination."""
     from sim2real import composer
     from sim2real.composer.observation.observable import MJCFFeature
 
@@ -104,14 +104,14 @@ def make_graph(task: Any, options: dict[str, Any], seconds: float) -> Any:
         action: Any
 
     class Agent(BaseNode):
-        """Waves the legs, and leans on what they did."""
+        """Waves the legs, with feedback of their angles."""
 
         def init_output(self, rng: Any = None, graph_state: Any = None) -> Any:
             return Angles(jnp.zeros(12))
 
         def step(self, step_state: Any) -> Any:
-            seen = step_state.inputs["world"][-1].data.values["quadruped/angles"]
-            return step_state, Angles(wave(step_state.ts, seen[-1]))
+            angles = step_state.inputs["world"][-1].data.values["quadruped/angles"]
+            return step_state, Angles(wave(step_state.ts, angles[-1]))
 
     world = composer.ComposedWorld("world", task, **options)
     agent = Agent("actuator", rate=world.rate, delay_dist=0.003)
@@ -122,7 +122,7 @@ def make_graph(task: Any, options: dict[str, Any], seconds: float) -> Any:
 
 
 def programs(copies: int, length: int) -> tuple[dict[str, tuple[Any, Any]], int]:
-    """Return what is compared: name -> a program of one copy and the starts of all, and the control steps it takes."""
+    """Return name -> (program of one copy, starts of all copies), and the number of control steps."""
     import jax
     import jax.numpy as jnp
     from mujoco import mjx
@@ -163,18 +163,18 @@ def programs(copies: int, length: int) -> tuple[dict[str, tuple[Any, Any]], int]
 
 
 def left(data: Any) -> Any:
-    """Return what is looked at of a state: positions, whether something had no room, rows of constraints."""
+    """Return positions, whether contacts or constraints had no room, and the number of rows of constraints."""
     from sim2real.composer.physics.mjx.warp.warp import overflowed
 
     return data.qpos, overflowed(data), data._impl.nefc
 
 
 def warp(sizes: Sequence[int] | None, repeats: int, length: int) -> list[dict[str, Any]]:
-    """Return what an environment and a graph, with their delays, cost over as many bare steps of Warp."""
+    """Return the time of an environment and of a graph, with their delays, over that of as many bare steps of Warp."""
     import jax
 
     if importlib.util.find_spec("warp") is None:
-        print('MuJoCo Warp is not installed, its rows are left out: pip install "sim2real[warp]"', file=sys.stderr)
+        print('MuJoCo Warp is not installed, its rows are missing: pip install "sim2real[warp]"', file=sys.stderr)
         return []
     sizes = sizes or ((8,) if jax.default_backend() == "cpu" else (4096, 8192, 32768))
     return [r for copies in sizes for r in compared(copies, repeats, length)]
@@ -196,18 +196,18 @@ def compared(copies: int, repeats: int, length: int) -> list[dict[str, Any]]:
         _, overflow, rows[name] = jax.tree_util.tree_leaves(calls[name]())[:3]
         compile_s[name] = time.perf_counter() - begin
         if np.any(overflow):
-            raise RuntimeError(f"{name}: contacts or constraints of {np.sum(overflow)} copies were left out")
+            raise RuntimeError(f"{name}: contacts or constraints of {np.sum(overflow)} copies had no room")
     seconds = medians(calls, repeats)
     rate = {n: copies * ticks * SUBSTEPS / s for n, s in seconds.items()}
     constraints = ", ".join(f"{np.mean(r):.1f}" for r in rows.values())
     print(copies, seconds, compile_s, f"rows of constraints: {constraints}", file=sys.stderr)
-    told = f"bare mjx.step of Warp under the same control, {copies} copies"
+    about = f"bare mjx.step of Warp under the same control, {copies} copies"
     name = f"compose/{jax.default_backend()}/warp/{copies}"
-    found = [row(f"{name}/bare_steps_per_s", round(rate["bare"]), "1/s", "physics steps, mjx.step alone")]
+    lines = [row(f"{name}/bare_steps_per_s", round(rate["bare"]), "1/s", "physics steps, mjx.step alone")]
     for key in ("env", "graph"):
         over = round(seconds[key] / seconds["bare"], 3)
-        found.append(row(f"{name}/{key}_over_bare", over, "1", told, "<= 1.1"))
-        found.append(row(f"{name}/{key}_steps_per_s", round(rate[key]), "1/s", f"{rate['bare']:.3g} bare"))
-        seen = f"and a first rollout; {compile_s['bare']:.1f} bare"
-        found.append(row(f"{name}/{key}_compile_s", round(compile_s[key], 1), "s", seen))
-    return [*found, row(f"{name}/first_reset_s", round(first_s, 1), "s", "environment, graph, first reset")]
+        lines.append(row(f"{name}/{key}_over_bare", over, "1", about, "<= 1.1"))
+        lines.append(row(f"{name}/{key}_steps_per_s", round(rate[key]), "1/s", f"{rate['bare']:.3g} bare"))
+        compile_about = f"and a first rollout; {compile_s['bare']:.1f} bare"
+        lines.append(row(f"{name}/{key}_compile_s", round(compile_s[key], 1), "s", compile_about))
+    return [*lines, row(f"{name}/first_reset_s", round(first_s, 1), "s", "environment, graph, first reset")]

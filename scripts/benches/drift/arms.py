@@ -1,9 +1,8 @@
-"""The arm and the SO-101 inside the computer for the bench of drift: their pipelines' plants on a simulated clock.
+"""The arm and the SO-101 on a simulated clock for the bench of drift.
 
-Plants, latencies and the gate are those of the wall clock; in the place of bus and threads stand the times that they
-take. Robots differ in what their servos are like and in how late they are. The policy is written by hand: it moves the
-goals to one target after the other, as fast as a trained one may. Trained ones, after what the verdict asks for was
-done, run as on the robot: by its agent's node, and in numpy.
+Plants, latencies and the gate are those of the wall clock; random times replace bus and threads. Robots differ in the
+parameters of their servos and in their latencies. The policy is written by hand: it moves the goals from target to
+target, as fast as a trained one may. Trained policies run as on the robot: in its agent's node, in numpy.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 TARGET_S, APPROACH_HZ = 4.0, 4.0
-"""How long each target stands; how fast a goal nears it."""
+"""Time at each target; rate at which a goal approaches it."""
 STEP_RAD, STEP_S, STEPS = 0.12, 0.5, 8
-"""Small steps by which the delay is measured."""
+"""Size, duration and number of the small steps that measure the delay."""
 CARRIED = 0.3
 """Payload, as a share of the mass of all links."""
 _STEP_NS = 500_000
@@ -71,18 +70,18 @@ class ReachingArm:
 
     @classmethod
     def servos(cls, rng: np.random.Generator) -> dict[str, Any]:
-        """Draw what the servos are like: arguments of the plant."""
+        """Draw the servos' parameters: arguments of the plant."""
         off = lambda: rng.uniform(0.8, 1.2)  # noqa: E731
         coulomb = [off() * factor for factor in (1.5, 1.9, 1.2)]
         return {"stall": 0.87 * off(), "back_emf": 1.1 * off(), "armature": 1.25 * off(), "coulomb": coulomb}
 
     @property
     def truth(self) -> dict[str, Any]:
-        """What it is, for the report."""
+        """Its parameters, for the report."""
         return {name: value for name, value in asdict(self).items() if name != "number"}
 
     def changed(self, change: str) -> ReachingArm:
-        """Return the robot after something has changed; ``none``: as it is."""
+        """Return the robot after a change; ``none``: no change."""
         if change == "friction":
             return replace(self, plant=self.rubbing(FRICTION))
         if change == "delay":
@@ -96,10 +95,10 @@ class ReachingArm:
         return {**self.plant, "coulomb": [factor * level for level in self.plant["coulomb"]]}
 
     def record(self, path: Path, seconds: float, session: int) -> None:
-        """Write the log of the pipeline's excitation, with goals that come to it slowly from where the arm rests.
+        """Write the log of the pipeline's excitation, which begins slowly at the rest position.
 
         Args:
-            session: Its number: jitter differs from one to the next, and the excitation.
+            session: Seed of jitter and excitation.
         """
         robot, config = self._robot, load_pipeline(self.pipeline).record
         config = replace(config, duration_s=seconds, seed=1000 * self.number + session)
@@ -118,10 +117,10 @@ class ReachingArm:
         self._play(path, lambda k, *_: away if k // each % 2 else rest, STEP_S * (STEPS + 1), session)
 
     def deploy(self, path: Path, seconds: float, session: int) -> float:
-        """Write the log of an episode of the policy written by hand; nobody judges it: it does not succeed or fail.
+        """Write the log of an episode of the policy written by hand; return NaN, as it has no success.
 
         Args:
-            session: Its number: it says which targets.
+            session: Seed of the targets.
         """
         robot, rng = self._robot, np.random.default_rng([self.number, session])
         low, high = self.targets()
@@ -136,19 +135,19 @@ class ReachingArm:
         return float("nan")
 
     def success(self, bundle: Any, options: Any) -> list[float]:
-        """Return of each deployment of a trained policy whether the robot was at its target in the end: 1 or 0."""
+        """Return 1 for each deployment of a trained policy that ended at the target, else 0."""
         robot, seconds = self._robot, load_pipeline(self.pipeline).deploy.duration_s
-        found = []
+        reached = []
         for trial in range(100, 100 + options.trials):
             aim = np.asarray(robot.draw_aim(jax.random.key(trial)))
             angles = self._play(Path(os.devnull), trained(robot, bundle, aim), seconds, trial)
             states = {f"position[{i}]": column for i, column in enumerate(angles.T)}
             states |= {f"aim[{i}]": np.full(len(angles), value) for i, value in enumerate(aim)}
-            found.append(robot.score(np.arange(len(angles)) / hidden.RATE_HZ, states)["reached"])
-        return found
+            reached.append(robot.score(np.arange(len(angles)) / hidden.RATE_HZ, states)["reached"])
+        return reached
 
     def targets(self) -> tuple[Any, Any]:
-        """Return between which joint angles targets are [rad]."""
+        """Return lowest and highest joint angles of targets [rad]."""
         module = sys.modules[type(self._robot).__module__]
         return module.LOW, module.HIGH
 
@@ -158,6 +157,7 @@ class ReachingArm:
 
     def _play(self, path: Path, policy: Policy, seconds: float, session: int) -> np.ndarray:
         """Run the loop on a simulated clock, from rest, and write its log; return the true angles ``(N, joints)``."""
+        # Make the plant at rest, with the servos' settings, and the gate.
         robot, rng = self._robot, np.random.default_rng([self.number, session, 1])
         plant: Any = load_plant(robot.embedded.plant, self.plant)
         sheet, rest = robot.servos.sheet, robot.servos.at_rest
@@ -173,24 +173,27 @@ class ReachingArm:
         starts, ends = ({n: np.zeros(count) for n in ("sensor", "agent", "actuator")} for _ in range(2))
         readings, commands, angles = [], [], []
         for k in range(count):
+            # Times of the three nodes' steps.
             at = k / hidden.RATE_HZ
             for node, took in (("sensor", 1.2e-3), ("agent", 1e-4), ("actuator", 6e-4)):
                 starts[node][k], at = at, at + took * rng.uniform(0.8, 1.2)
                 ends[node][k] = at
-            asked_ns = round(1e9 * starts["sensor"][k])
-            clock.advance(asked_ns)
-            sampled_ns = asked_ns - round(1e9 * self.sensing_s * rng.uniform(0.85, 1.15))
+            # The measurement, one latency before the sensor's step, in the encoder's counts.
+            requested_ns = round(1e9 * starts["sensor"][k])
+            clock.advance(requested_ns)
+            sampled_ns = requested_ns - round(1e9 * self.sensing_s * rng.uniform(0.85, 1.15))
             rows = np.array([clock.sample(i, sampled_ns)[:2] for i in plant.servo_ids])
             angle = np.round(rows[:, 0] / hidden.COUNT_RAD) * hidden.COUNT_RAD - zero
             speed = np.round(rows[:, 1] / hidden.SPEED_COUNT_RAD_S) * hidden.SPEED_COUNT_RAD_S
             readings.append({"position": np.float32(angle), "velocity": np.float32(speed)})
             angles.append(plant.data.qpos.copy())
+            # The policy's goals act one latency after the actuator's step.
             goal = gate.apply(policy(k, goal, JointReading(**readings[-1])), 0.0, float(ends["agent"][k]), speed)
             commands.append({"goal": np.float32(goal)})
             sent_ns = round(1e9 * (ends["actuator"][k] + self.acting_s * rng.uniform(0.85, 1.15)))
             acts_ns = max(acts_ns, sent_ns)
-            for servo_id, own, offset in zip(plant.servo_ids, goal, zero, strict=True):
-                wanted = round((own + offset) / hidden.COUNT_RAD) * hidden.COUNT_RAD
+            for servo_id, joint_goal, offset in zip(plant.servo_ids, goal, zero, strict=True):
+                wanted = round((joint_goal + offset) / hidden.COUNT_RAD) * hidden.COUNT_RAD
                 clock.schedule(acts_ns, 0, servo_id, OperatingMode.POSITION, wanted)
         truth.close()
         if path != Path(os.devnull):
@@ -199,7 +202,7 @@ class ReachingArm:
 
 
 def trained(robot: Any, bundle: Any, aim: np.ndarray) -> Policy:
-    """Return a policy that was trained, as the robot runs it."""
+    """Return a trained policy, as the robot runs it."""
     agent, runner, rest = robot.make_agent(), bundle.runner(), np.asarray(robot.servos.at_rest, np.float32)
     past = np.zeros((robot.history, 3 * len(rest)), np.float32)
     step = StepState(params=AgentParams(aim=np.float32(aim), start=rest), state=AgentState(rest, past))
@@ -215,7 +218,7 @@ def trained(robot: Any, bundle: Any, aim: np.ndarray) -> Policy:
 
 
 class ReachingSO101(ReachingArm):
-    """The SO-101: what it holds is between its jaws."""
+    """The SO-101, with its payload between its jaws."""
 
     pipeline = "so101"
     links_kg = 0.485
@@ -225,7 +228,7 @@ class ReachingSO101(ReachingArm):
 
     @classmethod
     def servos(cls, rng: np.random.Generator) -> dict[str, Any]:
-        """Draw what the servos are like: arguments of the plant."""
+        """Draw the servos' parameters: arguments of the plant."""
         return {"gain": rng.uniform(0.8, 1.2), "friction": rng.uniform(0.8, 1.2)}
 
     def rubbing(self, factor: float) -> dict[str, Any]:

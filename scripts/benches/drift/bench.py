@@ -1,9 +1,9 @@
-"""Does a deployment's log tell that the robot has changed, and what? Robots that are changed behind a policy's back.
+"""How often the drift test detects a change of the robot from the logs of a deployment, and names its parameter.
 
-Each is recorded, identified, and deployed: as it was, with twice the friction, with 30 % more to carry, 15 ms later.
-Policies are written by hand for the robots as they were; before each deployment come the small steps by which deploy
-measures the delay. With --restore what the verdict asks for is done once, unattended, as ``sim2real run`` does it:
-identify, from the deployment's own logs where they suffice, else from a new recording; train; deploy.
+Each robot is recorded, identified, and deployed: unchanged, with twice the friction, with 30 % more payload, and 15 ms
+later. Policies are written by hand for the unchanged robots; small steps before each deployment measure the delay. With
+--restore the command of the verdict runs once, as ``sim2real run`` does it: identify, from the deployment's own logs if
+they suffice, else from a new recording; train; deploy.
 """
 
 from __future__ import annotations
@@ -15,12 +15,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from scipy.stats import binomtest
-
 from benches import jobs
 from benches.drift.arms import ReachingArm, ReachingSO101
 from benches.drift.pendulum import Pendulum
-from benches.figures import row
+from benches.figures import Row, row, share
 from benches.hidden import randomise
 from sim2real.errors import Sim2RealError
 
@@ -33,21 +31,23 @@ QUICK = {"runs": 1, "generations": 5, "record_s": 12.0, "seconds": 5.0, "folds":
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     parser.add_argument("--robot", choices=list(ROBOTS), default="pendulum", help="which kind of robot")
-    parser.add_argument("--runs", type=int, default=40, help="robots; each is deployed as it was, and changed")
-    parser.add_argument("--first", type=int, default=0, help="number of the first of them")
-    parser.add_argument("--changes", nargs="*", default=list(CHANGES), choices=CHANGES, help="what is changed")
+    parser.add_argument("--runs", type=int, default=40, help="robots, each deployed unchanged and changed")
+    parser.add_argument("--first", type=int, default=0, help="number of the first robot")
+    parser.add_argument("--changes", nargs="*", default=list(CHANGES), choices=CHANGES, help="changes of each robot")
     parser.add_argument("--record-s", type=float, help="length of the recording [s]; default: the robot's, as below")
     parser.add_argument("--seconds", type=float, help="length of an episode [s]")
     parser.add_argument("--episodes", type=int, help="episodes of a deployment")
     parser.add_argument("--generations", type=int, help="generations of the search")
-    parser.add_argument("--folds", type=int, default=5, help="parts that identification leaves out")
-    parser.add_argument("--restore", action="store_true", help="do what the verdict asks for, and judge the new policy")
+    parser.add_argument("--folds", type=int, default=5, help="held-out parts of the identification")
+    parser.add_argument("--restore", action="store_true", help="run the command of the verdict, test the new policy")
     parser.add_argument("--trials", type=int, default=10, help="deployments of the new policy")
-    parser.add_argument("--volts", type=float, default=2.0, help="most that it may command a pendulum")
+    parser.add_argument("--volts", type=float, default=2.0, help="largest command of a pendulum")
     parser.add_argument("--steps", type=int, help="policy steps of its training; default: the robot's")
     parser.add_argument("--envs", type=int, help="copies of its training")
     parser.add_argument("--jobs", type=int, default=1, help="robots at once, one process each; 1: in this process")
-    parser.add_argument("--within-s", type=float, help="end after this [s]: what was not done is told")
+    parser.add_argument(
+        "--within-s", type=float, help="end after this time [s]; the rows count robots that are not done"
+    )
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
@@ -55,50 +55,50 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     for name, value in ROBOTS[options.robot].defaults.items():
         if getattr(options, name) is None:
             setattr(options, name, value)
-    found, failed = jobs.robots(one_robot, range(options.first, options.first + options.runs), options)
-    lines = rows(found, options)
+    outcomes, failed = jobs.robots(one_robot, range(options.first, options.first + options.runs), options)
+    lines = rows(outcomes, options)
     lines.append(row(f"drift/{options.robot}/failed", len(failed), f"of {options.runs}", "", "0"))
-    if found:
-        spent = sum(robot["cpu_s"] for robot in found) / len(found)
+    if outcomes:
+        spent = sum(robot["cpu_s"] for robot in outcomes) / len(outcomes)
         lines.append(row(f"drift/{options.robot}/robot_cpu_s", spent, "s"))
-    return {"rows": lines, "robots": found, "failed": failed}
+    return {"rows": lines, "robots": outcomes, "failed": failed}
 
 
-def rows(found: list[dict[str, Any]], options: argparse.Namespace) -> list[dict[str, Any]]:
-    """Return the shares of verdicts and of right names, and of the tests' own alarms, with exact 95 % intervals.
+def rows(outcomes: list[dict[str, Any]], options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return the shares of verdicts, of right names, and of the tests' alarms, with exact 95 % intervals.
 
-    A robot is said to have changed where the verdict is to identify it again, be it by a test of its parameters or by
-    errors beyond what was promised.
+    A change counts as detected if the verdict is "re-identify", by a test of the parameters or by errors beyond the
+    promised ones.
     """
     lines, causes = [], ROBOTS[options.robot].causes
     for change in options.changes:
-        told = [r["changes"][change] for r in found]
-        tested = [t for t in told if "alarms" in t]
+        results = [r["changes"][change] for r in outcomes]
+        tested = [t for t in results if "alarms" in t]
         count = lambda holds, tested=tested: (sum(map(holds, tested)), len(tested))  # noqa: E731
         base = f"drift/{options.robot}/{change}"
-        again, sure = count(lambda t: t["verdict"] == "re-identify"), count(lambda t: bool(t["alarms"]))
+        detected, alarms = count(lambda t: t["verdict"] == "re-identify"), count(lambda t: bool(t["alarms"]))
         if change == "none":
-            lines += _share(f"{base}/false_alarms", *again, "<= 0.05") + _share(f"{base}/by_test", *sure, "<= 0.05")
+            lines += _share(f"{base}/false_alarms", *detected, "<= 0.05")
+            lines += _share(f"{base}/by_test", *alarms, "<= 0.05")
         else:
             right = count(lambda t, cause=causes[change]: cause in (t["named"], t["likely"]))
-            lines += _share(f"{base}/detected", *again, ">= 0.95") + _share(f"{base}/named", *right, ">= 0.9")
-            lines += _share(f"{base}/by_test", *sure, "")
-        if after := [s >= randomise.UPRIGHT for t in told for s in t.get("restored", {}).get("success", [])]:
+            lines += _share(f"{base}/detected", *detected, ">= 0.95")
+            lines += _share(f"{base}/named", *right, ">= 0.9")
+            lines += _share(f"{base}/by_test", *alarms, "")
+        if after := [s >= randomise.UPRIGHT for t in results for s in t.get("restored", {}).get("success", [])]:
             lines += _share(f"{base}/restored", sum(after), len(after), ">= 0.95")
-        lines.append(row(f"{base}/not_tested", len(found) - len(tested), f"of {len(found)}"))
+        lines.append(row(f"{base}/not_tested", len(outcomes) - len(tested), f"of {len(outcomes)}"))
     return lines
 
 
-def _share(name: str, count: int, of: int, goal: str) -> list[dict[str, Any]]:
-    if not of:
-        return [row(name, float("nan"), "of 0", "", goal)]
-    ends = binomtest(count, of).proportion_ci(method="exact")
-    return [row(name, count / of, f"of {of}", "", goal), row(f"{name}/low95", ends.low, ""),
-            row(f"{name}/high95", ends.high, "")]  # fmt: skip
+def _share(name: str, count: int, trials: int, goal: str) -> list[Row]:
+    value, low, high = share(count, trials) if trials else (float("nan"),) * 3
+    rows = [row(name, value, f"of {trials}", "", goal)]
+    return [*rows, row(f"{name}/low95", low, ""), row(f"{name}/high95", high, "")] if trials else rows
 
 
 def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
-    """Return what the test said about one robot, as it was and changed."""
+    """Return the test's results for one robot, unchanged and changed."""
     from sim2real.stages.pipeline.pipeline import load_pipeline
 
     begin = time.process_time()
@@ -107,21 +107,22 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
         session = Path(folder) / "session.mcap"
         robot.record(session, options.record_s, 0)
         identified = identify(pipeline, [session], number, options)
-        said: dict[str, Any] = {c: {"refused": "not done in time"} for c in options.changes}
+        results: dict[str, Any] = {c: {"refused": "not done in time"} for c in options.changes}
         try:
             for c in options.changes:
-                said[c] = one_change(robot, c, pipeline, identified, Path(folder), options)
-        except Exception as error:  # out of a callback from XLA it comes as one of XLA's
+                results[c] = one_change(robot, c, pipeline, identified, Path(folder), options)
+        except Exception as error:  # XLA wraps an error that a callback raises
             if jobs.OVER not in str(error):
                 raise
     about = {"number": number, "verdict": identified.verdict.status, "widening": identified.widening}
-    return {**about, "cpu_s": time.process_time() - begin, "truth": robot.truth, "changes": said}
+    return {**about, "cpu_s": time.process_time() - begin, "truth": robot.truth, "changes": results}
 
 
 def one_change(
     robot: Any, change: str, pipeline: Any, identified: Any, folder: Path, options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Return what the test said about a robot after one change."""
+    """Return the test's results for a robot after one change."""
+    # Deploy the changed robot, with the small steps that measure the delay.
     from sim2real.artifacts.recording import Recording
     from sim2real.stages.deploy.verdict import verdict_of
     from sim2real.stages.estimation.replay import tested
@@ -134,21 +135,21 @@ def one_change(
         replay, drifted = tested(pipeline, identified, [Recording.load(log).episode for log in logs])
     except Sim2RealError as error:
         return {"success": success, "refused": str(error)}
-    told = verdict_of(replay, drifted)
-    said = {
+    verdict = verdict_of(replay, drifted)
+    result = {
         "success": success,
         "alarms": list(drifted.alarms),
         "named": drifted.named.name if drifted.named else "",
         "likely": drifted.likely.name if drifted.likely else "",
-        "verdict": "" if told is None else told.status,
+        "verdict": "" if verdict is None else verdict.status,
         "seconds": drifted.seconds,
         "off": {r.name: [r.rmse, r.promised] for r in replay},
         "changes": [vars(c) for c in drifted.changes],
     }
     print(f"robot {robot.number}, {change}: {drifted.changes[0].name}, alarms {drifted.alarms}", flush=True)
     if options.restore and change != "none":
-        said["restored"] = restored(now, change, pipeline, identified, drifted, said, logs, options)
-    return said
+        result["restored"] = restored(now, change, pipeline, identified, drifted, result, logs, options)
+    return result
 
 
 def restored(
@@ -157,35 +158,35 @@ def restored(
     pipeline: Any,
     identified: Any,
     drifted: Any,
-    said: dict[str, Any],
+    result: dict[str, Any],
     logs: list[Path],
     options: argparse.Namespace,
 ) -> dict[str, Any]:
-    """Do what a verdict asks for, once, as a run does it; return the new policy's success, or that of the old one.
+    """Run the command of a verdict once, as a run does it; return the new policy's success, or that of the old one.
 
     Args:
-        change: What has changed, for the file's name.
-        said: That for the report, with the old policy's success.
+        change: Name of the change, for the file's name.
+        result: Results for the report, with the old policy's success.
     """
     import sim2real
     from sim2real.artifacts.identification import ROUND_TRIP
     from sim2real.commands.loop.retry import MAX_RETRIES, run_with_retries, why_insufficient, with_more_steps
     from sim2real.stages.deploy.next_command import logs_to_identify, terms_to_identify
 
-    if said["verdict"] != "re-identify":
-        return {"success": said["success"], "from": "not done"}
-    own: list[Path] = []
-    if said["named"] != ROUND_TRIP:  # that is refused before the policy moves anything: there is no such log
-        own = [Path(log) for log in logs_to_identify(logs, drifted, identified, logs[0].parent)]
+    if result["verdict"] != "re-identify":
+        return {"success": result["success"], "from": "not done"}
+    recordings: list[Path] = []
+    if result["named"] != ROUND_TRIP:  # that is refused before the policy moves anything: there is no such log
+        recordings = [Path(log) for log in logs_to_identify(logs, drifted, identified, logs[0].parent)]
     terms = terms_to_identify(pipeline.identify.terms, pipeline, identified, drifted)
     try:
-        again = identify(pipeline, own, now.number, options, terms) if own else None
+        again = identify(pipeline, recordings, now.number, options, terms) if recordings else None
     except Sim2RealError:
         again = None
     if again is None or why_insufficient(again):
-        own = [logs[0].with_name(f"{change}_session.mcap")]
-        now.record(own[0], options.record_s, 1000)
-        again = identify(pipeline, own, now.number, options, terms)
+        recordings = [logs[0].with_name(f"{change}_session.mcap")]
+        now.record(recordings[0], options.record_s, 1000)
+        again = identify(pipeline, recordings, now.number, options, terms)
     config, bundle = run_with_retries(
         lambda config: sim2real.train(pipeline, again, config),
         randomise.train_config(pipeline, "all", now.number, options),
@@ -193,19 +194,19 @@ def restored(
         MAX_RETRIES["train"],
     )[-1]
     success = now.success(bundle, options)
-    print(f"robot {now.number}, {change}: {success} after one iteration from {len(own)} logs", flush=True)
+    print(f"robot {now.number}, {change}: {success} after one iteration from {len(recordings)} logs", flush=True)
     wider = {p.name: p.upper for p in again.parameters if p.upper != _upper(identified, p.name)}
-    found = {"verdict": again.verdict.status, "misfit": again.misfit, "terms": terms, "bounds": wider}
-    found |= {"simulated": float(bundle.history.success.max()), "steps": config.ppo.total_steps}
-    return {"success": success, "from": [log.name for log in own], **found}
+    summary = {"verdict": again.verdict.status, "misfit": again.misfit, "terms": terms, "bounds": wider}
+    summary |= {"simulated": float(bundle.history.success.max()), "steps": config.ppo.total_steps}
+    return {"success": success, "from": [log.name for log in recordings], **summary}
 
 
-def _upper(found: Any, name: str) -> float | None:
-    return next((p.upper for p in found.parameters if p.name == name), None)
+def _upper(identified: Any, name: str) -> float | None:
+    return next((p.upper for p in identified.parameters if p.name == name), None)
 
 
 def identify(pipeline: Any, logs: list[Path], number: int, options: argparse.Namespace, terms: str = "own") -> Any:
-    """Return what logs say about a robot; with wider bounds where an estimate lies at one, as a run does it."""
+    """Return the identification of a robot, with wider bounds for an estimate at a bound, as a run does it."""
     import sim2real
     from sim2real.artifacts.recording import Recording
     from sim2real.commands.loop.retry import MAX_RETRIES, run_with_retries, with_wider_bounds

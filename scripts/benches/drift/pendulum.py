@@ -22,13 +22,7 @@ PROBE_S = 8.0
 
 @dataclass(frozen=True)
 class Pendulum:
-    """A hidden pendulum, and how it was when its policy was made.
-
-    Attributes:
-        robot: As it is.
-        before: As it was.
-        number: Its number.
-    """
+    """A hidden pendulum: ``robot`` now, and ``before``, when its policy was made."""
 
     robot: hidden.Hidden
     before: hidden.Hidden
@@ -48,28 +42,24 @@ class Pendulum:
 
     @property
     def truth(self) -> dict[str, Any]:
-        """What it is, for the report."""
+        """Its parameters, for the report."""
         return vars(self.robot)
 
     def changed(self, change: str) -> Pendulum:
-        """Return the robot after something has changed; ``none``: as it is."""
+        """Return the robot after a change; ``none``: no change."""
         robot = self.robot
         if change == "friction":
             robot = replace(robot, friction=FRICTION * robot.friction)
         if change == "delay":
             robot = replace(robot, acting=robot.acting + DELAY_S)
-        if change == "payload":  # where the mass is: the inertia grows, too
+        if change == "payload":  # at the mass, so the inertia grows, too
             inertia = 1.0 + (PAYLOAD - 1.0) * MASS_SHARE
             others = {n: getattr(robot, n) / inertia for n in ("gain", "damping", "friction")}
             robot = replace(robot, gravity=PAYLOAD * robot.gravity / inertia, **others)
         return replace(self, robot=robot)
 
     def record(self, path: Path, seconds: float, session: int) -> None:
-        """Write the log of an excitation.
-
-        Args:
-            session: Its number: jitter and losses differ from one to the next.
-        """
+        """Write the log of an excitation; ``session`` is the seed of jitter and losses."""
         hidden.write(path, hidden.play(self.robot, hidden.excited(seconds, self.number), seconds, session))
 
     def probe(self, path: Path, session: int) -> None:
@@ -103,7 +93,7 @@ def swing_up(robot: hidden.Hidden) -> hidden.Controller:
         energy = 0.5 * speed**2 + gravity * (math.cos(off) - 1.0)
         if abs(off) < 0.5 and abs(speed) < 6.0:
             wanted = -(1.5 * gravity * off + 1.2 * math.sqrt(gravity) * speed) / robot.gain
-        elif math.cos(off) < -0.9 and abs(speed) < 0.3:  # it hangs: anything moves it
+        elif math.cos(off) < -0.9 and abs(speed) < 0.3:  # it hangs: any voltage moves it
             wanted = LIMIT_V
         else:
             wanted = -math.copysign(LIMIT_V, energy * speed) if abs(energy) > 0.05 * gravity else 0.0

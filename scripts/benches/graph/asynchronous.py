@@ -1,4 +1,4 @@
-"""The asynchronous runtime: how fast the simulated clock steps, and how late threads wake on the wall clock."""
+"""The asynchronous runtime: steps a second on the simulated clock, and lateness of threads on the wall clock."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim2real.runtime.clock import Clock
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 WARM_S = 0.5
-"""The wall clock runs so long before it is measured [s]."""
+"""Time on the wall clock before the measurement [s]."""
 QUICK = {"seconds": 0.2, "rate": 100.0, "steps": 20}
 
 
@@ -36,7 +36,7 @@ def loop(rate_hz: float) -> dict[str, BaseNode]:
 
 
 def simulated(steps: int) -> list[dict[str, Any]]:
-    """Measure the simulated clock, as fast as it goes."""
+    """Measure the simulated clock at its highest speed."""
     nodes = loop(50.0)
     graph = AsyncGraph(nodes, nodes["agent"], clock=Clock.SIMULATED, duration_s=(steps + 50) / 50.0)
     state = graph.init(jax.random.key(0))

@@ -39,7 +39,7 @@ QUICK = {"copies": [2], "repeats": 1, "cases": ["hiccups"], "build": [10], "mjx"
 
 
 class _Normal:
-    """Stands for ``distrax.Normal``, which the GPU machine of the bench lacks: the fields that the graph reads."""
+    """The fields of ``distrax.Normal`` that the graph reads, as a GPU machine may have no distrax."""
 
     def __init__(self, loc: float, scale: float) -> None:
         self.loc, self.scale = loc, scale
@@ -165,10 +165,10 @@ def hand_program(rows: int, ticks: tuple[int, ...], world: Any, unroll: int = 1)
             x, cost, rng, commands, sensed, observations, actions = carry
             rng, k = jax.random.split(rng)
             action = jax.random.uniform(k, (1,), minval=-2.0, maxval=2.0)
-            seen = jnp.stack([jnp.cos(sensed[0, 0]), jnp.sin(sensed[0, 0]), sensed[0, 1] / 10.0])
+            features = jnp.stack([jnp.cos(sensed[0, 0]), jnp.sin(sensed[0, 0]), sensed[0, 1] / 10.0])
             commands, observations, actions = (
                 shift(commands, action),
-                shift(observations, seen),
+                shift(observations, features),
                 shift(actions, action),
             )
             for _ in range(count):
@@ -215,7 +215,7 @@ def tick(world: Any, p: Any, x: Any, cost: Any, u: Any) -> tuple[Any, Any]:
 
 
 def bytes_per_copy(graph: CompiledGraph) -> int:
-    """Return what a copy carries from row to row, parameters left out as copies may share them."""
+    """Return the bytes that a copy carries from row to row, without parameters, which copies may share."""
     gs = jax.eval_shape(lambda: graph.init(jax.random.key(0), {"world": params()})).replace(params={})
     return int(
         sum(np.prod(x.shape) * (8 if x.dtype.name.startswith("key") else x.dtype.itemsize) for x in jax.tree.leaves(gs))
@@ -268,7 +268,7 @@ def case(device: str, kind: str, copies: int, repeats: int, unrolls: Sequence[in
 
 def building(counts: Sequence[int]) -> list[dict[str, Any]]:
     """Measure how long timelines take to draw and to wire."""
-    found = []
+    rows = []
     for episodes in counts:
         graph_nodes = nodes()
         draw(graph_nodes, DURATION_S, 10, 0)
@@ -279,8 +279,8 @@ def building(counts: Sequence[int]) -> list[dict[str, Any]]:
         end = time.perf_counter()
         goals = ("< 1", "< 2") if episodes == 1_000 else ("linear", "linear")
         for what, seconds, goal in (("draw", middle - begin, goals[0]), ("wire", end - middle, goals[1])):
-            found.append(row(f"graph/build/{episodes}_episodes_{what}_s", round(seconds, 3), "s", goal=goal))
-    return found
+            rows.append(row(f"graph/build/{episodes}_episodes_{what}_s", round(seconds, 3), "s", goal=goal))
+    return rows
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -290,7 +290,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="kinds of timelines")
     parser.add_argument("--build", type=int, nargs="+", default=[1_000, 10_000], help="episodes to draw and to wire")
-    parser.add_argument("--mjx", type=int, default=64, help="copies of the MJX arm; 0 leaves it out")
+    parser.add_argument("--mjx", type=int, default=64, help="copies of the MJX arm; 0: none")
     parser.add_argument("--links", type=int, default=6, help="links of the MJX arm")
     parser.add_argument("--unroll", type=int, nargs="+", default=[], help="other numbers of rows in a pass of the loop")
 

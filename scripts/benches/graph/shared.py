@@ -1,4 +1,4 @@
-"""What both robots of the bench of graphs share."""
+"""Model and sizes that both robots of the bench of graphs share."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ _PWM_MODE, _SUPPLY_V = 16, 5.0
 
 
 class HiddenPlant:
-    """The dynamics of ``hidden_robots.Hidden``; what reads the encoder sees its play and noise.
+    """The dynamics of ``hidden.robots.Hidden``; measurements have the encoder's play and noise.
 
     Args:
         gain: Acceleration per volt [rad/s^2/V].
@@ -37,7 +37,7 @@ class HiddenPlant:
         self._speed = 0.0
 
     def advance(self, t_s: float) -> None:
-        """Integrate up to ``t_s`` [s], with friction that stops what it can."""
+        """Integrate up to ``t_s`` [s], with friction."""
         step_s = self._step_s
         for _ in range(round(t_s / step_s) - self._steps):
             pushed = self._gain * self._volts + self._gravity * math.sin(self._angle) - self._damping * self._speed
@@ -67,5 +67,5 @@ class HiddenPlant:
         return {"th": self._angle, "thdot": self._speed, "voltage": self._volts}
 
     def truth(self) -> dict[str, Any]:
-        """Return what a log can tell, in the units of ``pipelines/pendulum/model.py``."""
+        """Return the true parameters, in the units of ``pipelines/pendulum/model.py``."""
         return dict(self._truth)

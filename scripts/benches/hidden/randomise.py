@@ -1,4 +1,4 @@
-"""Does identification pay in training? Hidden robots, each trained for in five ways, and judged on the robot itself.
+"""Benefit of identification for training: policies trained in five ways, and deployed on hidden robots.
 
 The robots are far from ideal: measurements are noisy, latencies jitter, the computer pauses, answers get lost, some
 have play. A deployment succeeds that stays up: within 18 degrees of upright for 80 % of its second half.
@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
-from benches.figures import row
+from benches.figures import row, share
 from benches.hidden import robots as hidden
 from benches.hidden import wall_clock as hidden_wall
 from benches.jobs import robots
@@ -34,8 +33,8 @@ WAYS: dict[str, dict[str, Any]] = {
     "posterior": {"misfit": False, "noise": 0.0, "pauses": False, **GROWING},
     "all": GROWING,
 }
-"""Data sheet; 30 % around it; what was identified; its posterior; that with misfit, timing and noise. What is
-drawn grows as wide as that during the training."""
+"""Data sheet; 30 % around it; the estimate; its posterior; the posterior with misfit, timing and noise. The width of
+the draws grows to its final value during the training."""
 WEAR = hidden.Wear(jitter_s=0.008, lost=0.05, play_rad=0.02, noise_rad=0.05, hiccups_hz=1.5, hiccup_s=0.04)
 QUICK = {"robots": 1, "trials": 1, "seconds": 2.0, "steps": 512, "generations": 5, "record_s": 8.0, "envs": 16}
 
@@ -43,7 +42,7 @@ QUICK = {"robots": 1, "trials": 1, "seconds": 2.0, "steps": 512, "generations": 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     parser.add_argument("--robots", type=int, default=20, help="hidden robots")
-    parser.add_argument("--first", type=int, default=0, help="number of the first of them")
+    parser.add_argument("--first", type=int, default=0, help="number of the first robot")
     parser.add_argument("--trials", type=int, default=10, help="deployments of each policy")
     parser.add_argument("--seconds", type=float, default=8.0, help="length of a deployment")
     parser.add_argument("--record-s", type=float, default=RECORD_S, help="length of the recording")
@@ -51,11 +50,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     for field in fields(hidden.Wear):
         flag = f"--{field.name.replace('_', '-')}"
         parser.add_argument(flag, type=float, default=getattr(WEAR, field.name), help="see hidden_robots.Wear")
-    parser.add_argument("--volts", type=float, default=2.0, help="most that a policy may command")
+    parser.add_argument("--volts", type=float, default=2.0, help="largest command of a policy")
     parser.add_argument("--steps", type=int, default=3_000_000, help="policy steps of a training")
     parser.add_argument("--envs", type=int, default=256, help="copies of a training")
     parser.add_argument("--generations", type=int, default=80, help="generations of the search")
-    parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS), help="what is trained on")
+    parser.add_argument("--ways", nargs="*", default=list(WAYS), choices=list(WAYS), help="kinds of training")
     parser.add_argument("--clock", choices=["simulated", "wall"], default="simulated", help="of the robots")
     parser.add_argument("--jobs", type=int, default=1, help="robots at once, one process each; 1: in this process")
 
@@ -64,35 +63,35 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     """Record, identify, train and deploy for each robot."""
     numbers = list(range(options.first, options.first + options.robots))
     begin = time.perf_counter()
-    found, failed = robots(one_robot, numbers, options)
-    lines = rows(found, options, time.perf_counter() - begin)
+    outcomes, failed = robots(one_robot, numbers, options)
+    lines = rows(outcomes, options, time.perf_counter() - begin)
     lines.append(row("randomise/failed", len(failed), f"of {len(numbers)}", "", "0"))
-    return {"rows": lines, "robots": found, "failed": failed}
+    return {"rows": lines, "robots": outcomes, "failed": failed}
 
 
-def rows(found: list[dict[str, Any]], options: argparse.Namespace, seconds: float) -> list[dict[str, Any]]:
+def rows(outcomes: list[dict[str, Any]], options: argparse.Namespace, seconds: float) -> list[dict[str, Any]]:
     """Return each way's share of success with its exact 95 % interval, all deployments of all robots together."""
     lines = []
     for way in options.ways:
-        good = np.array([np.array(robot["ways"][way]["success"]) >= UPRIGHT for robot in found])
-        still = np.array([np.mean(np.array(robot["ways"][way].get("still", [0.0])) >= UPRIGHT) for robot in found])
-        test = binomtest(int(good.sum()), good.size).proportion_ci(method="exact")
+        good = np.array([np.array(robot["ways"][way]["success"]) >= UPRIGHT for robot in outcomes])
+        still = np.array([np.mean(np.array(robot["ways"][way].get("still", [0.0])) >= UPRIGHT) for robot in outcomes])
+        value, low, high = share(int(good.sum()), good.size)
         name = f"randomise/{'wall/' if options.clock == 'wall' else ''}{way}"
         lines += [
-            row(f"{name}/success", good.mean(), f"of {good.size} deployments", "", ">= 0.95" if way == "all" else ""),
-            row(f"{name}/low95", test.low, "share"),
-            row(f"{name}/high95", test.high, "share"),
+            row(f"{name}/success", value, f"of {good.size} deployments", "", ">= 0.95" if way == "all" else ""),
+            row(f"{name}/low95", low, "share"),
+            row(f"{name}/high95", high, "share"),
             row(f"{name}/still", still.mean(), f"upright and below {STILL_RAD_S} rad/s"),
-            row(f"{name}/robots", int((good.mean(axis=1) >= 0.95).sum()), f"of {len(found)} with 95 %"),
+            row(f"{name}/robots", int((good.mean(axis=1) >= 0.95).sum()), f"of {len(outcomes)} with 95 %"),
         ]
-    accepted = sum(robot["verdict"] == "accepted" for robot in found)
-    lines.append(row("randomise/accepted", accepted, f"of {len(found)} identifications"))
-    lines.append(row("randomise/robot_s", seconds * options.jobs / max(len(found), 1), "s"))
+    accepted = sum(robot["verdict"] == "accepted" for robot in outcomes)
+    lines.append(row("randomise/accepted", accepted, f"of {len(outcomes)} identifications"))
+    lines.append(row("randomise/robot_s", seconds * options.jobs / max(len(outcomes), 1), "s"))
     return lines
 
 
 def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
-    """Return what became of one robot."""
+    """Return the results of one robot."""
     import sim2real
     from sim2real.errors import Sim2RealError
     from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -109,7 +108,7 @@ def one_robot(number: int, options: argparse.Namespace) -> dict[str, Any]:
             try:
                 bundle = sim2real.train(pipeline, identified, train_config(pipeline, way, number, options))
                 motions = deployed(robot, pipeline, bundle, options, Path(folder) / way)
-            except Sim2RealError as error:  # what is not trained, or is stopped by the gate, succeeds never
+            except Sim2RealError as error:  # a policy that is not trained, or that the gate stops, has no success
                 ways[way] = {"success": [0.0] * options.trials, "refused": str(error)}
                 print(f"robot {number}, {way}: {error}", flush=True)
                 continue
@@ -156,8 +155,8 @@ def deployed(
 
 def played(robot: hidden.Hidden, bundle: Any, options: argparse.Namespace, session: int) -> tuple[np.ndarray, ...]:
     """Return times [s], true angles [rad] and speeds [rad/s] of a session on the simulated clock."""
-    found = hidden.play(robot, controller(bundle, options.volts), options.seconds, session)
-    return found.t, found.angle, found.speed
+    session_log = hidden.play(robot, controller(bundle, options.volts), options.seconds, session)
+    return session_log.t, session_log.angle, session_log.speed
 
 
 def upright(t_s: np.ndarray, angle: np.ndarray, speed: np.ndarray, fastest: float) -> float:
@@ -175,11 +174,11 @@ def upright(t_s: np.ndarray, angle: np.ndarray, speed: np.ndarray, fastest: floa
 
 def train_config(pipeline: Any, way: str, seed: int, options: argparse.Namespace) -> Any:
     """Return the training's configuration for one of ``WAYS``."""
-    told = dict(WAYS[way])
-    top = {n: told.pop(n) for n in ("model", "randomise") if n in told}
+    settings = dict(WAYS[way])
+    top = {n: settings.pop(n) for n in ("model", "randomise") if n in settings}
     few = {"minibatches": 2, "evaluations": 1} if options.envs < pipeline.train.ppo.minibatches else {}
     ppo = replace(pipeline.train.ppo, total_steps=options.steps, num_envs=options.envs, **few)
-    vary = replace(pipeline.train.vary, **told)
+    vary = replace(pipeline.train.vary, **settings)
     return replace(pipeline.train, seed=seed, force=True, vary=vary, ppo=ppo, **top)
 
 
@@ -193,14 +192,14 @@ def controller(bundle: Any, volts: float) -> Callable[[float, float], float]:
 
     backend = NumpyBackend(bundle.weights)
     history = int(next(t.history for t in bundle.contract.observation if t.history > 1))
-    seen, sent = np.zeros((history, 3)), np.zeros(history)
+    readings, sent = np.zeros((history, 3)), np.zeros(history)
 
     def act(angle: float, speed: float) -> float:
         now = np.array([np.cos(angle), np.sin(angle), speed / 10.0])
-        observation = np.concatenate([now, seen.ravel(), sent]).astype(np.float32)
+        observation = np.concatenate([now, readings.ravel(), sent]).astype(np.float32)
         command = float(np.clip(backend(observation)[0], -volts, volts))
-        seen[1:], sent[1:] = seen[:-1].copy(), sent[:-1].copy()
-        seen[0], sent[0] = now, command
+        readings[1:], sent[1:] = readings[:-1].copy(), sent[:-1].copy()
+        readings[0], sent[0] = now, command
         return command
 
     return act

@@ -1,8 +1,7 @@
-"""Pendulums that nobody has seen: drawn by chance, simulated without the package on a clock of their own.
+"""Pendulums with random parameters, simulated on their own clock without the package.
 
-A disk on a servo, integrated in steps of 0.5 ms by hand. A loop of 50 Hz measures it late, with jitter, an encoder's
-counts and play, and commands it late; bus answers get lost. What is drawn stays here: the stages get a log, as of any
-robot.
+A disk on a servo is integrated in steps of 0.5 ms. A loop of 50 Hz measures it late, with jitter, an encoder's counts
+and play, and commands it late; some bus answers are lost. The stages get only the log, as of any robot.
 """
 
 from __future__ import annotations
@@ -21,23 +20,23 @@ from sim2real.log.writer import McapRecorder
 RATE_HZ, STEP_S = 50.0, 5e-4
 COUNT_RAD, SPEED_COUNT_RAD_S = 2 * math.pi / 4096, 0.229 * 2 * math.pi / 60
 SHEET = {"gain": 26.96, "gravity": 129.5, "damping": 0.99, "friction": 6.1}
-"""About the pendulum's data sheet, around which robots are drawn: [rad/s^2/V], [rad/s^2], [1/s], [rad/s^2]."""
+"""The pendulum's data sheet, the centre of all draws: [rad/s^2/V], [rad/s^2], [1/s], [rad/s^2]."""
 SPREAD = 0.3
 _RETRY_S = 0.004
 SPEED_NOISE = 15.0
-"""A speed is this many times as noisy as an angle [1/s]."""
+"""Noise of a speed over that of an angle [1/s]."""
 Controller = Callable[[float, float], float]
 """Angle [rad] and angular velocity [rad/s], as measured -> voltage [V]."""
 
 
 @dataclass(frozen=True)
 class Wear:
-    """How far robots that are drawn may be from ideal ones.
+    """Limits of the defects of drawn robots.
 
     Attributes:
         jitter_s: Largest deviation of either latency [s].
-        lost: Share of the answers that are lost, where some are.
-        play_rad: Half of the encoder's backlash, where there is some [rad].
+        lost: Share of lost answers, for robots with losses.
+        play_rad: Half of the encoder's backlash, for robots with backlash [rad].
         noise_rad: Largest deviation of the encoder's noise [rad]; the speed's is 15 times that [rad/s].
         hiccups_hz: Pauses of the computer a second.
         hiccup_s: Their mean length [s].
@@ -63,10 +62,10 @@ class Hidden:
         sensing: Mean age of a measurement.
         acting: Mean time from a command to the motor.
         jitter: Deviation of each.
-        lost: Share of the answers that are lost, and asked for again.
+        lost: Share of lost answers, which are requested again.
         play: Half of the encoder's backlash [rad].
         noise: Deviation of the encoder's noise [rad].
-        hiccups: Pauses of the computer a second, of a mean length.
+        hiccups: Pauses of the computer per second, and their mean length.
         seed: Of jitter and losses.
     """
 
@@ -87,13 +86,13 @@ class Hidden:
     def draw(seed: int, wear: Wear = Wear()) -> Hidden:
         """Draw a robot: within 30 % of the data sheet, 10 to 60 ms late, a third each with losses, play, a payload."""
         rng = np.random.default_rng([20261123, seed])
-        own = {n: v * rng.uniform(1 - SPREAD, 1 + SPREAD) for n, v in SHEET.items()}
+        parameters = {n: v * rng.uniform(1 - SPREAD, 1 + SPREAD) for n, v in SHEET.items()}
         total, share = rng.uniform(0.010, 0.060), rng.uniform(0.3, 0.7)
         losses, play, payload = rng.random(3) < 1 / 3
         if payload:  # the inertia grows, so that the motor gets weaker
-            own["gain"] *= 0.85
+            parameters["gain"] *= 0.85
         return Hidden(
-            **own,
+            **parameters,
             sensing=share * total,
             acting=(1 - share) * total,
             jitter=rng.uniform(0.0, wear.jitter_s),
@@ -129,11 +128,8 @@ class Played:
 
 
 def play(robot: Hidden, controller: Controller, seconds: float, session: int) -> Played:
-    """Run a session from rest, hanging.
-
-    Args:
-        session: Its number: jitter and losses differ from one to the next.
-    """
+    """Run a session from rest, hanging; ``session`` is the seed of jitter and losses."""
+    # Draw all times first: computation, ages of measurements, delays of commands.
     rng = np.random.default_rng([robot.seed, session])
     count, steps = int(seconds * RATE_HZ), int(seconds / STEP_S) + 1
     angle, speed, encoder = np.zeros(steps), np.zeros(steps), np.zeros(steps)
@@ -149,6 +145,7 @@ def play(robot: Hidden, controller: Controller, seconds: float, session: int) ->
     noise = robot.noise * np.array([1.0, SPEED_NOISE]) * rng.standard_normal((count, 2)) if robot.noise else None
     t_step, begin_agent, begin_actuator, sent = one_after_another(count, took)
     acts = np.maximum.accumulate(sent + lags)
+    # Integrate up to each measurement, with the commands that act until then.
     measured, volts = np.zeros((count, 2)), np.zeros(count)
     now, done = 0, -1
     for k in range(count):
@@ -171,13 +168,12 @@ def play(robot: Hidden, controller: Controller, seconds: float, session: int) ->
 
 
 def one_after_another(count: int, took: dict[str, np.ndarray], rate_hz: float = RATE_HZ) -> tuple[np.ndarray, ...]:
-    """Return when each step of sensor, agent and actuator starts, and when the last ends, all ``(N,)`` [s].
+    """Return the starts of the steps of sensor, agent and actuator, and the ends of the last, all ``(N,)`` [s].
 
-    A node waits for its input, and for its own last step to end.
+    A node waits for its input, and for the end of its own last step.
 
     Args:
-        took: Node -> how long its steps take ``(N,)`` [s].
-        rate_hz: Steps per second [Hz].
+        took: Node -> duration of its steps ``(N,)`` [s].
     """
     starts = {n: np.zeros(count) for n in took}
     ends = {n: np.zeros(count) for n in took}
@@ -190,7 +186,7 @@ def one_after_another(count: int, took: dict[str, np.ndarray], rate_hz: float = 
 
 
 def _advance(robot: Hidden, angle: np.ndarray, speed: np.ndarray, encoder: np.ndarray, i: int, volts: float) -> None:
-    """Integrate one step: semi-implicit, with friction that stops what it can."""
+    """Integrate one step: semi-implicit, with friction."""
     pushed = robot.gain * volts + robot.gravity * math.sin(angle[i]) - robot.damping * speed[i]
     free = speed[i] + STEP_S * pushed
     speed[i + 1] = math.copysign(max(abs(free) - STEP_S * robot.friction, 0.0), free)
@@ -199,11 +195,7 @@ def _advance(robot: Hidden, angle: np.ndarray, speed: np.ndarray, encoder: np.nd
 
 
 def excited(seconds: float, seed: int, volts: float = 1.8) -> Controller:
-    """Return a multisine.
-
-    Args:
-        volts: Its largest value [V].
-    """
+    """Return a multisine of at most ``volts``."""
     rng = np.random.default_rng(seed)
     t = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
     tones, phases = np.linspace(0.2, 3.0, 24), rng.uniform(0, 2 * np.pi, 24)
@@ -213,20 +205,16 @@ def excited(seconds: float, seed: int, volts: float = 1.8) -> Controller:
 
 
 def probed(volts: float = 1.5, steps: int = 8) -> Controller:
-    """Return what a deployment does first, to measure the delay: small steps to both sides, each from rest.
-
-    Args:
-        volts: Size of a step [V].
-    """
-    made, left, still = 0, 0, 0
+    """Return the small steps that measure the delay before a deployment: to both sides, each from rest."""
+    count, left, still = 0, 0, 0
 
     def act(angle: float, speed: float) -> float:
-        nonlocal made, left, still
+        nonlocal count, left, still
         del angle
         left, still = max(left - 1, 0), 0 if left or abs(speed) > 0.05 else still + 1
-        if still >= 5 and made < steps:
-            made, left, still = made + 1, 8, 0
-        return volts * (-1) ** made if left else 0.0
+        if still >= 5 and count < steps:
+            count, left, still = count + 1, 8, 0
+        return volts * (-1) ** count if left else 0.0
 
     return act
 
@@ -251,9 +239,8 @@ def write_log(
 
     Args:
         times: Node -> starts, and ends, of its steps ``(N,)`` [s].
-        readings: What the sensor sent in each step: a message, or a mapping of fields.
-        commands: What the agent sent, and the actuator let through, likewise.
-        units: Field -> unit.
+        readings: The sensor's output of each step: a message, or a mapping of fields.
+        commands: The output of agent and actuator of each step, likewise.
     """
     nodes = {"sensor": None, "agent": "sensor", "actuator": "agent"}
     graph = {

@@ -19,10 +19,10 @@ def put_on_the_bus(robot: Hidden, pipeline: Any) -> None:
 
     The computer's own pauses are those of this machine: ``hiccups`` are not played.
     """
-    made = pipeline.load()
+    pipeline_robot = pipeline.load()
     jitter = math.sqrt(3.0) * robot.jitter
     emulator = replace(
-        made.embedded.emulator,
+        pipeline_robot.embedded.emulator,
         sensing_latency_s=robot.sensing,
         sensing_jitter_s=min(jitter, robot.sensing),
         actuation_latency_s=robot.acting,
@@ -34,7 +34,7 @@ def put_on_the_bus(robot: Hidden, pipeline: Any) -> None:
         "speed_noise": float(SPEED_NOISE * robot.noise),
         "seed": robot.seed,
     }
-    made.embedded = replace(made.embedded, plant=PLANT, emulator=emulator, plant_args=plant)
+    pipeline_robot.embedded = replace(pipeline_robot.embedded, plant=PLANT, emulator=emulator, plant_args=plant)
 
 
 def record(pipeline: Any, folder: Path, seconds: float, volts: float, seed: int) -> Any:
@@ -56,9 +56,9 @@ def deploy(pipeline: Any, bundle: Any, folder: Path, seconds: float, trials: int
 
     folder.mkdir()
     config = replace(pipeline.deploy, duration_s=seconds, episodes=trials, measure_delay=False)
-    found = sim2real.deploy(pipeline, bundle, folder, config)
+    deployment = sim2real.deploy(pipeline, bundle, folder, config)
     motions = []
-    for recording in found.recordings:
+    for recording in deployment.recordings:
         t_s, states = recording.true_states()
         motions.append((t_s, states["th"], states["thdot"]))
     return motions

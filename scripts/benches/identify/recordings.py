@@ -1,4 +1,4 @@
-"""The real recordings that identification is judged on, read from a folder and selected by a text."""
+"""The recordings of real motors, read from a folder and selected by a text."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SPECS = {
     "so101_log_test": "step_response single_joint_*[0.5:1]",
 }  # fmt: skip
 PAST = 20
-"""Samples of the disk before a test part that its initial state may be estimated from."""
+"""Number of samples before a test part of the disk from which its initial state is estimated."""
 
 
 def load(case: str, data: Path, spec: str, past: int = 0) -> dict[str, Episode]:
@@ -45,11 +45,11 @@ def load(case: str, data: Path, spec: str, past: int = 0) -> dict[str, Episode]:
         raise UsageError(
             f"{data} is no file {pattern} and no folder with such files", hint=f"--data: {case}'s recordings"
         )
-    found = {"disk": _disk, "xl330": _xl330, "so101_log": _so101}[case](files, spec, past)
-    if not found:
+    episodes = {"disk": _disk, "xl330": _xl330, "so101_log": _so101}[case](files, spec, past)
+    if not episodes:
         names = ", ".join(f.name for f in files)
-        raise UsageError(f"{spec!r} selects nothing of {names}", hint="say with --fit and --test what to take of them")
-    return found
+        raise UsageError(f"{spec!r} selects no part of {names}", hint="select parts with --fit and --test")
+    return episodes
 
 
 def _mapping(case: str) -> Path:
@@ -69,18 +69,20 @@ def _disk(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
 def _xl330(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
     del past
     wanted = dict(part.split("=") for part in spec.split() if part != "all")
-    found = {}
+    episodes = {}
     for file in files:
         about = json.loads(file.read_text())
-        own = {"kp": str(about["kp"]), "motion": about["trajectory"], "file": file.stem}
-        if all(own[key] in values.split(",") for key, values in wanted.items()):
-            found[f"kp {own['kp']} {own['motion']} {file.stem}"] = import_file(file, load_mapping(_mapping("xl330")))
-    return found
+        labels = {"kp": str(about["kp"]), "motion": about["trajectory"], "file": file.stem}
+        if all(labels[key] in values.split(",") for key, values in wanted.items()):
+            episodes[f"kp {labels['kp']} {labels['motion']} {file.stem}"] = import_file(
+                file, load_mapping(_mapping("xl330"))
+            )
+    return episodes
 
 
 def _so101(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
     del past
-    found = {}
+    episodes = {}
     for part in spec.split():
         pattern, _, share = part.partition("[")
         a, b = (float(x) for x in share.rstrip("]").split(":")) if share else (0.0, 1.0)
@@ -89,7 +91,7 @@ def _so101(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
                 with np.load(file) as content:
                     count = len(content["t_meas_s"])
                 samples = slice(round(a * count), round(b * count))
-                found[f"{file.stem}[{a:g}:{b:g}]" if share else file.stem] = import_file(
+                episodes[f"{file.stem}[{a:g}:{b:g}]" if share else file.stem] = import_file(
                     file, load_mapping(_mapping("so101_log")), samples
                 )
-    return found
+    return episodes

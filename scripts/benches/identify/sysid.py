@@ -2,7 +2,7 @@
 
 Every rig is one hinge (or six that do not touch each other) with a point mass, an armature, viscous damping and dry
 friction (``frictionloss``), fitted by the toolbox's default optimiser (Gauss-Newton on finite differences, scaled by
-the Jacobian) to free runs over whole recordings. What the toolbox offers is used as it is, with these choices:
+the Jacobian) to free runs over whole recordings. The toolbox is used unchanged, with these choices:
 
 - Commands are held between samples. The toolbox resamples them linearly, which smears a held command by half a sample,
   so they are expanded to physics steps beforehand and its resampling is switched off.
@@ -45,10 +45,10 @@ class Recording:
 
     Attributes:
         t: stamps [s], shape (N,).
-        command: what was sent at each stamp and held until the next, shape (N, k).
+        command: command at each stamp, held until the next, shape (N, k).
         position: measured joint positions [rad], shape (N, joints).
         start: position and velocity at the first stamp, shape (joints, 2).
-        constants: what is known of this recording. Of the XL330: ``kp``, the register of the position gain, ``mass``
+        constants: constants of this recording; for the XL330 ``kp``, the register of the position gain, ``mass``
             [kg] and ``length`` [m] of the load, and ``torque_enable``, shape (N,).
     """
 
@@ -72,16 +72,13 @@ class Recording:
 
 @dataclass(frozen=True)
 class SysidResult:
-    """What ``mujoco.sysid`` reached.
+    """The result of ``mujoco.sysid``.
 
     Attributes:
-        values: the parameters by name.
-        interval95: lower and upper limit by name.
         predictions: free runs over the test recordings at the measured stamps, shape (N, joints) each.
         seconds: wall-clock time of the optimisation.
         evaluations: roll-outs of all fitted recordings, those of finite differences too.
-        evaluations_per_s: evaluations over seconds.
-        physics_steps_per_evaluation: how many physics steps one of them is.
+        physics_steps_per_evaluation: number of physics steps of one of them.
     """
 
     values: dict[str, float]
@@ -109,7 +106,7 @@ class _Run:
         return sysid.TimeSeries(grid, self.recording.command[held])
 
     def sequences(self, name: str) -> sysid.ModelSequences:
-        """Return what the toolbox fits."""
+        """Return the toolbox's form of the recording."""
         recording, model = self.recording, self.spec.compile()
         measured = sysid.TimeSeries.from_names(recording.t - recording.t[0], recording.position, model, [SENSOR])
         position, velocity = recording.start.T
@@ -143,7 +140,7 @@ def _modifier(put: Put) -> Callable[[mujoco.MjSpec, sysid.Parameter], None]:
 def _parameters(
     rows: dict[str, tuple[float, float, float, Put]], delay: bool
 ) -> tuple[sysid.ParameterDict, sysid.SignalTransform]:
-    """Return parameters (first guess, bounds and what each sets), and the transform that delays the sensor."""
+    """Return parameters (first guess, bounds, setter), and the transform that delays the sensor."""
     parameters, transform = sysid.ParameterDict(), sysid.SignalTransform(normalize=False)
     for name, (guess, low, high, put) in rows.items():
         parameters.add(sysid.Parameter(name, guess, low, high, modifier=_modifier(put)))
@@ -154,7 +151,7 @@ def _parameters(
 
 
 class _Counted:
-    """The toolbox's residual function, which counts what it evaluates."""
+    """The toolbox's residual function, with a counter of evaluations."""
 
     def __init__(self, runs: Sequence[_Run], transform: sysid.SignalTransform) -> None:
         sequences = [run.sequences(f"run{i}") for i, run in enumerate(runs)]
@@ -176,9 +173,9 @@ def _fit(
     residual = _Counted(runs, transform)
     begin = time.perf_counter()
     with contextlib.redirect_stdout(io.StringIO()):
-        best, found = sysid.optimize(parameters, residual, verbose=False, max_iters=iterations, x_scale="jac")
+        best, optimum = sysid.optimize(parameters, residual, verbose=False, max_iters=iterations, x_scale="jac")
     seconds, evaluations = time.perf_counter() - begin, residual.evaluations
-    _, half = sysid.calculate_intervals(residual(found.x, best)[0], found.jac)
+    _, half = sysid.calculate_intervals(residual(optimum.x, best)[0], optimum.jac)
     values = {name: float(best[name].value[0]) for name in best.keys()}  # noqa: SIM118
     interval = {name: (v - float(h), v + float(h)) for (name, v), h in zip(values.items(), half, strict=True)}
     return best, SysidResult(values, interval, [], seconds, evaluations, evaluations / seconds, residual.steps)
@@ -326,15 +323,15 @@ def so101(fit: list[Recording], test: list[Recording], delay: bool) -> SysidResu
     }
     spec = _spec(PHYSICS_S["so101"], 1e-9, 0.1, 0.01)
     spans = [r.part(0, int(np.searchsorted(r.t, r.t[0] + SO101_SPAN_S))) for r in fit]
-    found, columns = [], []
+    results, columns = [], []
     for index in range(len(SO101_JOINTS)):
         parameters, transform = _parameters(rows, delay)
         runs = [_Run(span.joint(index), spec) for span in spans]
         best, result = _fit(runs, parameters, transform, ITERATIONS["so101"])
-        found.append(result)
+        results.append(result)
         columns.append([_free_run(best, [_Run(r.joint(index), spec)]) for r in test])
-    seconds, evaluations = sum(r.seconds for r in found), sum(r.evaluations for r in found)
-    named = list(zip(SO101_JOINTS, found, strict=True))
+    seconds, evaluations = sum(r.seconds for r in results), sum(r.evaluations for r in results)
+    named = list(zip(SO101_JOINTS, results, strict=True))
     return SysidResult(
         {f"{joint}.{name}": value for joint, r in named for name, value in r.values.items()},
         {f"{joint}.{name}": limits for joint, r in named for name, limits in r.interval95.items()},
@@ -342,5 +339,5 @@ def so101(fit: list[Recording], test: list[Recording], delay: bool) -> SysidResu
         seconds,
         evaluations,
         evaluations / seconds,
-        found[0].physics_steps_per_evaluation,
+        results[0].physics_steps_per_evaluation,
     )

@@ -1,4 +1,4 @@
-"""What mujoco.sysid reaches on the recordings that our identification is judged on, in the same run."""
+"""The errors of mujoco.sysid on the recordings and parts of our identification, in the same run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def rows(case: str, fitted: Mapping[str, Episode], test: Mapping[str, Episode], 
 
 
 def recording(episode: Episode, command: str, field: str, **constants: object) -> sysid.Recording:
-    """Return an episode as the yardstick takes it; it starts at the first measured position, at rest."""
+    """Return an episode in the yardstick's form; it starts at the first measured position, at rest."""
     t = episode.steps["sensor"].begun_s
     commands, position = (
         np.asarray(a, np.float64) for a in (_of(episode, "actuator", command), _of(episode, "sensor", field))
@@ -37,23 +37,23 @@ def _disk(fitted: list[Episode], test: Mapping[str, Episode], ours: Mapping[str,
     whole = recording(next(iter(test.values())), "action", "th")
     slope = np.polyfit(whole.t[PAST - 12 : PAST + 1] - whole.t[PAST], whole.position[PAST - 12 : PAST + 1, 0], 3)
     part = whole.part(PAST, len(whole.t), np.array([[slope[3], slope[2]]]))
-    found: list[Row] = []
+    lines: list[Row] = []
     for delay in (False, True):
         result = sysid.disk(recording(fitted[0], "action", "th"), [part], delay)
         error = float(np.sqrt(np.mean((result.predictions[0] - part.position) ** 2)))
         name = "disk/sysid" if delay else "disk/sysid_no_delay"
         about = f"mujoco.sysid, {result.evaluations} evaluations"
-        found += [(f"{name}_free_run_rmse_rad", error, "rad", about, ""), (f"{name}_s", result.seconds, "s", about, "")]
+        lines += [(f"{name}_free_run_rmse_rad", error, "rad", about, ""), (f"{name}_s", result.seconds, "s", about, "")]
         if delay:
             low, high = result.interval95["delay"]
-            found.append(
+            lines.append(
                 ("disk/sysid_delay_ms", 1e3 * result.values["delay"], "ms", f"{1e3 * low:.2f} to {1e3 * high:.2f}", "")
             )
             ratio = ours["disk/free_run_rmse_rad"] / error
-            found.append(
+            lines.append(
                 ("disk/free_run_over_sysid", ratio, "1", "mujoco.sysid with delay, and a constant torque", "<= 0.75")
             )
-    return found
+    return lines
 
 
 def _xl330(fitted: list[Episode], test: Mapping[str, Episode], ours: Mapping[str, float]) -> list[Row]:
@@ -62,18 +62,18 @@ def _xl330(fitted: list[Episode], test: Mapping[str, Episode], ours: Mapping[str
         kp = int(_of(episode, "actuator", "kp")[0, 0])
         return recording(episode, "goal", "position", kp=kp, mass=0.49, length=0.1, torque_enable=on)
 
-    found: list[Row] = []
+    lines: list[Row] = []
     judged = [of(e) for e in test.values()]
     for delay in (False, True):
         result = sysid.xl330([of(e) for e in fitted], judged, delay)
         error = np.mean([np.abs(p - r.position).mean() for p, r in zip(result.predictions, judged, strict=True)])
         name = "xl330/sysid" if delay else "xl330/sysid_no_delay"
         about = f"mujoco.sysid, {result.evaluations} evaluations in {result.seconds:.0f} s"
-        found.append((f"{name}_test_mae_mrad", 1e3 * float(error), "mrad", about, ""))
+        lines.append((f"{name}_test_mae_mrad", 1e3 * float(error), "mrad", about, ""))
         if delay:
             ratio = ours["xl330/test_mae_mrad"] / (1e3 * float(error))
-            found.append(("xl330/test_mae_over_sysid", ratio, "1", "mujoco.sysid with delay", ""))
-    return found
+            lines.append(("xl330/test_mae_over_sysid", ratio, "1", "mujoco.sysid with delay", ""))
+    return lines
 
 
 def _so101(fitted: list[Episode], test: Mapping[str, Episode], ours: Mapping[str, float]) -> list[Row]:
@@ -82,13 +82,13 @@ def _so101(fitted: list[Episode], test: Mapping[str, Episode], ours: Mapping[str
     judged = [recording(e, "goal", "position") for e in test.values()]
     longest = [e for e in fitted if e.duration_s > 60.0]  # each joint moves in those
     result = sysid.so101([recording(e, "goal", "position") for e in longest or fitted], judged, True)
-    found: list[Row] = []
-    for name, predicted, own in zip(test, result.predictions, judged, strict=True):
-        error = 1e3 * np.sqrt(np.mean((predicted - own.position) ** 2, axis=0))
-        moved = np.ptp(own.command, axis=0) > 0.02
-        found += [
-            (f"so101/{name}/{joint}_sysid_rmse_mrad", float(e), "mrad", "mujoco.sysid, each joint by itself", "")
+    lines: list[Row] = []
+    for name, predicted, truth in zip(test, result.predictions, judged, strict=True):
+        error = 1e3 * np.sqrt(np.mean((predicted - truth.position) ** 2, axis=0))
+        moved = np.ptp(truth.command, axis=0) > 0.02
+        lines += [
+            (f"so101/{name}/{joint}_sysid_rmse_mrad", float(e), "mrad", "mujoco.sysid, each joint alone", "")
             for joint, e, m in zip(joints, error, moved, strict=True)
             if m
         ]
-    return found
+    return lines

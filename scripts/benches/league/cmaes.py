@@ -7,15 +7,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-MOST = 1e12
-"""Loss of a candidate that ended as no number."""
+WORST_LOSS = 1e12
+"""Loss of a candidate whose simulation returned NaN or infinity."""
 
 
 class CmaEs:
     """One run.
 
     Args:
-        mean: Where it begins ``(P,)``, within [0, 1].
+        mean: Start ``(P,)``, within [0, 1].
     """
 
     def __init__(self, mean: np.ndarray, sigma: float, population: int, rng: np.random.Generator) -> None:
@@ -31,7 +31,7 @@ class CmaEs:
         self.mean, self.sigma, self._c = mean.copy(), sigma, np.eye(n)
         self._ps, self._pc, self._generation = np.zeros(n), np.zeros(n), 0
 
-    def ask(self) -> np.ndarray:
+    def sample(self) -> np.ndarray:
         """Return candidates ``(population, P)``, drawn again a few times where they leave the box."""
         self._d, self._b = np.linalg.eigh(self._c)
         self._d = np.sqrt(np.maximum(self._d, 1e-20))
@@ -42,8 +42,8 @@ class CmaEs:
             steps[out] = draw(int(out.sum()))
         return np.clip(self.mean + self.sigma * steps, 0.0, 1.0)
 
-    def tell(self, candidates: np.ndarray, losses: np.ndarray) -> None:
-        """Learn from a generation.
+    def update(self, candidates: np.ndarray, losses: np.ndarray) -> None:
+        """Update mean, step size and covariance from a generation.
 
         Args:
             candidates: Shape ``(population, P)``.
@@ -72,30 +72,30 @@ def minimise(
     sigma: float = 0.25,
     population: int = 0,
 ) -> tuple[np.ndarray, float, int]:
-    """Search until a deadline, with a restart from elsewhere and twice the population whenever a run has converged.
+    """Search until a deadline; after convergence, restart at a random place with twice the population.
 
     Args:
         losses: Candidates ``(N, P)`` in the unit box -> ``(N,)``.
-        start: Where the first run begins ``(P,)``.
-        deadline: On the clock of the process's processor time [s]; one generation is always made.
-        population: Candidates a generation of the first run; 0: as the tutorial says.
+        start: Start of the first run ``(P,)``.
+        deadline: On the clock of the process's processor time [s]; at least one generation is evaluated.
+        population: Candidates of a generation of the first run; 0: the tutorial's.
 
     Returns:
-        The best candidate, its loss, and how many were evaluated.
+        The best candidate, its loss, and the number of evaluations.
     """
     rng = np.random.default_rng(seed)
     count = population or 4 + int(3 * np.log(len(start)))
     best, lowest, evaluated = start.copy(), np.inf, 0
     run = CmaEs(start, sigma, count, rng)
     while True:
-        candidates = run.ask()
-        found = np.nan_to_num(losses(candidates), nan=MOST, posinf=MOST)
-        evaluated += len(found)
-        if found.min() < lowest:
-            lowest, best = float(found.min()), candidates[np.argmin(found)].copy()
+        candidates = run.sample()
+        values = np.nan_to_num(losses(candidates), nan=WORST_LOSS, posinf=WORST_LOSS)
+        evaluated += len(values)
+        if values.min() < lowest:
+            lowest, best = float(values.min()), candidates[np.argmin(values)].copy()
         if time.process_time() > deadline:
             return best, lowest, evaluated
-        run.tell(candidates, found)
-        if np.ptp(found) <= 1e-3 * abs(found.min()) or run.sigma < 1e-4:
+        run.update(candidates, values)
+        if np.ptp(values) <= 1e-3 * abs(values.min()) or run.sigma < 1e-4:
             count *= 2
             run = CmaEs(rng.uniform(0.0, 1.0, len(start)), sigma, count, rng)

@@ -1,11 +1,11 @@
-"""MuJoCo's joints in the league: mujoco.sysid as its user would, the same with a delay and more terms, and PACE's form.
+"""MuJoCo's joints in the league: mujoco.sysid plain, with a delay and more terms, and PACE's form.
 
-All three simulate the same models and are scored by the toolbox's own residuals; what differs is what is identified,
-and how. mujoco.sysid: its default optimiser from a guess, then from random places until the time is over. PACE (F.
+All three simulate the same models with the toolbox's own residuals; parameters and optimisers differ. mujoco.sysid: its
+default optimiser from a guess, then from random places until the time is over. PACE (F.
 Bjelonic et al., "Towards Bridging the Gap: Systematic Sim-to-Real Transfer for Diverse Legged Robots",
 leggedrobotics/pace-sim2real f8ec8b85): of each joint armature, viscous damping, friction and encoder bias, and one
-delay in whole steps, by CMA-ES from the middle of the bounds with sigma 0.5; the drive's gain beside them, as its
-authors advise where that is not known.
+delay in whole steps, by CMA-ES from the middle of the bounds with sigma 0.5; also the drive's gain, as its authors
+advise if that is unknown.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ GO2_KP, GO2_KD = 20.0, 0.5
 _SERVO = (0.003, 0.0002, 0.03)
 _ARMATURE = {"disk": (1e-4, 1e-6, 1e-3), "xl330": _SERVO, "sts3250": (0.01, 0.0002, 0.1), "so101": (0.01, 1e-3, 0.1)}
 _TORQUE = {"xl330": (0.5, 0.1, 2.0), "sts3250": (4.0, 0.5, 15.0)}
-"""Around what the makers say of the torque at standstill [N m]."""
+"""Guess and bounds around the data sheet's torque at standstill [N m]."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """What of one rig is simulated and identified.
+    """Simulated parts and parameters of one rig; parameters are name -> first guess, bounds, setter.
 
     Attributes:
-        runs: A recording -> the parts of it that are simulated one after the other.
-        plain: What a user of the toolbox identifies: name -> first guess, bounds, what it sets.
-        more: What we identify besides, without the delay.
-        pace: What PACE identifies, without biases and the delay.
+        runs: Recording -> its parts, which are simulated one after the other.
+        plain: Parameters of a user of the toolbox.
+        more: Our further parameters, without the delay.
+        pace: PACE's parameters, without biases and the delay.
         bias: Sets an encoder's bias in the drive: the joint's number, the bias [rad]; None without a position drive.
     """
 
@@ -71,25 +71,21 @@ class _Residual:
     def __call__(self, x: np.ndarray, parameters: sysid.ParameterDict, **options: Any) -> Any:
         if self.evaluations and time.process_time() > self.deadline:
             raise _TimeOver
-        found = self._function(x, parameters, **options)
+        residuals = self._function(x, parameters, **options)
         columns = x.reshape(len(x), -1)
         self.evaluations += columns.shape[1]
-        stacked = np.nan_to_num(np.concatenate(found[0]), nan=1e3).reshape(-1, columns.shape[1])
+        stacked = np.nan_to_num(np.concatenate(residuals[0]), nan=1e3).reshape(-1, columns.shape[1])
         losses = np.sum(stacked**2, axis=0)
         if np.min(losses) < self.lowest:
             self.lowest, self.best = float(np.min(losses)), columns[:, int(np.argmin(losses))].copy()
         self.losses = losses
-        return found
+        return residuals
 
 
 def fit_sysid(
     rig: Rig, fitted: Sequence[Recording], ours: bool, budget_s: float, seed: int
 ) -> tuple[Callable[[Sequence[Recording]], list[np.ndarray]], str]:
-    """Fit with the toolbox's optimiser within a budget, from several places.
-
-    Returns:
-        What predicts recordings, and what was done in words.
-    """
+    """Fit with the toolbox's optimiser within a budget, from several places; return the predictor and a summary."""
     parameters, transform = _parameters({**rig.plain, **(rig.more if ours else {})}, ours)
     runs = [run for r in fitted for run in rig.runs(r)]
     residual, starts = _Residual(runs, transform, time.process_time() + budget_s), 0
@@ -103,18 +99,14 @@ def fit_sysid(
                 break
             parameters.randomize(rng)
     parameters.update_from_vector(residual.best)
-    told = f"{residual.evaluations} evaluations, {starts} starts"
-    return lambda own: [predict(rig, parameters, r) for r in own], told
+    summary = f"{residual.evaluations} evaluations, {starts} starts"
+    return lambda recordings: [predict(rig, parameters, r) for r in recordings], summary
 
 
 def fit_pace(
     rig: Rig, fitted: Sequence[Recording], budget_s: float, seed: int
 ) -> tuple[Callable[[Sequence[Recording]], list[np.ndarray]], str]:
-    """Fit PACE's parameters with CMA-ES within a budget.
-
-    Returns:
-        What predicts recordings, and what was done in words.
-    """
+    """Fit PACE's parameters with CMA-ES within a budget; return the predictor and a summary."""
     joints = fitted[0].position.shape[1]
     biases = {f"bias{j}": (0.0, -0.1, 0.1, _bias(rig, j)) for j in range(joints)}
     parameters, transform = _parameters({**rig.pace, **biases}, True)
@@ -139,16 +131,16 @@ def fit_pace(
         raise ValueError("the delay does not stand before the biases")
     u, _, count = minimise(losses, np.full(len(low), 0.5), deadline, seed, sigma=0.5)
     parameters.update_from_vector(values(u))
-    return lambda own: [predict(rig, parameters, r) for r in own], f"{count} evaluations"
+    return lambda recordings: [predict(rig, parameters, r) for r in recordings], f"{count} evaluations"
 
 
-def predict(rig: Rig, parameters: sysid.ParameterDict, own: Recording) -> np.ndarray:
+def predict(rig: Rig, parameters: sysid.ParameterDict, recording: Recording) -> np.ndarray:
     """Return positions at the recording's stamps, from its first state ``(N, joints)`` [rad]."""
-    found = rigs._free_run(parameters, rig.runs(own))
+    free_run = rigs._free_run(parameters, rig.runs(recording))
     biases = [
-        float(parameters[f"bias{j}"].value[0]) if f"bias{j}" in parameters else 0.0 for j in range(found.shape[1])
+        float(parameters[f"bias{j}"].value[0]) if f"bias{j}" in parameters else 0.0 for j in range(free_run.shape[1])
     ]
-    return found + np.array(biases)
+    return free_run + np.array(biases)
 
 
 def _parameters(rows: dict[str, Row], delay: bool) -> tuple[sysid.ParameterDict, sysid.SignalTransform]:
@@ -173,7 +165,7 @@ def _bias(rig: Rig, joint: int) -> rigs.Put:
 
 
 def _feed_back(spec: mujoco.MjSpec, joint: int, value: float) -> None:
-    """Have a position drive, whose gain is set, see the encoder's bias; not added, as the toolbox keeps one spec."""
+    """Set the encoder's bias in a position drive whose gain is set before; the toolbox keeps one spec for all calls."""
     drive = spec.actuators[joint]
     drive.biasprm[0] = drive.biasprm[1] * value
 
@@ -186,9 +178,9 @@ def one_joint(kind: str) -> Rig:
         joint = {"damping": (0.0005, 0.0, 0.01, rigs._damping), "frictionloss": (0.0005, 0.0, 0.02, rigs._friction)}
         drive = {"mass": (0.1, 0.01, 1.0, rigs._mass), "gain": (0.005, 0.0005, 0.1, rigs._gain)}
         bias = {"torque": (0.0, -0.01, 0.01, rigs._bias)}
-        known = {"gain": drive["gain"]}  # its load is known
+        motor = {"gain": drive["gain"]}  # its load is given
         runs = lambda r: [rigs._Run(r, spec)]  # noqa: E731
-        return Rig(runs, {**drive, **joint}, bias, {**known, **joint, **armature}, None)
+        return Rig(runs, {**drive, **joint}, bias, {**motor, **joint, **armature}, None)
     if kind in _TORQUE:
         joint = {"damping": (0.01, 0.0, 0.5, rigs._damping), "frictionloss": (0.03, 0.0, 0.3, rigs._friction)}
         drive = {"torque": (*_TORQUE[kind], rigs._torque)}
@@ -203,15 +195,15 @@ def one_joint(kind: str) -> Rig:
     return Rig(runs, {**drive, **joint}, more, {**drive, **joint, **armature}, _feed_back)
 
 
-def _servo_runs(own: Recording) -> list[Any]:
+def _servo_runs(recording: Recording) -> list[Any]:
     """Return the parts with torque on and off; the register's gain is that which makes the recording's duty."""
-    kp = own.constants["duty_per_rad"] * 256 * rigs.PWM_LIMIT / rigs.PULSES_PER_RAD
-    return rigs._xl330_runs(replace(own, constants={**own.constants, "kp": kp}))
+    kp = recording.constants["duty_per_rad"] * 256 * rigs.PWM_LIMIT / rigs.PULSES_PER_RAD
+    return rigs._xl330_runs(replace(recording, constants={**recording.constants, "kp": kp}))
 
 
-def legs(own: Recording) -> Rig:
+def legs(recording: Recording) -> Rig:
     """Return a robot from its MJCF, all joints of it with position drives as the Go2's."""
-    spec = _legs_spec(own.constants["mjcf"])
+    spec = _legs_spec(recording.constants["mjcf"])
     count = len(spec.joints)
 
     def every(put: Callable[[Any], None]) -> None:
@@ -248,10 +240,10 @@ class _LegsRun(rigs._Run):
     """A recording of all joints."""
 
     def sequences(self, name: str) -> sysid.ModelSequences:
-        own, model = self.recording, self.spec.compile()
+        recording, model = self.recording, self.spec.compile()
         sensors = [s.name for s in self.spec.sensors]
-        measured = sysid.TimeSeries.from_names(own.t - own.t[0], own.position, model, sensors)
-        state = sysid.create_initial_state(model, *own.start.T)
+        measured = sysid.TimeSeries.from_names(recording.t - recording.t[0], recording.position, model, sensors)
+        state = sysid.create_initial_state(model, *recording.start.T)
         return sysid.ModelSequences(name, self.spec, name, state, self.control, measured)
 
 

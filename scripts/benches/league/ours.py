@@ -1,4 +1,4 @@
-"""Our own entry in the league: what `sim2real identify` does with a robot as it is set up, a fold at a time."""
+"""Our entry in the league: `sim2real identify` with the settings of a robot, for one fold."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
 SETS = {"disk": "disk", "xl330": "xl330", "so101": "so101_log"}
 """Sets with a pipeline of ours, and its name."""
 CHOOSES = ("sts3250",)
-"""Sets with `--terms auto`; of a quadruped's twelve joints that takes a quarter of an hour."""
+"""Sets with `--terms auto`; for a quadruped's twelve joints that takes 15 min."""
 ARM = """<mujoco>
   <option timestep="0.002"/>
   <worldbody>
@@ -47,13 +47,10 @@ ARM = """<mujoco>
 
 
 def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
-    """Identify with our own configuration, which takes the time that it takes.
+    """Identify with our own settings, without a limit of time; return the predictor and a summary.
 
     Args:
-        fold: What is held out; where there is a pipeline, what is fitted is read anew, as logs.
-
-    Returns:
-        What predicts the fold's test recordings, and what was done in words.
+        fold: If the set has a pipeline, its recordings are read again, as logs.
     """
     return _fit_pipeline(name, fold, data, seed) if name in SETS else _fit_described(name, fold, seed)
 
@@ -68,43 +65,43 @@ def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict
         left = int(fit_spec.split()[1])
         specs = [f"{DISK_BLOCK * i}:{DISK_BLOCK * (i + 1)}" for i in range(DISK_BLOCKS) if i != left]
     fitted = {k: e for spec in specs for k, e in recordings.load(pipeline, data, spec).items()}
-    found = identify.identify(case, fitted)
+    identified = identify.identify(case, fitted)
     test = recordings.load(pipeline, data, test_spec, recordings.PAST)
 
-    def predict(own: Sequence[Recording]) -> list[np.ndarray]:
-        columns = identify.predict(case, {"identified": found.values}, test)
-        return [_at(case, columns, r, one) for r, one in enumerate(own)]
+    def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
+        columns = identify.predict(case, {"identified": identified.values}, test)
+        return [_at(case, columns, r, one) for r, one in enumerate(test_recordings)]
 
-    return predict, f"{found.search.record.evaluations if found.search else 0} candidates, then refined"
+    return predict, f"{identified.search.record.evaluations if identified.search else 0} candidates, then refined"
 
 
 def _fit_described(name: str, fold: Fold, seed: int) -> tuple[Predict, str]:
-    """Identify a robot of which there is a model and logs, with the terms and the settings of `--mjcf`."""
-    # Whether gains are in the logs is decided by what is fitted; where they are all the same there is nothing to tell.
+    """Identify a robot from a model and logs, with the terms and the settings of `--mjcf`."""
+    # The logs have the gains only if the fitted recordings differ in them: a constant gain has no effect of its own.
     gains = len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
     with tempfile.TemporaryDirectory() as folder:
         logs = _written(fold.fitted, Path(folder), gains)
-        with contextlib.redirect_stderr(io.StringIO()):  # it says what it takes each column for, fold after fold
+        with contextlib.redirect_stderr(io.StringIO()):  # drops the messages on columns, which repeat for each fold
             pipeline = from_model.from_flags(RobotFlags(mjcf=_model(fold.fitted, Path(folder))), [str(p) for p in logs])
         robot = held_out_parts.offering(pipeline.load(), "auto" if name in CHOOSES else "own")
         fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
     config = replace(pipeline.identify, seed=seed)
     case = identify.Case(name, config, robot, robot.identifiable(config.max_delay_s))
-    found = _fit_with_terms(case, fitted) if name in CHOOSES else identify.identify(case, fitted)
+    identified = _fit_with_terms(case, fitted) if name in CHOOSES else identify.identify(case, fitted)
 
-    def predict(own: Sequence[Recording]) -> list[np.ndarray]:
+    def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
         with tempfile.TemporaryDirectory() as folder:
-            test = [open_recording(p, pipeline, robot).episode for p in _written(own, Path(folder), gains)]
-        columns = _free_run(case, found.values, test, own)
-        return [_at(case, columns, r, one, started=True) for r, one in enumerate(own)]
+            test = [open_recording(p, pipeline, robot).episode for p in _written(test_recordings, Path(folder), gains)]
+        columns = _free_run(case, identified.values, test, test_recordings)
+        return [_at(case, columns, r, one, started=True) for r, one in enumerate(test_recordings)]
 
-    terms = f"{len(found.problem.table)} parameters of --mjcf, refined from the model's"
-    terms += f"; terms {', '.join(found.problem.table.terms) or 'none'}"
-    return predict, f"{terms}; engine {found.problem.engine.name}"
+    terms = f"{len(identified.problem.table)} parameters of --mjcf, refined from the model's"
+    terms += f"; terms {', '.join(identified.problem.table.terms) or 'none'}"
+    return predict, f"{terms}; engine {identified.problem.engine.name}"
 
 
 def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
-    """Identify with the optional terms that the recordings choose, as ``--terms auto`` does."""
+    """Identify with optional terms chosen on held-out parts, as ``--terms auto`` does."""
     c, episodes = replace(case.config, terms="auto"), list(fitted.values())
     model, length = case.model, c.settle_s + c.horizon_s
     table = held_out_parts.widest(model.parameters, c.terms)
@@ -117,11 +114,7 @@ def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
 
 
 def _model(fitted: Sequence[Recording], folder: Path) -> Path:
-    """Return the model's file: the one that comes with the recordings, or the guide's arm with their load.
-
-    Raises:
-        UsageError: When their loads differ.
-    """
+    """Return the model's file: that of the recordings, or the guide's arm with their load, which must be one."""
     if "mjcf" in fitted[0].constants:
         return Path(fitted[0].constants["mjcf"])
     loads = {(r.constants["mass"], r.constants["length"]) for r in fitted}
@@ -133,14 +126,14 @@ def _model(fitted: Sequence[Recording], folder: Path) -> Path:
     return path
 
 
-def _written(own: Sequence[Recording], folder: Path, gains: bool) -> list[Path]:
-    """Return recordings as files of another recorder, with names that say what is what.
+def _written(recordings_to_write: Sequence[Recording], folder: Path, gains: bool) -> list[Path]:
+    """Write recordings as files of another recorder, with descriptive names of columns; return their paths.
 
     Args:
-        gains: Whether the firmware's gain differs between recordings, and is in them.
+        gains: Whether the files have a column of the firmware's gain.
     """
     paths = []
-    for i, r in enumerate(own):
+    for i, r in enumerate(recordings_to_write):
         columns: dict[str, Any] = {"t_s": r.t, "q_rad": r.position, "q_goal_rad": r.command}
         if "torque_enable" in r.constants:
             columns["torque_enable"] = np.asarray(r.constants["torque_enable"], np.float64)[:, None]
@@ -152,30 +145,30 @@ def _written(own: Sequence[Recording], folder: Path, gains: bool) -> list[Path]:
 
 
 def _free_run(
-    case: identify.Case, values: dict[str, Any], test: Sequence[Episode], own: Sequence[Recording]
+    case: identify.Case, values: dict[str, Any], test: Sequence[Episode], test_recordings: Sequence[Recording]
 ) -> dict[str, np.ndarray]:
-    """Return columns of one simulation of each test recording, from the state that every entrant is given."""
-    # What is shown before the largest delay is not compared: without room beyond the delay that is next to nothing.
+    """Return columns of one simulation of each test recording, from the same initial state as for all entrants."""
+    # Samples before the largest delay are not compared, so that delay is hardly larger than the estimate.
     config = replace(case.config, max_delay_s=values["delay"] + 2 * case.robot.tick_s)
     spans = [Span(r, 0.0, False) for r in range(len(test))]
     problem = Problem(case.model, test, spans, max(e.duration_s for e in test), config)
-    # A cubic in time for each joint, of which position and velocity are known.
-    starts = np.stack([np.pad(r.start, ((0, 0), (0, 2))) for r in own])
-    problem.data = problem.data._replace(starts=problem.data.starts.at[: len(own)].set(starts))
+    # The initial state is a cubic in time for each joint, with the given position and velocity.
+    starts = np.stack([np.pad(r.start, ((0, 0), (0, 2))) for r in test_recordings])
+    problem.data = problem.data._replace(starts=problem.data.starts.at[: len(test_recordings)].set(starts))
     columns = prediction.samples(problem, {"identified": values}, 0.0)
     return columns | {"ahead": columns["into"]}
 
 
 def _at(
-    case: identify.Case, columns: dict[str, np.ndarray], recording: int, own: Recording, started: bool = False
+    case: identify.Case, columns: dict[str, np.ndarray], recording: int, one: Recording, started: bool = False
 ) -> np.ndarray:
     """Return predicted positions at a recording's stamps, ``(N, joints)``.
 
     Args:
-        started: Whether the simulation begins in its first state, which then stands before what was predicted.
+        started: Whether the simulation begins in the recording's first state, which is then the first prediction.
     """
     pick = (columns["recording"] == recording) & (columns["ahead"] > 0)
     t, first = columns["ahead"][pick], [0.0] if started else []
     predicted = [columns[f"{f}_identified"][pick] for f in case.fields]
-    lines = [[*(own.start[j, :1] if started else []), *line] for j, line in enumerate(predicted)]
-    return np.stack([np.interp(own.t - own.t[0], [*first, *t], line) for line in lines], axis=1)
+    lines = [[*(one.start[j, :1] if started else []), *line] for j, line in enumerate(predicted)]
+    return np.stack([np.interp(one.t - one.t[0], [*first, *t], line) for line in lines], axis=1)

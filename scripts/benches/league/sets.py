@@ -1,4 +1,4 @@
-"""The sets of the league: every recording there is, and which parts of it are held out in turn."""
+"""The sets of the league: all recordings, and their parts that are held out in turn."""
 
 from __future__ import annotations
 
@@ -25,13 +25,10 @@ bam/feetech/actuator.py."""
 
 @dataclass(frozen=True)
 class Fold:
-    """What is held out once.
+    """Recordings to fit, and held-out ones to predict.
 
     Attributes:
-        name: What it is.
-        fitted: The recordings to fit.
-        test: Those to predict.
-        spec: The same in the words of ``benches/recordings.py``: (fit, test); None where our stage has no words for it.
+        spec: Both in the syntax of ``benches/identify/recordings.py``: (fit, test); None for a set without a pipeline.
     """
 
     name: str
@@ -45,10 +42,9 @@ class LeagueSet:
     """Recordings of one rig.
 
     Attributes:
-        name: Its name.
         folder: Its folder below ``--data``.
         unit: Unit of its figure.
-        score: Predicted positions and measured ones ``(N, joints)``, and the recording -> the figure.
+        score: Predicted positions ``(N, joints)`` and the recording -> the figure.
         folds: Makes the folds from the folder of all data.
     """
 
@@ -59,20 +55,20 @@ class LeagueSet:
     folds: Callable[[Path], list[Fold]]
 
 
-def rmse_rad(predicted: np.ndarray, own: Recording) -> float:
+def rmse_rad(predicted: np.ndarray, recording: Recording) -> float:
     """Return the root mean square error over time and joints [rad]."""
-    return float(np.sqrt(np.mean((predicted - own.position) ** 2)))
+    return float(np.sqrt(np.mean((predicted - recording.position) ** 2)))
 
 
-def rmse_mrad(predicted: np.ndarray, own: Recording) -> float:
+def rmse_mrad(predicted: np.ndarray, recording: Recording) -> float:
     """Return the median over the joints that are moved of the root mean square error [mrad]."""
-    each = 1e3 * np.sqrt(np.mean((predicted - own.position) ** 2, axis=0))
-    return float(np.median(each[np.ptp(own.command, axis=0) > 0.02]))
+    each = 1e3 * np.sqrt(np.mean((predicted - recording.position) ** 2, axis=0))
+    return float(np.median(each[np.ptp(recording.command, axis=0) > 0.02]))
 
 
-def mae_mrad(predicted: np.ndarray, own: Recording) -> float:
+def mae_mrad(predicted: np.ndarray, recording: Recording) -> float:
     """Return the mean absolute error [mrad]."""
-    return float(1e3 * np.mean(np.abs(predicted - own.position)))
+    return float(1e3 * np.mean(np.abs(predicted - recording.position)))
 
 
 def part(t: np.ndarray, command: np.ndarray, position: np.ndarray, begin: int, end: int, ahead: bool) -> Recording:
@@ -82,13 +78,13 @@ def part(t: np.ndarray, command: np.ndarray, position: np.ndarray, begin: int, e
         t: Stamps ``(N,)`` [s].
         command: Shape ``(N, k)``.
         position: Shape ``(N, joints)`` [rad].
-        ahead: Whether samples behind ``begin`` may be used: those before it alone for what is predicted.
+        ahead: Whether samples behind ``begin`` may be used: for predicted parts only those before it.
     """
     near = slice(max(begin - PAST, 0), begin + (PAST if ahead else 1))
     if near.stop - near.start < PAST:  # where ours begins: recordings.PAST samples in
         begin += recordings.PAST
         near = slice(begin - PAST, begin + (PAST if ahead else 1))
-    fits = [np.polyfit(t[near] - t[begin], own[near], 3) for own in position.T]
+    fits = [np.polyfit(t[near] - t[begin], angles[near], 3) for angles in position.T]
     start = np.array([[f[3], f[2]] for f in fits])
     return Recording(t[begin:end] - t[begin], command[begin:end], position[begin:end], start)
 
@@ -140,10 +136,15 @@ def xl330(data: Path) -> list[Fold]:
 def so101(data: Path) -> list[Fold]:
     """Return one fold a motion."""
     every = recordings.load("so101_log", data, "*")
-    own = {name: recording(e, "goal", "position") for name, e in every.items()}
+    by_motion = {name: recording(e, "goal", "position") for name, e in every.items()}
     return [
-        Fold(n, tuple(r for m, r in own.items() if m != n), (own[n],), (" ".join(m for m in own if m != n), n))
-        for n in own
+        Fold(
+            n,
+            tuple(r for m, r in by_motion.items() if m != n),
+            (by_motion[n],),
+            (" ".join(m for m in by_motion if m != n), n),
+        )
+        for n in by_motion
     ]
 
 
@@ -151,25 +152,25 @@ def go2(data: Path) -> list[Fold]:
     """Return three blocks of 5 s."""
     (file,) = _files(data, "go2", "*.npz")
     with np.load(file) as content:
-        t, told, q = content["t_s"], content["q_told_rad"], content["q_rad"]
+        t, goal, q = content["t_s"], content["q_told_rad"], content["q_rad"]
     edges = np.linspace(0, len(t), GO2_BLOCKS + 1).astype(int).tolist()
     model = {"mjcf": str(file.with_name("go2.xml"))}
-    folds = blocks(t, told, q, edges, lambda i: None)
-    known = lambda rs: tuple(Recording(r.t, r.command, r.position, r.start, model) for r in rs)  # noqa: E731
-    return [Fold(f.name, known(f.fitted), known(f.test)) for f in folds]
+    folds = blocks(t, goal, q, edges, lambda i: None)
+    with_model = lambda rs: tuple(Recording(r.t, r.command, r.position, r.start, model) for r in rs)  # noqa: E731
+    return [Fold(f.name, with_model(f.fitted), with_model(f.test)) for f in folds]
 
 
 def sts3250(data: Path) -> list[Fold]:
     """Return one fold a motion."""
-    own = {}
+    by_motion = {}
     for file in _files(data, "bam_sts3250", "*.json"):
         about = json.loads(file.read_text())
         column = lambda key, rows=about["entries"]: np.array([e[key] for e in rows], np.float64)  # noqa: E731
         q, goal, t = column("position")[:, None], column("goal_position")[:, None], column("timestamp")
         constants = {"duty_per_rad": about["kp"] * STS_DUTY_PER_KP, "vin": about["vin"], "profiled": True}
         load = {"mass": about["mass"], "length": about["length"], "torque_enable": column("torque_enable") > 0.5}
-        own[about["trajectory"]] = Recording(t - t[0], goal, q, np.array([[q[0, 0], 0.0]]), {**constants, **load})
-    return [Fold(n, tuple(r for m, r in own.items() if m != n), (own[n],)) for n in own]
+        by_motion[about["trajectory"]] = Recording(t - t[0], goal, q, np.array([[q[0, 0], 0.0]]), {**constants, **load})
+    return [Fold(n, tuple(r for m, r in by_motion.items() if m != n), (by_motion[n],)) for n in by_motion]
 
 
 def _xl330(episode: Any) -> Recording:
@@ -181,10 +182,10 @@ def _xl330(episode: Any) -> Recording:
 
 
 def _files(data: Path, folder: str, pattern: str) -> list[Path]:
-    found = sorted((data / folder).glob(pattern))
-    if not found:
+    files = sorted((data / folder).glob(pattern))
+    if not files:
         raise UsageError(f"{data / folder} has no {pattern}", hint="--data: the folder of all sets")
-    return found
+    return files
 
 
 SETS = {

@@ -31,14 +31,14 @@ code = main(sys.argv[2:])
 json.dump(counts, open(sys.argv[1], "w"))
 sys.exit(code)
 """
-"""A command of sim2real that writes how often each event of JAX came."""
+"""A command of sim2real that writes the counts of JAX's events."""
 _MISSES = "/jax/compilation_cache/cache_misses"
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     parser.add_argument("--robots", nargs="*", default=list(_GOALS), choices=list(_GOALS), help="which robots")
-    parser.add_argument("--data", type=Path, help="folder of public recordings, with go2/; without it go2 is left out")
+    parser.add_argument("--data", type=Path, help="folder of public recordings, with go2/; without it go2 is skipped")
     parser.add_argument("--cold-s", type=float, help="the yardstick on this machine [s]; default: it is measured")
     parser.add_argument("--flags", nargs=argparse.REMAINDER, default=[], help="further flags of identify")
 
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         rows.append(row("identify-time/cold_s", round(cold_s, 1), "s"))
         for robot in options.robots:
             if robot == "go2" and options.data is None:
-                print("go2 is left out: --data names no folder of recordings", file=sys.stderr)
+                print("go2 is skipped: --data names no folder of recordings", file=sys.stderr)
                 continue
             folder = Path(scratch) / robot
             folder.mkdir()
@@ -69,11 +69,11 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _logs(robot: str, folder: Path, data: Path | None) -> tuple[list[str], list[str]]:
-    """Return the flags that name two logs of one length; of the Go2 there is one."""
+    """Return the flags that name two logs of one length; for the Go2 twice the same."""
     if robot == "pendulum":
         logs = [ROOT / "datasets" / "pendulum" / f"{name}.mcap" for name in ("chirp", "multisine")]
     elif robot == "go2" and data is not None:
-        return (own := ["--mjcf", str(data / "go2" / "go2.xml"), "--log", str(data / "go2" / "chirp_fit.npz")]), own
+        return (flags := ["--mjcf", str(data / "go2" / "go2.xml"), "--log", str(data / "go2" / "chirp_fit.npz")]), flags
     else:
         logs = [_recorded(robot, folder / str(seed), seed) for seed in (0, 1)]
     first, second = (["--log", str(log)] for log in logs)
@@ -90,7 +90,7 @@ def _recorded(robot: str, folder: Path, seed: int) -> Path:
 
 
 def _identify(robot: str, log: list[str], folder: Path, options: argparse.Namespace) -> tuple[float, int]:
-    """Identify from a log; return the processor time [s], and how many programs were not in the cache."""
+    """Identify from a log; return the processor time [s], and the number of programs that were not in the cache."""
     environment = yardstick.plain_environment(os.environ) | {
         "JAX_PLATFORMS": "cpu",
         "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),

@@ -22,7 +22,7 @@ from benches.figures import row
 
 CLOSE_M = 0.02
 SETTLE_S = 0.3
-"""How long a prediction is simulated before it is compared [s]."""
+"""Time of a prediction before it is compared [s]."""
 QUICK = demo.QUICK
 
 
@@ -42,10 +42,10 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def run_seed(seed: int, runs: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Run the arm, and the baseline where that is asked for, and collect what the stages measured."""
+    """Run the arm and, unless --no-nominal, the baseline; return the results of the stages."""
     run_dir, result = stages.whole_run(options.bench, seed, runs, options.flags)
     result["mae_mrad"] = held_out_mae_mrad(stages.done(run_dir, "identify").output("predictions"))
-    # How far the tip was from the target in the last half second of each deployment.
+    # Distance of the tip from the target in the last half second of each deployment.
     result["distances_m"] = stages.deployed(run_dir, "distance_m")
     if not options.no_nominal:
         baseline = stages.nominal_run(options.bench, seed, runs, run_dir)
@@ -63,7 +63,7 @@ def held_out_mae_mrad(predictions: Path) -> float:
 
 
 def train_rows(arm: str, run_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
-    """Train an arm in a run folder that holds a recording and an identification; return how long that took."""
+    """Train an arm in a run folder that holds a recording and an identification; return times and success."""
     import jax
 
     begin = time.monotonic()
@@ -73,7 +73,7 @@ def train_rows(arm: str, run_dir: Path, flags: list[str]) -> list[dict[str, Any]
     success = np.max(history["success"], axis=1)
     good = np.flatnonzero(success >= 0.95)
     first_s = history["seconds"][int(good[0])] if good.size else None
-    found = [
+    figures = [
         ("compile_s", history["compile_s"], "s", ""),
         ("train_s", history["train_s"], "s", ""),
         ("time_to_0.95_s", first_s, "s", "< 180"),
@@ -82,21 +82,21 @@ def train_rows(arm: str, run_dir: Path, flags: list[str]) -> list[dict[str, Any]
         ("env_steps_per_s", history["env_steps_per_s"], "1/s", ""),
     ]
     how = f"{jax.devices()[0].device_kind} {' '.join(flags)}"
-    return [row(f"{arm}/train/{n}", v, unit, how, goal) for n, v, unit, goal in found]
+    return [row(f"{arm}/train/{n}", v, unit, how, goal) for n, v, unit, goal in figures]
 
 
 def rows(arm: str, seeds: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return every figure of an arm, one value a seed."""
-    found = stages.rows(arm, seeds, {"total_s": "< 900"})
+    lines = stages.rows(arm, seeds, {"total_s": "< 900"})
     mae = [round(s["mae_mrad"], 2) for s in seeds]
-    found.append(row(f"{arm}/held_out_mae_mrad", mae, "mrad", "1 s ahead, held out", "< 10"))
+    lines.append(row(f"{arm}/held_out_mae_mrad", mae, "mrad", "1 s ahead, held out", "< 10"))
     for key, label in (("distances_m", "identified"), ("nominal_distances_m", "nominal")):
         if key in seeds[0]:
             reached = [int(np.sum(np.array(s[key]) < CLOSE_M)) for s in seeds]
             goal = "9 of 10" if label == "identified" else ""
-            found.append(
+            lines.append(
                 row(f"{arm}/reached/{label}", reached, f"of {len(seeds[0][key])}", "within 2 cm at the end", goal)
             )
             middle = [round(1e3 * float(np.median(s[key])), 1) for s in seeds]
-            found.append(row(f"{arm}/distance/{label}", middle, "mm", "median"))
-    return found
+            lines.append(row(f"{arm}/distance/{label}", middle, "mm", "median"))
+    return lines

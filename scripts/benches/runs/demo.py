@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def run_seed(seed: int, runs: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Run demo and baseline for one seed and collect what the stages measured."""
+    """Run demo and baseline for one seed; return the results of the stages."""
     run_dir, result = stages.whole_run("pendulum", seed, runs, options.flags)
     record, identify = stages.done(run_dir, "record"), stages.done(run_dir, "identify")
     ratio, ours, theirs = prediction_ratio(record.output("log"), record.output("truth"), identify.output("predictions"))
@@ -65,15 +65,15 @@ def run_seed(seed: int, runs: Path, options: argparse.Namespace) -> dict[str, An
 
 def rows(seeds: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return every figure, one value a seed; of deployments, one each."""
-    found = stages.rows("demo", seeds, {"train_s": "< 90", "total_s": "< 240", "error": "+-5"})
+    lines = stages.rows("demo", seeds, {"train_s": "< 90", "total_s": "< 240", "error": "+-5"})
     ratio = [round(s["prediction_over_true_model"], 2) for s in seeds]
-    found.append(row("demo/prediction_over_true_model", ratio, "1", "true model, same commands", "< 1.5"))
+    lines.append(row("demo/prediction_over_true_model", ratio, "1", "true model, same commands", "< 1.5"))
     for key, label in (("deployments", "identified"), ("nominal_deployments", "nominal")):
         if key in seeds[0]:
             values = [round(d, 3) for s in seeds for d in s[key]]
             goal = "> 0.9 in 9 of 10" if label == "identified" else ""
-            found.append(row(f"demo/upright/{label}", values, "share of the last 5 s", "", goal))
-    return found
+            lines.append(row(f"demo/upright/{label}", values, "share of the last 5 s", "", goal))
+    return lines
 
 
 def prediction_ratio(log: Path, truth: Path, predictions: Path) -> tuple[float, float, float]:

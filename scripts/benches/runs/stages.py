@@ -1,4 +1,4 @@
-"""Whole runs of a robot, stage by stage, by the command line: what the benches of the demo and of the arm share."""
+"""Whole runs of a robot through the command line: shared code of the benches of the demo and of the arm."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ def add_flags(parser: argparse.ArgumentParser, seeds: list[int]) -> None:
     """Add the flags of a bench of whole runs, with its default seeds."""
     parser.add_argument("--seeds", type=int, nargs="+", default=seeds)
     parser.add_argument("--keep", type=Path, help="keep the run folders here")
-    parser.add_argument("--no-nominal", action="store_true", help="leave the training on the nominal model out")
+    parser.add_argument("--no-nominal", action="store_true", help="without the training on the nominal model")
 
 
 def run_seeds(
     options: argparse.Namespace, run_seed: Callable[[int, Path, argparse.Namespace], dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return what ``run_seed(seed, folder, options)`` measures with each seed, every one in a folder of its own."""
+    """Return the results of ``run_seed(seed, folder, options)`` for each seed, each in its own folder."""
     with tempfile.TemporaryDirectory() as scratch:
         root = (options.keep or Path(scratch)).resolve()
         return [run_seed(seed, root / f"seed{seed}", options) for seed in options.seeds]
 
 
 def sim2real(*arguments: str) -> None:
-    """Run a command in a separate process, as a user does; what it prints goes to stderr."""
+    """Run a command in a separate process, as a user does."""
     print("sim2real", *arguments, file=sys.stderr)
     subprocess.run([sys.executable, "-m", "sim2real.cli", *arguments], check=True, stdout=subprocess.DEVNULL)
 
@@ -48,7 +48,7 @@ def done(run_dir: Path, stage: str) -> StageFolder:
 
 
 def whole_run(pipeline: str, seed: int, runs: Path, flags: list[str]) -> tuple[Path, dict[str, Any]]:
-    """Run all stages; return the run folder, and what they took and found."""
+    """Run all stages; return the run folder, and their times and estimates."""
     begin = time.monotonic()
     sim2real("run", pipeline, "--seed", str(seed), "--runs", str(runs), *flags)
     result: dict[str, Any] = {"seed": seed, "total_s": time.monotonic() - begin}
@@ -67,7 +67,7 @@ def nominal_run(pipeline: str, seed: int, runs: Path, run_dir: Path) -> Path:
 
 
 def estimates(identify: StageFolder) -> dict[str, Any]:
-    """Return how far the identified dynamics and the round trip are off the true ones, where there is a true one."""
+    """Return the errors of the identified dynamics and of the round trip, for parameters with a true value."""
     document = json.loads(identify.output("parameters").read_text())
     by_name = {p["name"]: p for p in document["parameters"]}
     trip = by_name["round_trip_delay"]
@@ -87,13 +87,13 @@ def deployed(run_dir: Path, quantity: str) -> list[float]:
 
 def rows(name: str, seeds: list[dict[str, Any]], goals: dict[str, str]) -> list[dict[str, Any]]:
     """Return seconds and errors of whole runs, one value a seed; goals by the end of a row's name."""
-    found = []
+    lines = []
     for stage in (*STAGES, "total"):
         values = [round(s[f"{stage}_s"], 1) for s in seeds]
-        found.append(row(f"{name}/{stage}_s", values, "s", "", goals.get(f"{stage}_s", "")))
+        lines.append(row(f"{name}/{stage}_s", values, "s", "", goals.get(f"{stage}_s", "")))
     off = [round(s["round_trip_error_ms"], 2) for s in seeds]
-    found.append(row(f"{name}/round_trip_error_ms", off, "ms", "true latency", "+-3"))
+    lines.append(row(f"{name}/round_trip_error_ms", off, "ms", "true latency", "+-3"))
     for parameter in seeds[0]["errors"]:
         values = [round(100 * s["errors"][parameter], 2) for s in seeds]
-        found.append(row(f"{name}/{parameter}_error", values, "%", "true parameter", goals.get("error", "")))
-    return found
+        lines.append(row(f"{name}/{parameter}_error", values, "%", "true parameter", goals.get("error", "")))
+    return lines
