@@ -13,7 +13,7 @@ from benches.runs import arm, stages
 from shared_run import copied
 
 from sim2real import cli
-from sim2real.commands import table as command_table
+from sim2real.commands import command_kinds, run_commands
 
 pytestmark = pytest.mark.realtime
 
@@ -29,8 +29,8 @@ def commands(monkeypatch, finished_run_dir):
             copied(finished_run_dir, Path(flags[flags.index("--runs") + 1]) / pipeline / finished_run_dir.name)
         assert cli.main([command, pipeline, *flags]) == 0, "flags that the command does not have"
 
-    for runs_stages in ("_run_all", "_call_stage"):
-        monkeypatch.setattr(command_table, runs_stages, lambda *_: None)
+    monkeypatch.setattr(run_commands, "_run_stages", lambda *_: None)
+    monkeypatch.setattr(command_kinds, "run_stage", lambda *_: None)
     monkeypatch.setattr(stages, "sim2real", sim2real)
     return called
 
