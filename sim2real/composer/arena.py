@@ -34,7 +34,7 @@ def _base() -> MjSpec:
 
 
 class Arena(Entity):
-    """The entity at the top: global settings, and whatever subclasses build.
+    """The entity at the top: global settings, and the parts that subclasses build.
 
     Args:
         name: Name of the model; default: the file's.
@@ -42,11 +42,11 @@ class Arena(Entity):
     """
 
     def _build(self, *args: Any, **kwargs: Any) -> None:
-        given = dict(zip(("name", "xml_path"), args, strict=False)) | kwargs
-        path = given.get("xml_path")
+        options = dict(zip(("name", "xml_path"), args, strict=False)) | kwargs
+        path = options.get("xml_path")
         self._mjcf_root = Model.from_path(path) if path else Model.owning(_base().copy())
-        if given.get("name"):
-            self._mjcf_root.model = given["name"]
+        if options.get("name"):
+            self._mjcf_root.model = options["name"]
 
     @property
     def mjcf_model(self) -> Model:
@@ -69,8 +69,8 @@ class Arena(Entity):
 
     @property
     def ground_geoms(self) -> list[Element]:
-        """The geoms of the ground; none unless a subclass says so."""
+        """The geoms of the ground; default: none."""
         return []
 
     def regenerate(self, random_state: RandomState) -> None:
-        """Lay the arena out anew; nothing unless a subclass does."""
+        """Lay the arena out again; subclasses override it."""

@@ -44,7 +44,7 @@ class observable(cached_property):  # noqa: N801
     _in_class = False
 
     def __set_name__(self, owner: type, name: str) -> None:
-        """Note that the decorated function is a method: its first argument is the object, whatever it is called."""
+        """Note that the decorated function is a method: its first argument is the object, under any name."""
         self._in_class = True
 
     @property
@@ -80,5 +80,5 @@ def declared(owner: Any) -> dict[str, Callable[..., Any]]:
 
 @functools.cache
 def _declared(owner: type) -> tuple[str, ...]:
-    found = ((name, inspect.getattr_static(owner, name)) for name in sorted(dir(owner)))
-    return tuple(name for name, value in found if isinstance(value, observable) and value.takes_physics)
+    members = ((name, inspect.getattr_static(owner, name)) for name in sorted(dir(owner)))
+    return tuple(name for name, value in members if isinstance(value, observable) and value.takes_physics)

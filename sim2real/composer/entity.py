@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 class FreePropObservableMixin(ABC):
-    """What the observables of a free-moving object must offer."""
+    """Observables that a free-moving object must have."""
 
     @property
     @abstractmethod
@@ -92,7 +92,7 @@ class Entity(ABC):
 
     @property
     def observables(self) -> Observables:
-        """What can be observed of this entity."""
+        """The observables of this entity."""
         return self._observables
 
     @property
@@ -102,7 +102,7 @@ class Entity(ABC):
 
     @property
     def attachment_site(self) -> Model | Element:
-        """Where other entities are attached unless told otherwise: a site or the model."""
+        """Default place for other entities: a site or the model."""
         return self.mjcf_model
 
     @property
@@ -129,7 +129,7 @@ class Entity(ABC):
         return frame
 
     def detach(self) -> None:
-        """Take this entity off its parent; what is attached to it stays.
+        """Detach this entity from its parent, together with the entities below it.
 
         Raises:
             NotAttachedError: When it has no parent.
@@ -187,12 +187,12 @@ class Entity(ABC):
         Raises:
             UsageError: When the shape is another.
         """
-        own = physics.bind(self.root_body).xmat
-        xp = namespace(xmat, own)
+        frame = physics.bind(self.root_body).xmat
+        xp = namespace(xmat, frame)
         matrix = xp.asarray(xmat)
         if matrix.shape not in ((3, 3), (9,)):
             raise UsageError(f"`xmat` should have shape (3, 3) or (9,): got {matrix.shape}")
-        return xp.reshape(xp.reshape(xp.asarray(own), (3, 3)).T @ xp.reshape(matrix, (3, 3)), matrix.shape)
+        return xp.reshape(xp.reshape(xp.asarray(frame), (3, 3)).T @ xp.reshape(matrix, (3, 3)), matrix.shape)
 
     def _pose_holder(self) -> tuple[Element, bool]:
         """Return the free joint or the frame that holds the pose, and whether it is a free joint."""
@@ -243,7 +243,7 @@ class Entity(ABC):
         Args:
             position: Added, ``(3,)`` [m].
             quaternion: The turn, ``(4,)``; applied after the present one.
-            rotate_velocity: Turn the linear velocity too; the angular one is in the local frame and turns by itself.
+            rotate_velocity: Turn the linear velocity too; the angular velocity is in the local frame.
         """
         old_position, old_quaternion = self.get_pose(physics)
         new_position = new_quaternion = None

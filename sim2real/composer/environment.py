@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 class ObservationPadding(Enum):
-    """What fills a buffer until enough samples have arrived."""
+    """Values that fill a buffer until enough samples have arrived."""
 
     INITIAL_VALUE = -1
     """The first sample."""
@@ -43,9 +43,9 @@ class Observation(OrderedDict[str, PyTree]):
     """Name -> array; a name may leave out the models in front of it as long as only one key ends with it."""
 
     def __missing__(self, key: str) -> PyTree:
-        found = [k for k in self if k.endswith(f"/{key}")]
-        if len(found) == 1:
-            return self[found[0]]
+        matches = [k for k in self if k.endswith(f"/{key}")]
+        if len(matches) == 1:
+            return self[matches[0]]
         raise KeyError(f"{key!r}. Available: {', '.join(self)}")
 
 
@@ -93,7 +93,7 @@ class Environment(dm_env.Environment):
             task._root_entity = arena
         if n_sub_steps is not None:
             warnings.warn("`n_sub_steps` is deprecated: set the task's time steps", DeprecationWarning, stacklevel=2)
-        self._task, self._time_limit, self._n_sub_steps_given = task, time_limit, n_sub_steps
+        self._task, self._time_limit, self._fixed_sub_steps = task, time_limit, n_sub_steps
         self._random_state = (
             random_state if isinstance(random_state, np.random.RandomState) else np.random.RandomState(random_state)
         )
@@ -115,7 +115,7 @@ class Environment(dm_env.Environment):
         self._drop()
         self._physics = self._compiler.start(self._legacy_step)
         self._proxy: PyTree = weakref.proxy(self._physics)
-        steps = self._n_sub_steps_given or self._task.physics_steps_per_control_step
+        steps = self._fixed_sub_steps or self._task.physics_steps_per_control_step
         self._n_sub_steps = steps
         limit = self._time_limit / (self._physics.timestep() * steps)
         self._step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else math.inf
@@ -134,7 +134,7 @@ class Environment(dm_env.Environment):
 
     @property
     def physics(self) -> Physics:
-        """The physics, as a weak reference: it dies when the models are compiled anew and at ``close``."""
+        """The physics, as a weak reference: it ends with the next compilation of the models and with ``close``."""
         return self._proxy
 
     @property
@@ -144,8 +144,8 @@ class Environment(dm_env.Environment):
 
     def control_timestep(self) -> float:
         """Return the time between two actions [s]."""
-        if self._n_sub_steps_given is not None:
-            return self._physics.timestep() * self._n_sub_steps_given
+        if self._fixed_sub_steps is not None:
+            return self._physics.timestep() * self._fixed_sub_steps
         return self._task.control_timestep
 
     def add_extra_hook(self, hook_name: str, hook_callable: Hook) -> None:
@@ -217,8 +217,8 @@ class Environment(dm_env.Environment):
         return dm_env.TimeStep(step_type, reward, discount, self._observe())
 
     def _observe(self) -> PyTree:
-        found = self._updater.get_observation()
-        return Observation(found) if isinstance(found, dict) else found
+        values = self._updater.get_observation()
+        return Observation(values) if isinstance(values, dict) else values
 
     def action_spec(self) -> PyTree:
         """Return shape and bounds of an action."""
@@ -252,7 +252,7 @@ class Environment(dm_env.Environment):
         return dm_env.TimeStep(step_type, self.reward_spec(), self.discount_spec(), self.observation_spec())
 
     def close(self) -> None:
-        """Let go of the physics."""
+        """Free the physics."""
         self._drop()
 
     def _drop(self) -> None:

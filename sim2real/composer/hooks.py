@@ -31,7 +31,7 @@ WITH_ACTION = ("before_step", "before_substep")
 
 
 class Hooks:
-    """The hooks of a task and its entities; those that do nothing are left out."""
+    """The hooks of a task and its entities; hooks that no class overrides do not run."""
 
     def __init__(self, task: Task) -> None:
         self._task = task
@@ -45,8 +45,8 @@ class Hooks:
         entities = list(self._task.iter_entities())
         for name in HOOK_NAMES:
             wrap = _with_action if name in WITH_ACTION else _as_it_is
-            found = [(f"{type(e).__name__}.{name}", getattr(e, name)) for e in entities if _overrides(e, Entity, name)]
-            self._entity_hooks[name] = [(label, wrap(hook)) for label, hook in found]
+            owners = [e for e in entities if _overrides(e, Entity, name)]
+            self._entity_hooks[name] = [(f"{type(e).__name__}.{name}", wrap(getattr(e, name))) for e in owners]
 
     def add(self, name: str, hook: Hook) -> None:
         """Run a function after the hooks of the task and the entities.
@@ -61,7 +61,7 @@ class Hooks:
         self._extra[name].append(hook)
 
     def is_empty(self, name: str) -> bool:
-        """Return whether nothing happens at a hook."""
+        """Return whether a hook of a name has no function to run."""
         return not (_overrides(self._task, Task, name) or self._entity_hooks[name] or self._extra[name])
 
     def run(self, name: str, *args: PyTree) -> None:
@@ -73,7 +73,7 @@ class Hooks:
             self.call(name, hook, *args)
 
     def call(self, label: str, function: Callable[..., T], *args: PyTree) -> T:
-        """Return what a function returns; ``label`` says which one it is."""
+        """Return what a function returns; ``label`` names it in errors."""
         del label
         return function(*args)
 

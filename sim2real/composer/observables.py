@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree
 
 OPTIONS = frozenset({"update_interval", "buffer_size", "delay", "aggregator", "corruptor", "enabled"})
-"""What ``set_options`` can set."""
+"""Options of ``set_options``."""
 
 
 class ObservableKeys:
@@ -57,7 +57,7 @@ class Observables:
         return self._keys
 
     def as_dict(self, fully_qualified: bool = True) -> OrderedDict[str, Observable]:
-        """Return name -> observable; names are prefixed with the entity's full name unless told otherwise."""
+        """Return name -> observable; default: names are prefixed with the entity's full name."""
         prefix = self._entity.mjcf_model.full_identifier if fully_qualified else ""
         return OrderedDict((prefix + name, value) for name, value in self._observables.items())
 
@@ -116,10 +116,10 @@ class Observables:
         return {name: value(physics) for name, value in self._observables.items()}
 
     def __getattr__(self, name: str) -> PyTree:
-        found = self.__dict__.get("_observables", {})
-        if name in found:
-            return found[name]
+        observables = self.__dict__.get("_observables", {})
+        if name in observables:
+            return observables[name]
         declared = inspect.getattr_static(type(self), name, None)
-        if isinstance(declared, property):  # Python asks here when a property failed: let it say itself what it missed
+        if isinstance(declared, property):  # the property failed: its own error names the missing attribute
             return declared.__get__(self, type(self))
-        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}. Observables: {', '.join(found)}")
+        raise AttributeError(f"{type(self).__name__} has no attribute {name!r}. Observables: {', '.join(observables)}")

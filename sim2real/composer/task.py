@@ -64,14 +64,14 @@ class Task(ABC):
     @property
     def observables(self) -> OrderedDict[str, Observable]:
         """Name -> observable: those of the task, then those of every entity."""
-        found: OrderedDict[str, Observable] = OrderedDict()
+        observables: OrderedDict[str, Observable] = OrderedDict()
         for name, function in define.declared(self).items():
-            found[name] = Generic(function)
-            found[name].enabled = True
-        found.update(self.task_observables)
+            observables[name] = Generic(function)
+            observables[name].enabled = True
+        observables.update(self.task_observables)
         for entity in self.iter_entities():
-            found.update(entity.observables.as_dict())
-        return found
+            observables.update(entity.observables.as_dict())
+        return observables
 
     @property
     def task_observables(self) -> Mapping[str, Observable]:
@@ -173,7 +173,7 @@ class Task(ABC):
         """Return the reward of the step that was just taken, or its terms by name, whose sum it is."""
 
     def should_terminate_episode(self, physics: BasePhysics) -> bool | Array:
-        """Return whether the episode ends here; default: what ``get_termination`` says."""
+        """Return whether the episode ends here; default: the result of ``get_termination``."""
         return self.get_termination(physics)
 
     def get_termination(self, physics: BasePhysics) -> bool | Array:

@@ -155,6 +155,6 @@ Steps: TypeAlias = int | Callable[..., int]
 Aggregate: TypeAlias = Callable[[Any], Any]
 """A reduction of a buffer's first axis, of the arrays of either engine."""
 Corrupt: TypeAlias = Callable[..., Any]
-"""What is called as ``corrupt(value, random_state=...)`` on every sample of an observable."""
+"""A function ``corrupt(value, random_state=...)`` of every sample of an observable."""
 Hook: TypeAlias = Callable[..., Any]
-"""A hook of a task or an entity; what it takes depends on its name."""
+"""A hook of a task or an entity; its arguments depend on its name."""

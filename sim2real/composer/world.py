@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @struct.dataclass
 class WorldParams(Base):
-    """What is to be identified, or differs from copy to copy.
+    """Parameters to identify, or that differ from copy to copy.
 
     Attributes:
         values: Name -> array, in the unit of the attribute that it sets.
@@ -99,14 +99,14 @@ class ComposedWorld(BaseWorld):
         super().__init__(name, ticks, color=color, order=order)
         self.input_name, self.field = command, field
         self.law: StepLaw | None = None
-        """What is set before every physics step from the state then; a subclass's. Of the model: fields alone."""
+        """Sets fields of the model before every physics step from the state; set by a subclass."""
         self._parameters = dict(parameters or {})
         self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
         self._apart, self._derived = False, frozenset[str]()
-        found = self._view()
-        self._set(found, self.init_params())  # refuses what cannot vary
+        physics = self._view()
+        self._set(physics, self.init_params())  # refuses what cannot vary
         if self._derives:
-            self._derived = constants.derived(self.environment.model, found.mjx_model)
+            self._derived = constants.derived(self.environment.model, physics.mjx_model)
             self.environment.carry(self._derived)
 
     def _view(self) -> MjxPhysics:
@@ -141,7 +141,7 @@ class ComposedWorld(BaseWorld):
         return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel), self._lawful(params))
 
     def output(self, state: State) -> PyTree:
-        """Return the message that says what a state is; default: the task's observation."""
+        """Return the message of a state; default: the task's observation."""
         return Observations(state.observation)
 
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
@@ -160,7 +160,7 @@ class ComposedWorld(BaseWorld):
         before = self.entered(step_state.state, action)
         params = step_state.params
         state: PyTree = self.environment.step(before, action, self._model(params), self._lawful(params))
-        # What is over stays over: others look only now and then.
+        # An episode that has ended stays ended: readers look only now and then.
         truncated = jnp.where(before.done, before.truncated, state.truncated)
         state = state.replace(done=before.done | state.done, truncated=truncated)
         new = step_state.replace(state=state)
@@ -240,5 +240,5 @@ class ComposedWorld(BaseWorld):
         return getattr(step_state.inputs[self.input_name].data, self.field)[-1]
 
     def _params(self, graph_state: GraphState | None) -> WorldParams:
-        found = (graph_state or GraphState()).params.get(self.name)
-        return self.init_params() if found is None else found
+        params = (graph_state or GraphState()).params.get(self.name)
+        return self.init_params() if params is None else params

@@ -51,9 +51,9 @@ def reach(
             physics.mark_as_dirty()
             return True
         mj.mj_jacSite(model, data, jacobian[:3], jacobian[3:], number)
-        own = jacobian[:, columns]
+        reduced = jacobian[:, columns]
         damping = _DAMPING if size > _FAR else 0.0
-        move = np.linalg.lstsq(own.T @ own + damping * np.eye(columns.size), own.T @ error, rcond=None)[0]
+        move = np.linalg.lstsq(reduced.T @ reduced + damping * np.eye(columns.size), reduced.T @ error, rcond=None)[0]
         length = np.linalg.norm(move)
         if size > _SLOWEST * length:  # it no longer comes nearer
             break
@@ -72,7 +72,7 @@ def _columns(physics: Physics, joints: Elements) -> list[np.ndarray]:
 
 
 def _error(xpos: np.ndarray, xmat: np.ndarray, position: ArrayLike, quaternion: ArrayLike) -> np.ndarray:
-    """Return what is missing: a translation [m] and a rotation vector [rad], in the world's axes, shape ``(6,)``."""
+    """Return the error: a translation [m] and a rotation vector [rad], in the world's axes, shape ``(6,)``."""
     error, there, missing = np.empty(6), np.empty(4), np.empty(4)
     error[:3] = np.asarray(position) - xpos
     goal = np.asarray(quaternion, float) / np.linalg.norm(quaternion)

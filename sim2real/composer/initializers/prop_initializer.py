@@ -1,4 +1,4 @@
-"""Placing props where they touch nothing."""
+"""Placing props where they have no contact."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ _Contacts = tuple[Any, Any, Any]
 
 
 class PropPlacer(Initializer):
-    """Draws a pose for one prop after the other, until it touches nothing; then lets them settle if asked to.
+    """Draws a pose for one prop after the other, until it has no contact; then lets them settle, if so configured.
 
     Args:
         position: Position ``(3,)`` [m], or a variation.
         quaternion: Orientation ``(4,)``, or a variation.
-        ignore_collisions: Take the first pose, whatever it touches.
+        ignore_collisions: Take the first pose, with or without contacts.
         max_qvel_tol: Velocity below which a prop has settled [rad/s or m/s].
         max_qacc_tol: Acceleration below which a prop has settled [rad/s^2 or m/s^2].
         max_attempts_per_prop: Poses that are tried for each prop.
         settle_physics: Let the physics run until the props rest; everything else is held.
         min_settle_physics_time: Shortest time to settle [s].
         max_settle_physics_time: Longest time to settle [s].
-        max_settle_physics_attempts: How often everything is placed anew when the props do not come to rest.
-        raise_exception_on_settle_failure: Raise when they never do, rather than warn.
+        max_settle_physics_attempts: How often all props are placed again when they do not come to rest.
+        raise_exception_on_settle_failure: Raise an error rather than warn.
 
     Raises:
         UsageError: When ``max_settle_physics_attempts`` is below 1.
@@ -80,8 +80,8 @@ class PropPlacer(Initializer):
         self._joints = []
         for prop in self._props:
             free = get_frame_freejoint(prop.mjcf_model)
-            own = prop.mjcf_model.find_all("joint")
-            self._joints += own if free is None or free in own else [free, *own]
+            joints = prop.mjcf_model.find_all("joint")
+            self._joints += joints if free is None or free in joints else [free, *joints]
 
     def __call__(
         self, physics: Any, random_state: Any, ignore_contacts_with_entities: Iterable[Entity] | None = None
@@ -112,7 +112,7 @@ class PropPlacer(Initializer):
             self._place(physics, random_state, cached)
 
     def _place_on_mjx(self, physics: MjxPhysics, random_state: JaxRandomState, ignored: list[Entity]) -> None:
-        """Place the props inside a compiled program; ``physics.fail`` says where that did not work."""
+        """Place the props inside a compiled program; ``physics.fail`` marks the copies without a place."""
         from sim2real.composer.physics.mjx.placing import place
 
         if self._settles:

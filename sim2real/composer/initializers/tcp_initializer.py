@@ -79,9 +79,9 @@ class ToolCenterPointInitializer(Initializer):
     def _reach(
         self, physics: Physics, random_state: RandomState, site: Element, position: ArrayLike, quaternion: ArrayLike
     ) -> bool:
-        own = getattr(self._arm, "set_site_to_xpos", None)
-        if own is not None:
-            return own(
+        solve = getattr(self._arm, "set_site_to_xpos", None)
+        if solve is not None:
+            return solve(
                 physics=physics,
                 random_state=random_state,
                 site=site,
@@ -113,7 +113,7 @@ class ToolCenterPointInitializer(Initializer):
         return limits.T
 
     def _touches(self, physics: Physics) -> bool:
-        """Return whether the arm touches itself or the hand, or one of both touches what is not free."""
+        """Return whether the arm touches itself or the hand, or one of both touches a fixed part of the world."""
         arm = self._numbers(physics, self._arm.mjcf_model.find_all("geom", exclude_attachments=True))
         hand = [] if self._hand is None else self._hand.mjcf_model.find_all("geom", exclude_attachments=True)
         robot = arm | self._numbers(physics, hand)

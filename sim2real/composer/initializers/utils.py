@@ -29,7 +29,7 @@ class JointStaticIsolator:
         self._qpos, self._qvel = self._held.qpos.copy(), self._held.qvel.copy()
 
     def __enter__(self) -> None:
-        """Nothing is done before."""
+        """Begin the block."""
 
     def __exit__(self, *error: object) -> None:
         """Put the other joints back."""

@@ -17,8 +17,8 @@ from sim2real.errors import UsageError
 if TYPE_CHECKING:
     from sim2real.composer.types import NativeDefault, Value
 
-_OF_SHORTCUTS = ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm")
-"""What every actuator but ``<general>`` sets by itself."""
+_SHORTCUT_ATTRIBUTES = ("dyntype", "dynprm", "gaintype", "gainprm", "biastype", "biasprm")
+"""Attributes that every actuator except ``<general>`` sets for the user."""
 
 
 def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Value]) -> H:
@@ -42,7 +42,7 @@ def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Value]) -> H
         native = adder() if defaults is None or kind == "body" else adder(defaults)
     if foreign:
         translate.reset(native, getattr(foreign.native, kind))
-    element = model.enlist(kind, native, tag, _given(attrs))
+    element = model.enlist(kind, native, tag, _renamed(attrs))
     try:
         if name is not None:
             native.name = name
@@ -90,7 +90,7 @@ def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Value])
     defaults = _defaults(model, attrs)
     adder = getattr(model._spec, f"add_{kind}")
     native = adder() if defaults is None else adder(defaults)
-    element = model.enlist(kind, native, tag, _given(attrs))
+    element = model.enlist(kind, native, tag, _renamed(attrs))
     try:
         native.name = attrs.get("name") or ""
         _lay_down(model, element)
@@ -101,31 +101,31 @@ def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Value])
 
 
 def _lay_down(model: Tree[Handle], element: Handle) -> None:
-    """Set all that was given of an element, as MuJoCo's parser reads it; the rest stays."""
-    native, kind, said = element._native, element.kind, element.recorded()
-    values = {k: v for k, v in said.values.items() if k not in ("name", "dclass")}
+    """Set the explicit attributes of an element, as MuJoCo's parser reads them; the rest stays."""
+    native, kind, record = element._native, element.kind, element.recorded()
+    values = {k: v for k, v in record.values.items() if k not in ("name", "dclass")}
     if ("reftype" in values) != ("refname" in values):  # a program sets one after the other
         values = {k: v for k, v in values.items() if k not in ("reftype", "refname")}
-    is_shortcut = kind == "actuator" and said.tag != "general"
-    if is_shortcut and model.records.has_defaults:  # they set these altogether, whatever the class says
-        translate.reset(native, translate.blank(kind), _OF_SHORTCUTS)
+    is_shortcut = kind == "actuator" and record.tag != "general"
+    if is_shortcut and model.records.has_defaults:  # their parser sets all of these, for every class
+        translate.reset(native, translate.blank(kind), _SHORTCUT_ATTRIBUTES)
         values = _inherited(element) | values
     if kind in files.KINDS:
         values = {k: files.adopt(model, v) if isinstance(v, files.Asset) else v for k, v in values.items()}
     naming = [k for k in REFERENCES.get(kind, ()) if k in values]
-    _fill(model, element, *translate.from_xml(kind, said.tag, values, naming))
+    _fill(model, element, *translate.from_xml(kind, record.tag, values, naming))
     for key in translate.ORIENTATIONS & values.keys():
         translate.assign(native, kind, key, values[key])
 
 
 def _inherited(element: Handle) -> dict[str, Value]:
     """Return what the classes of an element say of its own tag: the nearest one's word counts."""
-    found: dict[str, Value] = {}
-    known = schema.attributes(element.kind, element.tag)
-    for said in said_by_classes(element):
-        if said.tag == element.tag:  # the last one that was spoken of: a class has one actuator for all tags
-            found = {k: v for k, v in said.values.items() if k in known} | found
-    return found
+    inherited: dict[str, Value] = {}
+    valid = schema.attributes(element.kind, element.tag)
+    for record in class_records(element):
+        if record.tag == element.tag:  # the last one that was spoken of: a class has one actuator for all tags
+            inherited = {k: v for k, v in record.values.items() if k in valid} | inherited
+    return inherited
 
 
 def _fill(model: Tree[Handle], element: Handle, fixed: Mapping[str, Value], named: dict[str, Value]) -> None:
@@ -147,7 +147,7 @@ def _fill(model: Tree[Handle], element: Handle, fixed: Mapping[str, Value], name
 
 
 def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> None:
-    """Lay an element down anew: the defaults of its class, then the attributes given, as MuJoCo's parser reads them.
+    """Set all attributes of an element again: the defaults of its class, then the explicit ones, as MuJoCo reads them.
 
     For attributes that stand for several native ones, such as a servo's ``kp``, and for those that are taken back.
 
@@ -157,18 +157,20 @@ def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> Non
     Raises:
         AttributeError: When such an element has no such attribute.
     """
-    native, kind, said = element._native, element.kind, element.recorded()
-    known = schema.attributes(kind, said.tag)
-    if key is not None and key not in known:
-        available = ", ".join(sorted(known))
-        raise AttributeError(f"{key!r} is not a valid attribute for <{said.tag}>. Available: {available}")
+    native, kind, record = element._native, element.kind, element.recorded()
+    valid = schema.attributes(kind, record.tag)
+    if key is not None and key not in valid:
+        available = ", ".join(sorted(valid))
+        raise AttributeError(f"{key!r} is not a valid attribute for <{record.tag}>. Available: {available}")
     if key is not None and kind in ("body", "inertial"):  # whose children and inertia are no attributes of its own
         translate.reset(native, element.class_defaults, (translate.native_name(kind, key),))
         model.touch()
         return
-    _catch_up(element, said.values, key)
-    native_only = {k: said.values.pop(k) for k in list(said.values) if k not in known and k not in ("name", "dclass")}
-    foreign = _foreign(model, said.values.get("dclass"))
+    _catch_up(element, record.values, key)
+    native_only = {
+        k: record.values.pop(k) for k in list(record.values) if k not in valid and k not in ("name", "dclass")
+    }
+    foreign = _foreign(model, record.values.get("dclass"))
     translate.reset(native, getattr(foreign.native, kind) if foreign else element.class_defaults)
     for reference in [r for r in model.references if r[0] is native]:
         del model.references[reference]
@@ -177,16 +179,16 @@ def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> Non
         for extra, value in native_only.items():
             translate.assign(native, kind, extra, value)
     finally:
-        said.values.update(native_only)
+        record.values.update(native_only)
 
 
-def _catch_up(element: Handle, said: dict[str, Value], key: str | None) -> None:
-    """Take over what an element holds now: arrays may have been written into, what it names may be called otherwise."""
+def _catch_up(element: Handle, explicit: dict[str, Value], key: str | None) -> None:
+    """Update explicit attributes: a program may have written into arrays, or renamed referenced elements."""
     for name in REFERENCES.get(element.kind, ()):
-        target = references.held(element, name) if name in said and name != key else None
+        target = references.held(element, name) if name in explicit and name != key else None
         if target is not None:
-            said[name] = target
-    for name in said:
+            explicit[name] = target
+    for name in explicit:
         if name in ("name", "dclass") or name in REFERENCES.get(element.kind, ()):
             continue
         try:
@@ -194,7 +196,7 @@ def _catch_up(element: Handle, said: dict[str, Value], key: str | None) -> None:
         except AttributeError:
             continue
         if isinstance(value, np.ndarray):
-            said[name] = np.array(explicit_values.show(value, said[name]))
+            explicit[name] = np.array(explicit_values.show(value, explicit[name]))
 
 
 def reclass(model: Tree[Handle], element: Handle, name: str, value: Value) -> None:
@@ -213,14 +215,14 @@ def reclass(model: Tree[Handle], element: Handle, name: str, value: Value) -> No
 
 
 def class_of(element: Handle) -> str:
-    """Return the class of an element: its own one, or that of the nearest body that has one for what it holds."""
+    """Return the class of an element: its own, or the ``childclass`` of the nearest body that has one."""
     name, holder = element.recorded().values.get("dclass"), element.parent
     while name is None and isinstance(holder, Handle):
         name, holder = holder._native.childclass or None, holder.parent
     return getattr(name, "name", name) or "main"
 
 
-def said_by_classes(element: Handle) -> Iterator[explicit_values.Given]:
+def class_records(element: Handle) -> Iterator[explicit_values.ExplicitValues]:
     """Yield what the classes of an element say of elements of its kind, the nearest class first."""
     model: Tree[Handle] = element.root
     name: str | None = class_of(element)
@@ -300,8 +302,8 @@ def remove(model: Tree[Handle], element: Handle) -> None:
     model.touch()
 
 
-def _given(attrs: dict[str, Value]) -> dict[str, Value]:
-    """Leave those attributes that were given a value, under PyMJCF's names."""
+def _renamed(attrs: dict[str, Value]) -> dict[str, Value]:
+    """Return the attributes that have a value, under PyMJCF's names."""
     if "class_" in attrs:
         attrs["dclass"] = attrs.pop("class_")
     for name in [name for name, value in attrs.items() if value is None]:
@@ -319,10 +321,10 @@ def _defaults(model: Tree[Handle], attrs: dict[str, Value]) -> NativeDefault | N
     if name is None:
         return None
     name = getattr(name, "name", name)  # a class of defaults, or its name
-    found = model._spec.find_default(name)
-    if found is None:
+    defaults = model._spec.find_default(name)
+    if defaults is None:
         raise UsageError(f"model {model.model!r} has no default class {name!r}")
-    return found
+    return defaults
 
 
 def _add_inertial(model: Tree[H], body: H, attrs: dict[str, Value]) -> H:

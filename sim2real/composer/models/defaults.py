@@ -113,11 +113,11 @@ class _Shown(np.ndarray):
 class DefaultElement(Element):
     """The defaults of one kind of element in a class.
 
-    What is set here also reaches the elements of the class, and those of the classes below it, that do not say it
-    themselves.
+    Setting an attribute also sets it in the elements of the class, and of the classes below it, that do not have it
+    as an explicit attribute.
 
     Args:
-        tag: The tag under which they were asked for: a class has the same defaults for all actuators.
+        tag: The tag in the caller's request: a class has the same defaults for all actuators.
     """
 
     __slots__ = ("_owner", "_tag")
@@ -153,8 +153,8 @@ class DefaultElement(Element):
         """MuJoCo's own defaults; asking a class for its class ends the process."""
         return translate.blank(self.kind)
 
-    def recorded(self) -> explicit_values.Given:
-        """Return what the class says."""
+    def recorded(self) -> explicit_values.ExplicitValues:
+        """Return the explicit attributes of the class."""
         return self.root.records.of_class(self._native, self.kind)
 
     @property
@@ -178,9 +178,9 @@ class DefaultElement(Element):
         value = value.name if isinstance(value, Element) else value
         fixed: Mapping[str, Value] | None = None
         if not translate.is_plain(self._native, self.kind, name, value):
-            known = schema.attributes(self.kind, self._tag)
-            if name not in known:
-                available = ", ".join(sorted(known))
+            valid = schema.attributes(self.kind, self._tag)
+            if name not in valid:
+                available = ", ".join(sorted(valid))
                 raise AttributeError(f"{name!r} is not a valid attribute for <{self._tag}>. Available: {available}")
             fixed, _ = translate.from_xml(self.kind, self._tag, {name: value}, ())
         self.root.records.note_default(self._native, self.kind, self._tag, name, value)
@@ -196,16 +196,16 @@ class DefaultElement(Element):
 
     def _followers(self, name: str) -> Iterator[Element]:
         """Yield the elements whose value of an attribute comes from here: classes first, this one included."""
-        classes, found = [self._owner], set()
+        classes, names = [self._owner], set()
         while classes:
             one = classes.pop()
             below = DefaultElement(one, self.kind, getattr(one.native, self.kind), self._tag)
             if one != self._owner and name in below.recorded().values:
                 continue
-            found.add(one.name)
+            names.add(one.name)
             classes += one.default
             yield below
         for element in self.root.find_all(self.kind, exclude_attachments=True):
             owner = element._native.classname
-            if (owner.name if owner else "main") in found and name not in element.recorded().values:
+            if (owner.name if owner else "main") in names and name not in element.recorded().values:
                 yield element

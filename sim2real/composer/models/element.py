@@ -29,7 +29,7 @@ class Element(Handle):
     """One element of a model; made by ``Model.find``, ``find_all`` and ``add``.
 
     Reading and setting any other attribute reads and sets it in the model's ``MjSpec``, in MJCF's spelling or in
-    MuJoCo's own; what was not given reads as None, whatever the defaults are. There is one handle on each element.
+    MuJoCo's own; an attribute that is not explicit reads as None. There is one handle on each element.
     """
 
     __slots__ = ()
@@ -37,7 +37,7 @@ class Element(Handle):
     root: Tree[Element]
 
     def add(self, tag: str, **attrs: Value) -> Element:
-        """Add an element to a body, a part of its path to a tendon, or to a tuple what it names.
+        """Add an element to a body, a part of the path to a tendon, or a reference to a tuple.
 
         Args:
             tag: ``body``, ``geom``, ``joint``, ``freejoint``, ``site``, ``camera``, ``light`` or ``inertial``.
@@ -89,8 +89,8 @@ class Element(Handle):
 
     def find(self, kind: str, identifier: str) -> Element | None:
         """Return the element of a kind with a name, if it stands below this body; else None."""
-        found = self.root.find(kind, identifier)
-        return found if found is not None and found in self.find_all(kind) else None
+        element = self.root.find(kind, identifier)
+        return element if element is not None and element in self.find_all(kind) else None
 
     def all_children(self) -> list[Element]:
         """Return what stands directly in this body."""
@@ -109,10 +109,10 @@ class Element(Handle):
     def to_xml_string(
         self, prefix_root: Tree[Element] | None = None, self_only: bool = False, pretty_print: bool = True
     ) -> str:
-        """Return this element as MJCF: what was given of it, and what stands in it.
+        """Return this element as MJCF: its explicit attributes and its children.
 
         Args:
-            prefix_root: The model from which names are seen; default: the element's own.
+            prefix_root: The model that names are relative to; default: the element's own.
         """
         return xml.to_xml_string(self, prefix_root, self_only, pretty_print)
 
@@ -133,28 +133,28 @@ class Element(Handle):
                 return next((j for j in self.find_all("joint", True) if j._native.type == mj.mjtJoint.mjJNT_FREE), None)
             if name == "inertial":
                 return self.root.handle("inertial", native) if native.explicitinertial else None
-        said = self.recorded()
-        if name not in said.values and name in schema.attributes(kind, said.tag):
+        record = self.recorded()
+        if name not in record.values and name in schema.attributes(kind, record.tag):
             return None
         if name in REFERENCES.get(kind, ()):
             return referenced(self, name)
-        if name.startswith("file") and said.values.get(name):
-            return files.asset_of(self.root, kind, said.values[name])
+        if name.startswith("file") and record.values.get(name):
+            return files.asset_of(self.root, kind, record.values[name])
         if name in ("dclass", "childclass"):
-            return self.root.default_class(said.values[name])
-        return self._shown(name, said)
+            return self.root.default_class(record.values[name])
+        return self._shown(name, record)
 
-    def _shown(self, name: str, said: explicit_values.Given) -> Value:
+    def _shown(self, name: str, record: explicit_values.ExplicitValues) -> Value:
         """Return the value of a plain attribute, in PyMJCF's form where it was given."""
         try:
             value = translate.read(self._native, self.kind, name)
         except AttributeError:
-            if name not in said.values:
+            if name not in record.values:
                 raise
-            return explicit_values.parse(said.values[name])
+            return explicit_values.parse(record.values[name])
         if isinstance(value, np.ndarray):  # which the caller may write into
             self.root.touch()
-        return explicit_values.show(value, said.values[name]) if name in said.values else value
+        return explicit_values.show(value, record.values[name]) if name in record.values else value
 
     def __setattr__(self, name: str, value: Value) -> None:
         if name == "name":
@@ -162,28 +162,28 @@ class Element(Handle):
             rename(self, value or "")
             self.root.touch()
             return
-        kind, said = self.kind, self.recorded()
+        kind, record = self.kind, self.recorded()
         value = files.adopt(self.root, value) if isinstance(value, files.Asset) else value
         if name in ("dclass", "childclass"):
             builder.reclass(self.root, self, name, value)
         elif name in REFERENCES.get(kind, ()) and self._holds(name):
             refer(self, translate.native_name(kind, name), value)
-            said.note(name, value)
+            record.note(name, value)
         elif value is not None and name != "refname" and translate.is_plain(self._native, kind, name, value):
             translate.assign(self._native, kind, name, value)
-            said.note(name, value)
+            record.note(name, value)
             self.root.touch()
         else:
-            before = said.values.get(name)
-            said.note(name, value)
+            before = record.values.get(name)
+            record.note(name, value)
             try:
                 builder.rebuild(self.root, self, name)
             except Exception:
-                said.note(name, before)
+                record.note(name, before)
                 raise
 
     def _holds(self, name: str) -> bool:
-        """Return whether the ``MjSpec`` has an attribute by itself, rather than what several in MJCF stand for."""
+        """Return whether the ``MjSpec`` has an attribute, rather than several attributes in MJCF that stand for it."""
         native = self._native
         if name == "refname" and native.reftype == mj.mjtObj.mjOBJ_UNKNOWN:  # until its type is laid down as well
             return False
@@ -198,7 +198,7 @@ Elements = Element | Iterable[Element]
 
 
 def as_elements(elements: Elements) -> tuple[tuple[Element, ...], bool]:
-    """Return what was given as a tuple, and whether it was a single element.
+    """Return elements as a tuple, and whether the argument was a single element.
 
     Raises:
         UsageError: When something in it is no element, or the kinds differ.
@@ -206,13 +206,13 @@ def as_elements(elements: Elements) -> tuple[tuple[Element, ...], bool]:
     if elements is None:
         raise UsageError("nothing to bind: the element is None", hint="find() returns None where it finds nothing")
     if isinstance(elements, Element) or not isinstance(elements, Iterable):
-        found: tuple[Element, ...] = (elements,)
+        sequence: tuple[Element, ...] = (elements,)
     else:
-        found = tuple(elements)
-    for element in found:
+        sequence = tuple(elements)
+    for element in sequence:
         if not isinstance(element, Element):
             raise UsageError(f"expected an element of a model, got {type(element).__name__}: {element!r}")
-    kinds = sorted({e.kind for e in found})
+    kinds = sorted({e.kind for e in sequence})
     if len(kinds) > 1:
         raise UsageError(f"Cannot bind to a collection containing multiple element types: {', '.join(kinds)}")
-    return found, isinstance(elements, Element)
+    return sequence, isinstance(elements, Element)

@@ -7,7 +7,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 
 class Listed(Protocol):
-    """What is in a list: an ``Element``."""
+    """An item of a list: an ``Element``."""
 
     @property
     def name(self) -> str | None:
@@ -32,13 +32,13 @@ class ElementList(Sequence[E], Generic[E]):
 
     def __getitem__(self, key: Any) -> Any:
         """Return an element by its number or its name, or a list of them for a slice."""
-        found = self._find()
+        elements = self._find()
         if not isinstance(key, str):
-            return found[key]
-        named = [e for e in found if e.name == key]
+            return elements[key]
+        named = [e for e in elements if e.name == key]
         if not named:
             raise KeyError(
-                f"there is no <{self._tag}> {key!r}. Available: {', '.join(filter(None, (e.name for e in found)))}"
+                f"there is no <{self._tag}> {key!r}. Available: {', '.join(filter(None, (e.name for e in elements)))}"
             )
         return named[0]
 

@@ -100,8 +100,8 @@ def attributes(kind: str) -> dict[str, Field]:
     except KeyError:
         raise UsageError(f"elements of kind {kind!r} cannot be bound. Available: {', '.join(KINDS)}") from None
     prefix = re.compile(rf"\A({'|'.join(prefixes)})_")
-    found = [f for struct in ("data", "model") for f in array_fields(struct).values() if f.size in sizes]
-    return {prefix.sub("", f.name): f for f in found}
+    fields = [f for struct in ("data", "model") for f in array_fields(struct).values() if f.size in sizes]
+    return {prefix.sub("", f.name): f for f in fields}
 
 
 _RANGES = {
@@ -150,14 +150,14 @@ def resolve(model: MjModel, kind: str, names: tuple[str, ...]) -> tuple[int, ...
         UsageError: When the model has no element of one of the names.
     """
     object_type = OBJECT_TYPES[kind]
-    found = tuple(mj.mj_name2id(model, object_type, name) for name in names)
-    if -1 in found:
-        known = names_of(model, kind)
+    numbers = tuple(mj.mj_name2id(model, object_type, name) for name in names)
+    if -1 in numbers:
+        available = names_of(model, kind)
         raise UsageError(
-            f"the compiled model has no {kind} {names[found.index(-1)]!r}. Available: {', '.join(known)}",
+            f"the compiled model has no {kind} {names[numbers.index(-1)]!r}. Available: {', '.join(available)}",
             hint="an element added after the model was compiled is there after the next compilation",
         )
-    return found
+    return numbers
 
 
 def names_of(model: MjModel, kind: str) -> list[str]:

@@ -98,7 +98,7 @@ class Model(Tree[Element]):
 
     @property
     def spec(self) -> MjSpec:
-        """The ``MjSpec``, without what is attached. Once it was handed out, every compilation starts from scratch."""
+        """The ``MjSpec``, without attached models. After the first access every compilation starts from scratch."""
         self.expose()
         return self._spec
 
@@ -106,8 +106,8 @@ class Model(Tree[Element]):
         try:
             return self.__dict__["_sections"][name]
         except KeyError:
-            known = ", ".join(self.__dict__.get("_sections", ()))
-            raise AttributeError(f"a model has no {name!r}. Sections: {known}") from None
+            available = ", ".join(self.__dict__.get("_sections", ()))
+            raise AttributeError(f"a model has no {name!r}. Sections: {available}") from None
 
     @property
     def name(self) -> str:
@@ -140,7 +140,7 @@ class Model(Tree[Element]):
     # -- compiling
 
     def compile(self) -> MjModel:
-        """Return the ``mujoco.MjModel`` of this model with all that is attached to it."""
+        """Return the ``mujoco.MjModel`` of this model with all attached models."""
         return compose.compile_model(self)
 
     def to_xml_string(self) -> str:

@@ -1,4 +1,4 @@
-"""One model among others: its name, what it is attached to and what is attached to it, its settings, its changes."""
+"""One model among others: its name, its parent and attached models, its settings, its changes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Scope:
 
     Attributes:
         parent_model: The model that this one is attached to, or None.
-        attachments: Name -> what is attached to this one, in order.
+        attachments: Name -> attached model and its frame, in order.
         inherits_angle: Whether angles are read in the unit of the model that this one is attached to: so it is until
             ``compiler.angle`` is set, for models that programs make. Documents have a unit of their own.
         overrides: Settings that were written while other models were attached.

@@ -58,10 +58,10 @@ class Section:
     @property
     def _native(self) -> Value:
         """Return the part of the ``MjSpec`` that holds the fields."""
-        found = self._model._spec
+        part = self._model._spec
         for step in self._path.split(".") if self._path else ():
-            found = getattr(found, step)
-        return found
+            part = getattr(part, step)
+        return part
 
     def add(self, tag: str, **attrs: Value) -> Value:
         """Add an element, such as ``actuator.add('motor', joint=...)``.
@@ -70,7 +70,7 @@ class Section:
             UsageError: When elements of this tag do not stand in this section.
         """
         if not self._kinds:
-            raise UsageError(f"nothing is added to <{self._name}>: set its attributes")
+            raise UsageError(f"<{self._name}> holds no elements: set its attributes")
         kind = self._kinds[0] if len(self._kinds) == 1 else tag
         if kind not in self._kinds or tag == "plugin":
             hint = schema.FROM_DOCUMENTS if (self._name, tag) in schema.tables() else None
@@ -114,7 +114,7 @@ class Section:
         if self._name == "option" and name == "flag":
             return Flags(self._model)
         if not hasattr(self._native, name):
-            raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._known()}")
+            raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._available()}")
         value = merge_options.in_world(self._model, self._path, name, getattr(self._native, name))
         if isinstance(value, np.ndarray):  # which the caller may write into
             self._model.touch_settings()
@@ -131,7 +131,7 @@ class Section:
             value = int(float(value.rstrip("kKmMgG")) * _BYTES.get(value[-1].lower(), 1))
         current = getattr(native, name, _UNSET)
         if current is _UNSET:
-            raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._known()}")
+            raise AttributeError(f"<{self._name}> has no attribute {name!r}. Available: {self._available()}")
         if name in _CHOICES and isinstance(value, str):
             if value not in _CHOICES[name]:
                 raise UsageError(f"{name}={value!r} is not valid. Available: {', '.join(_CHOICES[name])}")
@@ -142,7 +142,7 @@ class Section:
         setattr(native, name, translate.like(current, value))
         merge_options.note(self._model, self._path, name)
 
-    def _known(self) -> str:
+    def _available(self) -> str:
         return ", ".join(n for n in dir(self._native) if not n.startswith("_"))
 
 
@@ -189,10 +189,10 @@ class DocumentsOnly:
 
 def make_sections(model: Tree[Handle]) -> dict[str, Value]:
     """Return the sections of a model by name."""
-    found: dict[str, Value] = {name: Section(model, name, "", kinds) for name, kinds in schema.SECTIONS.items()}
+    sections: dict[str, Value] = {name: Section(model, name, "", kinds) for name, kinds in schema.SECTIONS.items()}
     for name, path in (("option", "option"), ("size", ""), ("compiler", "compiler"), ("visual", "visual")):
-        found[name] = Section(model, name, path)
-    found["statistic"] = Section(model, "statistic", "stat")
-    found |= {name: DocumentsOnly(name) for name in ("extension", "deformable")}
-    found["default"] = Defaults(model, "main")
-    return found
+        sections[name] = Section(model, name, path)
+    sections["statistic"] = Section(model, "statistic", "stat")
+    sections |= {name: DocumentsOnly(name) for name in ("extension", "deformable")}
+    sections["default"] = Defaults(model, "main")
+    return sections

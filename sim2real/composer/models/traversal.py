@@ -17,8 +17,8 @@ def get_attachment_frame(mjcf_model: Model) -> Any:
     parent = mjcf_model.parent_model
     if parent is None:
         return None
-    own = compose.free_body(mjcf_model)
-    return parent.find("attachment_frame", mjcf_model.model) if own is None else mjcf_model.handle("body", own)
+    body = compose.free_body(mjcf_model)
+    return parent.find("attachment_frame", mjcf_model.model) if body is None else mjcf_model.handle("body", body)
 
 
 def get_freejoint(element: Element) -> Element | None:
@@ -44,7 +44,7 @@ def commit_defaults(element: Element, attributes: Iterable[str] | None = None) -
     Args:
         attributes: Names of the attributes; default: all.
     """
-    for said in builder.said_by_classes(element):  # a class has one actuator for all tags
-        for name in said.values.keys() & schema.attributes(element.kind, element.tag):
+    for record in builder.class_records(element):  # a class has one actuator for all tags
+        for name in record.values.keys() & schema.attributes(element.kind, element.tag):
             if (attributes is None or name in attributes) and getattr(element, name) is None:
-                setattr(element, name, said.values[name])
+                setattr(element, name, record.values[name])

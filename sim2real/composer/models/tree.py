@@ -1,4 +1,4 @@
-"""The elements of one model: a handle on each, what was given of them, and what they refer to."""
+"""The elements of one model: their handles, explicit attributes and references."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, ClassVar, Generic, Self, TypeVar, cast
 
 from sim2real.composer.models.mjcf import translate
-from sim2real.composer.models.mjcf.explicit_values import Document, Given, PathPart, Records
+from sim2real.composer.models.mjcf.explicit_values import Document, ExplicitValues, PathPart, Records
 from sim2real.composer.models.mjcf.schema import KIND_OF_TAG, SECTION_OF
 from sim2real.composer.models.mjcf.translate import TREE_KINDS
 from sim2real.composer.models.scope import Scope
@@ -21,7 +21,7 @@ _ADDED_LATER = 1_000_000_000
 
 
 class Handle:
-    """One element of a model: what it is, where it stands and what it is called; its attributes are ``Element``'s."""
+    """One element of a model: its kind, its place and its name; ``Element`` adds the attributes."""
 
     __slots__ = ("_native", "kind", "root")
 
@@ -85,7 +85,7 @@ class Handle:
 
     @property
     def parent(self) -> Value:
-        """The body that holds this element, the section where it stands in no body, the model for the world."""
+        """The body that holds this element; else its section; the model for the world."""
         if self.kind == "inertial":
             return self.root.handle("body", self._native)
         if self.is_worldbody:
@@ -93,8 +93,8 @@ class Handle:
         native = getattr(self._native, "parent", None)
         return self.root.section_of(self.kind) if native is None else self.root.handle("body", native)
 
-    def recorded(self) -> Given:
-        """Return what was given of this element, rather than left at its default."""
+    def recorded(self) -> ExplicitValues:
+        """Return the explicit attributes of this element."""
         return self.root.records.of(self._native, self.kind)
 
 
@@ -102,15 +102,15 @@ H = TypeVar("H", bound=Handle, covariant=True)
 
 
 class Tree(Scope, Generic[H]):
-    """What ``Model`` keeps: everything that adds, removes, attaches and compiles works on this.
+    """The elements of a ``Model``; the functions that add, remove, attach and compile work on it.
 
     Attributes:
-        references: Native element and attribute -> the element that the attribute names, whatever that is called.
-        records: What was given of every element.
+        references: Native element and attribute -> the element that the attribute names.
+        records: The explicit attributes of every element.
         shows_text: Whether attributes that name elements by text read as text.
         removed: Deleted element that others name -> its name.
         counted: How many elements of each kind there were, and at which revision.
-        paths: Native tendon -> what it runs over, as far as that was read.
+        paths: Native tendon -> its path, as far as it was read.
     """
 
     handle_type: ClassVar[type[Handle]] = Handle
@@ -131,7 +131,7 @@ class Tree(Scope, Generic[H]):
 
     @classmethod
     def owning(cls, spec: MjSpec, document: Document | None = None) -> Self:
-        """Return a model around a spec that nobody else changes: changes are then seen, and results kept till then."""
+        """Return a model around a spec that no other code changes: results stay valid until a recorded change."""
         model = cls(spec=spec, document=document)
         model._revision = 0
         return model
@@ -150,8 +150,8 @@ class Tree(Scope, Generic[H]):
             return prefix + element._native.name
         peers = self.find_all(element.kind, exclude_attachments=True)
         number = [*map(id, peers)].index(id(element))
-        own = f"/unnamed_{element.kind}_{number}"
-        return (prefix or ("/" if relative_to is None else "")) + own
+        unnamed = f"/unnamed_{element.kind}_{number}"
+        return (prefix or ("/" if relative_to is None else "")) + unnamed
 
     # -- handles
 
@@ -186,7 +186,7 @@ class Tree(Scope, Generic[H]):
         return self.handle(kind, native)
 
     def strike(self, natives: list[Native]) -> None:
-        """Forget elements that are about to be deleted."""
+        """Drop the records of elements before they are deleted."""
         for native in natives:
             self._order.pop(native, None)
             self.records.forget(native)
@@ -232,20 +232,20 @@ class Tree(Scope, Generic[H]):
         """
         kind = KIND_OF_TAG.get(kind, kind)
         if kind in TREE_KINDS:
-            found = self.walk(self._spec.worldbody, kind, False, exclude_attachments)
-            return [] if immediate_children_only else list(found)
+            elements = self.walk(self._spec.worldbody, kind, False, exclude_attachments)
+            return [] if immediate_children_only else list(elements)
         natives = getattr(self._spec, translate.plural(kind), None)
         if natives is None:
             raise UsageError(f"{kind!r} is not a valid namespace: there are no elements of that kind")
         if immediate_children_only:
             return []
-        found = [self.handle(kind, n) for n in natives]
+        elements = [self.handle(kind, n) for n in natives]
         if not exclude_attachments:
             for attachment in self.attachments.values():
-                found += attachment.model.find_all(kind)
-        return found
+                elements += attachment.model.find_all(kind)
+        return elements
 
-    def walk(self, body: Native, kind: str, shallow: bool, own: bool) -> Iterator[H]:
+    def walk(self, body: Native, kind: str, shallow: bool, exclude_attachments: bool) -> Iterator[H]:
         """Yield the elements of a kind below a native body, in the order of the document.
 
         Args:
@@ -260,8 +260,8 @@ class Tree(Scope, Generic[H]):
             if not is_body or kind == "body":
                 yield self.handle(kind, child)
             if is_body and not shallow:
-                yield from self.walk(child, kind, shallow, own)
-        if attachment is not None and not own and not shallow:
+                yield from self.walk(child, kind, shallow, exclude_attachments)
+        if attachment is not None and not exclude_attachments and not shallow:
             yield from attachment.model.find_all(kind)
 
     def _position(self, native: Native) -> int:

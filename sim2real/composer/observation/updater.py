@@ -48,8 +48,8 @@ class _Channel:
 
     Args:
         steps_per_read: Physics steps from one observation to the next.
-        strip: Whether the axis of single samples is left out.
-        pad_initial: Whether what was never sampled reads as the first sample, rather than as zeros.
+        strip: Whether a buffer of one sample has no axis of samples.
+        pad_initial: Whether missing samples read as the first sample, rather than as zeros.
     """
 
     def __init__(
@@ -70,8 +70,8 @@ class _Channel:
         self.size = int(size() if callable(size) else size)
         self._strip = strip and self.size == 1
         self._pad_initial = pad_initial
-        # Samples that no observation can hold are left out, as in dm_control and on MJX: reading one may compute the
-        # physics anew, which other observables would show.
+        # Samples that no observation can hold are not taken, as in dm_control and on MJX: reading one may compute the
+        # physics again, which would change other observables.
         self._is_regular = not callable(self._interval) and not callable(self._delay)
         self._gaps: dict[int, tuple[int, int]] = {}
         self._steps_per_read = steps_per_read
@@ -100,16 +100,16 @@ class _Channel:
 
     def _until_read(self, now: int) -> tuple[int, int]:
         """Return how many samples later the next one comes that an observation holds, and how many steps later."""
-        found = self._gaps.get(now % self._steps_per_read)
-        if found is None:
+        gap = self._gaps.get(now % self._steps_per_read)
+        if gap is None:
             interval, taken = self._draw_interval(), 1
             while self._is_unread(now + taken * interval, interval):
                 taken += 1
-            found = self._gaps[now % self._steps_per_read] = taken, taken * interval
-        return found
+            gap = self._gaps[now % self._steps_per_read] = taken, taken * interval
+        return gap
 
     def _is_unread(self, taken: int, interval: int) -> bool:
-        """Return whether so many samples arrive after one, before the next read, that no observation holds it."""
+        """Return whether later samples push a sample out of the buffer before the next read."""
         arrival = taken + self._draw_delay()
         read = -(-arrival // self._steps_per_read) * self._steps_per_read
         return (read - arrival) // interval >= self.size
@@ -131,7 +131,7 @@ class _Channel:
         self._insert(now, np.array(self._sample(), dtype=self._dtype))
 
     def read(self, now: int) -> np.ndarray:
-        """Return the buffer, or what the aggregator makes of it."""
+        """Return the buffer, or the result of the aggregator."""
         arrived = self._arrived(now)
         if self._strip and not self.observable.aggregator:
             if arrived:
@@ -162,7 +162,7 @@ class _Channel:
         return samples[: min(there, self.size)]
 
     def observation_spec(self) -> specs.Array:
-        """Return what ``read`` returns: shape, dtype, and bounds where they are known."""
+        """Return the spec of ``read``: shape, dtype, and bounds where the observable has some."""
         spec: PyTree = self.spec
         aggregator = self.observable.aggregator
         shape = spec.shape if self._strip else (self.size, *spec.shape)
@@ -215,12 +215,12 @@ class Updater:
         self._now = 0
 
         def channels(observables: dict[str, PyTree]) -> dict[str, _Channel]:
-            made = type(observables)()
+            channels_by_name = type(observables)()
             for name, value in observables.items():
                 if value.enabled:
                     options = (self._steps_per_read, self._strip, self._pad_initial)
-                    made[name] = _Channel(name, value, physics, random_state, *options)
-            return made
+                    channels_by_name[name] = _Channel(name, value, physics, random_state, *options)
+            return channels_by_name
 
         self._channels = self._map(channels, self._observables)
         self._flat = [c for group in (self._channels if self._nested else (self._channels,)) for c in group.values()]

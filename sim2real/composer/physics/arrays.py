@@ -1,4 +1,4 @@
-"""Arithmetic on whatever an engine computes with: numpy arrays, or JAX arrays and tracers."""
+"""Arithmetic on the arrays of both engines: numpy arrays, or JAX arrays and tracers."""
 
 from __future__ import annotations
 

@@ -268,7 +268,7 @@ class BaseBinding(ABC):
         self.write(name, value)
 
     def _plain(self, array: PyTree) -> Array:
-        """Return an array, parts of which are not bound to the elements."""
+        """Return an array whose parts are not bound to the elements."""
         return array
 
     def __dir__(self) -> list[str]:

@@ -23,7 +23,7 @@ _PLACES = {
 
 
 class Scenery(Protocol):
-    """What a camera can look at: a ``Physics``."""
+    """A ``Physics``, for cameras."""
 
     model: ModelView
     data: DataView
@@ -57,7 +57,7 @@ class Pose(NamedTuple):
 
 
 class Selected(NamedTuple):
-    """What is seen at a place of an image: numbers, None where there is none, and where it is, shape ``(3,)`` [m]."""
+    """The object at a place of an image: numbers or None, and its position, shape ``(3,)`` [m]."""
 
     body: int | None
     geom: int | None
@@ -126,7 +126,7 @@ class Camera:
 
     @property
     def option(self) -> MjvOption:
-        """What is drawn: an ``MjvOption``, to be changed in place."""
+        """The ``MjvOption`` of the images, to be changed in place."""
         return self._option
 
     @property
@@ -146,7 +146,7 @@ class Camera:
     def matrices(self) -> CameraMatrices:
         """Return the factors of ``matrix``."""
         number, model, data = self._camera.fixedcamid, self._physics.model.ptr, self._physics.data.ptr
-        if number == -1:  # where the free camera is, is known to the scene alone: between its left and its right eye
+        if number == -1:  # only the scene has the pose of the free camera: between its two eyes
             self.update()
             position, forward, up = (
                 np.mean([getattr(eye, name) for eye in self._scene.camera], axis=0) for name in ("pos", "forward", "up")
@@ -166,10 +166,10 @@ class Camera:
         """Fill the scene with what the physics looks like now.
 
         Args:
-            scene_option: What is drawn: an ``MjvOption``; default: ``option``.
+            scene_option: The ``MjvOption`` of the image; default: ``option``.
         """
         model = self._physics.model.ptr
-        if model is not self._model:  # compiled anew since
+        if model is not self._model:  # compiled again since then
             self._model, self._scene = model, new_scene(model, self._max_geom)
         option = self._option if scene_option is None else getattr(scene_option, "ptr", scene_option)
         everything = int(mj.mjtCatBit.mjCAT_ALL)
@@ -186,8 +186,8 @@ class Camera:
         """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
 
         Args:
-            segmentation: Tell objects by numbers and types (``mjtObj``) instead; (-1, -1) is none.
-            scene_option: What is drawn: an ``MjvOption``; default: ``option``.
+            segmentation: Return numbers and types (``mjtObj``) of objects instead; (-1, -1) is none.
+            scene_option: The ``MjvOption`` of the image; default: ``option``.
             render_flag_overrides: Flags of ``mjtRndFlag``, by name in small letters, such as ``shadow``, or by
                 number -> value, for this image.
 
@@ -208,7 +208,7 @@ class Camera:
         return draw(self._scene, self._size, overlays, render_flag_overrides, depth, segmentation)
 
     def select(self, cursor_position: tuple[float, float]) -> Selected:
-        """Return what is seen at a place of the image.
+        """Return the object at a place of the image.
 
         Args:
             cursor_position: From 0 to 1 to the right, and from 0 to 1 upwards.
@@ -219,8 +219,8 @@ class Camera:
         body = mj.mjv_select(
             model, data, self._option, aspect, *cursor_position, self._scene, position, geom, flex, skin
         )
-        found = [None if i == -1 else int(i) for i in (body, geom[0], flex[0], skin[0])]
-        return Selected(*found, world_position=None if all(i is None for i in found) else position)
+        numbers = [None if i == -1 else int(i) for i in (body, geom[0], flex[0], skin[0])]
+        return Selected(*numbers, world_position=None if all(i is None for i in numbers) else position)
 
 
 class MovableCamera(Camera):
@@ -266,9 +266,9 @@ class TextOverlay:
     """
 
     def __init__(self, title: str = "", body: str = "", style: str = "normal", position: str = "top left") -> None:
-        for given, known in ((style, _FONTS), (position, _PLACES)):
-            if given not in known:
-                raise UsageError(f"texts have no style or position {given!r}. Available: {', '.join(known)}")
+        for name, choices in ((style, _FONTS), (position, _PLACES)):
+            if name not in choices:
+                raise UsageError(f"texts have no style or position {name!r}. Available: {', '.join(choices)}")
         self.title, self.body, self.style, self.position = title, body, _FONTS[style], _PLACES[position]
 
     def draw(self, context: MjrContext, rect: MjrRect) -> None:

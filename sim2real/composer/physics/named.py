@@ -121,8 +121,8 @@ class NamedArray(NDArrayOperatorsMixin):
         if len(ending) == 1:
             return ending[0]
         what = "is ambiguous" if ending else "is not there"
-        known = ", ".join(names[i] for i in ending) if ending else ", ".join(names)
-        raise KeyError(f"{self._field.name}: {kind} {name!r} {what}. Available: {known}")
+        available = ", ".join(names[i] for i in ending) if ending else ", ".join(names)
+        raise KeyError(f"{self._field.name}: {kind} {name!r} {what}. Available: {available}")
 
 
 def _column(key: Index) -> Index:
@@ -147,8 +147,8 @@ class NamedFields:
         field = layout.array_fields(self._struct).get(name)
         if field is None:
             raise AttributeError(f"{self._struct} has no array {name!r}")
-        found = self.__dict__[name] = NamedArray(self._model, field, self._holder)
-        return found
+        array = self.__dict__[name] = NamedArray(self._model, field, self._holder)
+        return array
 
 
 class Named:

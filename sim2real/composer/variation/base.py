@@ -162,7 +162,7 @@ class UnaryOperation(Parametric):
 
 
 class BinaryOperation(Parametric):
-    """An operator applied to two values, at least one of which varies."""
+    """An operator applied to two values; at least one of them varies."""
 
     def __init__(self, op: Callable[[PyTree, PyTree], PyTree], first: Varying, second: Varying) -> None:
         self._op, self._first, self._second = op, first, second

@@ -20,7 +20,7 @@ class Distribution(Parametric):
     """A distribution whose parameters may vary themselves; they can be read as attributes.
 
     Args:
-        single_sample: Draw one sample, whatever the shape of the initial value.
+        single_sample: Draw one sample for an initial value of any shape.
     """
 
     def __init__(self, *args: Varying, single_sample: bool = False, **kwargs: Varying) -> None:

@@ -27,7 +27,7 @@ class UniformQuaternion(Parametric):
 
 
 class QuaternionFromAxisAngle(Parametric):
-    """Rotations about an axis by an angle [rad], both of which may vary."""
+    """Rotations about an axis by an angle [rad]; both may vary."""
 
     def __init__(self, axis: Varying, angle: Varying) -> None:
         self._axis, self._angle = axis, angle

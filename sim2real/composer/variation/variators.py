@@ -69,7 +69,7 @@ class PhysicsVariator:
     """Varies attributes of the compiled model and of the state; for ``initialize_episode`` and the steps.
 
     On MJX the initial value is that of the compiled model, and only numeric fields of the model can vary from copy to
-    copy. Constants that MuJoCo derives from masses and lengths are computed anew.
+    copy. Constants that MuJoCo derives from masses and lengths follow.
     """
 
     def __init__(self) -> None:

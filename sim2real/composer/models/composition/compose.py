@@ -28,7 +28,7 @@ NAMED_KINDS = (
 
 
 def compile_model(model: Tree[Handle]) -> MjModel:
-    """Return the ``mujoco.MjModel`` of a model and all that is attached to it.
+    """Return the ``mujoco.MjModel`` of a model with all attached models.
 
     Raises:
         ValueError: MuJoCo's own message, when the composed model does not compile.
@@ -37,7 +37,7 @@ def compile_model(model: Tree[Handle]) -> MjModel:
 
 
 def compose(model: Tree[Handle]) -> MjSpec:
-    """Return a new ``MjSpec`` of a world: the model at its top with all that is attached to it, and their options.
+    """Return a new ``MjSpec`` of a world: the model at its top, all attached models, and their options.
 
     Raises:
         UsageError: When an element names one that is not there, or would be lost.
@@ -54,9 +54,9 @@ def compose(model: Tree[Handle]) -> MjSpec:
 def _whole(model: Tree[Handle], models: list[Tree[Handle]]) -> MjSpec:
     """Return a new ``MjSpec`` of a world with every element of its models.
 
-    MuJoCo's copies drop an element that names one of another model, where that is not in the copy; or they let it name
-    one of the same name that is. Such elements are made anew at the end: those that programs made are known, and those
-    whose names were read from text are found by counting.
+    MuJoCo's copies drop an element that refers to another model, or let it refer to an element of the same name in the
+    copy. Such elements are added again at the end. References that programs made are on record; references by text are
+    detected by counting.
     """
     late = late_elements.foreign_kinds(models)
     wanted = _wanted(models)
@@ -64,12 +64,12 @@ def _whole(model: Tree[Handle], models: list[Tree[Handle]]) -> MjSpec:
         out = _compose(model, late)
         late_elements.add(out, model, models, late)
         late_elements.point_aside(out, model, models, late)
-        found = late_elements.count(out)
-        lost = {kind for kind, number in wanted.items() if found[kind] != number}
+        counts = late_elements.count(out)
+        lost = {kind for kind, number in wanted.items() if counts[kind] != number}
         if not lost:
             return out
         if lost & late or not lost <= set(SECTION_KINDS):
-            each = ", ".join(f"{found[k]} of {wanted[k]} of kind {k}" for k in sorted(lost))
+            each = ", ".join(f"{counts[k]} of {wanted[k]} of kind {k}" for k in sorted(lost))
             raise UsageError(
                 f"model {model.model!r} loses elements when it is composed: {each} are left",
                 hint="an element that names another one by text names it as its own model does: arm/hand/finger",
@@ -87,7 +87,7 @@ def _wanted(models: list[Tree[Handle]]) -> dict[str, int]:
 
 
 def _compose(model: Tree[Handle], late: frozenset[str]) -> MjSpec:
-    """Return a new ``MjSpec`` that holds copies of a model and of all that is attached to it, with default options.
+    """Return a new ``MjSpec`` that holds copies of a model and of all attached models, with default options.
 
     Names of attached elements are prefixed with ``model/``; each attached model stands in a body of that name.
     Bodies, joints, geoms, actuators and so on are in depth-first order, as PyMJCF writes them.
@@ -119,24 +119,24 @@ def free_body(model: Tree[Handle]) -> Native | None:
 
 
 def copy_spec(model: Tree[Handle], late: frozenset[str] = frozenset()) -> MjSpec:
-    """Return a copy of a model's own spec in which every element has a name, and names what it should in this model.
+    """Return a copy of a model's own spec in which every element has a name, and the references of this model hold.
 
-    What an element names in another model has a name there that no element of this one has.
+    A reference to an element of another model gets a name that no element of this model has.
     """
     spec = model._spec
     unnamed = list(_unnamed(model))
-    left_out = [(native, native.name) for kind in late for native in getattr(spec, translate.plural(kind))]
+    dropped = [(native, native.name) for kind in late for native in getattr(spec, translate.plural(kind))]
     try:
         for native, name in unnamed:
             native.name = name
         for (native, key), target in model.references.items():
-            own = target.root is model and not target.is_removed
-            point(native, key, target._native.name if own else ELSEWHERE)
-        for native, _ in left_out:  # the names of what a copy drops stay taken in it
+            is_here = target.root is model and not target.is_removed
+            point(native, key, target._native.name if is_here else ELSEWHERE)
+        for native, _ in dropped:  # the copy keeps the names of dropped elements reserved
             native.name = ""
         out = spec.copy()
     finally:
-        for native, name in (*left_out, *((native, "") for native, _ in unnamed)):
+        for native, name in (*dropped, *((native, "") for native, _ in unnamed)):
             native.name = name
     for kind in late:
         for native in getattr(out, translate.plural(kind)):
@@ -147,8 +147,8 @@ def copy_spec(model: Tree[Handle], late: frozenset[str] = frozenset()) -> MjSpec
 def full_copy(model: Tree[Handle]) -> MjSpec:
     """Return a copy of a model's own spec as ``copy_spec`` does, with what names elements of other models."""
     wanted = late_elements.count(model._spec)
-    found = late_elements.count(copy_spec(model))
-    late = late_elements.closed(kind for kind, number in wanted.items() if found[kind] != number)
+    counts = late_elements.count(copy_spec(model))
+    late = late_elements.closed(kind for kind, number in wanted.items() if counts[kind] != number)
     out = copy_spec(model, late)
     for kind in late:
         for native in getattr(model._spec, translate.plural(kind)):

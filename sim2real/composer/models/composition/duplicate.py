@@ -1,4 +1,4 @@
-"""Copies of models: specs of their own, with all that is attached."""
+"""Copies of models, together with the attached models."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ T = TypeVar("T", bound=Tree[Handle])
 
 
 def duplicate(model: T) -> T:
-    """Return an independent copy of a model and of all that is attached to it; it is attached to nothing."""
+    """Return an independent copy of a model with all attached models; the copy has no parent."""
     twins: dict[Tree[Handle], Tree[Handle]] = {}
     natives: dict[Native, Native] = {}
-    made = _copy(model, twins, natives)
+    copy = _copy(model, twins, natives)
     for old, new in twins.items():
         new.overrides = old.overrides.among(twins)
         for (native, key), target in old.references.items():
             new.references[natives[native], key] = _twin(old, target, twins, natives)
         for native, path in old.paths.items():
             new.paths[natives[native]] = [_part(old, part, twins, natives) for part in path]
-    return made
+    return copy
 
 
 def _twin(
@@ -55,9 +55,9 @@ def _part(
 
 def _copy(model: T, twins: dict[Tree[Handle], Tree[Handle]], natives: dict[Native, Native]) -> T:
     spec = compose.full_copy(model)
-    made = twins[model] = type(model).owning(spec)
-    made.shows_text = model.shows_text
-    made.inherits_angle = model.inherits_angle
+    copy = twins[model] = type(model).owning(spec)
+    copy.shows_text = model.shows_text
+    copy.inherits_angle = model.inherits_angle
     natives[model._spec.worldbody] = spec.worldbody
     for kind in compose.NAMED_KINDS:
         plural = translate.plural(kind)
@@ -67,11 +67,11 @@ def _copy(model: T, twins: dict[Tree[Handle], Tree[Handle]], natives: dict[Nativ
                 new.name = ""
     for native in model._spec.tendons:
         path_of(model, native)
-    made.records = model.records.among(natives)
-    made._order = {natives[old]: number for old, number in model._order.items() if old in natives}
-    made._clock = itertools.count(max(made._order.values(), default=next(made._clock)) + 1)
+    copy.records = model.records.among(natives)
+    copy._order = {natives[old]: number for old, number in model._order.items() if old in natives}
+    copy._clock = itertools.count(max(copy._order.values(), default=next(copy._clock)) + 1)
     for name, attachment in model.attachments.items():
         child = _copy(attachment.model, twins, natives)
-        child.parent_model = made
-        made.attachments[name] = type(attachment)(child, natives[attachment.frame])
-    return made
+        child.parent_model = copy
+        copy.attachments[name] = type(attachment)(child, natives[attachment.frame])
+    return copy

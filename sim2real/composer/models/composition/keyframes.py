@@ -44,10 +44,10 @@ def _spread(compiled: MjModel, model: Tree[Handle], name: str, part: str, values
         return whole.ravel()
     kind, size = ("joint", f"n{part[1]}") if part[0] == "q" else ("actuator", "na" if part == "act" else "nu")
     whole = np.array(compiled.qpos0) if part == "qpos" else np.zeros(getattr(compiled, size))
-    own = [model.handle(kind, n) for n in getattr(model._spec, f"{kind}s")]
-    frames = [e for e in own if e.kind == "joint" and e.parent.is_frame]  # their joints came later
+    elements_here = [model.handle(kind, n) for n in getattr(model._spec, f"{kind}s")]
+    frames = [e for e in elements_here if e.kind == "joint" and e.parent.is_frame]  # their joints came later
     rows = np.zeros(0)
-    for elements in (own, [e for e in own if e not in frames]):
+    for elements in (elements_here, [e for e in elements_here if e not in frames]):
         ids = layout.resolve(compiled, kind, tuple(e.full_identifier for e in elements))
         rows = np.atleast_1d(layout.index(compiled, layout.attributes(kind)[part], ids, False))
         if rows.size == values.size:

@@ -1,8 +1,8 @@
 """Options of attached models: those that only one model sets hold for all; contradictions are errors.
 
 A field counts as set when a document or a program wrote it, or when it differs from MuJoCo's default. Sizes take the
-largest, tolerances the smallest value. What is set on a model of a world later, once models are attached, holds over
-what those models had set.
+largest, tolerances the smallest value. A setting that is written after models were attached takes precedence over the
+settings of those models.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ def _part(spec: MjSpec, path: str) -> Value:
 @functools.cache
 def _defaults() -> dict[str, dict[str, tuple[Value, Value]]]:
     """Return part -> field -> MuJoCo's default, and what compares fastest with it."""
-    blank, found = mj.MjSpec(), {}
+    blank, defaults = mj.MjSpec(), {}
     for path in PARTS:
         part = _part(blank, path)
         values = {name: getattr(part, name) for name in dir(part) if not name.startswith("_")}
-        found[path] = {k: _entry(v) for k, v in values.items() if isinstance(v, int | float | np.ndarray)}
-    found["option"] = {k: v for k, v in found["option"].items() if k not in ("disableflags", "enableflags")}
-    found[""] = {name: _entry(getattr(blank, name)) for name in _SIZES}
-    return found
+        defaults[path] = {k: _entry(v) for k, v in values.items() if isinstance(v, int | float | np.ndarray)}
+    defaults["option"] = {k: v for k, v in defaults["option"].items() if k not in ("disableflags", "enableflags")}
+    defaults[""] = {name: _entry(getattr(blank, name)) for name in _SIZES}
+    return defaults
 
 
 def _entry(value: Value) -> tuple[Value, Value]:
@@ -78,16 +78,16 @@ def _bits() -> dict[str, tuple[str, dict[str, int]]]:
     structs: dict[str, Value] = {"option": STRUCTS["mjOption"]}
     parts: Value = STRUCTS["mjVisual"].fields
     structs |= {f"visual.{part.name}": part.type for part in parts}
-    found = {}
+    bits = {}
     for path in PARTS:
         struct = structs.get(path.rstrip("_"))
         if struct is not None:
-            found[path] = path.rstrip("_").replace(".", "_"), {f.name: 1 << i for i, f in enumerate(struct.fields)}
-    return found
+            bits[path] = path.rstrip("_").replace(".", "_"), {f.name: 1 << i for i, f in enumerate(struct.fields)}
+    return bits
 
 
 def _author(spec: MjSpec, path: str, name: str) -> None:
-    """Note that a field was written, whatever its value."""
+    """Note that a field was written, with any value."""
     if path == FLAG:
         where, bit = FLAGS[name]
     else:
@@ -103,7 +103,7 @@ def _differ(a: Value, b: Value) -> bool:
 
 def settings(spec: MjSpec) -> Settings:
     """Return what a spec sets: (part, field) -> value; flags are ``enable`` or ``disable``."""
-    found: Settings = {}
+    values: Settings = {}
     written = {path: (getattr(spec.authored, where), bits) for path, (where, bits) in _bits().items()}
     for path, fields in _defaults().items():
         part = _part(spec, path)
@@ -112,20 +112,20 @@ def settings(spec: MjSpec) -> Settings:
             value = getattr(part, name)
             if isinstance(value, np.ndarray):
                 if value.tobytes() != quick or mask & bits.get(name, 0):
-                    found[path, name] = value.copy()
+                    values[path, name] = value.copy()
             elif (value != default and (value == value or default == default)) or mask & bits.get(name, 0):
-                found[path, name] = value
-    _add_flags(spec, found)
-    return found
+                values[path, name] = value
+    _add_flags(spec, values)
+    return values
 
 
-def _add_flags(spec: MjSpec, found: Settings) -> None:
+def _add_flags(spec: MjSpec, values: Settings) -> None:
     masks = {f: getattr(spec.authored, f) | getattr(spec.option, f) for f in ("disableflags", "enableflags")}
     if any(masks.values()):
         for name, (field, bit) in FLAGS.items():
             if masks[field] & bit:
                 raised = bool(getattr(spec.option, field) & bit)
-                found[FLAG, name] = "enable" if raised == (field == "enableflags") else "disable"
+                values[FLAG, name] = "enable" if raised == (field == "enableflags") else "disable"
 
 
 class Member(Protocol):
@@ -148,7 +148,7 @@ class Member(Protocol):
 
     @property
     def attachments(self) -> Mapping[str, Value]:
-        """What is attached to it."""
+        """The attached models, by name."""
         ...
 
     @property
@@ -161,7 +161,7 @@ class Member(Protocol):
         ...
 
     def settings(self) -> Settings:
-        """Return what it sets."""
+        """Return its settings."""
         ...
 
     def touch_settings(self) -> None:
@@ -191,10 +191,10 @@ class Overrides:
 
     def among(self, twins: Mapping[Value, Value]) -> Overrides:
         """Return the same of a copied model, among the copies of the others: model -> its copy."""
-        made = Overrides()
+        overrides = Overrides()
         for key, (when, covered) in self._noted.items():
-            made._noted[key] = when, weakref.WeakSet(twins[m] for m in covered if m in twins)
-        return made
+            overrides._noted[key] = when, weakref.WeakSet(twins[m] for m in covered if m in twins)
+        return overrides
 
     def __bool__(self) -> bool:
         return bool(self._noted)
@@ -208,13 +208,13 @@ def merged(models: Iterable[Member]) -> Settings:
     """
     models = list(models)
     later = [m.overrides for m in models if m.overrides]
-    found: Settings = {}
+    values: Settings = {}
     owner: dict[tuple[str, str], str] = {}
     for model in models:
         for key, value in model.settings().items():
             if any(overrides.beats(key, model) for overrides in later):
                 continue
-            mine, name = found.get(key, value), key[1]
+            mine, name = values.get(key, value), key[1]
             if name in _SMALLEST:
                 value = min(mine, value)
             elif name in _LARGEST:
@@ -225,11 +225,11 @@ def merged(models: Iterable[Member]) -> Settings:
                 raise UsageError(
                     f"Conflicting values for attribute `{'.'.join(filter(None, key))}`: {mine} in model "
                     f"{owner[key]!r}, {value} in model {model.model!r}",
-                    hint="set it in one of the two models only, or once more after they were attached",
+                    hint="set it in one of the two models only, or again after they were attached",
                 )
-            found[key] = value
+            values[key] = value
             owner.setdefault(key, model.model)
-    return found
+    return values
 
 
 def note(model: Member, path: str, name: str) -> None:
@@ -243,26 +243,26 @@ def note(model: Member, path: str, name: str) -> None:
     model.touch_settings()
 
 
-def in_world(model: Member, path: str, name: str, own: Value) -> Value:
+def in_world(model: Member, path: str, name: str, value_here: Value) -> Value:
     """Return the value of a setting in the world that a model is a part of, given the model's own.
 
     Args:
         path: Part of the spec, such as ``option`` or ``visual.map``; '' for sizes.
     """
     if model.parent_model is None and not model.attachments:
-        return own
-    value = merged(model.root_model.all_models()).get((path, name), own)
+        return value_here
+    value = merged(model.root_model.all_models()).get((path, name), value_here)
     if not isinstance(value, np.ndarray):
         return value
-    if np.array_equal(value, own):
-        return own
+    if np.array_equal(value, value_here):
+        return value_here
     value.flags.writeable = False  # another model's: writing into it would change nothing
     return value
 
 
-def clear(spec: MjSpec, found: Settings) -> None:
+def clear(spec: MjSpec, values: Settings) -> None:
     """Put settings back to MuJoCo's defaults, in a copy that is about to become a part of another spec."""
-    for path, name in found:
+    for path, name in values:
         if path == FLAG:
             spec.option.disableflags = spec.option.enableflags = 0
         else:
@@ -271,9 +271,9 @@ def clear(spec: MjSpec, found: Settings) -> None:
         setattr(spec.authored, where, 0)
 
 
-def apply(spec: MjSpec, found: Settings) -> None:
+def apply(spec: MjSpec, values: Settings) -> None:
     """Set settings."""
-    for (path, name), value in found.items():
+    for (path, name), value in values.items():
         if path == FLAG:
             set_flag(spec, name, value)
         else:

@@ -1,4 +1,4 @@
-"""Elements that are made anew in a composed spec: MuJoCo's copies would lose them, or let them name another one."""
+"""Elements that are added again to a composed spec: MuJoCo's copies would drop them, or change their references."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ _NAMED_BY = {"tendon": ("actuator", "sensor", "equality"), "actuator": ("sensor"
 
 
 def closed(kinds: Iterable[str]) -> frozenset[str]:
-    """Return kinds of elements that are made anew together: some, and those that name them."""
-    found = set(kinds)
+    """Return the kinds of elements that must be added again together: the given ones, and those that name them."""
+    closure = set(kinds)
     for kind, others in _NAMED_BY.items():
-        if kind in found:
-            found.update(others)
-    return frozenset(found | {"tuple"} if found else found)
+        if kind in closure:
+            closure.update(others)
+    return frozenset(closure | {"tuple"} if closure else closure)
 
 
 def foreign_kinds(models: list[Tree[Handle]]) -> frozenset[str]:
     """Return the kinds of elements in sections that name elements of other models, as far as programs named those."""
-    found = set()
+    kinds = set()
     for model in models:
         for (native, _), target in model.references.items():
             if target.root is not model or target.is_removed:
-                found.add(translate.kind_of(native))
+                kinds.add(translate.kind_of(native))
         if any(p.is_outdated(model) for native in model._spec.tendons for p in model.paths.get(native, ())):
-            found.add("tendon")
-    return closed(found & set(SECTION_KINDS))
+            kinds.add("tendon")
+    return closed(kinds & set(SECTION_KINDS))
 
 
 def final_name(target: Handle, top: Tree[Handle]) -> str:
@@ -64,30 +64,30 @@ def named(model: Tree[Handle], element: str, kind: str, target: Handle | str, to
     """Return the name, in the spec of a world, of what an element of a model names.
 
     Args:
-        target: What it names: an element, or a text.
+        target: The referenced element, or its name.
 
     Raises:
         UsageError: When it is not there.
     """
-    found: Any = target
+    element_named: Any = target
     if isinstance(target, str):
         if not kind:
             return target
-        found = model.find(kind, target)
-        if found is None:
-            known = ", ".join(filter(None, (e.name for e in model.find_all(kind, exclude_attachments=True))))
+        element_named = model.find(kind, target)
+        if element_named is None:
+            available = ", ".join(filter(None, (e.name for e in model.find_all(kind, exclude_attachments=True))))
             raise UsageError(
                 f"{element} of model {model.model!r} names the {kind} {target!r}, which is not there. "
-                f"Available: {known}",
+                f"Available: {available}",
                 hint="elements of attached models have the names of those in front: arm/hand/finger",
             )
-    if found.is_removed:
-        name = found.root.removed.get(found, "")
+    if element_named.is_removed:
+        name = element_named.root.removed.get(element_named, "")
         raise UsageError(
             f"{element} of model {model.model!r} names the {kind} {name!r}, which was removed",
             hint=f"remove the {element.split()[0]} as well, or let it name another {kind}",
         )
-    return final_name(found, top)
+    return final_name(element_named, top)
 
 
 def add(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], kinds: frozenset[str]) -> None:
@@ -114,7 +114,7 @@ def add(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], kinds: froze
 
 
 def copied(out: MjSpec, kind: str, native: Native, name: str) -> Native:
-    """Add a copy of an element to a spec; what it names is called as in its own spec, and a tendon has no path yet."""
+    """Add a copy of an element to a spec; its references keep their names, and a tendon has no path yet."""
     new = getattr(out, f"add_{kind}")()
     for key in translate.attributes(native):
         value = getattr(native, key)
@@ -149,9 +149,9 @@ COUNTED = (*TREE_KINDS, *SECTION_KINDS, *("mesh", "material", "texture", "hfield
 
 def count(spec: MjSpec) -> dict[str, int]:
     """Return how many elements of each kind a spec has; its world is no body."""
-    found = {kind: len(getattr(spec, translate.plural(kind))) for kind in COUNTED}
-    found["body"] -= 1
-    return found
+    counts = {kind: len(getattr(spec, translate.plural(kind))) for kind in COUNTED}
+    counts["body"] -= 1
+    return counts
 
 
 def count_own(model: Tree[Handle]) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""What was said of an element, in MJCF's spelling: an ``MjSpec`` holds values, but not which of them are defaults."""
+"""Explicit attributes of elements, in MJCF's spelling: an ``MjSpec`` holds values, but not which are defaults."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _EQUALITIES = {kind: name.removeprefix("mjEQ_").lower() for name, kind in mj.mjt
 
 
 @dataclass(slots=True)
-class Given:
+class ExplicitValues:
     """The tag of an element, and the attributes that were given to it: name -> value, as it was written."""
 
     tag: str
@@ -62,13 +62,13 @@ class PathPart:
 
 
 class Document:
-    """The text of a model, from which the tags and attributes of its elements are read when somebody asks.
+    """The text of a model; the tags and attributes of its elements are read on first use.
 
     Args:
-        text: MJCF, no two elements of which stand on one line.
+        text: MJCF with at most one element on a line.
 
     Attributes:
-        says_angle: Whether it says in which unit its angles are.
+        says_angle: Whether it sets the unit of angles.
     """
 
     def __init__(self, text: str) -> None:
@@ -76,30 +76,30 @@ class Document:
         self.says_angle = re.search(r"<compiler[^>]*\sangle\s*=", text) is not None
 
     @functools.cached_property
-    def lines(self) -> dict[int, Given]:
-        """Number of a line, from 1 -> what is given of the element that begins there."""
-        found, line = {}, 1
+    def lines(self) -> dict[int, ExplicitValues]:
+        """Number of a line, from 1 -> record of the element that begins there."""
+        records, line = {}, 1
         for match in _TAG.finditer(self._text):
             if match[1]:
                 pairs = _PAIR.findall(match[2])
-                found[line] = Given(match[1], {_name(k): unescape(a or b, _QUOTES) for k, a, b in pairs})
+                records[line] = ExplicitValues(match[1], {_name(k): unescape(a or b, _QUOTES) for k, a, b in pairs})
             line += match[0].count("\n")
-        return found
+        return records
 
     @functools.cached_property
     def classes(self) -> dict[str, str | None]:
         """Class of defaults -> the class above it, None for the one that holds for everything."""
-        found: dict[str, str | None] = {}
+        parents: dict[str, str | None] = {}
 
         def visit(node: Value, above: str | None) -> None:
             name = node.get("class", "main") if above is None else node.get("class")
-            found[name] = above
+            parents[name] = above
             for below in node.findall("default"):
                 visit(below, name)
 
         for top in ElementTree.fromstring(self._text).findall("default"):
             visit(top, None)
-        return found
+        return parents
 
 
 def _name(key: str) -> str:
@@ -107,43 +107,43 @@ def _name(key: str) -> str:
 
 
 class Records:
-    """What was given of every element of a model.
+    """The explicit attributes of every element of a model.
 
     Args:
-        document: What the model was made from, where it is known.
-        is_blank: Whether it was made from nothing: then nothing is given but what is noted.
+        document: The document of the model; None: a program made it.
+        is_blank: Whether the model began empty: then only noted attributes are explicit.
     """
 
     def __init__(self, document: Document | None = None, is_blank: bool = False) -> None:
         self._document, self.is_blank = document, is_blank
         self._has_defaults = False
-        self._of: dict[Native | tuple[Native, str], Given] = {}
+        self._of: dict[Native | tuple[Native, str], ExplicitValues] = {}
 
     @property
     def has_defaults(self) -> bool:
-        """Whether there may be a class of defaults that says something."""
+        """Whether a class of defaults may have explicit attributes."""
         return self._has_defaults or not self.is_blank
 
     def note_default(self, native: Native, kind: str, tag: str, name: str, value: Value) -> None:
         """Note that an attribute of a class of defaults was set."""
         self._has_defaults = True
-        said = self.of_class(native, kind)
-        said.tag = tag
-        said.note(name, value)
+        record = self.of_class(native, kind)
+        record.tag = tag
+        record.note(name, value)
 
     @property
     def is_silent_on_angles(self) -> bool:
-        """Whether nobody said if angles are in degrees: neither the document that there is, nor a program."""
+        """Whether neither the document nor a program has set the unit of angles."""
         return self._document is not None and not self._document.says_angle
 
     def say_angle(self) -> None:
-        """Note that a program said it."""
+        """ExplicitValues that a program has set the unit of angles."""
         if self._document is not None:
             self._document.says_angle = True
 
     def note(self, native: Native, tag: str, values: dict[str, Value]) -> None:
         """Note that an element was added."""
-        self._of[native] = Given(tag, values)
+        self._of[native] = ExplicitValues(tag, values)
 
     def class_parent(self, name: str) -> str | None:
         """Return the class of defaults above another one, or None."""
@@ -171,35 +171,35 @@ class Records:
 
     def among(self, natives: Mapping[Native, Native]) -> Records:
         """Return the same of a copied model: element -> its copy."""
-        made = Records(self._document, self.is_blank)
-        made._has_defaults = self._has_defaults
-        made._of = {natives[n]: Given(g.tag, dict(g.values)) for n, g in self._of.items() if n in natives}
-        return made
+        records = Records(self._document, self.is_blank)
+        records._has_defaults = self._has_defaults
+        records._of = {natives[n]: ExplicitValues(g.tag, dict(g.values)) for n, g in self._of.items() if n in natives}
+        return records
 
-    def of(self, native: Native, kind: str) -> Given:
-        """Return what was given of an element."""
+    def of(self, native: Native, kind: str) -> ExplicitValues:
+        """Return the explicit attributes of an element."""
         key = (native, kind) if kind == "inertial" else native
-        found = self._of.get(key)
-        if found is None:
-            found = self._of[key] = self._found(native, kind, translate.class_defaults)
-        return found
+        record = self._of.get(key)
+        if record is None:
+            record = self._of[key] = self._new_record(native, kind, translate.class_defaults)
+        return record
 
-    def of_class(self, native: Native, kind: str) -> Given:
-        """Return what a class of defaults says of the elements of a kind."""
-        found = self._of.get(native)
-        if found is None:  # asking a class for its class ends the process
-            found = self._of[native] = self._found(native, kind, lambda native, kind: translate.blank(kind))
-        return found
+    def of_class(self, native: Native, kind: str) -> ExplicitValues:
+        """Return the explicit attributes of a class of defaults for the elements of a kind."""
+        record = self._of.get(native)
+        if record is None:  # asking a class for its class ends the process
+            record = self._of[native] = self._new_record(native, kind, lambda native, kind: translate.blank(kind))
+        return record
 
-    def _found(self, native: Native, kind: str, defaults: Callable[[Native, str], Native]) -> Given:
+    def _new_record(self, native: Native, kind: str, defaults: Callable[[Native, str], Native]) -> ExplicitValues:
         if self.is_blank and kind != "inertial":
-            return Given(_tag(native, kind))
+            return ExplicitValues(_tag(native, kind))
         return self._written(native, kind) or read(native, kind, defaults(native, kind))
 
-    def _written(self, native: Native, kind: str) -> Given | None:
+    def _written(self, native: Native, kind: str) -> ExplicitValues | None:
         return None if kind == "inertial" else self.written(native)
 
-    def written(self, native: Native) -> Given | None:
+    def written(self, native: Native) -> ExplicitValues | None:
         """Return what the document has of an element, or of a part of a tendon's path; None without a document."""
         words = native.info.split()
         if self._document is None or len(words) != 2 or not words[1].isdigit():
@@ -207,21 +207,21 @@ class Records:
         return self._document.lines.get(int(words[1]))
 
 
-def read(native: Native, kind: str, blank: Native) -> Given:
-    """Return what can be told from an ``MjSpec`` alone: values that differ from the defaults, ``blank``."""
+def read(native: Native, kind: str, blank: Native) -> ExplicitValues:
+    """Return the explicit values according to an ``MjSpec`` alone: those that differ from the defaults, ``blank``."""
     tag = _tag(native, kind)
-    found = Given(tag)
+    record = ExplicitValues(tag)
     for name in schema.attributes(kind, tag):
         key = translate.native_name(kind, name)
         if key in translate.attributes(native):
             value = getattr(native, key)
             if not translate.same(value, getattr(blank, key)):
-                found.values[name] = value
-    return found
+                record.values[name] = value
+    return record
 
 
 def _tag(native: Native, kind: str) -> str:
-    """Return the tag of an element of an ``MjSpec`` that nobody wrote down: MuJoCo forgets some of it."""
+    """Return the tag of an element without a record; an ``MjSpec`` does not distinguish all tags."""
     if kind == "sensor":
         return _SENSORS.get(native.type, "user")
     if kind == "equality":
@@ -233,15 +233,19 @@ def _tag(native: Native, kind: str) -> str:
     return kind
 
 
-def show(value: Value, given: Value) -> Value:
+def show(value: Value, explicit: Value) -> Value:
     """Return a native value as PyMJCF shows it: keywords as text, arrays as long as they were given."""
     if isinstance(value, np.ndarray) and value.ndim == 1:
-        size = len(given.split()) if isinstance(given, str) else np.size(given)
+        size = len(explicit.split()) if isinstance(explicit, str) else np.size(explicit)
         return value[:size]
     if isinstance(value, bool | mj.mjtLimited):
-        return str(given).lower() if isinstance(given, str | bool | np.bool_) else ("false", "true", "auto")[int(value)]
+        return (
+            str(explicit).lower()
+            if isinstance(explicit, str | bool | np.bool_)
+            else ("false", "true", "auto")[int(value)]
+        )
     if isinstance(value, float):  # materials are kept in single precision
-        exact = _number(given)
+        exact = _number(explicit)
         return exact if exact is not None and np.float32(exact) == np.float32(value) else value
     if isinstance(value, int | str) and not hasattr(value, "name"):
         return value
@@ -249,12 +253,12 @@ def show(value: Value, given: Value) -> Value:
         shown = np.array(value)
         shown.flags.writeable = False
         return shown
-    return given
+    return explicit
 
 
-def _number(given: Value) -> float | None:
+def _number(value: Value) -> float | None:
     try:
-        return float(given)
+        return float(value)
     except (TypeError, ValueError):
         return None
 

@@ -62,11 +62,11 @@ def asset_of(model: Tree[Handle], kind: str, file: Asset | str) -> Asset:
     path = Path(file)
     for name in (file, str(Path(folder) / path), path.name):
         if name in spec.assets:
-            found = Asset(spec.assets[name], path.suffix)
-            if found.get_vfs_filename() == path.name:  # so a program that gave its contents called it
-                return found
-            digest = found.get_vfs_filename().removesuffix(path.suffix)
-            return Asset(found.contents, path.suffix, path.stem.removesuffix(f"-{digest}"))
+            asset = Asset(spec.assets[name], path.suffix)
+            if asset.get_vfs_filename() == path.name:  # so a program that gave its contents called it
+                return asset
+            digest = asset.get_vfs_filename().removesuffix(path.suffix)
+            return Asset(asset.contents, path.suffix, path.stem.removesuffix(f"-{digest}"))
     full = Path(spec.modelfiledir or ".") / (folder or "") / path
     if not full.is_file():
         raise UsageError(f"model {model.model!r} has no file {file!r}: it is neither among its assets nor at {full}")
@@ -74,12 +74,12 @@ def asset_of(model: Tree[Handle], kind: str, file: Asset | str) -> Asset:
 
 
 def collect(model: Tree[Handle]) -> dict[str, bytes]:
-    """Return the contents of all files of a model and of what is attached to it, by the names in its MJCF."""
-    found = {}
+    """Return the contents of all files of a model and of attached models, by the names in its MJCF."""
+    contents = {}
     for one in model.all_models():
         for _, asset in _named(one):
-            found[asset.get_vfs_filename()] = asset.contents
-    return found
+            contents[asset.get_vfs_filename()] = asset.contents
+    return contents
 
 
 def _named(model: Tree[Handle]) -> Iterator[tuple[Native, Asset]]:
@@ -91,7 +91,7 @@ def _named(model: Tree[Handle]) -> Iterator[tuple[Native, Asset]]:
 
 @contextlib.contextmanager
 def renamed(model: Tree[Handle]) -> Iterator[None]:
-    """Call every file of a model, and of what is attached to it, as ``collect`` does, in a ``with`` block."""
+    """Rename every file of a model and of attached models, as ``collect`` does, inside a ``with`` block."""
     undo: list[tuple[Native | MjSpec, str, str]] = []
     added: list[tuple[MjSpec, str]] = []
     try:

@@ -68,24 +68,24 @@ def from_path(path: str | os.PathLike[str], assets: dict[str, bytes] | None = No
 
 
 def _read(path: Path, folder: Path, assets: dict[str, bytes]) -> str:
-    """Return the text of a document with what it includes in its place."""
+    """Return the text of a document with its included documents in place."""
     name = str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
     text = assets[name].decode() if name in assets else path.read_text(encoding="utf-8")
     return _with_included(text, path.parent, folder, assets)
 
 
 def _with_included(text: str, beside: Path, folder: Path, assets: dict[str, bytes]) -> str:
-    """Return a document with what it includes in its place, looked for in two folders."""
+    """Return a document with its included documents in place; two folders are searched for them."""
 
     def included(match: re.Match[str]) -> str:
         candidates = [folder / match[1], beside / match[1]]
-        found = next((c for c in candidates if c.is_file() or match[1] in assets), None)
-        if found is None:
+        path = next((c for c in candidates if c.is_file() or match[1] in assets), None)
+        if path is None:
             raise UsageError(
                 f"the document includes {match[1]!r}, which is not there",
                 hint=f"looked for {candidates[0]}; from_xml_string takes model_dir and assets",
             )
-        body = _ROOT.search(_read(found, folder, assets))
+        body = _ROOT.search(_read(path, folder, assets))
         return body[2] if body else ""
 
     return _INCLUDE.sub(included, _COMMENT.sub("", text)) if "<include" in text else text

@@ -1,4 +1,4 @@
-"""Attributes that name other elements: they name them still when those are called otherwise."""
+"""Attributes that name other elements; they follow when those are renamed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ REFERENCES = {
 
 
 def refer(element: Handle, key: str, target: Handle | str | None) -> None:
-    """Let an attribute name another element, whatever that is called later.
+    """Let an attribute name another element; the reference follows later renames.
 
     Args:
         key: The attribute, in the spelling of ``MjSpec``.
@@ -64,17 +64,17 @@ def refer(element: Handle, key: str, target: Handle | str | None) -> None:
 
 def referenced(element: Handle, name: str) -> Handle | str | None:
     """Return the element that an attribute names, its name where it does not exist, or None."""
-    model, said = element.root, element.recorded()
+    model, record = element.root, element.recorded()
     key = _native_key(element, name)
     target = model.references.get((element._native, key))
     if target is not None:
         return None if target.is_removed else target
-    for found, kind, text in targets.targets(element.kind, element._native):
-        if found == key and model.shows_text:
+    for attribute, kind, text in targets.targets(element.kind, element._native):
+        if attribute == key and model.shows_text:
             return text
-        if found == key:
+        if attribute == key:
             return (model.find(kind, text) if kind else None) or text
-    text = said.values.get(name)
+    text = record.values.get(name)
     return None if isinstance(text, Handle) and text.is_removed else text
 
 
@@ -93,7 +93,7 @@ def _native_key(element: Handle, name: str) -> str:
 
 
 def rename(element: Handle, name: str) -> None:
-    """Call an element otherwise; what names it names it still."""
+    """Rename an element; references to it follow."""
     model: Tree[Handle] = element.root
     old = element.name
     if old:
@@ -108,7 +108,7 @@ def rename(element: Handle, name: str) -> None:
 
 
 def hold_below(model: Tree[Handle], prefix: str) -> None:
-    """Hold as elements what is named by text with a prefix: elements of a model that will be called otherwise.
+    """Turn references by text with a prefix into references by element, before a model is renamed.
 
     Args:
         prefix: The prefix of its names, such as ``arm/``.
@@ -117,9 +117,9 @@ def hold_below(model: Tree[Handle], prefix: str) -> None:
         lead = model.prefix(one) + prefix
         _read_paths(one)
         for native, key, kind, text in list(targets.by_text(one, targets.ALL)):
-            found = one.find(kind, text) if text.startswith(lead) and kind else None
-            if found is not None:
-                one.references[native, key] = found
+            target = one.find(kind, text) if text.startswith(lead) and kind else None
+            if target is not None:
+                one.references[native, key] = target
 
 
 def let_go(model: Tree[Handle], gone: Iterable[Handle]) -> None:
@@ -159,7 +159,7 @@ def _hold(elements: Iterable[Handle]) -> None:
 
 
 def _seeing(model: Tree[Handle]) -> Iterator[Tree[Handle]]:
-    """Yield a model and all that it is below: they can name its elements by text."""
+    """Yield a model and all models above it: they can name its elements by text."""
     one: Tree[Handle] | None = model
     while one is not None:
         yield one

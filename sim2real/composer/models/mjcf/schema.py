@@ -1,4 +1,4 @@
-"""Which tags MJCF has, where they stand and with which attributes, as MuJoCo's own parser knows them."""
+"""The tags of MJCF, their places and their attributes, according to MuJoCo's own parser."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ FROM_DOCUMENTS = "write it in MJCF, read that with mjcf.from_xml_string and atta
 @functools.cache
 def tables() -> dict[tuple[str, ...], frozenset[str]]:
     """Return path of tags, such as ``("actuator", "motor")`` -> names of attributes."""
-    found: dict[tuple[str, ...], list[str]] = {}
+    table: dict[tuple[str, ...], list[str]] = {}
     path: tuple[str, ...] = ()
     for line in mj.mj_printSchema(False, False).splitlines():
         entry = _ENTRY.match(line)
         if entry is None:
-            found[path] += line.split()
+            table[path] += line.split()
             continue
         depth = len(entry[1]) // _INDENT
         path = (*path[:depth], entry[2].replace("(world)", ""))
-        found[path] = entry[3].split()
-    return {path[1:]: frozenset(names) for path, names in found.items()}
+        table[path] = entry[3].split()
+    return {path[1:]: frozenset(names) for path, names in table.items()}
 
 
 @functools.cache
@@ -64,7 +64,7 @@ def attributes(kind: str, tag: str) -> frozenset[str]:
         tag: Its tag, such as ``motor``; the same as the kind where there is only one.
     """
     names: frozenset[str] = frozenset()
-    for path, found in tables().items():
+    for path, more in tables().items():
         if path[-1:] == (tag,) and (path == ("body",) or (len(path) == 2 and path[0] in (kind, *_SHARED))):
-            names |= found
+            names |= more
     return names - {"class"} | ({"dclass"} if "class" in names else frozenset())

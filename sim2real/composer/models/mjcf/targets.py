@@ -1,4 +1,4 @@
-"""Which attributes of the elements of an ``MjSpec`` name other elements, and of which kind those are."""
+"""The attributes of elements of an ``MjSpec`` that name other elements, and the kinds of those."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ FIXED: dict[str, dict[str, str]] = {
 
 The path of a tendon names elements too: see ``paths``."""
 SECTION_KINDS = ("pair", "exclude", "equality", "tendon", "actuator", "sensor", "tuple")
-"""Elements that stand in no body and name elements: MuJoCo drops them from a copy in which what they name is not."""
+"""Elements outside of bodies with references: MuJoCo drops them from a copy without the referenced elements."""
 ALL = frozenset(layout.KINDS)
 """Kinds of elements that are named."""
 COSMETIC = ("material", "texture")
-"""What an element can do without, when it is removed."""
+"""Kinds that an element works without, when they are removed."""
 _IN_CLASSES = {"material", "mesh", "hfield", "texture"}
 _IN_DEFAULTS = ("geom", "site", "light", "mesh", "material", "tendon")
 
 
 def targets(kind: str, native: Native) -> Iterator[tuple[str, str, str]]:
-    """Yield what an element names: the attribute, such as ``target`` or ``textures[1]``, kind and name of the other."""
+    """Yield the references of an element: attribute like ``target`` or ``textures[1]``, kind and name of the other."""
     for key, named in FIXED.get(kind, {}).items():
         value = getattr(native, key)
         if isinstance(value, str):
@@ -84,9 +84,9 @@ def _kind_of(kind: str, native: Native, key: str, number: int) -> str:
 
 
 def by_text(model: Tree[Handle], kinds: Collection[str]) -> Iterator[tuple[Native, str, str, str]]:
-    """Yield what the elements of a model name by text alone: the element, attribute, kind and name of the other.
+    """Yield the references of a model by text alone: the element, attribute, kind and name of the other.
 
-    What a program named by element is left out, and so are the paths of tendons.
+    References that a program made by element do not count, nor do the paths of tendons.
     """
     spec = model._spec
     for kind, attributes in FIXED.items():
@@ -97,7 +97,7 @@ def by_text(model: Tree[Handle], kinds: Collection[str]) -> Iterator[tuple[Nativ
 
 
 def of_classes(model: Tree[Handle], kinds: Collection[str]) -> Iterator[tuple[Native, str, str, str]]:
-    """Yield what the classes of defaults of a model name, as ``by_text`` does."""
+    """Yield the references in classes of defaults, as ``by_text`` does."""
     for name in model.records.class_names() if not _IN_CLASSES.isdisjoint(kinds) else ():
         for kind in _IN_DEFAULTS:
             native = getattr(model._spec.find_default(name), kind)

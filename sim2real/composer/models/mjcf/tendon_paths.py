@@ -1,4 +1,4 @@
-"""Paths of tendons: what they run over, held as elements. An ``MjSpec`` has names there, and does not change them."""
+"""Paths of tendons, held as elements. An ``MjSpec`` has names there, and does not change them."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _TAGS = {
 
 def path_of(model: Tree[Handle], native: Native) -> list[PathPart]:
     """Return the path of a tendon."""
-    known = model.paths.setdefault(native, [])
-    known += [_read(model, native, wrap) for wrap in list(native.path)[len(known) :]]
-    return known
+    parts = model.paths.setdefault(native, [])
+    parts += [_read(model, native, wrap) for wrap in list(native.path)[len(parts) :]]
+    return parts
 
 
 def _read(model: Tree[Handle], native: Native, wrap: Value) -> PathPart:
@@ -42,9 +42,9 @@ def _read(model: Tree[Handle], native: Native, wrap: Value) -> PathPart:
     values: dict[str, Value] = {"coef": wrap.coef} if tag == "joint" else {}
     if tag == "pulley":
         return PathPart(tag, {"divisor": wrap.divisor}, {})
-    said = model.records.written(wrap)
+    record = model.records.written(wrap)
     for key, target in zip(NAMING[tag], (wrap.target, wrap.sidesite if tag == "geom" else None), strict=False):
-        text = None if said is None else said.values.get(key)
+        text = None if record is None else record.values.get(key)
         if target is not None:
             values[key] = model.handle(KIND[key], target)
         elif text:

@@ -117,10 +117,10 @@ def read(native: Native, kind: str, key: str) -> Value:
 
 def is_plain(native: Native, kind: str, key: str, value: Value) -> bool:
     """Return whether a value can be put where the ``MjSpec`` holds an attribute, without MuJoCo's parser."""
-    found = _PLAIN.get((kind, key))
-    if found is None:
-        found = _PLAIN[kind, key] = _is_plain(native, kind, key)
-    return found[isinstance(value, str)]
+    plain = _PLAIN.get((kind, key))
+    if plain is None:
+        plain = _PLAIN[kind, key] = _is_plain(native, kind, key)
+    return plain[isinstance(value, str)]
 
 
 _PLAIN: dict[tuple[str, str], tuple[bool, bool]] = {}
@@ -167,15 +167,15 @@ _BLANKS: list[MjSpec] = []
 
 def class_defaults(native: Native, kind: str) -> Native:
     """Return what holds the defaults of an element's class."""
-    found = getattr(getattr(native, "classname", None), kind, None)
-    return blank(kind) if found is None else found
+    defaults = getattr(getattr(native, "classname", None), kind, None)
+    return blank(kind) if defaults is None else defaults
 
 
 def assign(native: Native, kind: str, key: str, value: Value) -> None:
     """Set an attribute of an element.
 
     Args:
-        value: What it is set to: numbers, keywords or text, as in MJCF.
+        value: Numbers, keywords or text, as in MJCF.
 
     Raises:
         AttributeError: When elements of this kind have no such attribute.
@@ -215,8 +215,8 @@ def _plan(native: Native, kind: str, key: str) -> tuple[str, int, Value, dict[st
         return key, 0, None, None
     name = native_name(kind, key)
     if name in _SKIPPED or not hasattr(native, name):
-        known = ", ".join(attributes(native))
-        raise AttributeError(f"{key!r} is not a valid attribute for <{kind}>. Available: {known}")
+        available = ", ".join(attributes(native))
+        raise AttributeError(f"{key!r} is not a valid attribute for <{kind}>. Available: {available}")
     value = getattr(native, name)
     is_array = isinstance(value, np.ndarray) and value.ndim == 1
     return name, value.size if is_array else 0, value.dtype if is_array else None, _ENUMS.get((kind, key))
@@ -277,7 +277,7 @@ def from_xml(
     Raises:
         ValueError: When the parser refuses the element.
     """
-    if kind == "tuple":  # which has no attributes; what it names is added later
+    if kind == "tuple":  # which has no attributes; its references are added later
         return {}, {}
     plain = tuple([(k, v if v.__class__ is str else _text(v)) for k, v in attrs.items() if k not in references])
     fixed, named = _parsed(kind, tag, plain, tuple(references))
@@ -301,11 +301,11 @@ def _parsed(
         text, owner = f"<{section}><{tag} {words}/></{section}>", spec
     source = getattr(mj.MjSpec.from_string(f"<mujoco>{text}</mujoco>"), plural(kind))[2 if kind == "body" else 0]
     fresh = getattr(owner, f"add_{kind}")()
-    given = {native_name(kind, k) for k, _ in plain}
+    explicit = {native_name(kind, k) for k, _ in plain}
     fixed, named = {}, {}
     for name in _attributes(type(source)):
         value = getattr(source, name)
-        if name in given or not same(value, getattr(fresh, name)):
+        if name in explicit or not same(value, getattr(fresh, name)):
             value = _detached(value)
             (named if _is_reference(value) else fixed)[name] = value
     return fixed, named

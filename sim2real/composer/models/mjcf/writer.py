@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 _MASS = 1.00123e-9
 """What bodies without mass are given while a model is written: no model has it."""
-_GIVEN = re.compile(rf'\s*<inertial [^>]*mass="{_MASS:.6g}"[^>]*/>')
+_PLACEHOLDER = re.compile(rf'\s*<inertial [^>]*mass="{_MASS:.6g}"[^>]*/>')
 _INERTIA = re.compile(rf' diaginertia="(?:{_MASS:.6g} ?){{3}}"')
 
 
@@ -34,5 +34,5 @@ def to_xml(spec: MjSpec) -> str:
     for body in thin:
         body.inertia = [_MASS] * 3
     spec.compile()
-    text = _INERTIA.sub("", _GIVEN.sub("", spec.to_xml()))
+    text = _INERTIA.sub("", _PLACEHOLDER.sub("", spec.to_xml()))
     return re.sub(r"(<body\b[^>]*)>\s*</body>", r"\1/>", text)

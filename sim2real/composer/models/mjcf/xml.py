@@ -1,4 +1,4 @@
-"""Elements as MJCF: what was given of them, without what they take from classes of defaults."""
+"""Elements as MJCF: their explicit attributes, without those of classes of defaults."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def to_xml_string(element: Value, prefix_root: Tree[Handle] | None, self_only: b
     """Return an element as MJCF.
 
     Args:
-        prefix_root: The model from which names are seen; default: the element's own.
+        prefix_root: The model that names are relative to; default: the element's own.
     """
     node = _node(element, prefix_root or element.root, self_only)
     if pretty_print:
@@ -32,12 +32,12 @@ _ORDER = ("inertial", "joint", "geom", "site", "camera", "light", "body")
 
 
 def _node(element: Value, top: Tree[Handle], self_only: bool) -> ElementTree.Element:
-    said = element.recorded().values
+    explicit = element.recorded().values
     node = ElementTree.Element(element.tag)
     if element.name and not element.is_worldbody and element.kind != "inertial":
         node.set("name", element.root.identify(element, relative_to=top))
-    for key in said:
-        value = said[key] if key.startswith("file") else getattr(element, key)
+    for key in explicit:
+        value = explicit[key] if key.startswith("file") else getattr(element, key)
         if key != "name" and value is not None:
             node.set("class" if key == "dclass" else key, _text(value, top))
     if self_only:

@@ -31,7 +31,7 @@ class Aggregator:
         self.name, self.preserves_bounds = name, preserves_bounds
 
     def __call__(self, values: Array) -> Array:
-        """Return the reduced values; a number, of which there is nothing to reduce, as it is."""
+        """Return the reduced values; a number without an axis stays as it is."""
         if np.ndim(values) == 0:  # as numpy does, and jax.numpy does not
             return values
         return getattr(namespace(values), self.name)(values, axis=0)

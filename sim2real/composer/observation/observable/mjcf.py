@@ -70,7 +70,7 @@ class MJCFCamera(Observable):
     """An image: uint8 ``(height, width, 3)``, depth float32 ``(.., 1)`` [m] or segmentation int32 ``(.., 2)``.
 
     Args:
-        scene_option: What is drawn: an ``MjvOption``.
+        scene_option: The ``MjvOption`` of the image.
 
     Raises:
         UsageError: When the element is no camera, or depth and segmentation are both asked for.

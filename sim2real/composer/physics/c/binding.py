@@ -63,7 +63,7 @@ class Place:
 
 
 class SyncedArray(np.ndarray):
-    """A part of a MuJoCo array: writing an item writes it there too, and marks what is computed from it.
+    """A part of a MuJoCo array: writing an item writes it there too, and marks computed quantities.
 
     Reading it again through its binding brings the newest values.
     """
@@ -74,7 +74,7 @@ class SyncedArray(np.ndarray):
     def __array_wrap__(
         self, array: np.ndarray, context: tuple[Any, ...] | None = None, return_scalar: bool = False
     ) -> PyTree:
-        """Return what is computed from this array as a plain one: sums of products then take a third less time."""
+        """Return results of functions of this array as plain arrays: sums of products then take a third less time."""
         return array[()] if return_scalar else array
 
     def __setitem__(self, key: Index, value: object) -> None:

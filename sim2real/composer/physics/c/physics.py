@@ -67,7 +67,7 @@ class Physics(BoundPhysics):
 
     @classmethod
     def from_mjcf_model(cls, model: Model) -> Physics:
-        """Compile a model with all that is attached to it."""
+        """Compile a model with all attached models."""
         return cls(model.compile())
 
     @classmethod
@@ -81,7 +81,7 @@ class Physics(BoundPhysics):
         return cls(mj.MjModel.from_xml_path(str(path)))
 
     def reload_from_mjcf_model(self, model: Model) -> None:
-        """Compile a model anew and start from its initial state."""
+        """Compile a model again and start from its initial state."""
         self._start(model.compile())
 
     def reload_from_xml_string(self, xml_string: str, assets: dict[str, bytes] | None = None) -> None:
@@ -120,17 +120,17 @@ class Physics(BoundPhysics):
 
     def copy(self, share_model: bool = False) -> Physics:
         """Return an independent copy of the state, and of the model unless it is to be shared."""
-        made = object.__new__(type(self))
-        made.legacy_step, made.variables, made._suppress = self.legacy_step, dict(self.variables), False
+        physics = object.__new__(type(self))
+        physics.legacy_step, physics.variables, physics._suppress = self.legacy_step, dict(self.variables), False
         model = self.model.ptr if share_model else mj.MjModel.__copy__(self.model.ptr)
         data = mj.MjData(model)
         mj.mj_copyData(data, model, self.data.ptr)
-        made._load(model, data)
-        return made
+        physics._load(model, data)
+        return physics
 
     def __reduce__(self) -> tuple[Any, ...]:
-        given = type(self), self.model.ptr, self.data.ptr, self.legacy_step, self.variables
-        return _restored, given
+        arguments = type(self), self.model.ptr, self.data.ptr, self.legacy_step, self.variables
+        return _restored, arguments
 
     # -- dynamics
 
@@ -235,14 +235,14 @@ class Physics(BoundPhysics):
             raise EpisodeInitializationError
 
     def recompute_constants(self) -> None:
-        """Compute what MuJoCo derives from masses and lengths anew, after they were changed."""
+        """Compute the constants that MuJoCo derives from masses and lengths, after these were changed."""
         mj.mj_setConst(self.model.ptr, mj.MjData(self.model.ptr))  # this state would be left as at the reference
         self.mark_as_dirty()
 
     def count_compensated(self) -> None:
         """Have MuJoCo see that bodies are compensated for gravity, where none was when the model was compiled."""
         model, before = self.model.ptr, copy.copy(self.model.ptr)
-        mj.mj_setConst(model, mj.MjData(model))  # nothing else sets the number of such bodies; the rest stays
+        mj.mj_setConst(model, mj.MjData(model))  # the only function that sets the number of such bodies
         for name, value in ((n, getattr(before, n)) for n in dir(before)):
             if isinstance(value, np.ndarray) and value.flags.writeable:
                 getattr(model, name)[...] = value
@@ -269,8 +269,8 @@ class Physics(BoundPhysics):
             height: Of the image [pixels].
             width: Of the image [pixels].
             camera_id: Number or name of one of the model's cameras; -1 is the free camera.
-            segmentation: Tell objects by numbers and types (``mjtObj``) instead.
-            scene_option: What is drawn: an ``MjvOption``.
+            segmentation: Return numbers and types (``mjtObj``) of objects instead.
+            scene_option: The ``MjvOption`` of the image.
             render_flag_overrides: Flags of ``mjtRndFlag`` -> value, for this image.
             scene_callback: Called with the physics and the ``MjvScene`` before it is drawn, to add shapes.
         """
@@ -280,7 +280,7 @@ class Physics(BoundPhysics):
 
     @property
     def contexts(self) -> None:
-        """None: there is no rendering context to keep up to date; what is drawn follows the model by itself."""
+        """None: images follow the model without a rendering context that the caller updates."""
         return
 
     def free(self) -> None:
@@ -294,7 +294,7 @@ class Physics(BoundPhysics):
 def _restored(
     kind: type[Physics], model: MjModel, data: MjData, legacy_step: bool, variables: dict[str, PyTree]
 ) -> Physics:
-    made = object.__new__(kind)
-    made.legacy_step, made.variables, made._suppress = legacy_step, variables, False
-    made._load(model, data)
-    return made
+    physics = object.__new__(kind)
+    physics.legacy_step, physics.variables, physics._suppress = legacy_step, variables, False
+    physics._load(model, data)
+    return physics

@@ -1,4 +1,4 @@
-"""OpenGL for the images of a model: contexts, what was uploaded to them, and pixels."""
+"""OpenGL for the images of a model: contexts, uploaded data, and pixels."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class _Context:
 
 
 class Overlay(Protocol):
-    """What is drawn over an image, such as a text."""
+    """A drawing over an image, such as a text."""
 
     def draw(self, context: MjrContext, rect: MjrRect) -> None:
         """Draw it into a part of the image."""

@@ -1,4 +1,4 @@
-"""Rollouts of many copies of a model on C MuJoCo, on all processors, under controls that are known beforehand."""
+"""Rollouts of many copies of a model on C MuJoCo, on all processors, under controls that are computed beforehand."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Start(NamedTuple):
 
 
 class StepLaw(Protocol):
-    """What is set before every physics step from the state then, by the same function in MJX and around C.
+    """Sets controls, forces and fields before every physics step from the state, in MJX and around C.
 
     Attributes:
         fields: The model's fields that it sets.
@@ -92,7 +92,7 @@ class OpenLoop(Protocol):
         """Take the physics out and return the ``MjModel``: from now on ``init_state`` computes nothing with it.
 
         Raises:
-            UsageError: When the controls, or anything else that is set, depend on the state; or what the world sends on
+            UsageError: When the controls, or anything else that is set, depend on the state; or the message on
                 more than positions, velocities and accelerations.
         """
 
@@ -105,7 +105,7 @@ class OpenLoop(Protocol):
         ...
 
     def controls(self, step_state: StepState) -> tuple[StepState, Array]:
-        """Return what is left of a tick without physics: the next step state, and the controls ``(substeps, nu)``."""
+        """Return a tick without its physics: the next step state, and the controls ``(substeps, nu)``."""
         ...
 
     def message(self, state: PyTree, qpos: Array, qvel: Array, qacc: Array) -> PyTree:
@@ -120,15 +120,15 @@ class OpenLoop(Protocol):
 
 
 def check_steps(world: BaseWorld, base: type) -> None:
-    """Refuse a world whose class steps or starts in its own way: nobody knows what that depends on.
+    """Refuse a world whose class overrides a step or a start: these may depend on the state.
 
     Raises:
         UsageError: With the method.
     """
     for name in ("step", "init_state", "init_output"):
         if getattr(type(world), name) is not getattr(base, name):
-            own = type(world).__name__
-            raise UsageError(f"world {world.name!r}: {own}.{name} is its own, and may depend on the state")
+            kind = type(world).__name__
+            raise UsageError(f"world {world.name!r}: {kind}.{name} is its own, and may depend on the state")
 
 
 class Rollouts:
@@ -138,7 +138,7 @@ class Rollouts:
         model: The ``MjModel``; it is copied.
         names: Fields that differ from copy to copy.
         derives: Whether constants that follow from them are computed for each copy.
-        law: What is set before every step; it costs a call of C for each.
+        law: Sets controls, forces and fields before every step; it costs a call of C for each.
 
     Raises:
         UsageError: When C does not look at a field, or only MJX has it.
@@ -194,17 +194,17 @@ class Rollouts:
         rows, law = ({n: flat(*pair) for n, pair in pairs.items()} for pairs in (wide, taken))
         begin = Start(*(flat(a, 1) for a in start))
         control = flat(controls, 3).reshape(count, ticks * self._substeps, -1)
-        found = [np.empty((count, 1 + ticks, n)) for n in (self._model.nq, self._model.nv, self._model.nv)]
+        results = [np.empty((count, 1 + ticks, n)) for n in (self._model.nq, self._model.nv, self._model.nv)]
         lanes = self._lanes(count, ticks * self._substeps)
         with _quiet():
             for first in range(0, count, lanes):
                 part = slice(first, min(first + lanes, count))
-                own = {n: values[part] for n, values in rows.items()}
+                some_fields = {n: values[part] for n, values in rows.items()}
                 some_law = {n: values[part] for n, values in law.items()}
-                made = self._part(own, Start(*(a[part] for a in begin)), control[part], some_law)
-                for whole, some in zip(found, made, strict=True):
+                some_results = self._part(some_fields, Start(*(a[part] for a in begin)), control[part], some_law)
+                for whole, some in zip(results, some_results, strict=True):
                     whole[part] = some
-        qpos, qvel, qacc = (a.reshape(*axes, *a.shape[1:]) for a in found)
+        qpos, qvel, qacc = (a.reshape(*axes, *a.shape[1:]) for a in results)
         return qpos, qvel, qacc
 
     def _part(
@@ -214,8 +214,8 @@ class Rollouts:
         batch, count, steps = self._batch, len(control), control.shape[1]
         ids = np.arange(count)
         for name, values in fields.items():
-            own = batch.expand(name)
-            own[:count] = values.reshape(count, *own.shape[1:])
+            field = batch.expand(name)
+            field[:count] = values.reshape(count, *field.shape[1:])
         failed = _failing(count, lambda: batch.set_const(ids)) if self._derives else np.zeros(count, bool)
         batch.warning[:] = 0
         batch.reset(ids, stage=mj.mjtStage.mjSTAGE_NONE)
@@ -224,9 +224,9 @@ class Rollouts:
         flags = batch.expand("opt.disableflags")
         compiled = flags.copy()
         flags |= int(mj.mjtDisableBit.mjDSBL_ACTUATION)
-        known = {n: batch.bind(n) for n in ("qpos", "qvel", "qacc")}  # before: they are filled by the next call
+        views = {n: batch.bind(n) for n in ("qpos", "qvel", "qacc")}  # before: they are filled by the next call
         failed |= _failing(count, lambda: batch.forward(ids))
-        begun = {n: rows[:count].copy() for n, rows in known.items()}
+        begun = {n: rows[:count].copy() for n, rows in views.items()}
         flags[:] = compiled
         batch.bind("qacc_warmstart")[:count] = start.warmstart
         out = {n: np.empty((count, steps, *first.shape[1:])) for n, first in begun.items()}
@@ -236,9 +236,9 @@ class Rollouts:
             failed |= _failing(count, lambda: batch.rollout(steps, control, record=tuple(out), ids=ids, out=out))
         failed |= batch.warning[:count, :, 1].any(axis=1)
         for name, rows in out.items():
-            made = np.concatenate([begun[name][:, None], rows[:, self._substeps - 1 :: self._substeps]], axis=1)
-            made[failed] = np.nan
-            yield made
+            trajectory = np.concatenate([begun[name][:, None], rows[:, self._substeps - 1 :: self._substeps]], axis=1)
+            trajectory[failed] = np.nan
+            yield trajectory
 
     def _stepwise(
         self, law: StepLaw, values: Mapping[str, np.ndarray], control: np.ndarray, out: Mapping[str, np.ndarray]

@@ -33,6 +33,6 @@ def _held(f: Callable[..., T], carry: T | None, *args: jax.Array) -> T:
 
 
 def _barrier(leaf: PyTree) -> PyTree:
-    """Return a leaf behind a barrier, unless it is a type of joint, which decides what is traced."""
-    known = not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact)
-    return leaf if known else jax.lax.optimization_barrier(leaf)
+    """Return a leaf behind a barrier, unless it is a type of joint: the trace depends on those."""
+    is_static = not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact)
+    return leaf if is_static else jax.lax.optimization_barrier(leaf)

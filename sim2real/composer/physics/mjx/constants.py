@@ -59,17 +59,17 @@ def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
         UsageError: On Warp, where MJX's own JAX does not know the model.
     """
     if is_warp(model):
-        found = derive(host, _twin(host, model)) | {"geom_aabb": _boxes(host, model)}
-        return {name: value for name, value in found.items() if varies(name)}
+        constants = derive(host, _twin(host, model)) | {"geom_aabb": _boxes(host, model)}
+        return {name: value for name, value in constants.items() if varies(name)}
     data = _at_reference(model, mjx.make_data(host, impl="jax"))
-    found = {"body_subtreemass": _subtree_masses(host, model), "geom_rbound": _radii(host, model)}
+    constants = {"body_subtreemass": _subtree_masses(host, model), "geom_rbound": _radii(host, model)}
     if host.nv:
-        found |= _inverse_weights(host, model, data)
+        constants |= _inverse_weights(host, model, data)
     if host.ntendon:
-        found["tendon_length0"] = data.ten_length
+        constants["tendon_length0"] = data.ten_length
     if np.any(_derived_equalities(host)):
-        found["eq_data"] = _equalities(host, model, data)
-    return found | _cameras(host, model, data) if host.ncam else found
+        constants["eq_data"] = _equalities(host, model, data)
+    return constants | _cameras(host, model, data) if host.ncam else constants
 
 
 @jax.jit
@@ -115,16 +115,16 @@ def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[st
     spatial = jnp.einsum("bvi,vw,bwi->bi", J, inverse, J)
     weights = jnp.where((host.body_weldid != 0)[:, None], spatial.reshape(-1, 2, 3).mean(axis=-1), 0.0)
     simple, mass = np.asarray(host.body_simple) == _ONLY_SLIDES, jnp.maximum(model.body_mass, mj.mjMINVAL)
-    found = {
+    constants = {
         "dof_M0": jnp.diag(M),
         "dof_invweight0": jnp.where(simple[host.dof_bodyid], 1.0 / mass[host.dof_bodyid], jnp.stack(dofs)),
         "body_invweight0": jnp.where(simple[:, None], jnp.stack([1.0 / mass, 0.0 * mass], axis=1), weights),
     }
     if host.nu:
-        found["actuator_acc0"] = jnp.linalg.norm(impl.actuator_moment @ inverse, axis=1)
+        constants["actuator_acc0"] = jnp.linalg.norm(impl.actuator_moment @ inverse, axis=1)
     if host.ntendon:
-        found["tendon_invweight0"] = jnp.einsum("ti,ij,tj->t", impl.ten_J, inverse, impl.ten_J)
-    return found
+        constants["tendon_invweight0"] = jnp.einsum("ti,ij,tj->t", impl.ten_J, inverse, impl.ten_J)
+    return constants
 
 
 @jax.jit
@@ -136,7 +136,7 @@ def _inertia_and_jacobians(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array,
 
 
 def _radii(host: MjModel, model: mjx.Model) -> jax.Array:
-    """Return the radii of spheres around the geoms; those whose size says nothing, such as meshes, keep theirs."""
+    """Return the radii of spheres around the geoms; geoms without a size of their own, such as meshes, keep theirs."""
     size, kind, types = model.geom_size, np.asarray(host.geom_type), mj.mjtGeom
     radii = {
         types.mjGEOM_SPHERE: size[:, 0],
@@ -145,10 +145,10 @@ def _radii(host: MjModel, model: mjx.Model) -> jax.Array:
         types.mjGEOM_CYLINDER: jnp.linalg.norm(size[:, :2], axis=1),
         types.mjGEOM_BOX: jnp.linalg.norm(size, axis=1),
     }
-    found = model.geom_rbound
+    bounds = model.geom_rbound
     for geom, radius in radii.items():
-        found = jnp.where(kind == int(geom), radius, found)
-    return found
+        bounds = jnp.where(kind == int(geom), radius, bounds)
+    return bounds
 
 
 def _boxes(host: MjModel, model: mjx.Model) -> jax.Array:
@@ -162,10 +162,10 @@ def _boxes(host: MjModel, model: mjx.Model) -> jax.Array:
         types.mjGEOM_CYLINDER: (x, x, y),
         types.mjGEOM_BOX: (x, y, z),
     }
-    found = model.geom_aabb[:, 1]
+    sizes = model.geom_aabb[:, 1]
     for geom, half in halves.items():
-        found = jnp.where(kind == int(geom), jnp.stack(half, axis=1), found)
-    return model.geom_aabb.at[:, 1].set(found)
+        sizes = jnp.where(kind == int(geom), jnp.stack(half, axis=1), sizes)
+    return model.geom_aabb.at[:, 1].set(sizes)
 
 
 def _derived_equalities(host: MjModel) -> tuple[np.ndarray, np.ndarray]:
@@ -181,21 +181,21 @@ def _equalities(host: MjModel, model: mjx.Model, data: mjx.Data) -> jax.Array:
     connects, welds = (jnp.asarray(rows)[:, None] for rows in _derived_equalities(host))
     anchor, one, two = model.eq_data[:, :3], host.eq_obj1id, host.eq_obj2id
 
-    def seen(here: np.ndarray, there: np.ndarray) -> jax.Array:  # the anchor in one body, in the axes of the other
+    def in_other(here: np.ndarray, there: np.ndarray) -> jax.Array:  # the anchor in one body, in the axes of the other
         place = data.xpos[here] + jnp.einsum("eij,ej->ei", data.xmat[here], anchor)
         return jnp.einsum("eji,ej->ei", data.xmat[there], place - data.xpos[there])
 
     turn = jax.vmap(multiply_quaternions)(data.xquat[one] * np.array([1.0, -1, -1, -1]), data.xquat[two])
-    connected = model.eq_data.at[:, 3:6].set(seen(one, two))
-    welded = model.eq_data.at[:, 3:6].set(seen(two, one)).at[:, 6:10].set(turn)
+    connected = model.eq_data.at[:, 3:6].set(in_other(one, two))
+    welded = model.eq_data.at[:, 3:6].set(in_other(two, one)).at[:, 6:10].set(turn)
     return jnp.where(connects, connected, jnp.where(welds, welded, model.eq_data))
 
 
 def _cameras(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
-    """Return where cameras are seen from their bodies at the reference position, as if all were fixed to them."""
+    """Return the poses of cameras relative to their bodies at the reference position, as if all were fixed to them."""
     body = host.cam_bodyid
     offset = jnp.einsum("cij,cj->ci", data.xmat[body], model.cam_pos)
     target = np.where(host.cam_targetbodyid >= 0, host.cam_targetbodyid, body)
     axes = jax.vmap(lambda q: jax.vmap(lambda v: rotate(v, q))(jnp.eye(3, dtype=q.dtype)).T)(model.cam_quat)
-    seen = {"cam_pos0": offset, "cam_poscom0": data.xpos[body] + offset - data.subtree_com[target]}
-    return {**seen, "cam_mat0": data.xmat[body] @ axes}
+    poses = {"cam_pos0": offset, "cam_poscom0": data.xpos[body] + offset - data.subtree_com[target]}
+    return {**poses, "cam_mat0": data.xmat[body] @ axes}

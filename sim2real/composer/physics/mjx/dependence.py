@@ -28,7 +28,7 @@ class Origin:
 def origins(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], marked: PyTree) -> PyTree:
     """Return an ``Origin`` for each leaf of what a function returns, in its tree.
 
-    Errs on the side of caution: every result of an operation counts as depending on all that goes into it.
+    Errs on the side of caution: every result of an operation counts as depending on all its operands.
 
     Args:
         marked: Which of them are marked: a bool for each leaf, in the arguments' tree.
@@ -40,5 +40,7 @@ def origins(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], mark
         if any(v in tainted for v in equation.invars if not hasattr(v, "val")):
             tainted.update(equation.outvars)
     number = {v: i for i, v in enumerate(program.invars)}
-    found = [Origin(False, None) if hasattr(v, "val") else Origin(v in tainted, number.get(v)) for v in program.outvars]
-    return jax.tree_util.tree_unflatten(places, found)
+    results = [
+        Origin(False, None) if hasattr(v, "val") else Origin(v in tainted, number.get(v)) for v in program.outvars
+    ]
+    return jax.tree_util.tree_unflatten(places, results)

@@ -78,7 +78,7 @@ class MjxEnvironment:
     """Runs a task on MJX.
 
     The hooks of the task and its entities are those of the C engine, called while the programs are traced: they read
-    and set the physics, compute with ``physics.np``, draw from ``random_state`` and keep what they need later in
+    and set the physics, compute with ``physics.np``, draw from ``random_state`` and keep values for later in
     ``physics.variables``. ``initialize_episode_mjcf`` and ``after_compile`` run once, when the environment is made;
     ``after_compile`` gets the C engine's physics, and the programs start from the model that it leaves.
 
@@ -169,7 +169,7 @@ class MjxEnvironment:
         physics.start = self.initial
         physics.dry = self._dry
         if state is None:
-            # On Warp nothing was computed yet; a model of the copy's own is not the one that was computed with.
+            # On Warp no quantity has been computed yet; a copy's own model is not the one of the initial data.
             physics.is_dirty = self._warp is not None or model is not None
             memory = {k: jnp.asarray(v) for k, v in self._registry.initial.items()}
             return physics, JaxRandomState(None, memory, self._registry)
@@ -214,7 +214,7 @@ class MjxEnvironment:
         Args:
             model: The ``mjx.Model`` of this copy; default: the compiled one.
             start: Positions ``(nq,)`` and velocities ``(nv,)`` that the hooks find; default: the model's, at rest.
-            law: What is set of the model from the state, not on Warp; ``step`` takes the same.
+            law: Sets fields of the model from the state, not on Warp; ``step`` takes the same.
         """
         physics, random_state = self._physics(None, model, law)
         random_state.key = key
@@ -275,8 +275,8 @@ class MjxEnvironment:
             self._hooks.run("after_substep", physics, random_state)
         self._hooks.run("after_step", physics, random_state)
         data, leaves, variables, key, memory = physics.tree(random_state)
-        kept = {"data": data, "leaves": leaves, "variables": variables, "key": key, "memory": memory}
-        return dataclasses.replace(state, steps=state.steps + 1, **kept), jnp.stack(controls)
+        carried = {"data": data, "leaves": leaves, "variables": variables, "key": key, "memory": memory}
+        return dataclasses.replace(state, steps=state.steps + 1, **carried), jnp.stack(controls)
 
     def step(
         self, state: State, action: jax.Array, model: mjx.Model | None = None, law: stepping.Law | None = None
@@ -284,7 +284,7 @@ class MjxEnvironment:
         """Return the copy one control step later; an episode that is over goes on, look at ``done``.
 
         Args:
-            action: As ``action_spec`` says: shape ``(nu,)``, unless the task has actions of its own.
+            action: Shape ``(nu,)``, unless the task has an ``action_spec`` of its own.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
         """
         physics, random_state = self._physics(state, model, law)
@@ -330,7 +330,7 @@ class MjxEnvironment:
             self._hooks.run("after_substep", physics, random_state)
             now, counts = state.steps * self.substeps + i + 1, i < self.substeps - 1
             new = {r.name: r.update(rings[r.name], now, physics, random_state, counts) for r in buffered}
-            if self._dry:  # is it known, for every physics step alike, whether something is to be computed anew?
+            if self._dry:  # is dirtiness the same before every physics step?
                 self._steady = physics.is_dirty is entry
             dirty = jnp.asarray(physics.is_dirty, bool)
             return (physics.tree(random_state), {**rings, **new}, dirty, diverged), None
@@ -341,13 +341,13 @@ class MjxEnvironment:
             tree, rings, _, diverged = carry
         else:
             (tree, rings, dirty, diverged), _ = jax.lax.scan(substep, carry, jnp.arange(self.substeps, dtype=jnp.int32))
-            if not isinstance(physics.is_dirty, bool):  # else it is known how every physics step leaves it
+            if not isinstance(physics.is_dirty, bool):  # else every physics step leaves it the same
                 physics.is_dirty = entry if self._steady else dirty
         physics.load(tree, random_state)
         return rings, diverged
 
     def action_spec(self) -> PyTree:
-        """Return shape and bounds of an action, as the task says."""
+        """Return shape and bounds of an action, from the task."""
         return self._action_spec
 
     def carry(self, names: Iterable[str]) -> None:
@@ -359,7 +359,7 @@ class MjxEnvironment:
         return dict(jax.eval_shape(self.reset, jax.random.key(0)).observation)
 
     def select(self, condition: jax.Array, a: State, b: State) -> State:
-        """Return copy ``a`` where the condition holds, else copy ``b``; for starting copies anew that are done."""
+        """Return copy ``a`` where the condition holds, else copy ``b``; e.g. to reset copies that are done."""
 
         def choose(x: jax.Array, y: jax.Array) -> jax.Array:
             if not jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key):
@@ -371,7 +371,7 @@ class MjxEnvironment:
 
 
 def _initial_data(model: MjModel) -> mjx.Data:
-    """Return the ``mjx.Data`` that an episode starts from: the model's initial state, with all that follows from it."""
+    """Return the ``mjx.Data`` that an episode starts from: the model's initial state, with all computed quantities."""
     physics = Physics(model)  # which computes everything, without the actuators
     return mjx.put_data(model, physics.data.ptr, impl="jax")
 

@@ -49,12 +49,12 @@ def check_model(model: MjModel) -> None:
 
 
 def settle_cone(model: MjModel) -> None:
-    """Make friction cones pyramidal where nothing can touch, and cones mean nothing; refuse those that MJX lacks.
+    """Make friction cones pyramidal in models without contacts, where they have no effect; refuse those that MJX lacks.
 
     With elliptic ones, which arenas have, MJX 3.17 fails on models that have constraints but no contact.
 
     Raises:
-        UsageError: With the geoms, where contacts without friction are asked for beside elliptic cones.
+        UsageError: With the geoms, where contacts without friction stand beside elliptic cones.
     """
     if model.opt.cone != mj.mjtCone.mjCONE_ELLIPTIC:
         return

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from sim2real.types import PyTree
 
-_GIVEN = ("qpos", "qvel")
+_START_FIELDS = ("qpos", "qvel")
 """What a start sets of the state, and what the physics then starts from."""
 
 
@@ -48,13 +48,15 @@ def check(
     marked = jax.tree_util.tree_map(lambda _: False, state).replace(data=_all_but(state.data, ("ctrl",)))
     while True:  # until what hooks keep from tick to tick is marked, too, where it depends on the state
         after, controls = origins(tick, (state, action), (marked, unmoved))
-        kept = _named(after.variables) | {f"random numbers{k}": v for k, v in _named((after.key, after.memory)).items()}
-        seen = jax.tree_util.tree_map(lambda old, new: old or new.marked, marked.variables, after.variables)
-        if any(o.marked for k, o in kept.items() if k.startswith("random")):
+        carried = _named(after.variables) | {
+            f"random numbers{k}": v for k, v in _named((after.key, after.memory)).items()
+        }
+        variables = jax.tree_util.tree_map(lambda old, new: old or new.marked, marked.variables, after.variables)
+        if any(o.marked for k, o in carried.items() if k.startswith("random")):
             raise _closed(name, "random numbers depend on the state")
-        if seen == marked.variables:
+        if variables == marked.variables:
             break
-        marked = marked.replace(variables=seen)
+        marked = marked.replace(variables=variables)
     if controls.marked:
         raise _closed(name, "its controls depend on the state")
     numbers = iter(range(len(jax.tree_util.tree_leaves(state))))
@@ -71,27 +73,27 @@ def check(
 def _check_start(environment: MjxEnvironment, name: str) -> State:
     """Check what hooks set at a start; return the shapes of a start."""
     start, key = environment.initial, jax.random.key(0)
-    place = tuple(jax.ShapeDtypeStruct(getattr(start, n).shape, getattr(start, n).dtype) for n in _GIVEN)
+    place = tuple(jax.ShapeDtypeStruct(getattr(start, n).shape, getattr(start, n).dtype) for n in _START_FIELDS)
     reset = lambda data, place: environment.reset_apart(key, None, place, data)  # noqa: E731
     shapes = jax.tree_util.tree_map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), start)
-    marked = _all_but(shapes, _GIVEN), (False, False)
-    found = origins(reset, (shapes, place), marked)
+    marked = _all_but(shapes, _START_FIELDS), (False, False)
+    sources = origins(reset, (shapes, place), marked)
     for what in ("variables", "leaves", "memory"):
-        if bad := [k for k, o in _named(getattr(found, what)).items() if o.marked]:
+        if bad := [k for k, o in _named(getattr(sources, what)).items() if o.marked]:
             raise _closed(name, f"{what}{bad[0]} is set at the start to what follows from the state")
     numbers = iter(range(len(jax.tree_util.tree_leaves(shapes))))
     places = jax.tree_util.tree_map(lambda _: next(numbers), shapes)
-    same = jax.tree_util.tree_map(lambda o, i: o.argument == i, found.data, places)
-    same = same.replace(qpos=not found.data.qpos.marked, qvel=not found.data.qvel.marked, ctrl=True)
+    same = jax.tree_util.tree_map(lambda o, i: o.argument == i, sources.data, places)
+    same = same.replace(qpos=not sources.data.qpos.marked, qvel=not sources.data.qvel.marked, ctrl=True)
     if changed := [k for k, is_same in _named(same).items() if not is_same]:
         raise _closed(name, f"hooks set {changed[0]} at the start")
     return jax.eval_shape(reset, shapes, place)
 
 
 def _check_message(state: State, marked: State, output: Callable[[State], PyTree], name: str) -> None:
-    """Check that a message says nothing but positions, velocities and accelerations."""
-    known = _all_but(state.data, ("qpos", "qvel", "qacc"))
-    everything = jax.tree_util.tree_map(lambda _: True, marked).replace(data=known)
+    """Check that a message depends on positions, velocities and accelerations alone."""
+    unmeasured = _all_but(state.data, ("qpos", "qvel", "qacc"))
+    everything = jax.tree_util.tree_map(lambda _: True, marked).replace(data=unmeasured)
     if bad := [k for k, o in _named(origins(output, (state,), (everything,))).items() if o.marked]:
         raise _closed(name, f"its message's {bad[0]} is more than positions, velocities and accelerations")
 

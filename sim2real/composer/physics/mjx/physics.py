@@ -36,7 +36,7 @@ _WARP_SWITCHES: dict[str, str] = dict.fromkeys(_FLUID, "_impl.has_fluid")
 
 
 Carried = tuple[mjx.Data, dict[str, jax.Array], dict[str, PyTree], jax.Array, dict[str, jax.Array]]
-"""All that changes: the state, fields of the model, variables of tasks, a key, what variations keep."""
+"""All changing values: the state, fields of the model, variables of tasks, a key, values of variations."""
 
 
 class MjxPhysics(Traced):
@@ -81,7 +81,7 @@ class MjxPhysics(Traced):
         self.named = Named(host, self.model, self.data)
 
     def read(self, field: layout.Field) -> PyTree:
-        """Return a whole field; computes everything anew first when an earlier write makes it out of date."""
+        """Return a whole field; all quantities are computed first when an earlier write makes it out of date."""
         if not field.triggers:
             self._settle()
         if field.struct == "model":
@@ -92,13 +92,13 @@ class MjxPhysics(Traced):
             raise AttributeError(f"MJX has no field {field.name!r} in its data") from None
 
     def mark_as_dirty(self) -> None:
-        """Have everything computed again before the next computed attribute is read through a binding."""
+        """Compute all quantities again before a binding reads a computed one."""
         self.is_dirty = True
 
     def _settle(self) -> None:
         """Compute everything that follows from the state where something was written since that was last done.
 
-        Whether it was is known while the program is made, as a rule. Where it is not, because it depends on the step
+        As a rule the trace decides whether that is the case. Where it cannot, because that depends on the step
         before, it belongs to the state, and the program decides.
         """
         dirty, where = self.is_dirty, self._where
@@ -115,7 +115,7 @@ class MjxPhysics(Traced):
 
     @contextlib.contextmanager
     def only_where(self, condition: jax.Array) -> Iterator[None]:
-        """Let what is read inside a ``with`` block change nothing where a condition, a boolean array, does not hold."""
+        """Let reads inside a ``with`` block compute no quantities where a condition, a boolean array, does not hold."""
         self._where = condition
         try:
             yield
@@ -179,7 +179,7 @@ class MjxPhysics(Traced):
             raise UsageError("MJX has no fluid forces with the integrator implicitfast", hint="use Euler or RK4")
 
     def recompute_constants(self) -> None:
-        """Compute what MuJoCo derives from masses and lengths anew, after they were changed."""
+        """Compute the constants that MuJoCo derives from masses and lengths, after these were changed."""
         for name, value in constants.derive(self.host, self.mjx_model).items():
             self.replace("model", name, value)
         self.mark_as_dirty()
@@ -251,7 +251,7 @@ class MjxPhysics(Traced):
     # -- state as a tree
 
     def tree(self, random_state: JaxRandomState) -> Carried:
-        """Return all that changes, as a tree."""
+        """Return all changing values, as a tree."""
         leaves = {name: _get(self.mjx_model, name) for name in sorted(self.changed)}
         variables = {name: jax.tree_util.tree_map(jnp.asarray, value) for name, value in self.variables.items()}
         return self.mjx_data, leaves, variables, random_state.key, dict(random_state.memory)
@@ -267,7 +267,7 @@ class MjxPhysics(Traced):
             mine.update(theirs)
 
     def retry(self, attempt: Callable[[], None], random_state: JaxRandomState, attempts: int) -> jax.Array:
-        """Run a function until it no longer calls ``fail``, at most so many times; return whether the last one failed.
+        """Run a function until it does not call ``fail``, at most ``attempts`` times; return whether it failed.
 
         Every attempt starts from the same state, with new random numbers.
         """

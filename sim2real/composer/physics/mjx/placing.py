@@ -51,16 +51,19 @@ def place(
     passed = [n for prop in ignored for n in _geoms(physics, prop)]
     for i, prop in enumerate(props):
         later = jnp.array([*passed, *(n for other in numbers[i + 1 :] for n in other)], int)
-        own = jnp.array(numbers[i], int)
+        geoms = jnp.array(numbers[i], int)
         initial = prop.get_pose(physics)
 
         def attempt(
-            prop: Entity = prop, own: jax.Array = own, later: jax.Array = later, initial: tuple[Array, Array] = initial
+            prop: Entity = prop,
+            geoms: jax.Array = geoms,
+            later: jax.Array = later,
+            initial: tuple[Array, Array] = initial,
         ) -> None:
             drawn = [evaluate(p, x, x, random_state) for p, x in zip(pose, initial, strict=True)]
             prop.set_pose(physics, *drawn)
             if not ignore_collisions:
-                physics.fail(_touches(physics, own, later))
+                physics.fail(_touches(physics, geoms, later))
 
         physics.fail(physics.retry(attempt, random_state, attempts))
 
@@ -69,7 +72,7 @@ def _geoms(physics: MjxPhysics, prop: Entity) -> list[int]:
     return [int(i) for i in physics.bind(prop.mjcf_model.find_all("geom")).element_id]
 
 
-def _touches(physics: MjxPhysics, own: jax.Array, later: jax.Array) -> jax.Array:
+def _touches(physics: MjxPhysics, geoms: jax.Array, later: jax.Array) -> jax.Array:
     """Return whether a geom of a prop touches one that counts."""
     if physics.dry:
         return jnp.zeros((), bool)
@@ -78,5 +81,5 @@ def _touches(physics: MjxPhysics, own: jax.Array, later: jax.Array) -> jax.Array
     impl: Any = data._impl
     contact = impl.contact
     pair = jnp.stack([contact.geom1, contact.geom2])
-    hit = (contact.dist <= 0) & jnp.isin(pair, own).any(axis=0) & ~jnp.isin(pair, later).any(axis=0)
+    hit = (contact.dist <= 0) & jnp.isin(pair, geoms).any(axis=0) & ~jnp.isin(pair, later).any(axis=0)
     return hit.any()

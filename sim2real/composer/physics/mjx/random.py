@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 
 Size = int | Sequence[int] | None
-"""The shape of what is drawn; None: that of the parameters."""
+"""The shape of a draw; None: that of the parameters."""
 
 
 class Registry:
     """Which variations keep something from draw to draw, such as the position of a random walk.
 
     Attributes:
-        initial: Name -> what is kept at the start of an episode.
+        initial: Name -> value at the start of an episode.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Registry:
 
     def name(self, owner: Variation, initial: ArrayLike) -> str:
         """Return the name of what an owner keeps."""
-        number = next((i for i, known in enumerate(self._owners) if known is owner), None)
+        number = next((i for i, other in enumerate(self._owners) if other is owner), None)
         if number is None:
             number = len(self._owners)
             self._owners.append(owner)
@@ -149,8 +149,8 @@ class JaxRandomState:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        known = ", ".join(n for n in dir(type(self)) if not n.startswith("_"))
-        raise AttributeError(f"on MJX random_state has no {name!r}. Available: {known}")
+        available = ", ".join(n for n in dir(type(self)) if not n.startswith("_"))
+        raise AttributeError(f"on MJX random_state has no {name!r}. Available: {available}")
 
     def rand(self, *shape: int) -> jax.Array:
         """Return floats in [0, 1)."""

@@ -103,7 +103,7 @@ class Ring:
         """Return the ring after a physics step, with a new sample in it when one is due.
 
         Args:
-            counts: Whether a sample may be taken now. Not so after the last physics step of a control step: that sample
+            counts: Whether a sample may be taken now. False after the last physics step of a control step: that sample
                 is taken once the task's ``after_step`` hooks have run, by another call.
         """
         if self.direct:
@@ -114,8 +114,8 @@ class Ring:
         with physics.only_where(taken):
             value = self.sample(physics, random_state)
         new = self._insert(ring, now, value, random_state)
-        for name, kept in before.items():  # a draw that did not happen leaves no trace
-            random_state.memory[name] = jnp.where(taken, random_state.memory[name], kept)
+        for name, value_before in before.items():  # a draw that did not happen leaves no trace
+            random_state.memory[name] = jnp.where(taken, random_state.memory[name], value_before)
         return jax.tree_util.tree_map(lambda a, b: jnp.where(due, a, b), new, ring)
 
     def _can_be_read(self, now: jax.Array) -> bool | jax.Array:
@@ -139,7 +139,7 @@ class Ring:
         }
 
     def read(self, ring: Samples, now: jax.Array) -> jax.Array:
-        """Return the last samples that have arrived, in the order of arrival, or what the aggregator makes of them."""
+        """Return the last samples that have arrived, in the order of arrival, or the result of the aggregator."""
         if self.direct:
             return self._shaped(ring["value"][None])
         order = ring["count"] - 1 - jnp.arange(self.capacity)
@@ -165,8 +165,8 @@ def make_rings(
     Args:
         observables: Key -> observable, enabled or not.
         steps: Physics steps that a control step has.
-        strip: Whether the axis of single samples is left out, as in the environment.
-        pad_initial: Whether what was never sampled reads as the first sample, rather than as zeros.
+        strip: Whether a buffer of one sample has no axis of samples.
+        pad_initial: Whether missing samples read as the first sample, rather than as zeros.
     """
     return [Ring(name, o, steps, strip, pad_initial, call) for name, o in observables.items() if o.enabled]
 
@@ -180,7 +180,7 @@ def _draw(value: Steps, random_state: JaxRandomState) -> jax.Array:
 
 
 def _bounds(value: object) -> tuple[int, int] | None:
-    """Return the least and the greatest value of a variation of integers, or None where it tells none."""
+    """Return the least and the greatest value of a variation of integers; None if it has no bounds."""
     if isinstance(value, deterministic.Constant):
         return int(value.value), int(value.value)
     if isinstance(value, deterministic.Sequence):

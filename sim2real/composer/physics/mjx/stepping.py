@@ -1,6 +1,6 @@
 """One step of MJX that ends where one of dm_control's ends, and the state that an episode starts from.
 
-Its stages are jitted by themselves: MJX is traced once for all programs that a model of one form is in, be it in
+Each stage is jitted on its own: MJX is traced once for all programs with a model of one form, be it in
 several places, for a batch or for a derivative: on an H100 the training of an arm compiles in 41 s instead of 61.
 """
 
@@ -34,7 +34,7 @@ def advance(model: mjx.Model, data: mjx.Data, legacy: bool, law: Law | None = No
 
     Args:
         legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
-        law: What is set of the model where constraints are made: from the state that a step begins with.
+        law: Sets fields of the model for constraints, from the state that a step begins with.
     """
     now = law(model, data) if law else model
     if not legacy:

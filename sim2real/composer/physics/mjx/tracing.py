@@ -28,7 +28,7 @@ T = TypeVar("T")
 _KEEP = "keep what changes in physics.variables[{name!r}], which belongs to each copy; set what does not in __init__"
 _DEPTH = 6
 _LIBRARIES = ("sim2real", "mujoco", "jax", "jaxlib", "numpy", "dm_env", "brax", "builtins", "functools", "weakref")
-_UNKNOWN = "while the program is made, values of the simulation are not known"
+_UNKNOWN = "while the program is made, values of the simulation do not exist"
 _WORDS: tuple[tuple[type[Exception], str, str, str], ...] = (
     (
         jax.errors.TracerBoolConversionError,
@@ -51,7 +51,7 @@ _WORDS: tuple[tuple[type[Exception], str, str, str], ...] = (
     (
         jax.errors.NonConcreteBooleanIndexError,
         "picks items with a mask",
-        "how many those are is not known while the program is made",
+        "their number does not exist while the program is made",
         "use physics.np.where(mask, values, 0)",
     ),
     (
@@ -94,8 +94,8 @@ def named(label: str) -> Iterator[None]:
 
 def _line(error: Exception) -> str:
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "site-packages" not in f.filename]
-    own = [f for f in frames if "/sim2real/composer/" not in f.filename.replace("\\", "/")]
-    return f" (line {own[-1].lineno}: {own[-1].line})" if own else ""
+    user_frames = [f for f in frames if "/sim2real/composer/" not in f.filename.replace("\\", "/")]
+    return f" (line {user_frames[-1].lineno}: {user_frames[-1].line})" if user_frames else ""
 
 
 class TracedHooks(Hooks):
@@ -143,9 +143,9 @@ class TracedHooks(Hooks):
 
 
 def _compare(label: str, owner: object, before: dict[str, object], after: dict[str, object]) -> None:
-    """Refuse changes: only what was absent or None may be filled in, with what is no value of the simulation."""
+    """Refuse changes: only absent attributes and None may be filled in, with no value of the simulation."""
     for name in sorted({*before, *after}):
-        old, new = before.get(name, _print(None)), after.get(name, _print(None))
+        old, new = before.get(name, _fingerprint(None)), after.get(name, _fingerprint(None))
         what = f"{type(owner).__name__}.{name}"
         if old == new:
             continue
@@ -154,7 +154,7 @@ def _compare(label: str, owner: object, before: dict[str, object], after: dict[s
                 f"{what} was set by a hook, {label}, to a value that only exists in the program",
                 hint=f"keep it in physics.variables[{name!r}]: it then belongs to each copy",
             )
-        if old != _print(None):
+        if old != _fingerprint(None):
             raise UsageError(
                 f"{what} is changed by {label}. Hooks run once, while the program is made: "
                 "every copy and every step would see the same value",
@@ -163,8 +163,8 @@ def _compare(label: str, owner: object, before: dict[str, object], after: dict[s
 
 
 def _attributes(owner: object) -> dict[str, object]:
-    seen: set[int] = {id(owner)}
-    return {k: _print(v, seen) for k, v in vars(owner).items() if not _is_cache(type(owner), k)}
+    visited: set[int] = {id(owner)}
+    return {k: _fingerprint(v, visited) for k, v in vars(owner).items() if not _is_cache(type(owner), k)}
 
 
 def _is_cache(owner: type, name: str) -> bool:
@@ -172,7 +172,7 @@ def _is_cache(owner: type, name: str) -> bool:
 
 
 class _Same:
-    """An object as such, whatever is in it."""
+    """An object, compared by identity."""
 
     def __init__(self, value: object) -> None:
         self.value = value
@@ -181,9 +181,9 @@ class _Same:
         return isinstance(other, _Same) and self.value is other.value
 
 
-def _print(value: object, seen: set[int] | None = None, depth: int = 0) -> object:
-    """Return what tells whether a value has changed: its contents, of containers and of a program's own objects."""
-    seen = set() if seen is None else seen
+def _fingerprint(value: object, visited: set[int] | None = None, depth: int = 0) -> object:
+    """Return a fingerprint of a value that changes with it: the contents of containers and of a program's objects."""
+    visited = set() if visited is None else visited
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | enum.Enum | np.generic):
         return type(value).__name__, repr(value)
     if isinstance(value, np.ndarray):
@@ -192,18 +192,21 @@ def _print(value: object, seen: set[int] | None = None, depth: int = 0) -> objec
         return _numbers(value.get_state())
     if isinstance(value, np.random.Generator):
         return repr(value.bit_generator.state)
-    if depth > _DEPTH or id(value) in seen:
+    if depth > _DEPTH or id(value) in visited:
         return _Same(value)
-    seen.add(id(value))
+    visited.add(id(value))
     if isinstance(value, dict):
-        return [(_print(k, seen, depth + 1), _print(v, seen, depth + 1)) for k, v in value.items()]
+        return [(_fingerprint(k, visited, depth + 1), _fingerprint(v, visited, depth + 1)) for k, v in value.items()]
     if isinstance(value, list | tuple | collections.deque):
-        return [_print(v, seen, depth + 1) for v in value]
+        return [_fingerprint(v, visited, depth + 1) for v in value]
     if isinstance(value, set | frozenset):
         return sorted(map(repr, value))
     if type(value).__module__.partition(".")[0] in _LIBRARIES or isinstance(value, type) or callable(value):
         return _Same(value)
-    return [_Same(value), *((k, _print(v, seen, depth + 1)) for k, v in getattr(value, "__dict__", {}).items())]
+    return [
+        _Same(value),
+        *((k, _fingerprint(v, visited, depth + 1)) for k, v in getattr(value, "__dict__", {}).items()),
+    ]
 
 
 def _has_tracer(value: object) -> bool:
@@ -230,5 +233,5 @@ def check_variables(before: dict[str, PyTree], after: dict[str, PyTree]) -> None
             raise UsageError(
                 f"physics.variables[{name!r}] starts as {dtype}{list(shape)} and is {dtype_after}{list(shape_after)} "
                 "after a step",
-                hint="start it with what it becomes, such as physics.np.zeros(3)",
+                hint="start it with its later shape and type, such as physics.np.zeros(3)",
             )

@@ -44,7 +44,7 @@ class Traced(BasePhysics):
 
 
 def constant(name: str) -> UsageError:
-    """Return what says that a field cannot be set."""
+    """Return the error that a field cannot be set."""
     return UsageError(
         f"MJX cannot change {name!r} inside a compiled program: it is one of its constants",
         hint="set it in initialize_episode_mjcf or after_compile, which run before that, or use the C engine",

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class WarpEngine:
     """Steps a model with MuJoCo Warp, in single precision, on a CUDA device or on the CPU.
 
-    MuJoCo Warp keeps the contacts of all copies in common arrays. They are made anew for every call and left out of the
-    state: what remains belongs to one copy, so copies can be selected, sliced and merged as on MJX's own JAX.
+    MuJoCo Warp keeps the contacts of all copies in common arrays. They are created for every call and are no part of
+    the state. So all of the state belongs to one copy, and copies can be selected, sliced and merged as on MJX's JAX.
 
     Args:
         nconmax: Contacts that there is room for, times the number of copies, which share it; None: MuJoCo Warp's guess.
@@ -47,7 +47,7 @@ class WarpEngine:
         from sim2real.composer.physics.mjx.warp import warp_stages  # it imports Warp
 
         self._stages = warp_stages
-        # Kernels print when something had no room, line by line; not so when a solver stops at its limit.
+        # Kernels print when something had no room, line by line, except when a solver stops at its limit.
         self.model = model.tree_replace({"opt._impl.warn_overflow": _short()})
         self._shared = {f"_impl.{k}": np.asarray(getattr(data._impl, k)) for k in _shared(data)}
         self.start = self._pack(data)
@@ -97,7 +97,7 @@ def make_engine(host: MjModel, impl: str, nconmax: int | None, njmax: int | None
 
 
 def overflowed(data: mjx.Data) -> jax.Array:
-    """Return whether contacts or constraints of a copy were left out for want of room, since its reset."""
+    """Return whether contacts or constraints of a copy were dropped for lack of room, since its reset."""
     impl: Any = data._impl
     return (impl.overflow & _short()) != 0
 

@@ -45,7 +45,7 @@ def _legacy(m: types.Model, d: types.Data) -> None:
     """Advance by a time step; positions and velocities of the new state are computed too (``mj_step2; mj_step1``).
 
     The data hold positions and velocities of the state before. As contacts are not kept from step to step, they are
-    what is computed first, not last: all in all, each stage once, as in ``mujoco_warp.step``.
+    computed first, not last: in sum, each stage once, as in ``mujoco_warp.step``.
     """
     integrator = mj.mjtIntegrator(m.opt.integrator)
     if _can_sleep(m):
@@ -61,11 +61,11 @@ def _legacy(m: types.Model, d: types.Data) -> None:
         d.sensordata.zero_()  # sensors of touch add to what is there
         _accelerations(m, d)
         (stages.euler if integrator == mj.mjtIntegrator.mjINT_EULER else stages.implicit)(m, d)
-    kept = d.cacc, d.cfrc_int  # what follows takes them for scratch
+    saved = d.cacc, d.cfrc_int  # what follows takes them for scratch
     if _asks_for_accelerations(m):
         d.cacc, d.cfrc_int = wp.zeros_like(d.cacc), wp.zeros_like(d.cfrc_int)
     _positions_and_velocities(m, d)
-    d.cacc, d.cfrc_int = kept
+    d.cacc, d.cfrc_int = saved
 
 
 def _accelerations(m: types.Model, d: types.Data) -> None:
@@ -109,7 +109,7 @@ def _asks_for_accelerations(m: types.Model) -> bool:
 
 def _with_room(order: Order, m: types.Model, d: types.Data) -> None:
     """Run a function with room for the contacts of all copies, in memory that Warp takes for the time of the call."""
-    kept = d.contact, d.naconmax, d.naccdmax
+    saved = d.contact, d.naconmax, d.naccdmax
     d.naconmax, d.naccdmax = d.naconmax * d.nworld, d.naccdmax * d.nworld
     new = {}
     for field in dataclasses.fields(Contact):
@@ -118,7 +118,7 @@ def _with_room(order: Order, m: types.Model, d: types.Data) -> None:
         new[field.name] = wp.empty((0 if unused else d.naconmax, *old.shape[1:]), dtype=old.dtype)
     d.contact = Contact(**new)
     order(m, d)
-    d.contact, d.naconmax, d.naccdmax = kept
+    d.contact, d.naconmax, d.naccdmax = saved
 
 
 def _function(name: str, order: Order) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
