@@ -31,7 +31,7 @@ from sim2real.artifacts.run.run_folder import finished, open_stage
 from sim2real.graph.episode import MessageRecord, StepRecord
 from sim2real.hardware.emulation.truth import Kind, TruthLog
 from sim2real.log.writer import McapRecorder
-from sim2real.stages.deploy import stage as deploy_stage
+from sim2real.stages.deploy import episodes
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 RECORD_S, VOLTS = 12.0, 2.0
@@ -56,14 +56,14 @@ def make(root: Path) -> Path:
             stage.output(name, path)
     run_dir = stage.run_dir
     with pytest.MonkeyPatch.context() as patch, sketched(pictures=1):
-        patch.setattr(deploy_stage, "opened", lambda *_: nullcontext())
-        patch.setattr(deploy_stage, "_episode", lambda *given: deployed(run_dir, *given))
+        patch.setattr(episodes, "opened", lambda *_: nullcontext())
+        patch.setattr(episodes, "_run_one", lambda *given: deployed(run_dir, *given))
         assert cli.main(["run", "pendulum", "--resume", str(run_dir), "--runs", str(root), *TINY]) == 0
     return run_dir
 
 
 def deployed(run_dir: Path, *given: Any) -> dict[str, Any]:
-    """Run the policy of a run on the simulated robot and write its log; takes what ``deploy._episode`` takes."""
+    """Run the policy of a run on the simulated robot and write its log; takes what ``episodes._run_one`` takes."""
     *_, log, config = given
     bundle = Bundle.load(finished(run_dir, "train").output("bundle"))
     played = hidden.play(ROBOT, randomise.controller(bundle, VOLTS), config.duration_s, 1)

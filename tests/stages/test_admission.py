@@ -59,7 +59,7 @@ CHANGES = {
     "another action": ("action", lambda a: (replace(a[0], name="x"), *a[1:]), "sends .*'x'"),
     "another unit of an action": ("action", lambda a: (replace(a[0], unit="V"), *a[1:]), "sends .*'V'"),
     "other actions first": ("action", lambda a: a[::-1], "sends "),
-    "50 times the speed": ("action", lambda a: (replace(a[0], high=50 * a[0].high), *a[1:]), "this robot bears -"),
+    "50 times the speed": ("action", lambda a: (replace(a[0], high=50 * a[0].high), *a[1:]), "this robot allows -"),
     "another rate": ("rate_hz", lambda hz: 2 * hz, "runs at 100 Hz, this robot at 50 Hz"),
     "other joint limits": ("limits", lambda m: {n: 2 * v for n, v in m.items()}, "was trained with 'lowest goal"),
     "limits of no joint": ("limits", lambda m: {"elsewhere": 1.0}, "this robot has no such limit"),
@@ -78,7 +78,7 @@ def test_a_policy_for_another_robot_is_refused(arm, what):
 def test_a_pendulum_policy_may_not_ask_for_100_volts():
     robot = load_pipeline("pendulum").load()
     contract = contract_of(robot, action=(replace(robot.action[0], low=-100.0, high=100.0),))
-    with pytest.raises(Sim2RealError, match="this robot bears -2 to 2"):
+    with pytest.raises(Sim2RealError, match="this robot allows -2 to 2"):
         preflight.require_fit(robot, Bundle(contract, still(contract)))
 
 

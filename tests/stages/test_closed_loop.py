@@ -19,10 +19,10 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import LOG, Recording
 from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.run_folder import STAGES, attempts, finished, open_stage
-from sim2real.commands import retry, run_loop
 from sim2real.commands.flags import RunFlags
+from sim2real.commands.loop import retry, run_loop
 from sim2real.robots.control_loop.loop import DELAYS
-from sim2real.stages.deploy.verdict import judged
+from sim2real.stages.deploy.verdict import judge
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
@@ -72,7 +72,7 @@ def world(tmp_path, finished_run_dir):
             (Scores({"success": 0.0}),), gap, recordings=logs, probe=Recording.load(stage.folder / PROBE)
         )
         known = Identification.load(finished(run_dir, "identify").output("parameters"))
-        for name, file in judged(found, pipeline, bundle, known, stage.folder).save(stage.folder).items():
+        for name, file in judge(found, pipeline, bundle, known, stage.folder).save(stage.folder).items():
             stage.output(name, file)
 
     def call(name, config, run_dir):
@@ -89,7 +89,7 @@ def world(tmp_path, finished_run_dir):
 
 def test_a_robot_that_became_later_is_identified_anew_and_deployed_again(world, monkeypatch):
     pipeline, root, call = world
-    monkeypatch.setattr(retry, "GOOD", 0.0)  # what so few steps teach is no policy
+    monkeypatch.setattr(retry, "MIN_SUCCESS", 0.0)  # what so few steps teach is no policy
     run_loop.run_all(pipeline, RunFlags(iterations=2, runs=root, **tiny(pipeline)), call)
     (run_dir,) = (root / "pendulum").iterdir()
     first, second = Iterations.load(run_dir).rows

@@ -17,7 +17,7 @@ from sim2real.graph.schedule import draw
 from sim2real.robots.control_loop.loop import control_nodes
 from sim2real.robots.roles import ROLES
 from sim2real.robots.score_columns import as_columns, as_sent
-from sim2real.stages.deploy import simulation_gap
+from sim2real.stages.deploy import simulation_gap, simulations
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ARM = load_pipeline("arm").load()
@@ -103,7 +103,7 @@ def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simul
     slow = steps(50)
     busy = Steps(**{**vars(slow), "end": slow.start + 100_000})
     episode = Episode(steps={"agent": busy}, messages={}, outputs={})
-    assert simulation_gap._simulate(ARM, None, {"gain": 1.0}, Timing.of(episode), 1.0, 1, "world") == (None, None)
+    assert simulations.simulate(ARM, None, [{"gain": 1.0}], Timing.of(episode), 1.0, 1, "world") == (None, None)
     assert (
         "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
     )
@@ -125,9 +125,9 @@ def test_simulated_measurements_are_compared_with_measurements():
     values = robot.nominal() | {"sensor_delay": late_s, "actuator_delay": 0.01}
     episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
     policy = Push(jnp.full(1, 1.5))
-    (t_s, world), (at_s, sensor) = simulation_gap._simulate(
-        robot, policy, [values], Timing.of(episode), 0.6, 1, "world"
-    )[0][0]
+    (t_s, world), (at_s, sensor) = simulations.simulate(robot, policy, [values], Timing.of(episode), 0.6, 1, "world")[
+        0
+    ][0]
     assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
     assert len(sensor["th"]) == len(at_s) < len(t_s)
     then = np.interp(at_s - late_s, t_s, world["th"])

@@ -12,8 +12,8 @@ from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
-from sim2real.stages.deploy import verdict
-from sim2real.stages.deploy.next_command import commands
+from sim2real.stages.deploy import show, verdict
+from sim2real.stages.deploy.next_command import with_command
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.view.page.deployment_verdict import tables, verdict_blocks
 
@@ -120,7 +120,7 @@ OWN = "--log runs/pendulum/T/deploy/episode_0.mcap --log runs/pendulum/T/deploy/
 )  # fmt: skip
 def test_the_command_can_be_typed(told, found, command, folder):
     """Where the robot has changed, recordings of before are left out."""
-    assert commands(told, load_pipeline("pendulum"), IDENTIFIED, folder, deployed(**found)).next == command
+    assert with_command(told, load_pipeline("pendulum"), IDENTIFIED, folder, deployed(**found)).next == command
 
 
 LADEN = Drift((replace(FRICTION, name="payload", unit="kg", before=0.0, now=0.15),), 0.05, ("payload",), 20.0)
@@ -143,7 +143,7 @@ def test_what_an_arm_holds_is_identified_from_then_on(drift, terms, command, tmp
     (folder / "manifest.json").write_text('{"stage": "deploy"}')
     logs = tuple(Recording(folder.relative_to(tmp_path) / f"episode_{i}.mcap", episode()) for i in (0, 1))
     found = replace(deployed(drift=drift), recordings=logs)
-    told = commands(Advice("re-identify", ()), load_pipeline("arm"), replace_terms(terms), folder, found)
+    told = with_command(Advice("re-identify", ()), load_pipeline("arm"), replace_terms(terms), folder, found)
     assert sorted(told.next.split()) == sorted(command.split())
 
 
@@ -153,13 +153,13 @@ def replace_terms(terms):
 
 
 def test_times_stand_beside_those_of_training():
-    rows = {g.quantity: g for g in verdict._trained(deployed(took_s=0.004), BUNDLE)}
+    rows = {g.quantity: g for g in verdict._times_of_training(deployed(took_s=0.004), BUNDLE)}
     assert rows["step_of_agent_p99_s"].gap == pytest.approx(0.003)
     assert rows["round_trip_delay_s"].simulation == pytest.approx(0.05)
 
 
 def test_a_deployment_without_an_identification_says_so(folder):
-    told = verdict.judged(deployed(), load_pipeline("pendulum"), BUNDLE, None, folder).advice
+    told = verdict.judge(deployed(), load_pipeline("pendulum"), BUNDLE, None, folder).advice
     assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
 
 
@@ -169,16 +169,16 @@ def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be
 
     monkeypatch.setattr(verdict, "tested", too_little)
     pipeline = load_pipeline("pendulum")
-    told = verdict.judged(deployed(success=0.0), pipeline, BUNDLE, IDENTIFIED, folder).advice
+    told = verdict.judge(deployed(success=0.0), pipeline, BUNDLE, IDENTIFIED, folder).advice
     assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")
     assert told.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")
-    assert verdict.judged(deployed(), pipeline, BUNDLE, IDENTIFIED, folder).advice.status == "not judged"
+    assert verdict.judge(deployed(), pipeline, BUNDLE, IDENTIFIED, folder).advice.status == "not judged"
 
 
 def test_console_and_page_end_in_the_verdict(capsys):
     shown = deployed(drift=ALARM)
     shown = replace(shown, advice=Advice("re-identify", ("friction is 12",), "sim2real identify pendulum"))
-    verdict.show(shown)
+    show.show_verdict(shown)
     said = capsys.readouterr()
     assert "friction" in said.out
     assert said.err.splitlines() == ["verdict: re-identify", "  friction is 12", "next: sim2real identify pendulum"]

@@ -124,7 +124,7 @@ def one_change(
     """Return the test's results for a robot after one change."""
     # Deploy the changed robot, with the small steps that measure the delay.
     from sim2real.artifacts.recording import Recording
-    from sim2real.stages.deploy.verdict import verdict_of
+    from sim2real.stages.deploy.verdict import model_advice
     from sim2real.stages.estimation.replay import tested
 
     now, first = robot.changed(change), 1 + CHANGES.index(change) * (options.episodes + 2)
@@ -135,7 +135,7 @@ def one_change(
         replay, drifted = tested(pipeline, identified, [Recording.load(log).episode for log in logs])
     except Sim2RealError as error:
         return {"success": success, "refused": str(error)}
-    verdict = verdict_of(replay, drifted)
+    verdict = model_advice(replay, drifted)
     result = {
         "success": success,
         "alarms": list(drifted.alarms),

@@ -1,4 +1,4 @@
-"""How a policy is deployed; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
+"""Flags of deploy. Imports no JAX, so that ``--help`` stays instant."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ class DeployConfig:
     bundle: str | None = None
     """Folder of the policy bundle; default: the newest training of the pipeline."""
     episodes: int = 2
-    """How many times to deploy."""
+    """Number of episodes."""
     duration_s: float = 10.0
-    """Length of a deployment [s]."""
+    """Length of an episode [s]."""
     settle_s: float = 20.0
-    """Longest wait for the robot to come to rest before a deployment [s]."""
+    """Longest wait for the robot to come to rest before an episode [s]."""
     seed: int = 0
     """Seed of the embedded robot."""
     backend: Literal["numpy", "onnx"] | None = None
-    """What runs the policy: numpy, or onnxruntime; default: numpy, but onnxruntime for a network of your own."""
+    """Library that runs the policy; default: numpy, but onnxruntime for a custom network."""
     blend_s: float = 0.0
-    """Time in which the policy's action grows from none to all of it, for a first try on a robot [s]."""
+    """Time in which the policy's action grows from zero to full size, for a first try on a robot [s]."""
     measure_delay: bool = True
-    """Measure the delay with a few small steps, where the robot says how, before the policy moves it."""
+    """Measure the delay with a few small steps before the policy moves the robot, if the robot defines such steps."""
     delay_tolerance_s: float = 0.008
-    """How far the measured delay may lie outside of those that the policy was trained with [s]."""
+    """Largest distance of the measured delay from the delays of training [s]."""
     force: bool = False
-    """Deploy, with a warning, though the delay is not what the policy was trained with."""
+    """Deploy with a warning if the measured delay is none of the delays of training."""
     hold: bool = False
-    """Hold the robot where an episode or Ctrl-C ends it, until Enter is pressed: for one that falls without torque."""
+    """Hold the robot at the end of an episode, or after Ctrl-C, until Enter is pressed: it may fall without torque."""
     dry_run: bool = False
-    """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
+    """Do everything except moving the robot: no torque, no goals; the withheld commands are logged and summed up."""
     strict_timing: bool = False
     """End with code 5 when more than 1 % of the steps miss their deadline."""
     max_tilt_rad: float | None = None
-    """How far the robot may lean before it is stopped, of one that sees its tilt; default: not checked [rad]."""
+    """Largest tilt [rad]; a robot that measures its tilt stops above it. Default: no limit."""
     gate: GateLimits = field(default_factory=GateLimits)
     """Limits on every command."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked before anything moves."""
+        """Check the fields, before the robot moves."""
         check_seed(self.seed)
         if self.max_tilt_rad is not None and not 0.0 < self.max_tilt_rad <= math.pi:
             raise UsageError(f"max_tilt_rad must lie in (0, pi] rad, got {self.max_tilt_rad}")

@@ -1,9 +1,8 @@
-"""What deploy asks of a policy bundle before anything moves, and of the robot's delay before the policy moves it."""
+"""Checks before a deployment: the bundle fits the robot; the robot's delay is one of those in training."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -21,115 +20,117 @@ from sim2real.stages.terminal.console import note
 _TRAIN = "train a policy for this pipeline"
 
 
-def require_untouched(trained: StageFolder) -> None:
-    """Refuse a bundle that is not the one that its training wrote.
+def require_untouched(training: StageFolder) -> None:
+    """Refuse a bundle whose hash differs from the one in the manifest of its training.
 
     Raises:
-        Sim2RealError: Its hash is not that of the manifest.
+        Sim2RealError: The hashes differ.
     """
-    path, written = trained.output("bundle"), trained.manifest["outputs"]["bundle"].get("sha256")
+    path, written = training.output("bundle"), training.manifest["outputs"]["bundle"].get("sha256")
     if sha256(path) != written:
         raise Sim2RealError(
             f"{path} is not the bundle that its training wrote: its hash is not the one in the manifest",
-            hint="train again; to deploy it all the same, name it with --bundle",
+            hint="train again; --bundle FOLDER deploys it without this check",
         )
 
 
 def require_fit(robot: Robot, bundle: Bundle) -> None:
-    """Refuse a bundle that is for another robot, or asks for what this one does not bear.
+    """Refuse a bundle for another robot, or one that exceeds the limits of this robot.
 
     Raises:
-        Sim2RealError: Naming what is different, or the policy is a teacher.
+        Sim2RealError: Names the difference; or the policy is a teacher.
     """
     bundle.spec.refuse_teacher()
     contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
-    for kind, found, expected in (
-        ("sees", _seen(contract.observation), _seen(robot.observation)),
-        ("sends", _sent(contract.action), _sent(robot.action)),
+    for verb, in_bundle, of_robot in (
+        ("sees", _observations(contract.observation), _observations(robot.observation)),
+        ("sends", _actions(contract.action), _actions(robot.action)),
     ):
-        if found != expected:
-            raise Sim2RealError(f"the policy {where} {kind} {found}, this robot has {expected}", hint=_TRAIN)
+        if in_bundle != of_robot:
+            raise Sim2RealError(f"the policy {where} {verb} {in_bundle}, this robot has {of_robot}", hint=_TRAIN)
     if contract.rate_hz != robot.rate_hz:
         raise Sim2RealError(
             f"the policy {where} runs at {contract.rate_hz:g} Hz, this robot at {robot.rate_hz:g} Hz", hint=_TRAIN
         )
-    for own, other in zip(contract.observation, robot.observation, strict=True):
-        if own.low and other.low and not np.allclose([own.low, own.high], [other.low, other.high], rtol=1e-6):
+    for trained, term in zip(contract.observation, robot.observation, strict=True):
+        bounds = [trained.low, trained.high], [term.low, term.high]
+        if trained.low and term.low and not np.allclose(*bounds, rtol=1e-6):
             raise Sim2RealError(
-                f"the policy {where} was trained with {own.name!r} from {own.low} to {own.high}, "
-                f"this robot says {other.low} to {other.high}",
+                f"the policy {where} was trained with {trained.name!r} from {trained.low} to {trained.high}, "
+                f"this robot has {term.low} to {term.high}",
                 hint=_TRAIN,
             )
-    for action, most in zip(contract.action, robot.action, strict=True):
-        if action.low < np.float32(most.low) or action.high > np.float32(most.high):  # training rounds them so
+    for action, limit in zip(contract.action, robot.action, strict=True):
+        # Training rounds the limits to float32.
+        if action.low < np.float32(limit.low) or action.high > np.float32(limit.high):
             raise Sim2RealError(
                 f"the policy {where} sends {action.name!r} from {action.low:g} to {action.high:g} {action.unit}, "
-                f"this robot bears {most.low:g} to {most.high:g}",
+                f"this robot allows {limit.low:g} to {limit.high:g}",
                 hint=_TRAIN,
             )
-    for name, limit in contract.limits.items():
-        if name not in robot.limits or not np.isclose(limit, robot.limits[name], rtol=1e-6):
+    for name, value in contract.limits.items():
+        if name not in robot.limits or not np.isclose(value, robot.limits[name], rtol=1e-6):
             raise Sim2RealError(
-                f"the policy {where} was trained with {name!r} = {limit:g}, "
+                f"the policy {where} was trained with {name!r} = {value:g}, "
                 f"this robot has {robot.limits.get(name, 'no such limit')}",
                 hint=_TRAIN,
             )
 
 
-def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config: DeployConfig) -> dict[str, Any]:
-    """Measure the robot's delay with small steps, and stop where the policy was not trained with it.
+def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config: DeployConfig) -> dict[str, str]:
+    """Measure the robot's delay with small steps, and refuse a policy that was not trained with it.
 
     Args:
-        robot: The robot, whose steps they are.
-        witness: Has the robot, open and at rest, without torque, and leaves it so; keeps what is measured and sent.
+        witness: Holds the open robot, at rest and without torque; records the commands and the measurements.
 
     Returns:
-        Lines for the summary.
+        Lines of the summary.
 
     Raises:
-        DelayChanged: The delay, or by how much it varies, lies outside of what the policy was trained with.
+        DelayChanged: The delay, or its variation, lies outside of the range in training.
         Sim2RealError: The robot does not answer.
     """
     if not config.measure_delay or config.dry_run or robot.probe is None:
         return {}
     if (trained := contract.trained_s.get(ROUND_TRIP)) is None:
-        note("warning: the policy does not say with which delays it was trained, so the robot's is not measured")
+        note("warning: the bundle does not list the delays of its training, so the robot's delay is not measured")
         return {}
-    found = measure_delay(witness, robot.probe)
-    if misfit(found, trained, config.delay_tolerance_s):  # a busy machine delays one step or another: look once more
+    # A busy machine may delay single steps, so a misfit is measured a second time.
+    answers = measure_delay(witness, robot.probe)
+    if misfit(answers, trained, config.delay_tolerance_s):
         witness.rig.wait_until_still(config.settle_s)
-        found = StepAnswers(np.append(found.delays_s, measure_delay(witness, robot.probe).delays_s))
-    said = f"{1e3 * found.delay_s:.0f} ms, the middle half within {1e3 * found.jitter_s:.0f} ms"
-    if reason := misfit(found, trained, config.delay_tolerance_s):
-        what = f"the delay is {said}: {reason}"
+        answers = StepAnswers(np.append(answers.delays_s, measure_delay(witness, robot.probe).delays_s))
+    measured = f"{1e3 * answers.delay_s:.0f} ms, the middle half within {1e3 * answers.jitter_s:.0f} ms"
+    if reason := misfit(answers, trained, config.delay_tolerance_s):
+        message = f"the delay is {measured}: {reason}"
         if not config.force:
             raise DelayChanged(
-                what,
+                message,
                 hint="record, identify and train again, or see where the delay is: sim2real latency; to deploy all "
                 "the same: --force",
             )
-        note(f"warning: {what}")
-    return {"measured delay": said}
+        note(f"warning: {message}")
+    return {"measured delay": measured}
 
 
-def misfit(found: StepAnswers, trained: tuple[float, float], tolerance_s: float) -> str | None:
-    """Return in words why a measured delay is not one that a policy was trained with; None: it is.
+def misfit(answers: StepAnswers, trained: tuple[float, float], tolerance_s: float) -> str | None:
+    """Return why a measured delay is none of the delays in training; None if it is one of them.
 
     Args:
-        trained: Shortest and longest of the training [s].
-        tolerance_s: How far it may lie outside, and how much more it may vary [s].
+        trained: Shortest and longest delay of the training [s].
+        tolerance_s: Allowed distance from these, and allowed additional variation [s].
     """
     low, high = trained
-    if not low - tolerance_s <= found.delay_s <= high + tolerance_s:
+    if not low - tolerance_s <= answers.delay_s <= high + tolerance_s:
         return f"the policy was trained with {1e3 * low:.0f} to {1e3 * high:.0f} ms"
-    if found.jitter_s > high - low + tolerance_s:
+    if answers.jitter_s > high - low + tolerance_s:
         return f"the policy was trained with delays that vary by {1e3 * (high - low):.0f} ms"
     return None
 
 
-def _seen(terms: Sequence[ObservationTerm]) -> list[tuple[str, tuple[str, ...], int]]:
+def _observations(terms: Sequence[ObservationTerm]) -> list[tuple[str, tuple[str, ...], int]]:
     return [(t.name, tuple(t.units), t.history) for t in terms]
 
 
-def _sent(terms: Sequence[ActionTerm]) -> list[tuple[str, str]]:
+def _actions(terms: Sequence[ActionTerm]) -> list[tuple[str, str]]:
     return [(t.name, t.unit) for t in terms]

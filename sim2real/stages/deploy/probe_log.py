@@ -1,4 +1,4 @@
-"""The small steps by which deploy measured the delay, as a log: what the robot answered is tested like an episode."""
+"""The log of the small steps that measure the delay; the model is tested on it as on an episode."""
 
 from __future__ import annotations
 
@@ -15,30 +15,32 @@ from sim2real.robots.probe import Witness
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 
-def write_probe(folder: Path, pipeline: Pipeline, robot: Robot, seen: Witness) -> Path | None:
-    """Write what was sent and measured during the steps, at the robot's rate.
+def write_probe(folder: Path, pipeline: Pipeline, robot: Robot, witness: Witness) -> Path | None:
+    """Write the commands and measurements of the steps at the robot's rate; return the log.
 
-    They were made faster than that: measurements in between are left out, so that a log says in a second as much as any
-    other, and so are repeated commands, which change nothing.
+    The steps ran faster than that. The log omits the measurements in between, so that a second of it weighs as much as
+    a second of any other log, and it omits repeated commands.
 
     Returns:
-        The log; None where there was no step, or where the robot does not say what its messages are.
+        None if no step was made, or if the robot has no messages of a control loop.
     """
-    if not seen.measured or not seen.sent or not isinstance(robot, LoopRobot):
+    if not witness.measured or not witness.sent or not isinstance(robot, LoopRobot):
         return None
+    # Select the measurements and commands at the robot's rate; a command that changes is always selected.
     sensor, actuator = robot.roles.sensor, robot.roles.actuator
-    period_ns, start_ns = round(1e9 / robot.rate_hz), min(seen.measured[0][0], seen.sent[0][0])
-    measured = _apart([begin_ns for begin_ns, *_ in seen.measured], period_ns)
-    changed = [i == 0 or not np.array_equal(goal, seen.sent[i - 1][2]) for i, (*_, goal) in enumerate(seen.sent)]
-    sent = _apart([begin_ns for begin_ns, *_ in seen.sent], period_ns, changed)
+    period_ns, start_ns = round(1e9 / robot.rate_hz), min(witness.measured[0][0], witness.sent[0][0])
+    measured = _apart([begin_ns for begin_ns, *_ in witness.measured], period_ns)
+    changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]
+    sent = _apart([begin_ns for begin_ns, *_ in witness.sent], period_ns, changed)
+    # Write them as steps of the sensor and the actuator.
     outputs = {sensor: robot.at_rest, actuator: robot.message(np.zeros(len(robot.action)))}
     graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
     metadata = {"pipeline": pipeline.name, "dry_run": False, "graph": graph, "probe": True}
     joints, units = {sensor: robot.joints}, dict.fromkeys(outputs, robot.units)
     recorder = McapRecorder(folder / PROBE, metadata, {}, outputs, [], joints, units)
     recorder.start(0, start_ns)
-    rows = [(sensor, k, *seen.measured[i][:2], robot.read(seen.measured[i][2])) for k, i in enumerate(measured)]
-    rows += [(actuator, k, *seen.sent[i][:2], robot.message(seen.sent[i][2])) for k, i in enumerate(sent)]
+    rows = [(sensor, k, *witness.measured[i][:2], robot.read(witness.measured[i][2])) for k, i in enumerate(measured)]
+    rows += [(actuator, k, *witness.sent[i][:2], robot.message(witness.sent[i][2])) for k, i in enumerate(sent)]
     for node, seq, *times_ns, output in rows:
         begin, end = ((t_ns - start_ns) // 1000 for t_ns in times_ns)
         recorder.step(StepRecord(node, seq, begin, begin, begin, -1, end, 0), output)
@@ -47,9 +49,9 @@ def write_probe(folder: Path, pipeline: Pipeline, robot: Robot, seen: Witness) -
 
 
 def _apart(times_ns: list[int], period_ns: int, always: list[bool] | None = None) -> list[int]:
-    """Return which of some times are a period apart at least, and those that count in any case."""
-    kept: list[int] = []
+    """Return the indices of times that are at least a period apart, and of those that ``always`` marks."""
+    selected: list[int] = []
     for i, t_ns in enumerate(times_ns):
-        if not kept or t_ns - times_ns[kept[-1]] >= period_ns or (always is not None and always[i]):
-            kept.append(i)
-    return kept
+        if not selected or t_ns - times_ns[selected[-1]] >= period_ns or (always is not None and always[i]):
+            selected.append(i)
+    return selected
