@@ -155,6 +155,7 @@ class Bundle(Summed):
             folder / BUNDLE, self.weights, self.contract, spec=self.spec, graph=self.graph, references=self.references
         )
         written = {"bundle": BUNDLE}
+        # Write the records of the training beside the bundle, which holds only the policy.
         if self.history is not None:
             self.history.save(folder / HISTORY)
             written["history"] = HISTORY

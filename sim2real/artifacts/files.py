@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from sim2real.errors import Sim2RealError
+from sim2real.types import Json
 
 T = TypeVar("T")
 
@@ -88,14 +89,17 @@ def write_json(path: Path, document: object) -> None:
     os.replace(draft, path)
 
 
-def _numbers(kind: Any, value: Any) -> Any:
+def _numbers(kind: Any, value: Json) -> Json:
     """Return a document with NaN for null in entries that are numbers."""
     inner = get_args(kind)
+    # A null in the place of a number is NaN.
     if kind is float:
         return math.nan if value is None else value
+    # Of a union, take the first type that can hold the value.
     if isinstance(kind, UnionType) or get_origin(kind) is Union:
         fitting = [k for k in inner if k is not NoneType and (k is float) != isinstance(value, dict | list)]
         return value if value is None or not fitting else _numbers(fitting[0], value)
+    # Convert the entries of dataclasses, dictionaries and lists by their types.
     if isinstance(value, dict):
         if dataclasses.is_dataclass(kind):
             hints = get_type_hints(kind)
@@ -136,11 +140,11 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
                 np.lib.format.write_array(file, np.asanyarray(values), allow_pickle=False)
 
 
-def _array(kind: type, value: Any) -> Any:
+def _array(kind: type, value: Json) -> Json:
     if kind is not np.ndarray:
         raise NotImplementedError(f"no {kind.__name__} in a file")
 
-    def flat(entry: Any) -> Any:
+    def flat(entry: Json) -> Json:
         return [flat(e) for e in entry] if isinstance(entry, list) else math.nan if entry is None else float(entry)
 
     return np.array(flat(value), np.float64)
@@ -151,7 +155,7 @@ def number(value: float | None, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
-def _plain(value: object) -> Any:
+def _plain(value: object) -> Json:
     """Return NumPy's arrays and numbers as lists and numbers of Python."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()

@@ -364,6 +364,7 @@ class Identification(Shown):
         """
         path = Path(path)
         file = path / PARAMETERS if path.is_dir() else path
+        # Read the estimates, then the samples and the timing if their files exist.
         with malformed(file, _AGAIN):
             identification = read_json(file, Identification)
             if identification.format != FORMAT:

@@ -84,6 +84,7 @@ class Sensitivity:
             return "No parameter has an interval, so none was moved."
         worst = self.parameters[0]
         lowest = float(worst.success.min())
+        # A policy that fails on the identified model needs more training first.
         if self.success < _MIN_SUCCESS:
             return f"The success on the identified model is only {self.success:.2f}: train longer first."
         if (at := self.breaks_at(worst)) is None:

@@ -217,6 +217,7 @@ class Timing(Shown):
             timing = read_json(file, Timing)
             if timing.format not in _READ:
                 raise Sim2RealError(f"{file} has format {timing.format}, this version reads {FORMAT}", hint=_AGAIN)
+        # Read the samples, and check that they belong to the nodes of the document.
         samples = file.with_suffix(".npz")
         with malformed(samples, _AGAIN):
             kinds: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in _ARRAYS}

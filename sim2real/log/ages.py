@@ -25,6 +25,7 @@ def input_ages(episode: Episode, node: str) -> dict[str, np.ndarray]:
     for (reader, name), messages in episode.messages.items():
         if reader != node:
             continue
+        # Find the newest message of each step; a step without a new message uses the previous one.
         row = messages.seq_in - first
         used = (messages.seq_in >= 0) & (row >= 0) & (row < len(start))
         newest = np.full(len(start), -np.inf)

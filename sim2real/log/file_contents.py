@@ -105,6 +105,7 @@ class Contents:
             A structured array, shape ``(N,)``, ordered by sequence: ``sequence``, ``log_time`` and ``publish_time``
             [ns], and ``data`` with the fields of the message.
         """
+        # Decode all messages at once: record header and data have a fixed size.
         dtype = np.dtype(
             {
                 "names": ["sequence", "log_time", "publish_time", "data"],
@@ -117,6 +118,7 @@ class Contents:
         if any(len(m) != dtype.itemsize for m in messages):
             raise Sim2RealError(f"topic {self.channels[channel].topic} holds messages that do not fit its own fields")
         rows = np.frombuffer(b"".join(messages), dtype)
+        # Select the range, and sort by sequence, as threads can write out of order.
         begin, end = span.log_times(self.epoch_ns)
         rows = rows[(rows["log_time"] >= begin) & (rows["log_time"] < end)]
         return rows[np.argsort(rows["sequence"], kind="stable")]

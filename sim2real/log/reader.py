@@ -177,6 +177,7 @@ def _connections(
         rows = contents.columns(number, MESSAGE_LAYOUT, span)
         seq_in = rows["data"]["seq_in"]
         in_episode = np.isin(seq_in, sequences.get(node, []))
+        # Times are on the wall clock [ns]; convert them to ticks since time 0.
         sent, received = ((rows[f].astype(np.int64) - contents.epoch_ns) // 1000 for f in ("publish_time", "log_time"))
         connections[node, channel.metadata["input"]] = Messages(
             seq_out=np.ascontiguousarray(rows["data"]["seq_out"]),

@@ -48,6 +48,7 @@ def recover(source: str | Path, target: str | Path) -> Recovery:
     if Path(target).exists():
         raise Sim2RealError(f"{target} exists already", hint="choose another name")
     with opened(source) as data:
+        # Collect all definitions first, as a damaged file can hold them after their messages.
         definitions = _definitions(data)
         try:
             with open(target, "xb") as stream:
@@ -90,6 +91,7 @@ def _definitions(data: mmap.mmap) -> _Definitions:
         elif record.opcode == Opcode.CHANNEL and (channel := parsed(Channel, source, record, ignored)) is not None:
             definitions.channels[channel.id] = channel
 
+    # Definitions outside of chunks have no checksum, so chunks win.
     for record in records(data, ignored):
         if record.opcode != Opcode.CHUNK:
             take(loose, data, record)

@@ -239,6 +239,7 @@ def _field(entry: Mapping[str, Json]) -> CdrField:
 def _pick(node: str, joint: str, source: str | None, leaves: Mapping[str, np.ndarray]) -> tuple[int, int]:
     if source is None:
         return -1, 0
+    # Split the source into a field and an element.
     match = re.fullmatch(r"(.*)\[(\d+)\]", source)
     name, element = (match[1], int(match[2])) if match else (source, 0)
     if name not in leaves:

@@ -195,6 +195,7 @@ class SessionFile:
         if not self._channels:
             self._early_events.append((monotonic_ns, ticks, level, kind, message))
             return
+        # Times before the episode's start are negative, which the wall clock allows.
         passed_ns = monotonic_ns - self._start_monotonic_ns if ticks is None else 1000 * ticks
         time_ns = self._epoch_ns + passed_ns
         stamp = [
@@ -252,6 +253,7 @@ def _nodes(
 ) -> dict[str, _Node]:
     unique_names(outputs, "the graph", "node")
     nodes, types = {}, {}
+    # Derive the topics of each node from the example of its output.
     for name, example in outputs.items():
         leaves = list(named_leaves(example).values())
         node_units = units.get(name, {})

@@ -18,6 +18,7 @@ from sim2real.errors import ERROR, OK, Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord, named_leaves
 from sim2real.log.backlog import RECORD_BYTES, Backlog, max_queue_bytes
 from sim2real.log.session_file import SessionFile
+from sim2real.types import Json, PyTree
 
 # A crash costs at most 0.25 s of data; 0.05 s of it is the margin for a writer thread that wakes late.
 FLUSH_PERIOD_S = 0.2
@@ -59,9 +60,9 @@ class McapRecorder:
     def __init__(
         self,
         path: str | Path,
-        metadata: Mapping[str, Any],
+        metadata: Mapping[str, Json],
         attachments: Mapping[str, bytes],
-        outputs: Mapping[str, Any],
+        outputs: Mapping[str, PyTree],
         inputs: Iterable[tuple[str, str]],
         joint_states: Mapping[str, Mapping[str, Mapping[str, str]]] | None = None,
         units: Mapping[str, Mapping[str, str]] | None = None,
@@ -108,7 +109,7 @@ class McapRecorder:
         self._started = True
         self._put(self._file.start, epoch_ns, monotonic_ns)
 
-    def step(self, record: StepRecord, output: Any) -> None:
+    def step(self, record: StepRecord, output: PyTree) -> None:
         """Queue a step that has ended, and its output: a pytree like the example, or a mapping by leaf name."""
         leaves = _snapshot(record.node, output, self._names.get(record.node, {}))
         self._put(self._file.step, record, leaves)
@@ -141,7 +142,7 @@ class McapRecorder:
         self,
         status: str = "finished",
         exit_code: int = OK,
-        summary: Mapping[str, Any] | None = None,
+        summary: Mapping[str, Json] | None = None,
         report: Callable[[str], None] | None = None,
     ) -> None:
         """Write all queued records and ``session_end``, and close the file. Later calls do nothing.
@@ -284,7 +285,7 @@ class McapRecorder:
             self.close("aborted", ERROR)
 
 
-def _snapshot(node: str, output: Any, expected: dict[str, None]) -> list[Any]:
+def _snapshot(node: str, output: PyTree, expected: dict[str, None]) -> list[PyTree]:
     """Return the leaves of an output; writable numpy arrays are copied, as the caller may change them."""
     if isinstance(output, Mapping) and output.keys() == expected.keys():
         leaves = [output[name] for name in expected]

@@ -134,6 +134,7 @@ def _draw_connection(axes: Axes, begin: float, end: float, number: int, connecti
         "shrinkB": 26,
     }
     axes.annotate("", xy=(end, 0.0), xytext=(begin, 0.0), arrowprops=arrow)
+    # Label the arc with delay, window and options.
     words = [f"{1e3 * connection.delay:.3g} ms"]
     words += [f"window {connection.window}"] * (connection.window > 1)
     words += [word for word in ("blocking", "skip", "trainable") if getattr(connection, word)]

@@ -124,6 +124,7 @@ def _identify_tab(identification: Identification, recording: int, which: str) ->
     samples = {name: values[chosen] for name, values in identification.samples.items()}
     t_s, segment = samples["t"], samples["segment"]
     plots, columns = {}, {}
+    # Draw measurements and models, interrupted between segments.
     for quantity in identification.fields:
         curves = []
         for model in ("measured", *(m for m in identification.models(quantity) if m != "no delay")):

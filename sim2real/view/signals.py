@@ -79,6 +79,7 @@ def signals_of(recording: Recording) -> Signals:
         raise Sim2RealError(f"the log {recording.path} holds no step", hint="record for longer")
     graph = episode.metadata.get("graph", {})
     measured, commanded = [], []
+    # Nodes with inputs command, nodes without inputs measure.
     for node, steps in episode.steps.items():
         inputs = graph.get(node, {}).get("inputs", {}) or [k for k in episode.messages if k[0] == node]
         outputs = episode.outputs.get(node, {})

@@ -313,12 +313,14 @@ def newest(root: Path, pipeline: str, stage: str, run_dir: Path | None = None) -
     Raises:
         Sim2RealError: When no run has one; the hint names the command that makes it.
     """
+    # Prefer the artifact of the given run.
     here = finished(run_dir, stage) if run_dir else None
     if here is not None:
         return here
     folders = sorted((Path(root) / pipeline).glob("*"))
     candidates = [done for folder in folders if (done := finished(folder, stage)) is not None]
     if not candidates:
+        # Count unfinished attempts and dry runs, which explain the error.
         others = [attempt for folder in folders for attempt in attempts(folder, stage)]
         dry = sum(attempt.dry for attempt in others)
         kinds = [(len(others) - dry, "unfinished"), (dry, "dry run" if dry == 1 else "dry runs")]

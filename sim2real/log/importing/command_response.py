@@ -89,6 +89,7 @@ class Following:
     def by_level(self, scale: float = 1.0) -> Following:
         """Return the relation with signs from the means if the correlations do not decide them."""
         (spread, _), (mean, level) = self.spread, self.mean
+        # Compare the means with the command's, and with its opposite.
         near, far = (
             np.abs(self._apart(mean[:, None] - sign * scale * level)) / (spread[:, None] + 1e-30)
             for sign in (1.0, -1.0)

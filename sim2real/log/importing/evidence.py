@@ -95,6 +95,7 @@ def turn(values: np.ndarray) -> tuple[str, int] | None:
     levels = np.unique(np.round(values, 9))
     if not 5 <= levels.size < 0.8 * values.size + 5:
         return None
+    # All steps must be multiples of the smallest usual step.
     steps = np.diff(levels)
     step = float(np.median(steps[steps > 1e-7])) if (steps > 1e-7).any() else 0.0
     if not step or np.mean(np.abs(steps / step - np.round(steps / step)) > 0.05) > 0.1:

@@ -257,6 +257,7 @@ def _range(file: ForeignFile, counts: Mapping[str, int], samples: slice | None) 
             f"the nodes differ in their number of samples, so a range of samples is no range of time: {listed}",
             hint="import all samples, and cut the file itself",
         )
+    # Check the limits, as a slice would accept any number.
     count = next(iter(counts.values()))
     first, stop, _ = samples.indices(count)
     beyond = [n for n in (samples.start, samples.stop) if n is not None and not -count <= n <= count]
@@ -278,6 +279,7 @@ def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMappin
     values = values[selected] if values.ndim else np.broadcast_to(values, selected.shape)
     _check_finite(file, f"field {where}", values, selected)
     dtype = values.dtype if values.dtype.kind == "f" else np.dtype(np.float64)
+    # Scale and reshape the samples.
     scale = np.asarray(how.scale)
     if scale.ndim and scale.shape != values.shape[1:]:
         raise UsageError(

@@ -109,6 +109,7 @@ class ImportMapping:
         """
         where = "the mapping" if path is None else str(path)
         _check_keys(tables, ("pipeline", "nodes"), where)
+        # The pipeline of the document must agree with the given one.
         named = _value(tables, "pipeline", str, where)
         if named is None and pipeline is None:
             raise UsageError(f"{where} does not name the pipeline of the log", hint='add pipeline = "NAME"')
@@ -143,6 +144,7 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
             "there is no mapping of the file's signals",
             hint="name the robot with --pipeline NAME, or a --mapping FILE.toml",
         )
+    # Read the document, with errors that name the file.
     path = Path(path)
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))

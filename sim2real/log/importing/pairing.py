@@ -95,6 +95,7 @@ def _kind(command: Signal) -> str:
 
 def _one(fitting: Sequence[Signal], what: str, path: str) -> Signal | None:
     """Return the only candidate, or the only one with the better name; None without candidates."""
+    # Narrow the candidates by the quality of their names.
     for better in (
         lambda s: True, lambda s: s.meaning.unit != "raw", lambda s: s.meaning.side != "",
         lambda s: s.meaning.unit != "", lambda s: s.meaning.quantity != "",

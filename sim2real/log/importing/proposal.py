@@ -138,6 +138,7 @@ def _commanded(
     kind = pair.kind or (
         "position" if command.meaning.unit in ("rad", "deg") or follows(relation, command, path) else "duty"
     )
+    # A command without a following position is taken by its name.
     if kind != "position":
         command = _other_command(command, measured, places)
         unit = {"velocity": "rad/s", "torque": "N m"}.get(kind, "")
@@ -145,6 +146,7 @@ def _commanded(
         fields = {_FIELDS[kind]: field_of(command, unit, [1.0] * command.width)}
         return command, fields, [f"{command.name!r} commands {kind}: {notes}"]
     command, scales, more = goal(measured, command, relation, checked.to_rad, path, hints.as_told)
+    # Compare goals and positions in radians, for turns and copies.
     in_rad = command.values[rows[1]] * scales, measured.values[rows[0]] / checked.to_rad
     turn, on_turns = _circle(command, turn, *in_rad, abs(scales[0]), checked.hinges)
     copies = evidence.copied(clocks[1][rows[1]], clocks[0][rows[0]], *in_rad)

@@ -99,6 +99,7 @@ def align_turns(
         for field, how in node.fields.items()
         if how.unit in ("rad", "")  # without a unit where a robot has hinges and slides
     ]
+    # Shift each command to the positions of the same shape.
     for name, field, how in angles:
         for other, goal, its in angles:
             a, b = outputs[name][field], outputs[other][goal]

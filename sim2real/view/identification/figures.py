@@ -62,6 +62,7 @@ def free_runs(result: Identification, name: str) -> str:
     for recording, quantity in shown(result, np.unique(result.free["recording"]).tolist()):
         rows = result.free["recording"] == recording
         segments, counts = np.unique(result.free["segment"][rows], return_counts=True)
+        # Draw the longest run of the recording.
         rows &= result.free["segment"] == segments[counts.argmax()]  # the longest segment
         t_s = result.free["t"][rows]
         models = [m for m in ("measured", "no delay", "identified") if f"{quantity}_{m}" in result.free]
@@ -133,6 +134,7 @@ def search(result: Identification, name: str) -> str:
         figure = new_figure(2.6, 4.4)
         axes = figure.subplots()
         axes.plot(np.arange(1, len(result.search.history) + 1), result.search.history, color=BLUE)
+        # Mark the loss after the refinement.
         if refined:
             axes.axhline(refined[-1], color=GREEN, ls=style.DASHES[1], lw=1.2)
             entries = [

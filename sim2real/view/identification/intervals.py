@@ -61,6 +61,7 @@ def aggregate(quantities: Sequence[Quantity], name: str) -> str:
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes in grid.ravel()[len(shown) :]:
             axes.set_visible(False)
+        # Draw a panel for each quantity.
         for quantity, axes in zip(shown, grid.ravel(), strict=False):
             _recordings(axes, quantity)
         entries = [
@@ -148,6 +149,7 @@ def _in_errors(axes: Axes, group: Sequence[Estimate]) -> None:
             text = "fixed" if e.verdict == "fixed" else "no standard error"
             axes.text(0.2, row, text, va="center", color=MUTED, fontsize=8)
             continue
+        # Mark nominal value and truth; an arrow marks a value beyond the edge.
         for value, color, mark in ((e.nominal, ORANGE, "s"), (e.truth, GREEN, "D")):
             if value is None:
                 continue

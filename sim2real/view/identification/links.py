@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from sim2real.artifacts.estimation.links import Link, links_table
 from sim2real.artifacts.files import number
@@ -33,10 +33,11 @@ def link_blocks(links: Sequence[Link]) -> list[Block]:
     return [FigureBlock(svg, caption), TableBlock.of("Links", links_table(links))]
 
 
-def draw_link(ax: Any, link: Link) -> None:
+def draw_link(ax: Axes, link: Link) -> None:
     """Draw the distribution of a link's delays with its mean and its 95th percentile."""
     large = np.flatnonzero(link.share >= _MIN_SHARE * link.share.max())
     drawn = slice(max(large[0] - 1, 0), large[-1] + 2)
+    # Draw the distribution, then mean, interval and 95th percentile.
     ms, share = 1e3 * link.delays[drawn], 100.0 * link.share[drawn]
     ax.fill_between(ms, share, step="mid", color=BLUE, alpha=0.8, lw=0)
     if link.mean.low95 is not None and link.mean.high95 is not None:

@@ -47,12 +47,14 @@ def residuals(result: Identification, quantity: str) -> Residuals:
     held_out = s["held_out"].astype(bool) & (s["into"] > result.settle_s)
     steps = np.diff(s["t"][held_out])[np.diff(s["segment"][held_out]) == 0]
     period_s = float(np.median(steps)) if steps.size else 0.0
+    # Place the recordings one after the other on one time axis.
     t_s, reached = s["t"].astype(float).copy(), 0.0
     for number, recording in enumerate(result.recordings):
         of_recording = held_out & (s["recording"] == recording)
         if number and of_recording.any():
             t_s[of_recording] += reached + period_s - float(s["t"][of_recording].min())
         reached = max(reached, float(t_s[of_recording].max(initial=0.0)))
+    # Draw residuals without overlapping segments, but use all for the statistics.
     chosen = held_out & result.disjoint()
     lags = autocorrelation(rest[held_out], s["segment"][held_out])
     return Residuals(
@@ -121,6 +123,7 @@ def _histogram(axes: Axes, values: np.ndarray, sigma: float | None) -> None:
     """Draw the density over the range of most residuals; the outer bins hold the rest."""
     if not values.size:
         return
+    # Choose the range, which outliers must not widen.
     deviation = float(np.sqrt(np.mean(values**2))) or 1e-12
     reach = max(2.0 * float(np.quantile(np.abs(values), 0.9)), 4 * (sigma or 0.0), 1e-12)
     bins = np.linspace(-reach, reach, _BINS)

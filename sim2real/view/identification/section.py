@@ -99,6 +99,7 @@ def _parameters(result: Identification) -> list[Block]:
             "inside the shaded 95 % band agree with the estimate. Arrows point to marks beyond the edge.",
         ),
     ]
+    # List undetermined combinations, and the errors to expect of a longer log.
     if result.check:
         check = result.check
         items = [_sentence(m) for m in check.messages] or ["The data determines each parameter."]
@@ -133,6 +134,7 @@ def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
     columns = ["parameter", "estimate", "s.e.", "95 % interval", "unit", "nominal", "bounds"]
     columns += ["truth", "error", "verdict"] if with_truth else ["verdict"]
     rows = []
+    # Show two digits of the standard error, and as many decimals of the estimate.
     for e in map(in_readable_unit, estimates):
         places = decimals_for(e.standard_error, e.estimate)
         ends = MISSING if e.low95 is None else f"{fixed(e.low95, places)} to {fixed(e.high95, places)}"
@@ -297,6 +299,7 @@ def _correlation(result: Identification) -> list[Block]:
     if not result.correlation:
         return []
     names, matrix = result.correlation.names, result.correlation.matrix
+    # List the strongest pairs in the caption.
     pairs = [
         (names[i], names[j], matrix[i, j]) for i in range(len(names)) for j in range(i) if abs(matrix[i, j]) > _STRONG
     ]
@@ -347,6 +350,7 @@ def _free_run_table(result: Identification) -> TableBlock:
 
 
 def _tiles(result: Identification) -> Iterator[Tile]:
+    # The worst position comes first, then delays, residuals and the search.
     for row in result.held_out[:1]:
         which = f"{row.name}, the worst of {len(result.held_out)}," if len(result.held_out) > 1 else row.name
         note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.rmse.items() if m != "identified")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.estimation.noise import Noise
@@ -29,7 +30,7 @@ def picture(path: Path, episodes: Episodes) -> None:
         _figure(episodes).savefig(path, dpi=110, facecolor="white")
 
 
-def _figure(episodes: Episodes) -> Any:
+def _figure(episodes: Episodes) -> Figure:
     nodes = [n for n in episodes.recorded_s if n in episodes.drawn_s]
     noise = [n for n in episodes.noise if n.column in episodes.off]
     grows = episodes.curriculum != (1.0, 1.0)
@@ -55,7 +56,7 @@ def _figure(episodes: Episodes) -> Any:
     return figure
 
 
-def _parameter(ax: Any, parameter: Varied, drawn: np.ndarray) -> None:
+def _parameter(ax: Axes, parameter: Varied, drawn: np.ndarray) -> None:
     """Draw the histogram of a parameter's draws, its value, and its 95 % interval."""
     scale, unit = (1e3, "ms") if parameter.unit == "s" else (1.0, parameter.unit)
     ax.hist(scale * drawn, bins=_BINS, color=BLUE, alpha=0.8)
@@ -66,7 +67,7 @@ def _parameter(ax: Any, parameter: Varied, drawn: np.ndarray) -> None:
     ax.set_xlabel("drawn" if parameter.low95 is None else "drawn; band: 95 % interval", fontsize="x-small")
 
 
-def _curriculum(ax: Any, shares: tuple[float, float]) -> None:
+def _curriculum(ax: Axes, shares: tuple[float, float]) -> None:
     """Draw the share of all differences between episodes over the training."""
     ax.plot([0.0, 1.0], shares, color=BLUE)
     ax.set_ylim(-0.05, 1.05)
@@ -75,7 +76,7 @@ def _curriculum(ax: Any, shares: tuple[float, float]) -> None:
     ax.set_xlabel("share of the training; other plots: at its end", fontsize="x-small")
 
 
-def _times(ax: Any, node: str, recorded: np.ndarray, drawn: np.ndarray) -> None:
+def _times(ax: Axes, node: str, recorded: np.ndarray, drawn: np.ndarray) -> None:
     """Draw recorded and drawn computation times, in logarithmic counts, as hiccups are rare."""
     recorded, drawn = recorded[np.isfinite(recorded)], drawn[np.isfinite(drawn)]
     if not (recorded.size and drawn.size):
@@ -93,11 +94,11 @@ def _times(ax: Any, node: str, recorded: np.ndarray, drawn: np.ndarray) -> None:
     ax.set_xlabel(f"drawn; line: recorded, up to {recorded.max():.1f} ms", fontsize="x-small")
 
 
-def _noise(ax: Any, noise: Noise, off: np.ndarray) -> None:
+def _noise(ax: Axes, noise: Noise, off: np.ndarray) -> None:
     """Draw the differences between measurements and model, and the noise of a reading in simulation."""
     wide = max(float(np.quantile(np.abs(off), 0.995)), 1e-12)
     bins = np.linspace(-wide, wide, _BINS)
-    ax.hist(off, bins=bins, density=True, histtype="step", color=ORANGE, lw=1.2)
+    ax.hist(off, bins=bins.tolist(), density=True, histtype="step", color=ORANGE, lw=1.2)
     size = math.sqrt(noise.deviation**2 + noise.bias**2 + noise.quantum**2 / 12.0)
     if size > 0.0:
         x = np.linspace(-wide, wide, 200)

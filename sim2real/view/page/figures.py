@@ -76,6 +76,7 @@ def deployment(log: Signals, simulation: Sequence[Series], units: Mapping[str, s
     commands = [n for n in simulated if n.partition("[")[0] == "command"]
     zoom = (0.0, round(min(3.0, log.episode.duration_s / 3), 1))
     panels = []
+    # Draw measurements, then commands, with the simulation beside them.
     for series in log.measured:
         lines = [Line(series.t_s, series.values, "robot", "measured")]
         if series.name in simulated:

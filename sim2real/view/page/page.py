@@ -118,6 +118,7 @@ def write_page(
 def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:
     """Return notes on newer unfinished attempts, which an older one replaces, and on stale stages."""
     notes = []
+    # Mention newer attempts that have no section.
     for stage in STAGES:
         tried = attempts(run_dir, stage)
         if tried and (stage not in artifacts or tried[0].folder != artifacts[stage].folder):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from sim2real.artifacts.summary import words_and_unit
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
 from sim2real.log.ages import oldest_input
+from sim2real.types import Json
 from sim2real.view import timing
 from sim2real.view.blocks import (
     MISSING,
@@ -64,6 +64,7 @@ def train_section(artifact: StageFolder) -> PageSection:
     whose = (
         f"seed {curves.best_seed}, the best of {seeds}" if curves.best_seed is not None else f"median of {seeds} seeds"
     )
+    # Show the success of the policy in the bundle.
     shown = last[curves.best_seed] if curves.best_seed is not None else np.nanmedian(last)
     tiles = [
         Tile("success in simulation", f"{shown:.0%}", whose if seeds > 1 else "one seed"),
@@ -89,6 +90,7 @@ def _drawn_blocks(artifact: StageFolder) -> list[Block]:
         "those of the recording, noise with the differences between measurements and model. The posterior's deviations "
         f"are multiplied by {drawn.widening:.1f}, to cover errors of the model."
     )
+    # Describe pauses, pushes and the curriculum if there are any.
     if drawn.cut or drawn.again:
         caption += (
             f" {drawn.cut} of {drawn.timelines} timelines end before a pause of the computer that is too long for the "
@@ -172,12 +174,13 @@ def _timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
     p99 = {n: float(np.quantile(values, 0.99)) for n, values in late.items() if len(values)}
     worst = max(p99, key=lambda n: p99[n])
     yield Tile("lateness, p99", f"{p99[worst]:.2f} ms", f"of {worst}, the worst node")
+    # Lateness does not show old messages, so show the oldest input, too.
     old = {n: np.concatenate([oldest_input(e, n) for e in episodes]) for n in episodes[0].steps}
     oldest = {n: 1e3 * float(ages.max()) for n, ages in old.items() if ages.size}
     if oldest:
         reader = max(oldest, key=lambda n: oldest[n])
         yield Tile("oldest input of a step", f"{oldest[reader]:.1f} ms", f"of {reader}")
-    ends: list[Mapping[str, Any]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
+    ends: list[Mapping[str, Json]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
     overruns = [t.get("overruns", 0) for end in ends for t in end.get("timing", {}).values()]
     if overruns:
         lost = ends[-1].get("lost_replies")  # the count covers all episodes of a session
@@ -186,7 +189,7 @@ def _timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
 
 def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = False) -> list[Block]:
     """Return figures and table about an episode's timing."""
-    end: Mapping[str, Any] = episode.metadata.get("log", {}).get("session_end") or {}
+    end: Mapping[str, Json] = episode.metadata.get("log", {}).get("session_end") or {}
     rows, measured = [], Timing.of(episode)
     # Make a row for each node: quantiles of period, lateness, computation, bus and age.
     for node in timing.in_order(episode):

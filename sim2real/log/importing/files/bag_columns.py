@@ -43,6 +43,7 @@ class _Column:
         Raises:
             TypeError: When the value is no number.
         """
+        # A vector must have the same number of entries in all messages.
         width = len(value) if isinstance(value, list) else 0
         if self.problem:
             return
@@ -51,6 +52,7 @@ class _Column:
                 f"messages differ in their number of entries: {self.width} before message {number}, {width} in it"
             )
             return
+        # Append integers exactly; change to floats at the first other number.
         values = value if width else [value]
         try:
             self._numbers.extend(values)
@@ -184,6 +186,7 @@ def _clock(stamp: np.ndarray, log: np.ndarray) -> tuple[str, str]:
     """
     steps, log_steps = np.diff(stamp.astype(np.float64)), np.diff(log.astype(np.float64))
     recorder = "the recorder's clock is used"
+    # Stamps that are missing, constant or out of order are no clock.
     if not (np.isfinite(stamp) & (stamp > 0)).all():
         return STAMP, f"{int((~(stamp > 0)).sum())} of {len(stamp)} stamps in the headers are 0: {recorder}"
     if not steps.any():
@@ -194,6 +197,7 @@ def _clock(stamp: np.ndarray, log: np.ndarray) -> tuple[str, str]:
     if (k := _set_forward(steps, log_steps, stamp - log)) is not None:
         late = f"message {k + 1} has a stamp {1e-9 * steps[k]:.4g} s after that of the one before, but came "
         return STAMP, f"{late}{1e-9 * log_steps[k]:.4g} s after it: {recorder}"
+    # A coarse clock is replaced by the recorder's, unless it is simulated at another rate.
     repeated = float((steps == 0).mean())
     if repeated > _MAX_REPEATED and not (steps < 0).any() and not (log_steps < 0).any():
         if abs(np.ptp(stamp) / max(np.ptp(log), 1) - 1) < _MAX_RATE_ERROR:

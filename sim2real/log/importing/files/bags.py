@@ -279,6 +279,7 @@ def _messages(path: Path, topics: dict[str, _Topic], damage: Damage) -> Iterator
 def _topic(channel: Channel, schema: Schema | None) -> _Topic:
     """Return an empty topic, with its decoder or the reason to skip it."""
     kind = schema.name if schema is not None else channel.message_encoding
+    # Choose the decoder by the encoding.
     if channel.message_encoding == "json":
         return _Topic(channel.topic, kind, json.loads, "")
     if channel.message_encoding != "cdr" or schema is None or schema.encoding != "ros2msg":
@@ -289,6 +290,7 @@ def _topic(channel: Channel, schema: Schema | None) -> _Topic:
         decode = decoder(schema.name, schema.data.decode())
     except (UndecodableError, ValueError) as error:
         return _Topic(channel.topic, kind, None, str(error))
+    # Skip types without joints, as images and transforms.
     package, name = kind.split("/")[0], kind.split("/")[-1]
     jointless = package in _JOINTLESS or (package == "sensor_msgs" and name not in _JOINTS)
     return _Topic(channel.topic, kind, decode, "messages of this type hold no joints" if jointless else "")

@@ -171,6 +171,7 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
 
 
 def _read_json(path: Path) -> RawSignals:
+    # Check the size before parsing, as the parsed document takes ten times the memory.
     require_size(path, MAX_TEXT_BYTES)
     encoding = encoding_of(path, "JSON")
     try:
@@ -186,6 +187,7 @@ def _read_json(path: Path) -> RawSignals:
         raise UsageError(f"{path} holds a single value, no signals", hint=WHOLE)
     require_signals(len(keys), path)
 
+    # A name is a key, or a path with dots and brackets.
     def load(name: str) -> Json:
         if isinstance(document, dict) and name in document:
             return document[name]

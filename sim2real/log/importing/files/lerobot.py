@@ -185,6 +185,7 @@ def _loaded(file: pyarrow.parquet.ParquetFile, rows: np.ndarray | None, name: st
     import pyarrow
 
     require_memory(8.0 * _count([file], name), f"{name!r} of {file.metadata.num_rows} rows")
+    # Read the column, and select the rows of the episode.
     column = file.read(columns=[name]).column(0)
     if rows is not None:
         column = column.take(rows)
@@ -195,6 +196,7 @@ def _loaded(file: pyarrow.parquet.ParquetFile, rows: np.ndarray | None, name: st
         return column.to_numpy(zero_copy_only=False)
     if pyarrow.types.is_struct(column.type) or column.null_count or pyarrow.types.is_nested(column.type.value_type):
         return column.to_pylist()
+    # Lists of one length become an array without a detour over Python.
     fixed = pyarrow.types.is_fixed_size_list(column.type)
     lengths = [column.type.list_size] if fixed else np.unique(np.diff(column.offsets.to_numpy()))
     if len(lengths) != 1:

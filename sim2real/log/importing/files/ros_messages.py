@@ -44,6 +44,7 @@ def decoder(name: str, definition: str) -> Decode:
 def _parse(name: str, text: str) -> _Types:
     """Return type -> fields (type, array, name) of a ``ros2msg`` schema."""
     types = {}
+    # Each part defines one type; the first one has no title.
     for part in re.split(r"^=+\s*$", text, flags=re.MULTILINE):
         lines = [line.split("#")[0] for line in part.strip().splitlines()]
         if lines and (title := re.match(r"\s*MSG:\s*(\S+)", lines[0])):

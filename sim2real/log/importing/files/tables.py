@@ -164,6 +164,7 @@ class _Table:
         """Return a line's cells, without empty cells after the last column with a name."""
         width = len(self.header)
         named = max((i + 1 for i, name in enumerate(self.header) if name), default=0)
+        # Drop empty cells after the last named column.
         while len(row) > named and not row[-1].strip():
             row.pop()
         if [cell.strip() for cell in row[:named]] == self.header[:named]:
@@ -202,6 +203,7 @@ class _Table:
     def _take(self, block: list[tuple[int, list[str]]]) -> None:
         """Convert the cells of some lines, column by column."""
         numbers = [n for n, _ in block]
+        # Try integers, then floats; keep other cells as text with their lines.
         for column, cells in zip(self._blocks, zip(*(row for _, row in block), strict=True), strict=True):
             try:
                 column.append(np.array([int(cell) for cell in cells], np.int64))
@@ -239,6 +241,7 @@ class _Table:
         blocks = self._blocks[self.header.index(name)]
         if not blocks:
             return []
+        # Choose by the first text: lists, dates, or numbers with missing values.
         texts = [cell for block in blocks if isinstance(block, list) for cell in block]
         if texts and texts[0][1].lstrip().startswith("["):
             return self._lists(texts, name)
