@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from benches.figures import row
+from benches.figures import Report, row
 from sim2real import cli
 from sim2real.errors import ERROR, HARDWARE_LOST, SAFETY_STOP, Sim2RealError
 from sim2real.hardware.emulation import emulator
@@ -331,7 +331,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time; each takes most of a core as it begins")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Let each fault happen in some runs."""
     rows, by_fault = [], {name: [] for name in options.faults}
     seeds = range(options.first_seed, options.first_seed + options.runs)

@@ -24,7 +24,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
-from benches.figures import medians, row
+from benches.figures import Report, Row, medians, row
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord
 from sim2real.log.reader import TruncatedLogWarning, read_log
@@ -51,7 +51,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=int, default=7, help="how often the range is read")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Record in real time, ours first, then read the log."""
     with tempfile.TemporaryDirectory() as scratch:
         log = Path(scratch) / "session.mcap"
@@ -91,7 +91,7 @@ def paced(write: Callable[[int], None], rate_hz: float, count: int) -> np.ndarra
     return took
 
 
-def loop(log: Path, other: Path, rate_hz: float, seconds: float) -> list[dict[str, Any]]:
+def loop(log: Path, other: Path, rate_hz: float, seconds: float) -> list[Row]:
     """Return the time of a tick of the loop that recording takes."""
     # Ours first: the recorder in the loop.
     count, period_us = round(rate_hz * seconds), round(1e6 / rate_hz)

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benches.figures import row
+from benches.figures import Report, Row, row
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
@@ -55,7 +55,7 @@ def policy(observations: int, actions: int, rate_hz: float, hidden: tuple[int, .
     return make_runner(weights, contract)
 
 
-def a_step(steps: int) -> list[dict[str, Any]]:
+def a_step(steps: int) -> list[Row]:
     """Measure single steps of a policy, with the checks of observations and actions."""
     runner, rng = policy(32, 8, 50.0), np.random.default_rng(1)
     observations = rng.normal(size=(steps, 32)).astype(np.float32)
@@ -88,7 +88,7 @@ def nodes_of(rig: Rig, rate_hz: float) -> dict[str, BaseNode]:
     )
 
 
-def loop(rate_hz: float, seconds: float, spin_s: float) -> list[dict[str, Any]]:
+def loop(rate_hz: float, seconds: float, spin_s: float) -> list[Row]:
     """Measure the lateness of the nodes of twelve joints on the wall clock, beside an emulated bus."""
     # The emulator, the device and the rig, then the graph on them.
     plant = f"{Path(__file__).with_name('twelve_joints.py')}:TwelveJoints"
@@ -130,6 +130,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Measure single steps of the policy, and the loop."""
     return {"rows": [*a_step(options.steps), *loop(options.rate, options.seconds, options.spin_s)]}

@@ -6,12 +6,11 @@ import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
-from benches.figures import row
+from benches.figures import Report, row
 from benches.train import environment
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
@@ -60,7 +59,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Measure on one device, then on several."""
     several = options.devices or jax.local_device_count()
     measure = {"train": train_on(options), "identify": identify_on(options)}

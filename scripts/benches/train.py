@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 import jax
 import numpy as np
 
-from benches.figures import row
+from benches.figures import Report, Row, row
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
@@ -50,7 +49,7 @@ def environment(timelines: int, episode_s: float) -> GraphEnvironment:
     return GraphEnvironment(graph, task)
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Train on the device that JAX finds."""
     env = environment(options.timelines, options.episode_s)
     config = PPOConfig(
@@ -65,7 +64,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     return {"rows": rows(result, f"train/{options.name or jax.default_backend()}/pendulum/{options.seeds}_seeds")}
 
 
-def rows(result: TrainResult, name: str) -> list[dict[str, Any]]:
+def rows(result: TrainResult, name: str) -> list[Row]:
     """Return speed, success at the end, and the time at which the best and the worst seed succeeded."""
     success = np.asarray(result.history["success"])
     lines = [

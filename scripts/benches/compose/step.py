@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from benches.figures import medians, row
+from benches.figures import Row, medians, row
 
 LINKS = 6
 SIZE = 48, 64
@@ -128,7 +128,7 @@ class Apart:
         self._thread.shutdown()
 
 
-def step(repeats: int, steps_in_a_row: int) -> list[dict[str, Any]]:
+def step(repeats: int, steps_in_a_row: int) -> list[Row]:
     """Return how long control steps of a task take, in processor time: with a camera as well, where there is OpenGL."""
     rows = []
     for name, count, camera, shadows, goal in (

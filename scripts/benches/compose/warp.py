@@ -11,7 +11,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from benches.figures import medians, row
+from benches.figures import Row, medians, row
+from sim2real.types import Array, Key, PyTree
 
 LEGS = {"fl": (1, 1), "fr": (1, -1), "hl": (-1, 1), "hr": (-1, -1)}
 TIMESTEP, SUBSTEPS = 0.004, 5
@@ -70,7 +71,7 @@ def walk() -> Any:
             add("axes", MJCFFeature("xmat", self.torso))
             self.set_timesteps(SUBSTEPS * TIMESTEP, TIMESTEP)
 
-        def initialize_episode(self, physics: Any, random_state: Any) -> None:
+        def initialize_episode(self, physics: Any, random_state: PyTree) -> None:
             physics.bind(self.joints).qpos = random_state.uniform(-0.1, 0.1, len(self.joints))
 
         def get_reward(self, physics: Any) -> Any:
@@ -82,7 +83,7 @@ def walk() -> Any:
     return Walk()
 
 
-def wave(t: Any, angles: Any) -> Any:
+def wave(t: Array, angles: Array) -> Any:
     """Return set points of the servos at a time [s] and at joint angles ``(12,)`` [rad]."""
     import jax.numpy as jnp
 
@@ -106,10 +107,10 @@ def make_graph(task: Any, options: dict[str, Any], seconds: float) -> Any:
     class Agent(BaseNode):
         """Waves the legs, with feedback of their angles."""
 
-        def init_output(self, rng: Any = None, graph_state: Any = None) -> Any:
+        def init_output(self, rng: Key | None = None, graph_state: PyTree = None) -> Any:
             return Angles(jnp.zeros(12))
 
-        def step(self, step_state: Any) -> Any:
+        def step(self, step_state: PyTree) -> Any:
             angles = step_state.inputs["world"][-1].data.values["quadruped/angles"]
             return step_state, Angles(wave(step_state.ts, angles[-1]))
 
@@ -137,22 +138,22 @@ def programs(copies: int, length: int) -> tuple[dict[str, tuple[Any, Any]], int]
     model = environment.mjx_model
     blank = mjx.make_data(environment.model, impl="warp", naconmax=copies * CONTACTS, njmax=ROWS)
 
-    def bare(start: Any) -> Any:
-        def step(data: Any, t: Any) -> Any:
+    def bare(start: PyTree) -> Any:
+        def step(data: PyTree, t: Array) -> Any:
             data = data.replace(ctrl=wave(t, data.qpos[joints]))
             return jax.lax.scan(lambda d, _: (mjx.step(model, d), None), data, length=SUBSTEPS)[0], None
 
         return left(jax.lax.scan(step, blank.replace(qpos=start[0], qvel=start[1]), times)[0])
 
-    def env(start: Any) -> Any:
-        def step(state: Any, t: Any) -> Any:
+    def env(start: PyTree) -> Any:
+        def step(state: PyTree, t: Array) -> Any:
             state = environment.step(state, wave(t, state.data.qpos[joints]))
             return state, (state.reward, sum(x.sum() for x in state.observation.values()), state.done)
 
         state, outcome = jax.lax.scan(step, start, times)
         return left(state.data), outcome
 
-    def in_graph(key: Any) -> Any:
+    def in_graph(key: Key) -> Any:
         eps = jax.random.randint(key, (), 0, graph.episodes)
         return left(graph.rollout(graph.init(key, eps=eps))[0].state["world"].data)
 
@@ -162,14 +163,14 @@ def programs(copies: int, length: int) -> tuple[dict[str, tuple[Any, Any]], int]
     return states, ticks
 
 
-def left(data: Any) -> Any:
+def left(data: PyTree) -> Any:
     """Return positions, whether contacts or constraints had no room, and the number of rows of constraints."""
     from sim2real.composer.physics.mjx.warp.warp import overflowed
 
     return data.qpos, overflowed(data), data._impl.nefc
 
 
-def warp(sizes: Sequence[int] | None, repeats: int, length: int) -> list[dict[str, Any]]:
+def warp(sizes: Sequence[int] | None, repeats: int, length: int) -> list[Row]:
     """Return the time of an environment and of a graph, with their delays, over that of as many bare steps of Warp."""
     import jax
 
@@ -180,7 +181,7 @@ def warp(sizes: Sequence[int] | None, repeats: int, length: int) -> list[dict[st
     return [r for copies in sizes for r in compared(copies, repeats, length)]
 
 
-def compared(copies: int, repeats: int, length: int) -> list[dict[str, Any]]:
+def compared(copies: int, repeats: int, length: int) -> list[Row]:
     """Return the rows of one number of copies."""
     import jax
     import numpy as np

@@ -18,7 +18,7 @@ from typing import Any
 from benches import jobs
 from benches.drift.arms import ReachingArm, ReachingSO101
 from benches.drift.pendulum import Pendulum
-from benches.figures import Row, row, share
+from benches.figures import Report, Row, row, share
 from benches.hidden import randomise
 from sim2real.errors import Sim2RealError
 
@@ -50,7 +50,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Record, identify, change, deploy and test each robot."""
     for name, value in ROBOTS[options.robot].defaults.items():
         if getattr(options, name) is None:
@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     return {"rows": lines, "robots": outcomes, "failed": failed}
 
 
-def rows(outcomes: list[dict[str, Any]], options: argparse.Namespace) -> list[dict[str, Any]]:
+def rows(outcomes: list[Row], options: argparse.Namespace) -> list[Row]:
     """Return the shares of verdicts, of right names, and of the tests' alarms, with exact 95 % intervals.
 
     A change counts as detected if the verdict is "re-identify", by a test of the parameters or by errors beyond the

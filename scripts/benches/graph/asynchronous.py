@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import Any
 
 import jax
 
-from benches.figures import row
+from benches.figures import Report, Row, row
 from sim2real.graph.node import BaseNode
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.runtime.asynchronous import AsyncGraph
@@ -35,7 +34,7 @@ def loop(rate_hz: float) -> dict[str, BaseNode]:
     return {n.name: n for n in (sensor, agent, actuator, world)}
 
 
-def simulated(steps: int) -> list[dict[str, Any]]:
+def simulated(steps: int) -> list[Row]:
     """Measure the simulated clock at its highest speed."""
     nodes = loop(50.0)
     graph = AsyncGraph(nodes, nodes["agent"], clock=Clock.SIMULATED, duration_s=(steps + 50) / 50.0)
@@ -53,7 +52,7 @@ def simulated(steps: int) -> list[dict[str, Any]]:
     ]
 
 
-def wall_clock(rate_hz: float, seconds: float) -> list[dict[str, Any]]:
+def wall_clock(rate_hz: float, seconds: float) -> list[Row]:
     """Measure four jitted nodes on the wall clock."""
     nodes = loop(rate_hz)
     graph = AsyncGraph(nodes, nodes["agent"])
@@ -82,6 +81,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, default=5000, help="supervisor steps on the simulated clock")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Measure both clocks."""
     return {"rows": [*simulated(options.steps), *wall_clock(options.rate, options.seconds)]}

@@ -10,13 +10,12 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benches.figures import compare, row
+from benches.figures import Report, Row, compare, row
 from benches.graph.shared import EPISODES, MODEL, unroll_of
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import StaticDist
@@ -26,6 +25,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.runtime.compilation.wiring import wire
+from sim2real.types import Array, Key, PyTree
 from sim2real.worlds.ode import OdeWorld
 
 DURATION_S = 4.0
@@ -44,7 +44,7 @@ class _Normal:
     def __init__(self, loc: float, scale: float) -> None:
         self.loc, self.scale = loc, scale
 
-    def sample(self, seed: Any, sample_shape: tuple[int, ...]) -> Any:
+    def sample(self, seed: Key, sample_shape: tuple[int, ...]) -> PyTree:
         return self.loc + self.scale * jax.random.normal(seed, sample_shape)
 
 
@@ -54,7 +54,7 @@ _Normal.__name__ = "Normal"
 class RandomAgent(MODEL.Agent):
     """The seed's agent without a policy: random actions, but observations and histories are kept."""
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Draw an action."""
         rng, key = jax.random.split(step_state.rng)
         action = jax.random.uniform(key, (1,), minval=-2.0, maxval=2.0)
@@ -64,36 +64,36 @@ class RandomAgent(MODEL.Agent):
 class CostWorld(OdeWorld):
     """The seed's world, Runge-Kutta with Coulomb friction by sign: it adds up the cost beside the physics."""
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the nominal parameters."""
         del rng, graph_state
         return MODEL.nominal_params()
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Start at the parameters' state, at no cost."""
         start = ((graph_state or GraphState()).params.get(self.name) or self.init_params(rng)).start
         return MODEL.Measurement(th=start[0], thdot=start[1]), jnp.float32(0.0)
 
-    def command(self, step_state: StepState) -> Any:
+    def command(self, step_state: StepState) -> PyTree:
         """Return the voltage during this tick [V]."""
         return step_state.inputs["actuator"][-1].data.action[0]
 
-    def derivative(self, params: Any, state: Any, command: Any) -> Any:
+    def derivative(self, params: PyTree, state: PyTree, command: Array) -> PyTree:
         """Return velocity [rad/s] and acceleration [rad/s^2]."""
         p, th, thdot = params, state.th, state.thdot
         motor = p.K / p.R * (command - p.K * thdot)
         gravity = p.mass * MODEL.GRAVITY * p.length * jnp.sin(th)
         return MODEL.Measurement(th=thdot, thdot=(motor + gravity - p.b * thdot - p.c * jnp.sign(thdot)) / p.J)
 
-    def limit(self, params: Any, state: Any) -> Any:
+    def limit(self, params: PyTree, state: PyTree) -> PyTree:
         """Clip the speed."""
         return state.replace(thdot=jnp.clip(state.thdot, -params.max_speed, params.max_speed))
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the initial angle and velocity."""
         return self.init_state(rng, graph_state)[0]
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Integrate, and add the cost."""
         x, cost = step_state.state
         moved, output = super().step(step_state.replace(state=x))
@@ -101,7 +101,7 @@ class CostWorld(OdeWorld):
         return moved.replace(state=(moved.state, cost + task_cost(moved.state, u))), output
 
 
-def task_cost(x: Any, u: Any) -> Any:
+def task_cost(x: PyTree, u: Array) -> PyTree:
     """Return the seed's cost of a state under a voltage."""
     th = x.th - 2 * jnp.pi * jnp.floor((x.th + jnp.pi) / (2 * jnp.pi))
     return th**2 + 0.1 * (x.thdot / (1 + 10 * jnp.abs(th))) ** 2 + 0.01 * u**2
@@ -130,22 +130,22 @@ def timelines(graph_nodes: dict[str, BaseNode], hiccup: bool = False) -> Timelin
 
 
 class _WithHiccups(StaticDist):
-    def __init__(self, base: Any) -> None:
+    def __init__(self, base: PyTree) -> None:
         super().__init__(base.dist)
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         return super().sample(rng, shape) + np.where(rng.random(shape) < 1 / 500, 0.05, 0.0)
 
 
-def params() -> Any:
+def params() -> PyTree:
     """Return the seed's parameters."""
     return MODEL.nominal_params().replace(max_speed=40.0)
 
 
-def graph_program(graph: CompiledGraph) -> Callable[[Any], Any]:
+def graph_program(graph: CompiledGraph) -> Callable[[PyTree], PyTree]:
     """Return the rollout of one copy, on a random timeline."""
 
-    def run(key: Any) -> Any:
+    def run(key: Key) -> PyTree:
         k_init, k_eps, k_th = jax.random.split(key, 3)
         start = jnp.stack([jax.random.uniform(k_th, (), minval=-3.14, maxval=3.14), jnp.float32(0.0)])
         eps = jax.random.randint(k_eps, (), 0, graph.episodes)
@@ -155,13 +155,13 @@ def graph_program(graph: CompiledGraph) -> Callable[[Any], Any]:
     return run
 
 
-def hand_program(rows: int, ticks: tuple[int, ...], world: Any, unroll: int = 1) -> Callable[[Any], Any]:
+def hand_program(rows: int, ticks: tuple[int, ...], world: OdeWorld, unroll: int = 1) -> Callable[[PyTree], PyTree]:
     """Return the same robot without a graph: shift registers, one step of delay each way."""
     p = params()
     shift = lambda ring, new: jnp.concatenate([new[None], ring[:-1]])  # noqa: E731
 
-    def run(key: Any) -> Any:
-        def policy_step(carry: Any, count: int) -> Any:
+    def run(key: Key) -> PyTree:
+        def policy_step(carry: PyTree, count: int) -> PyTree:
             x, cost, rng, commands, sensed, observations, actions = carry
             rng, k = jax.random.split(rng)
             action = jax.random.uniform(k, (1,), minval=-2.0, maxval=2.0)
@@ -176,7 +176,7 @@ def hand_program(rows: int, ticks: tuple[int, ...], world: Any, unroll: int = 1)
             sensed = shift(sensed, jnp.stack([x.th, x.thdot]))
             return x, cost, rng, commands, sensed, observations, actions
 
-        def row(carry: Any, _: None) -> tuple[Any, None]:
+        def row(carry: PyTree, _: None) -> tuple[PyTree, None]:
             for count in ticks:
                 carry = policy_step(carry, count)
             return carry, None
@@ -191,12 +191,12 @@ def hand_program(rows: int, ticks: tuple[int, ...], world: Any, unroll: int = 1)
     return run
 
 
-def bare_program(rows: int, ticks: tuple[int, ...], world: Any) -> Callable[[Any], Any]:
+def bare_program(rows: int, ticks: tuple[int, ...], world: OdeWorld) -> Callable[[PyTree], PyTree]:
     """Return the physics alone, under a constant voltage."""
     p = params()
 
-    def run(key: Any) -> Any:
-        def row(carry: Any, _: None) -> tuple[Any, None]:
+    def run(key: Key) -> PyTree:
+        def row(carry: PyTree, _: None) -> tuple[PyTree, None]:
             for _ in range(sum(ticks)):
                 carry = tick(world, p, *carry, jnp.float32(0.5))
             return carry, None
@@ -208,7 +208,7 @@ def bare_program(rows: int, ticks: tuple[int, ...], world: Any) -> Callable[[Any
     return run
 
 
-def tick(world: Any, p: Any, x: Any, cost: Any, u: Any) -> tuple[Any, Any]:
+def tick(world: OdeWorld, p: PyTree, x: PyTree, cost: PyTree, u: Array) -> tuple[PyTree, PyTree]:
     """Integrate one tick of the world under a voltage, and add the cost."""
     x = world.integrate(p, x, u)
     return x, cost + task_cost(x, u)
@@ -222,7 +222,7 @@ def bytes_per_copy(graph: CompiledGraph) -> int:
     )
 
 
-def case(device: str, kind: str, copies: int, repeats: int, unrolls: Sequence[int] = ()) -> list[dict]:
+def case(device: str, kind: str, copies: int, repeats: int, unrolls: Sequence[int] = ()) -> list[Row]:
     """Measure one kind of timelines at one number of copies; with ``unrolls`` also other rows per pass of the loop."""
     rates, ticks = CASES[kind]
     graph_nodes = nodes(*rates)
@@ -266,7 +266,7 @@ def case(device: str, kind: str, copies: int, repeats: int, unrolls: Sequence[in
     ]
 
 
-def building(counts: Sequence[int]) -> list[dict[str, Any]]:
+def building(counts: Sequence[int]) -> list[Row]:
     """Measure how long timelines take to draw and to wire."""
     rows = []
     for episodes in counts:
@@ -295,7 +295,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--unroll", type=int, nargs="+", default=[], help="other numbers of rows in a pass of the loop")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Measure on the device that JAX finds."""
     device = f"graph/{options.name or jax.default_backend()}"
     copies = options.copies or ([1024] if jax.default_backend() == "cpu" else [20_000, 100_000])

@@ -8,12 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benches.figures import compare, row
+from benches.figures import Row, compare, row
 from benches.graph.shared import EPISODES, MODEL, unroll_of
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.types import Array, Key, PyTree
 
 
 def arm(links: int) -> tuple[Any, dict[str, BaseNode]]:
@@ -45,22 +46,22 @@ class ArmAgent(BaseNode):
 
     links = 6
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the joints at zero."""
         del rng, graph_state
         return MODEL.Command(action=jnp.zeros(self.links))
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Return the next set points, and lean on what the joints do."""
         return step_state, MODEL.Command(action=wave(step_state.ts, step_state.inputs["world"][-1].data.qpos))
 
 
-def wave(t: Any, q: Any) -> Any:
+def wave(t: Array, q: Array) -> PyTree:
     """Return the arm's set points at a time [s] and at joint angles ``(N,)`` [rad]."""
     return 0.3 * jnp.sin(3.0 * t + jnp.arange(float(len(q)))) - 0.1 * q
 
 
-def mjx_case(device: str, copies: int, repeats: int, links: int) -> list[dict]:
+def mjx_case(device: str, copies: int, repeats: int, links: int) -> list[Row]:
     """Measure the arm's graph against the same number of bare ``mjx.step``."""
     from mujoco import mjx
 
@@ -68,20 +69,20 @@ def mjx_case(device: str, copies: int, repeats: int, links: int) -> list[dict]:
     graph = CompiledGraph(graph_nodes, "actuator", draw(graph_nodes, 1.0, EPISODES, 0))
     ticks = graph.rows * graph.wiring.ticks
 
-    def start(key: Any) -> Any:
+    def start(key: Key) -> PyTree:
         # Every copy from a place of its own: XLA would compute equal copies only once.
         params = world.init_params()
         return params.replace(qpos=params.qpos + jax.random.uniform(key, (links,), minval=-0.1, maxval=0.1))
 
-    def in_graph(key: Any) -> Any:
+    def in_graph(key: Key) -> PyTree:
         eps = jax.random.randint(key, (), 0, graph.episodes)
         return graph.rollout(graph.init(key, {"world": start(key)}, eps=eps))[0].state["world"].qpos.sum()
 
-    def bare(key: Any) -> Any:
+    def bare(key: Key) -> PyTree:
         params = start(key)
         data = world.init_state(key, GraphState(params={"world": params}))
 
-        def step(d: Any, t: Any) -> tuple[Any, None]:
+        def step(d: PyTree, t: Array) -> tuple[PyTree, None]:
             # The same motion as in the graph: the solver's iterations depend on what the arm does.
             return mjx.step(params.model, d.replace(ctrl=wave(t, d.qpos))), None
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benches.figures import row, share
+from benches.figures import Report, Row, row, share
 from benches.hidden import robots as hidden
 from benches.hidden import wall_clock as hidden_wall
 from benches.jobs import robots
@@ -59,7 +59,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=1, help="robots at once, one process each; 1: in this process")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Record, identify, train and deploy for each robot."""
     numbers = list(range(options.first, options.first + options.robots))
     begin = time.perf_counter()
@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     return {"rows": lines, "robots": outcomes, "failed": failed}
 
 
-def rows(outcomes: list[dict[str, Any]], options: argparse.Namespace, seconds: float) -> list[dict[str, Any]]:
+def rows(outcomes: list[Row], options: argparse.Namespace, seconds: float) -> list[Row]:
     """Return each way's share of success with its exact 95 % interval, all deployments of all robots together."""
     lines = []
     for way in options.ways:

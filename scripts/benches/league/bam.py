@@ -11,8 +11,7 @@ whole episodes, a given load, and offset and delay as parameters. Other than BAM
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,10 @@ import numpy as np
 
 from benches.identify.sysid import Recording
 from benches.league.cmaes import minimise
+from sim2real.types import Array, PyTree
 
+Constants = Mapping[str, float | bool]
+"""Load, supply voltage, and kind of a recording."""
 STEP_S, GRAVITY = 0.005, 9.80665
 POPULATION = 32
 _COMMON = {
@@ -44,7 +46,7 @@ ARM_LOAD = {"mass": 0.0, "length": 0.0, "vin": 7.4, "duty_per_rad": 16 * 0.166, 
 """An STS3215 at the gain that the SO-101's software sets, without a load: BAM has none for an arm's joints."""
 
 
-def bounds(kind: str, constants: dict[str, Any]) -> dict[str, tuple[float, float]]:
+def bounds(kind: str, constants: Constants) -> dict[str, tuple[float, float]]:
     """Return parameter -> (low, high) of the model ``M1`` or ``M6``."""
     limits = {**_COMMON, **(_M6 if kind == "M6" else {})}
     if constants.get("profiled"):
@@ -52,7 +54,7 @@ def bounds(kind: str, constants: dict[str, Any]) -> dict[str, tuple[float, float
     return {n: (_DISK.get(n, b) if constants.get("voltage") else b) for n, b in limits.items()}
 
 
-def friction(p: dict[str, Any], motor: Any, load: Any, speed: Any) -> Any:
+def friction(p: dict[str, Array], motor: Array, load: Array, speed: Array) -> PyTree:
     """Return the largest friction [N m], by M6 if its parameters are present, else by M1.
 
     Args:
@@ -73,8 +75,8 @@ def friction(p: dict[str, Any], motor: Any, load: Any, speed: Any) -> Any:
 
 
 def simulate(
-    p: dict[str, Any], constants: dict[str, Any], duty_per_rad: Any, start: Any, commands: Any, on: Any
-) -> Any:
+    p: dict[str, Array], constants: Constants, duty_per_rad: Array, start: Array, commands: Array, on: Array
+) -> PyTree:
     """Return positions at every step, ``(T,)`` [rad].
 
     Args:
@@ -85,7 +87,7 @@ def simulate(
     mass, length = constants["mass"], constants["length"]
     inertia = mass * length**2 + p["armature"]
 
-    def step(state: Any, row: Any) -> Any:
+    def step(state: PyTree, row: PyTree) -> PyTree:
         (q, speed, setpoint), (command, enabled) = state, row
         if constants.get("voltage"):
             volts = command
@@ -123,15 +125,15 @@ class Bench:
         gains = jnp.array([r.constants.get("duty_per_rad", 0.0) for r in recordings])
         starts = jnp.array([r.start[0] for r in recordings])
 
-        def one(u: Any, gain: Any, start: Any, command: Any, enabled: Any) -> Any:
+        def one(u: Array, gain: Array, start: Array, command: Array, enabled: Array) -> PyTree:
             p = dict(zip(self.names, low + (high - low) * u, strict=True))
             before = jnp.interp(grid - p["command_delay"], grid, command)
             return simulate(p, constants, gain, start, before, enabled)
 
-        def play(u: Any) -> Any:
+        def play(u: Array) -> PyTree:
             return jax.vmap(lambda g, s, c, e: one(u, g, s, c, e))(gains, starts, commands, on)
 
-        def loss(u: Any) -> Any:
+        def loss(u: Array) -> PyTree:
             return jnp.sum(weight * jnp.abs(play(u) - measured)) / jnp.sum(weight)
 
         self._grid, self._play, self.losses = grid, jax.jit(play), jax.jit(jax.vmap(loss))

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from benches import figures, jobs
+from benches.figures import Report, Row
 from benches.identify.sysid import Recording
 from benches.league import bam as league_bam
 from benches.league import mujoco_joints as league_mujoco
@@ -60,7 +61,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--results", type=Path, help="JSON lines: an earlier run's are read, new ones are added")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Fit, predict, and return the rows and every fold's figures."""
     if options.jobs < 1:
         raise UsageError(f"jobs must be at least 1, got {options.jobs}")
@@ -161,7 +162,7 @@ def _first(recording: Recording, samples: int) -> Recording:
     return replace(cut, constants=constants)
 
 
-def rows(measured: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def rows(measured: Sequence[dict[str, Any]]) -> list[Row]:
     """Return mean and worst over the folds of each set and entrant, or the reason why there is no figure."""
     table = []
     for name in dict.fromkeys(r["set"] for r in measured):

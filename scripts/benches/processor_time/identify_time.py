@@ -12,9 +12,8 @@ import os
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
-from benches.figures import row
+from benches.figures import Report, row
 from benches.processor_time import yardstick
 from benches.provenance import ROOT
 from sim2real.errors import Sim2RealError
@@ -43,7 +42,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flags", nargs=argparse.REMAINDER, default=[], help="further flags of identify")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Measure the yardstick, then each robot.
 
     Raises:

@@ -14,9 +14,8 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from benches.figures import row
+from benches.figures import Report, Row, row
 from benches.processor_time import yardstick
 from benches.provenance import ROOT
 from sim2real.errors import Sim2RealError
@@ -50,7 +49,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cold-s", type=float, help="the yardstick on this machine [s]; default: it is measured")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Run the tests, then the yardstick.
 
     Raises:
@@ -97,7 +96,7 @@ def outcome(report: Path) -> Tests:
     return Tests(kinds["passed"], kinds["skipped"], tuple(failed), {n: round(s, 1) for n, s in rooms.most_common()})
 
 
-def rows(done: yardstick.Measurement, tests: Tests, cold_s: float) -> list[dict[str, Any]]:
+def rows(done: yardstick.Measurement, tests: Tests, cold_s: float) -> list[Row]:
     """Return the rows of the report."""
     return [
         row("suite/processor_over_cold", round(done.processor_s / cold_s, 2), "cold", "cold", "<= 16"),

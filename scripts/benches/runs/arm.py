@@ -18,7 +18,7 @@ import numpy as np
 
 from benches.runs import demo
 from benches.runs import stages
-from benches.figures import row
+from benches.figures import Report, Row, row
 
 CLOSE_M = 0.02
 SETTLE_S = 0.3
@@ -33,7 +33,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run`, with --train of `train`")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Run the arm once a seed, or train it; return the rows and a record of every seed."""
     if options.train:
         return {"rows": train_rows(options.bench, options.train.resolve(), options.flags)}
@@ -62,7 +62,7 @@ def held_out_mae_mrad(predictions: Path) -> float:
     return 1e3 * float(np.mean(errors))
 
 
-def train_rows(arm: str, run_dir: Path, flags: list[str]) -> list[dict[str, Any]]:
+def train_rows(arm: str, run_dir: Path, flags: list[str]) -> list[Row]:
     """Train an arm in a run folder that holds a recording and an identification; return times and success."""
     import jax
 
@@ -85,7 +85,7 @@ def train_rows(arm: str, run_dir: Path, flags: list[str]) -> list[dict[str, Any]
     return [row(f"{arm}/train/{n}", v, unit, how, goal) for n, v, unit, goal in figures]
 
 
-def rows(arm: str, seeds: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def rows(arm: str, seeds: list[Row]) -> list[Row]:
     """Return every figure of an arm, one value a seed."""
     lines = stages.rows(arm, seeds, {"total_s": "< 900"})
     mae = [round(s["mae_mrad"], 2) for s in seeds]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benches.runs import stages
-from benches.figures import row
+from benches.figures import Report, Row, row
 from sim2real.artifacts.recording import Recording
 from sim2real.robots.roles import ROLES
 from sim2real.stages.identify.true_values import true_values
@@ -40,7 +40,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run pendulum`")
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: argparse.Namespace) -> Report:
     """Run the demo once a seed; return the rows and a record of every seed."""
     seeds = stages.run_seeds(options, run_seed)
     return {"rows": rows(seeds), "seeds": seeds}
@@ -63,7 +63,7 @@ def run_seed(seed: int, runs: Path, options: argparse.Namespace) -> dict[str, An
     return result
 
 
-def rows(seeds: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def rows(seeds: list[Row]) -> list[Row]:
     """Return every figure, one value a seed; of deployments, one each."""
     lines = stages.rows("demo", seeds, {"train_s": "< 90", "total_s": "< 240", "error": "+-5"})
     ratio = [round(s["prediction_over_true_model"], 2) for s in seeds]

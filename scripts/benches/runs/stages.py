@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benches.figures import row
+from benches.figures import Row, row
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, finished
 
 
@@ -26,7 +26,7 @@ def add_flags(parser: argparse.ArgumentParser, seeds: list[int]) -> None:
 
 def run_seeds(
     options: argparse.Namespace, run_seed: Callable[[int, Path, argparse.Namespace], dict[str, Any]]
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     """Return the results of ``run_seed(seed, folder, options)`` for each seed, each in its own folder."""
     with tempfile.TemporaryDirectory() as scratch:
         root = (options.keep or Path(scratch)).resolve()
@@ -85,7 +85,7 @@ def deployed(run_dir: Path, quantity: str) -> list[float]:
     return [episode["real"][quantity] for episode in result["episodes"]]
 
 
-def rows(name: str, seeds: list[dict[str, Any]], goals: dict[str, str]) -> list[dict[str, Any]]:
+def rows(name: str, seeds: list[Row], goals: dict[str, str]) -> list[Row]:
     """Return seconds and errors of whole runs, one value a seed; goals by the end of a row's name."""
     lines = []
     for stage in (*STAGES, "total"):
