@@ -6,7 +6,6 @@ import atexit
 import contextlib
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -28,6 +27,7 @@ from sim2real.runtime.statistics import NodeStatistics
 from sim2real.runtime.stepper import Stepper
 from sim2real.runtime.wall_clock.handover import Reply
 from sim2real.runtime.wall_clock.wall_clock import WallClockRun
+from sim2real.types import PyTree
 
 _INTERRUPTED_S = 1.0
 """Time that the nodes' ``stop`` may take when a start is interrupted, e.g. by Ctrl-C [s]."""
@@ -38,29 +38,28 @@ class AsyncGraph:
 
     There are two ways to run it. After ``start``, ``run_for`` and ``wait`` let the graph run, and the supervisor makes
     its own steps. After ``reset``, as in a gym environment, each ``step`` takes the supervisor's output from the caller
-    and returns what the supervisor sees at its next step. The graph stops when ``with graph:`` is left and when the
-    interpreter exits.
+    and returns the supervisor's next step state. The graph stops when ``with graph:`` is left and when the interpreter
+    exits.
 
-    A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step. The call
-    that is waiting raises the failure with the node's name; if none is waiting, the next call does. A step that hangs
-    is a failure too; as its thread is busy, the node's ``stop`` is then called from another thread. The same is done
-    for a node that is still in its startup when the graph stops.
+    A failure stops all nodes at once: each node's ``stop`` is called in the node's thread after its last step. The
+    waiting call, or else the next one, raises the failure with the node's name. A step that hangs is a failure too; as
+    its thread is busy, the node's ``stop`` is then called from another thread. The same applies to a node that is still
+    in its startup when the graph stops.
 
     Args:
         nodes: The nodes, by name or as a list.
-        supervisor: The node whose steps the caller of ``reset``, ``step`` and ``run`` sees, usually the policy.
-        clock: The wall clock or the simulated clock.
+        supervisor: The node at whose steps ``reset``, ``step`` and ``run`` return, usually the policy.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit. Simulated clock only.
         duration_s: Length of drawn timelines [s]; default: no end, further delays are drawn when they are needed.
             Simulated clock only.
         timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
-        timeout_s: How long a call waits for the next step, and the supervisor for its caller [s].
-        spin_s: How long before each step a thread polls the clock instead of sleeping [s]. Wall clock only.
+        timeout_s: Longest wait of a call for the next step, and of the supervisor for its caller [s].
+        spin_s: Time before each step in which a thread polls the clock instead of sleeping [s]. Wall clock only.
         step_timeout_s: Time after which a step of any node counts as hanging, which stops the graph [s]; 0: never;
-            default: ten periods of its node, at least 1 s. The caller's own time does not count. Wall clock only.
+            default: ten periods of its node, at least 1 s. The caller's time does not count. Wall clock only.
 
     Raises:
-        UsageError: When the nodes do not form a graph, or an option does not fit the clock.
+        UsageError: The nodes do not form a graph, or an option does not fit the clock.
     """
 
     def __init__(
@@ -92,29 +91,23 @@ class AsyncGraph:
         self._check_options()
 
     def init(
-        self, rng: jax.Array, params: Mapping[str, Any] | None = None, order: Sequence[str] | None = None
+        self, rng: jax.Array, params: Mapping[str, PyTree] | None = None, order: Sequence[str] | None = None
     ) -> GraphState:
-        """Return the state in which the graph starts; see ``init_graph_state``.
-
-        Args:
-            params: Parameters that are used as given; the other nodes' come from ``init_params``.
-            order: Names of nodes that are initialised first.
-        """
+        """Return the state in which the graph starts; see ``init_graph_state`` for the arguments."""
         return init_graph_state(self.nodes, self.supervisor, rng, params, order)
 
     def warmup(self, graph_state: GraphState, jit_step: bool | Mapping[str, bool] = True) -> None:
         """Compile all steps ahead of time for graph states like this one, unless they are compiled already.
 
-        A step without side effects is then run once and its result dropped, which fills caches. A step with a callback
-        or in plain Python is not run.
+        A step without side effects is then run once, which fills caches. A step with a callback or in plain Python is
+        not run.
 
         Args:
-            graph_state: As ``init`` returns it.
-            jit_step: Whether to compile the steps: one value for all nodes, or node name -> value (True for nodes that
-                are not named). Nodes with ``jittable = False`` are never compiled.
+            jit_step: Whether to compile the steps: one value for all nodes, or node name -> value (default: True).
+                Nodes with ``jittable = False`` are never compiled.
 
         Raises:
-            UsageError: When a step's results do not fit its node's state or default output.
+            UsageError: A step's results do not fit its node's state or default output.
         """
         if isinstance(jit_step, Mapping):
             unknown = [n for n in jit_step if n not in self.nodes]
@@ -129,25 +122,23 @@ class AsyncGraph:
         """Start an episode in which the supervisor makes its own steps.
 
         Args:
-            graph_state: As ``init`` returns it.
-            timeout_s: How long the nodes' startups may take [s]; if they fail, stopping may take as long again.
+            timeout_s: Longest time of the nodes' startups [s]; after a failure stopping may take the same time.
 
         Raises:
-            UsageError: When the graph is running.
-            Sim2RealError: When a startup failed, or another thread stopped the graph meanwhile. All nodes are stopped
-                then.
+            UsageError: The graph is running.
+            Sim2RealError: A startup failed, or another thread stopped the graph meanwhile. All nodes are then stopped.
         """
         if self.running:
             raise UsageError("the graph is running", hint="call stop() first")
         self._start(graph_state, own=True, timeout_s=timeout_s)
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Stop the graph; may be called at any time and from any thread. Does nothing if it is stopped already.
+        """Stop the graph, at any time and from any thread; without effect on a stopped graph.
 
         A start in progress is ended too: after this call no node's startup is running or will run.
 
         Raises:
-            Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or that a node did not end.
+            Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not end.
         """
         atexit.unregister(self.stop)
         with self._lock:
@@ -168,37 +159,33 @@ class AsyncGraph:
         return run.snapshot()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the graph is stopped, or the end of the simulated timeline is reached.
-
-        Returns:
-            False if the time was up before that.
-        """
+        """Wait until the graph is stopped, or reaches the end of the simulated timeline; False after a timeout."""
         if self._run is None:
             raise UsageError("the graph is not running", hint="call start() first")
         return self._run.wait(timeout_s)
 
     def reset(self, graph_state: GraphState, timeout_s: float = 60.0) -> tuple[GraphState, StepState]:
-        """Start an episode, after stopping a running one; return what the supervisor sees at its first step."""
+        """Start an episode, after stopping a running one; return the supervisor's first step state."""
         self.stop()
         run = self._start(graph_state, own=False, timeout_s=timeout_s)
         step_state = run.observe(self._timeout_s)
         return run.snapshot(), step_state
 
     def step(
-        self, graph_state: GraphState, step_state: StepState | None = None, output: Any = None
+        self, graph_state: GraphState, step_state: StepState | None = None, output: PyTree = None
     ) -> tuple[GraphState, StepState]:
-        """Make the supervisor's step and return what it sees at its next one.
+        """Make the supervisor's step and return its next step state.
 
         Args:
-            graph_state: Not used, as the nodes keep their own states while the graph runs; here to have the signature
-                of ``CompiledGraph.step``.
+            graph_state: Without effect, as the nodes keep their states while the graph runs; ``CompiledGraph.step`` has
+                the same signature.
             step_state: The supervisor's step state after the step; None: unchanged.
-            output: The step's output; None: the supervisor makes the step itself.
+            output: The step's output; None: the supervisor's ``step`` is called.
 
         Raises:
-            UsageError: Before ``reset``, past the end of the timeline, or when the output does not have the form of the
-                supervisor's default output (the same step can then be made again).
-            GraphTimeout: When there was no next step in time.
+            UsageError: ``reset`` was not called, the timeline is at its end, or the output does not have the form of
+                the supervisor's default output (the same step can then be made again).
+            GraphTimeout: There was no next step in time.
         """
         del graph_state
         run = self._running()
@@ -208,10 +195,7 @@ class AsyncGraph:
         return run.snapshot(), observed
 
     def run(self, graph_state: GraphState) -> GraphState:
-        """Run the graph to the end of the supervisor's next step, which the supervisor makes itself.
-
-        Starts the graph from ``graph_state`` if it is not running.
-        """
+        """Run to the end of the supervisor's next step, made by its own ``step``; start the graph if it is stopped."""
         run = self._run if self.running and self._run else self._restart(graph_state)
         run.observe(self._timeout_s)
         run.settle(run.reply(Reply()), self._timeout_s)
@@ -241,6 +225,7 @@ class AsyncGraph:
             self.stop()
 
     def _check_options(self) -> None:
+        # Options of one clock only, and their ranges.
         simulated = self.clock is Clock.SIMULATED
         if simulated:
             if self._duration_s is not None and self._timeline is not None:
@@ -253,6 +238,8 @@ class AsyncGraph:
             raise UsageError(
                 "real_time_factor, spin_s and step_timeout_s must be at least 0, timeout_s must be positive"
             )
+
+        # Averaged inputs.
         for node in self.nodes.values():
             averaged = [c for c in node.inputs.values() if c.averaged]
             if averaged and not simulated:
@@ -261,6 +248,8 @@ class AsyncGraph:
                     "begun (interp='zoh_mean'), which the wall clock cannot",
                     hint="use interp='zoh', or leave simulated worlds out of a graph on the wall clock",
                 )
+
+        # The timeline has all nodes and connections.
         if self._timeline is not None:
             missing = [n for n in self.nodes if n not in self._timeline.vertices]
             edges = {(n, i) for n, node in self.nodes.items() for i in node.inputs}
@@ -286,16 +275,20 @@ class AsyncGraph:
                     f"{', '.join(self._run.alive)} did not end when the graph was stopped, and may still act",
                     hint="start a new process",
                 )
+
+        # Compile the steps, and make the run.
         stops = self._stops
         data = self._prepare(graph_state)
         common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, own)
         if self.clock is Clock.SIMULATED:
             endless = self._duration_s is None and self._timeline is None
-            drawn = Growing(self.nodes, self._seed(graph_state), check_bursts) if endless else None
-            timeline, episode = (drawn.timeline, 0) if drawn else self._timeline_of(graph_state)
-            run = SimulatedRun(*common, timeline, episode, self._factor, drawn)
+            growing = Growing(self.nodes, self._seed(graph_state), check_bursts) if endless else None
+            timeline, episode = (growing.timeline, 0) if growing else self._timeline_of(graph_state)
+            run = SimulatedRun(*common, timeline, episode, self._factor, growing)
         else:
             run = WallClockRun(*common, self._spin_s, self._timeout_s, self._step_timeout_s)
+
+        # Publish it, so that stop() in another thread finds it, and begin.
         with self._lock:
             if self._stops != stops:
                 raise Sim2RealError("the graph was stopped while it started", hint="call start() or reset() again")
@@ -313,7 +306,7 @@ class AsyncGraph:
     def _timeline_of(self, graph_state: GraphState) -> tuple[Timeline, int]:
         """Return the timelines and the index of the episode to play.
 
-        Timelines that are drawn here depend on nothing but the graph state's ``eps`` and the supervisor's key.
+        Timelines that are drawn here depend only on the graph state's ``eps`` and the supervisor's key.
         """
         eps = int(graph_state.eps)
         if self._timeline is not None:
@@ -336,7 +329,7 @@ class AsyncGraph:
             raise UsageError("the graph is not running", hint="call start() or reset() first")
         self._run.check()
         if self._run.ended:
-            self._run.check()  # it may have failed since it was asked first
+            self._run.check()  # it may have failed since the first check
             raise UsageError("the graph has been stopped", hint="call start() or reset() to run it again")
         return self._run
 
@@ -344,23 +337,23 @@ class AsyncGraph:
         self.stop()
         return self._start(graph_state, own=False, timeout_s=self._timeout_s)
 
-    def _reply(self, step_state: StepState | None, output: Any) -> Reply:
+    def _reply(self, step_state: StepState | None, output: PyTree) -> Reply:
         if output is None:
             return Reply(step_state)
         return Reply(step_state, self._run_data[self.supervisor.name].form.pack(output))
 
 
-def _check_supervisor(supervisor: object, nodes: Any) -> None:
+def _check_supervisor(supervisor: object, nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> None:
     if isinstance(supervisor, BaseNode):
         return
-    given = list(nodes.values()) if isinstance(nodes, Mapping) else list(nodes)
+    nodes = list(nodes.values()) if isinstance(nodes, Mapping) else list(nodes)
     if isinstance(supervisor, str):
-        what, hint = f"the name {supervisor!r}", "pass the node itself"
+        kind, hint = f"the name {supervisor!r}", "pass the node, not its name"
     elif isinstance(supervisor, Mapping | list | tuple | set):
-        what, hint = f"{len(supervisor)} nodes", "one node's steps are what reset() and step() stop at: pass that one"
+        kind, hint = f"{len(supervisor)} nodes", "pass the one at whose steps reset() and step() shall return"
     else:
-        what, hint = f"a {type(supervisor).__name__}", "pass one of the nodes"
+        kind, hint = f"a {type(supervisor).__name__}", "pass one of the nodes"
     raise UsageError(
-        f"the supervisor must be a node, not {what}. Nodes: {', '.join(str(getattr(n, 'name', n)) for n in given)}",
+        f"the supervisor must be a node, not {kind}. Nodes: {', '.join(str(getattr(n, 'name', n)) for n in nodes)}",
         hint=hint,
     )

@@ -15,8 +15,8 @@ from sim2real.graph.node import TICKS_PER_S
 
 _NS_PER_TICK = 1_000_000_000 // TICKS_PER_S
 _SWITCH_INTERVAL_S = 0.00005
-_PRIORITY, _HIGHEST = 1, 3
-"""Of control threads among those of real time, and of the guardian, which must never wait for them."""
+_PRIORITY, _GUARDIAN_PRIORITY = 1, 3
+"""Real-time priorities of control threads, and of the guardian, which must never wait for them."""
 
 
 class Clock(Enum):
@@ -47,18 +47,12 @@ class MonotonicClock:
         return (time.monotonic_ns() - self.origin_ns) / 1e9
 
     def sleep_past(self, tick: int, stopping: threading.Event, spin: int = 0) -> bool:
-        """Sleep until the clock shows more than ``tick``.
+        """Sleep until the clock shows more than ``tick``; return False if ``stopping`` was set meanwhile.
 
-        "More", because a message may still arrive while the clock shows ``tick``, and by the rules it belongs to a step
-        that starts at ``tick``.
+        "More", because a message that arrives while the clock shows ``tick`` belongs to a step that starts at ``tick``.
 
         Args:
-            tick: When to wake [ticks].
-            stopping: Ends the sleep at once when it is set.
-            spin: How long to poll instead of sleeping at the end [ticks].
-
-        Returns:
-            False if ``stopping`` was set.
+            spin: Time to poll instead of sleeping at the end [ticks].
         """
         while (rest := tick + 1 - spin - self.now()) > 0:
             if stopping.wait(rest / TICKS_PER_S):
@@ -69,15 +63,14 @@ class MonotonicClock:
 
 
 def keep_time() -> None:
-    """Have the operating system wake the calling thread before others, if it allows that.
+    """Give the calling thread a real-time priority, if the operating system allows it.
 
-    Of three nodes at 500 Hz, beside an emulated bus on two processors, the latest in a hundred wake 0.2 to 0.4 ms late
-    with it and 0.9 to 1.9 ms without. Processes and threads that are started from this one do not inherit it. On Linux
-    it takes root, or a limit for real-time priorities (``ulimit -r``) of at least 3: where the guardian's higher one is
-    not allowed, this one is not taken either.
+    Processes and threads that are started from this one do not inherit it. On Linux it needs root, or a limit for
+    real-time priorities (``ulimit -r``) of at least 3. The effect is in docs/reference/choices.md.
     """
     with suppress(AttributeError, OSError):
-        for priority in (_HIGHEST, _PRIORITY):
+        # If the guardian's higher priority is not allowed, this thread takes none either.
+        for priority in (_GUARDIAN_PRIORITY, _PRIORITY):
             os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
 
@@ -88,7 +81,7 @@ _realtime_before: tuple[bool, float, bool] = (True, 0.005, False)
 
 @contextmanager
 def realtime() -> Iterator[None]:
-    """Keep the interpreter from pausing control threads; wall-clock episodes do this by themselves.
+    """Keep the interpreter from pausing control threads; wall-clock episodes call this.
 
     On entry the garbage collector runs once and is then switched off: reference cycles made inside the block are not
     freed before its end (the runtime's own steps make none). Objects alive at entry are frozen (``gc.freeze``). The

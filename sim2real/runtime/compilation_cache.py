@@ -1,4 +1,4 @@
-"""Where compiled programs are kept between runs: a folder that JAX reads and writes, bounded in size.
+"""The cache of compiled programs between runs: a folder of bounded size that JAX reads and writes.
 
 Imports no JAX: the folder is set in the environment, which child processes inherit, or in JAX's own configuration where
 JAX was imported before.
@@ -24,9 +24,9 @@ VARIABLE = "SIM2REAL_CACHE"
 """A folder, or ``off``."""
 OFF = "off"
 _JAX = "JAX_COMPILATION_CACHE_DIR"
-_LARGEST_BYTES = 2 * 2**30
-"""Size to which the folder is cut when a process begins; an identification leaves 10 to 40 MB, a training as much."""
-_ALWAYS = {
+_MAX_BYTES = 2 * 2**30
+"""Size to which the folder is cut when a process begins; an identification or a training adds 10 to 40 MB."""
+_SETTINGS = {
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.0",  # a run compiles a hundred small programs: 3 s together
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
 }
@@ -41,7 +41,7 @@ def location(place: str | None = None) -> Path | None:
         place: A folder, or ``off``; None takes ``SIM2REAL_CACHE``, otherwise the platform's cache folder.
 
     Raises:
-        UsageError: When the place is an existing file.
+        UsageError: The place is an existing file.
     """
     place = place or os.environ.get(VARIABLE) or None
     if place == OFF:
@@ -72,11 +72,13 @@ def enable(place: str | None = None) -> Path | None:
             pass
     except OSError:  # a home directory that is read-only or full: compiling takes longer, and that is all
         return None
-    _forget_unfinished(folder)
+
+    # Remove broken and old programs, then set the folder for child processes, and for JAX if it was imported before.
+    _remove_unfinished(folder)
     _mark(folder)
-    _cut(folder, _LARGEST_BYTES)
+    _cut(folder, _MAX_BYTES)
     os.environ[_JAX] = str(folder)
-    for name, value in _ALWAYS.items():
+    for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
     if (jax := sys.modules.get("jax")) is not None and jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -86,7 +88,7 @@ def enable(place: str | None = None) -> Path | None:
 
 
 def size_bytes(folder: Path) -> int:
-    """Return how much a folder of programs holds."""
+    """Return the size of all programs in a folder."""
     return sum(size for _, size, _ in _entries(folder))
 
 
@@ -113,26 +115,26 @@ def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
                     yield max(status.st_atime, status.st_mtime), status.st_size, Path(entry.path)
 
 
-def _cut(folder: Path, most: int) -> None:
-    """Remove the programs that were not used for longest until the folder holds no more than that [bytes]."""
+def _cut(folder: Path, max_bytes: int) -> None:
+    """Remove the least recently used programs until the folder holds at most ``max_bytes``."""
     entries = sorted(_entries(folder), reverse=True)
     total = 0
     for _, size, path in entries:
         total += size
-        if total > most:
+        if total > max_bytes:
             with contextlib.suppress(OSError):
                 path.unlink()
 
 
 def release() -> None:
-    """Note that this process writes no more programs."""
+    """Remove the note that this process writes programs."""
     while _MARKS:
         with contextlib.suppress(OSError):
             _MARKS.pop().unlink(missing_ok=True)
 
 
 def _mark(folder: Path) -> None:
-    """Note that this process writes here."""
+    """Leave a note that this process writes programs into the folder."""
     mark = folder / f"{socket.gethostname()}-{os.getpid()}.writing"
     with contextlib.suppress(OSError):
         mark.touch()
@@ -141,8 +143,8 @@ def _mark(folder: Path) -> None:
         atexit.register(lambda: release() if os.getpid() == owner else None)
 
 
-def _forget_unfinished(folder: Path) -> None:
-    """Remove what processes of this host wrote that were killed: JAX writes in place, and a part of a program stays."""
+def _remove_unfinished(folder: Path) -> None:
+    """Remove the programs of killed processes of this host: JAX writes in place, so a part of a program may be left."""
     host = f"{socket.gethostname()}-"
     for mark in folder.glob(f"{host}*.writing"):
         with contextlib.suppress(OSError, ValueError):

@@ -1,9 +1,9 @@
-"""The data of one node in one episode: what its steps read and replace, on either clock."""
+"""The data that one node's steps read and replace in an episode, on either clock."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection
 from sim2real.runtime.compilation.wiring import EMPTY_AGE_S
 from sim2real.runtime.init import default_output
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Array
@@ -36,16 +37,16 @@ class Format:
         default: The default output.
     """
 
-    def __init__(self, node: str, default: Any) -> None:
+    def __init__(self, node: str, default: PyTree) -> None:
         self.node = node
         leaves, self.tree = jax.tree_util.tree_flatten(default)
         self.default = [np.asarray(leaf) for leaf in leaves]
 
-    def pack(self, output: Any) -> list[np.ndarray]:
+    def pack(self, output: PyTree) -> list[np.ndarray]:
         """Return copies of an output's leaves, as arrays that the node cannot change any more.
 
         Raises:
-            UsageError: When structure, shapes or dtypes differ from those of the default output.
+            UsageError: Structure, shapes or dtypes differ from those of the default output.
         """
         leaves, tree = jax.tree_util.tree_flatten(output)
         if tree != self.tree:
@@ -59,7 +60,7 @@ class Format:
                 raise self._differs(f"{array.tolist()}, which does not fit into {like.dtype}")
         return arrays
 
-    def unpack(self, leaves: Sequence[Array]) -> Any:
+    def unpack(self, leaves: Sequence[Array]) -> PyTree:
         """Return the output that has these leaves."""
         return jax.tree_util.tree_unflatten(self.tree, leaves)
 
@@ -111,7 +112,7 @@ class Window:
 
 
 class NodeData:
-    """What one node carries from step to step.
+    """The windows, random key, parameters and state of one node.
 
     Args:
         graph_state: The state at the episode's start.
@@ -119,7 +120,7 @@ class NodeData:
             clock, where the messages' delays are real.
 
     Attributes:
-        carried: ``(rng, params, state, steps made)``; replaced as a whole, so that other threads can read it any time.
+        carried: ``(rng, params, state, number of steps)``; replaced as a whole, so other threads can read it any time.
     """
 
     def __init__(self, node: BaseNode, graph_state: GraphState, emulate_delays: bool) -> None:
@@ -140,7 +141,7 @@ class NodeData:
             raise UsageError(
                 f"the graph state has nothing for node {node.name!r}", hint="make graph states with init()"
             ) from None
-        self.carried: tuple[Any, Any, Any, int] = (parts[0], parts[1], parts[2], 0)
+        self.carried: tuple[PyTree, PyTree, PyTree, int] = (parts[0], parts[1], parts[2], 0)
 
     def step_state(self, seq: int, tick: int) -> StepState:
         """Return the step state of step ``seq``, which starts at ``tick``."""
@@ -153,8 +154,8 @@ class NodeData:
         """Return the ages of the messages, for inputs with a trainable delay that is applied; see ``Window.ages``."""
         return {name: self.windows[name].ages(tick) for name in self._emulated}
 
-    def keep(self, changed: dict[str, Any]) -> None:
-        """Keep the fields that a step replaced, and count the step."""
+    def keep(self, changed: dict[str, PyTree]) -> None:
+        """Store the fields that a step replaced, and count the step."""
         rng, params, state, steps = self.carried
         self.carried = (
             changed.get("rng", rng),

@@ -31,10 +31,10 @@ class Stopped(Exception):  # noqa: N818
 def named(error: BaseException, node: str, during: str) -> Sim2RealError:
     """Return the error to raise in the caller's thread for ``error``, which ``node`` raised.
 
-    A ``Sim2RealError`` is returned itself, with a note; any other is wrapped in a ``NodeFailed``.
+    A ``Sim2RealError`` is returned unchanged, with a note; any other is wrapped in a ``NodeFailed``.
 
     Args:
-        during: What the node was doing, e.g. ``startup``, ``step 12`` or ``stop``.
+        during: The node's call, e.g. ``startup``, ``step 12`` or ``stop``.
     """
     if isinstance(error, Sim2RealError):
         error.add_note(f"node {node!r}, {during}")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 
 from sim2real.errors import UsageError
 
@@ -18,16 +19,7 @@ T = TypeVar("T")
 
 
 def matched(node: str, what: str, got: T, reference: str, like: object) -> T:
-    """Return ``got`` with exactly the dtypes of ``like``, after ``check_match``; no value changes.
-
-    Args:
-        what: Description of ``got``, for errors.
-        reference: Description of ``like``, for errors.
-        like: Arrays, or shapes and dtypes.
-
-    Raises:
-        UsageError: As ``check_match``.
-    """
+    """Return ``got`` with exactly the dtypes of ``like``, after ``check_match``, whose arguments it takes."""
     check_match(node, what, got, reference, like)
 
     def cast(new: ArrayLike, old: ArrayLike) -> ArrayLike:
@@ -50,30 +42,32 @@ def check_match(node: str, what: str, got: object, reference: str, like: object)
         like: Arrays, or shapes and dtypes.
 
     Raises:
-        UsageError: When they differ, naming the first leaf that does.
+        UsageError: They differ; the message names the first leaf that does.
     """
+    # Structure first, then leaf by leaf.
     where = f"node {node!r}: {what} differs from {reference}"
     trees = [jax.tree_util.tree_structure(t) for t in (got, like)]
     if trees[0] != trees[1]:
         raise UsageError(f"{where}: {trees[0]} instead of {trees[1]}", hint="keep to the same fields everywhere")
     flat, _ = jax.tree_util.tree_flatten_with_path(like)
     for new, (path, old) in zip(jax.tree_util.tree_leaves(got), flat, strict=True):
-        found, wanted = _describe(new), jnp.result_type(old)
-        weak = getattr(found, "weak_type", False) and jnp.result_type(new, wanted) == wanted
-        if new is old or (found is not None and np.shape(old) == found.shape and (weak or found.dtype == wanted)):
+        kind, wanted = _describe(new), jnp.result_type(old)
+        weak = getattr(kind, "weak_type", False) and jnp.result_type(new, wanted) == wanted
+        if new is old or (kind is not None and np.shape(old) == kind.shape and (weak or kind.dtype == wanted)):
             continue
-        looks = type(new).__name__ if found is None else f"{found.dtype}{list(found.shape)}"
+        text = type(new).__name__ if kind is None else f"{kind.dtype}{list(kind.shape)}"
         raise UsageError(
-            f"{where}: {jax.tree_util.keystr(path) or 'the value'} is {looks} instead of {wanted}{list(np.shape(old))}",
+            f"{where}: {jax.tree_util.keystr(path) or 'the value'} is {text} instead of {wanted}{list(np.shape(old))}",
             hint="keep shapes and dtypes fixed, e.g. jnp.float32(0.0) in init, x.astype(...) in step",
         )
 
 
-def _describe(leaf: object) -> Any:
+def _describe(leaf: object) -> jax.ShapeDtypeStruct | ShapedArray | None:
     """Return shape and dtype of a leaf; None if it is neither an array nor a number."""
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return leaf
     try:
-        return jax.typeof(leaf)
+        kind = jax.typeof(leaf)
     except TypeError:
         return None
+    return kind if isinstance(kind, ShapedArray) else None

@@ -28,23 +28,27 @@ _NEVER = 2**62
 
 
 class _Link:
-    """One connection of the timeline: which messages each step consumes, and what the record says of them.
+    """One connection of the timeline: the messages that each step consumes, and those that the log records.
 
-    The two differ for a trainable delay: the window takes messages in at the least delay, so that the step can pick
-    those that have arrived at the delay that it has. The record has the arrivals at that delay.
+    The two differ for a trainable delay: the window takes messages in at the smallest delay, and the step picks those
+    that have arrived at the current delay. The log has the arrivals at the current delay.
+
+    Args:
+        edge: The messages at the smallest delay.
+        recorded: The messages at the current delay.
     """
 
-    def __init__(self, edge: Edge, told: Edge, episode: int, steps: int) -> None:
+    def __init__(self, edge: Edge, recorded: Edge, episode: int, steps: int) -> None:
         self.waiting: dict[int, list[np.ndarray]] = {}
-        self.plan(edge, told, episode, steps)
+        self.plan(edge, recorded, episode, steps)
 
-    def plan(self, edge: Edge, told: Edge, episode: int, steps: int) -> None:
-        """Take a timeline, which may be a longer one; see the class for the arguments."""
+    def plan(self, edge: Edge, recorded: Edge, episode: int, steps: int) -> None:
+        """Take a timeline, which may be a longer one than before."""
         self.sender = edge.sender
-        self.told_received: list[int] = told.received[episode].tolist()
-        self.told_seq_in: list[int] = told.seq_in[episode].tolist()
-        self._told = np.flatnonzero(told.seq_in[episode] >= 0)
-        self._told_bounds = np.searchsorted(told.seq_in[episode][self._told], np.arange(steps + 1)).tolist()
+        self.recorded_received: list[int] = recorded.received[episode].tolist()
+        self.recorded_seq_in: list[int] = recorded.seq_in[episode].tolist()
+        self._recorded = np.flatnonzero(recorded.seq_in[episode] >= 0)
+        self._recorded_bounds = np.searchsorted(recorded.seq_in[episode][self._recorded], np.arange(steps + 1)).tolist()
         self.received: list[int] = edge.received[episode].tolist()
         self.seq_in: list[int] = edge.seq_in[episode].tolist()
         self.used = np.flatnonzero(edge.seq_in[episode] >= 0)
@@ -54,12 +58,12 @@ class _Link:
         """Return the messages that step ``k`` consumes, oldest first."""
         return self.used[self.bounds[k] : self.bounds[k + 1]].tolist()
 
-    def told(self, k: int) -> list[int]:
-        """Return the messages that step ``k`` was the first to see, oldest first."""
-        return self._told[self._told_bounds[k] : self._told_bounds[k + 1]].tolist()
+    def recorded(self, k: int) -> list[int]:
+        """Return the messages that step ``k`` consumes in the log, oldest first."""
+        return self._recorded[self._recorded_bounds[k] : self._recorded_bounds[k + 1]].tolist()
 
     def put(self, m: int, leaves: list[np.ndarray], always: bool) -> None:
-        """Keep message ``m`` if a step will consume it; ``always``: a step of a longer timeline may."""
+        """Store message ``m`` if a step will consume it; ``always``: a step of a longer timeline may."""
         if always or self.seq_in[m] >= 0:
             self.waiting[m] = leaves
 
@@ -86,11 +90,11 @@ class _Player:
         self.ends: list[int] = vertex.end[episode, :steps].tolist()
         self.slots: list[int] = slot(node, np.arange(steps + 1)).tolist()
         for i in node.inputs:
-            given = (timeline.edges[node.name, i], _told(data, i, timeline), episode, steps)
+            arguments = (timeline.edges[node.name, i], _recorded_edge(data, i, timeline), episode, steps)
             if i in self.links:
-                self.links[i].plan(*given)
+                self.links[i].plan(*arguments)
             else:
-                self.links[i] = _Link(*given)
+                self.links[i] = _Link(*arguments)
 
     def blocked(self, k: int) -> int:
         """Return the last arrival among the messages that step ``k`` waited for [ticks]; 0 if there are none."""
@@ -98,7 +102,7 @@ class _Player:
         return max((link.received[m] for link in awaited for m in link.consumed(k)[-1:]), default=0)
 
     def ready(self, players: Mapping[str, _Player]) -> bool:
-        """Return whether everything that the next step consumes has been sent."""
+        """Return whether all messages that the next step consumes have been sent."""
         for link in self.links.values():
             last = link.bounds[self.k + 1]
             if last and link.used[last - 1] >= players[link.sender].k:
@@ -106,8 +110,8 @@ class _Player:
         return True
 
 
-def _told(data: NodeData, name: str, timeline: Timeline) -> Edge:
-    """Return an input's messages as they arrive at the delay that it has: of a trainable one not the timeline's."""
+def _recorded_edge(data: NodeData, name: str, timeline: Timeline) -> Edge:
+    """Return an input's messages at its current delay; that of a trainable one may differ from the timeline's."""
     node = data.node
     edge, dist = timeline.edges[node.name, name], data.windows[name].state.delay_dist
     if not isinstance(dist, TrainableDist):
@@ -122,9 +126,9 @@ class SimulatedRun:
     Args:
         graph_state: The state at the episode's start.
         recorder: Receives all steps and messages, or None.
-        own: Whether the supervisor makes its steps itself.
+        own: Whether the supervisor makes its own steps.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit.
-        growing: Draws longer and longer timelines, of which ``timeline`` is the first; None: the episode ends with it.
+        growing: Draws longer timelines that begin with ``timeline``; None: the episode ends with ``timeline``.
     """
 
     def __init__(
@@ -176,7 +180,7 @@ class SimulatedRun:
             self._recorder.start(time.time_ns(), time.monotonic_ns())
 
     def observe(self, timeout_s: float) -> StepState:
-        """Run the graph to the supervisor's next step and return what it sees."""
+        """Run the graph to the supervisor's next step and return its step state."""
         if self._own:
             raise UsageError(
                 f"the supervisor {self._supervisor!r} makes its own steps",
@@ -199,12 +203,12 @@ class SimulatedRun:
         return self._pending
 
     def reply(self, reply: Reply) -> int:
-        """Make the supervisor's step with the caller's reply; return how many steps it has made."""
-        given, self._pending = self._pending, None
-        if given is None:
+        """Make the supervisor's step with the caller's reply; return its number of steps."""
+        offered, self._pending = self._pending, None
+        if offered is None:
             raise UsageError("no step is on offer", hint="call reset() first")
         player = self._players[self._supervisor]
-        self._make(player, given, reply)
+        self._make(player, offered, reply)
         return player.k
 
     def settle(self, finished: int, timeout_s: float) -> None:
@@ -235,7 +239,7 @@ class SimulatedRun:
             for player in self._players.values():
                 for name, link in player.links.items():
                     for m in range(self._players[link.sender].k):
-                        if not 0 <= link.told_seq_in[m] < player.k:
+                        if not 0 <= link.recorded_seq_in[m] < player.k:
                             self._recorder.message(self._message_record(player, name, m, -1))
 
     def snapshot(self) -> GraphState:
@@ -262,12 +266,12 @@ class SimulatedRun:
         return True
 
     def _next(self) -> int:
-        """Return when the next step starts [ticks], once the timeline is long enough to know."""
+        """Return the start of the next step [ticks], after drawing a longer timeline if it needs one."""
         self._grow()
         return min(p.begins[p.k] for p in self._players.values())
 
     def _grow(self) -> None:
-        """Take a longer timeline where the next step may lie behind the end of this one."""
+        """Take a longer timeline if the next step may lie behind the end of this one."""
         growing = self._growing
         while growing and min(p.begins[p.k] for p in self._players.values()) >= growing.ticks:
             growing.grow()
@@ -275,11 +279,11 @@ class SimulatedRun:
                 player.plan(growing.timeline, 0)
 
     def _event(self) -> None:
-        """Make the step that comes next in time, or offer it to the caller; do nothing once the graph is stopped."""
+        """Make the step that comes next in time, or offer it to the caller; do nothing in a stopped graph."""
         ready = [p for p in self._players.values() if p.begins[p.k] < _NEVER and p.ready(self._players)]
         if not ready:
             raise Sim2RealError(
-                "no node can step: the timeline has steps that wait for messages which nobody sends",
+                "no node can step: the timeline has steps that wait for messages without a sender",
                 hint="draw it with sim2real.graph.schedule.draw for these nodes",
             )
         player = min(ready, key=lambda p: p.begins[p.k])  # of equals, the first in the graph's order
@@ -290,30 +294,34 @@ class SimulatedRun:
             self._stopping.wait(max(0.0, rest))
         if self.ended:
             return
+
+        # Take in the messages that the step consumes.
         for name, link in player.links.items():
             messages = [self._message(link, m) for m in link.consumed(player.k)]
             player.data.windows[name].push(messages)
             if not player.data.node.inputs[name].trainable:
                 player.log.read(name, begin, messages[-1].sent if messages else None)
-        given = player.data.step_state(player.k, begin)
+        step_state = player.data.step_state(player.k, begin)
         if player.data.node.name == self._supervisor and not self._own:
-            self._pending = given
+            self._pending = step_state
         else:
-            self._make(player, given, Reply())
+            self._make(player, step_state, Reply())
 
-    def _make(self, player: _Player, given: StepState, reply: Reply) -> None:
+    def _make(self, player: _Player, offered: StepState, reply: Reply) -> None:
         """Make a step, send its output and record it."""
         node, k = player.data.node, player.k
         begin, end = player.begins[k], player.ends[k]
         ages = player.data.ages(begin)
         try:
-            player.stepper.show(self._recorder, given, ages, reply)
-            result = player.stepper.answer(player.data, given, ages, reply)
+            player.stepper.show(self._recorder, offered, ages, reply)
+            result = player.stepper.answer(player.data, offered, ages, reply)
             moved = overwritten(result.ts, begin, end, node.name)
         except Exception as error:
             self.stop(0.0)
             failure = named(error, node.name, f"step {k}")
             raise failure from failure.__cause__
+
+        # Send the output, then update the drift, the statistics and the log.
         player.k += 1
         for link in player.outputs:
             link.put(k, result.leaves, self._growing is not None)
@@ -331,7 +339,7 @@ class SimulatedRun:
         record = StepRecord(name, k, player.slots[k], begin, begin, moved, player.ends[k], player.drift)
         self._recorder.step(record, player.data.form.unpack(result.leaves))
         for input_name, link in player.links.items():
-            for m in link.told(k):
+            for m in link.recorded(k):
                 self._recorder.message(self._message_record(player, input_name, m, k))
 
     def _message(self, link: _Link, m: int) -> Message:
@@ -341,4 +349,4 @@ class SimulatedRun:
     def _message_record(self, player: _Player, name: str, m: int, seq_in: int) -> MessageRecord:
         link = player.links[name]
         sent = self._players[link.sender].ends[m]
-        return MessageRecord(player.data.node.name, name, m, seq_in, sent, link.told_received[m])
+        return MessageRecord(player.data.node.name, name, m, seq_in, sent, link.recorded_received[m])

@@ -25,9 +25,9 @@ class NodeStatistics(NamedTuple):
         period_s: Time from one step's wake-up to the next one's.
         lateness_s: Time from a step's start by the timing rules to its wake-up.
         overruns: Number of steps that started late only because the previous step had not ended.
-        age_s: Input -> how long before a step's start the newest message that it used was sent: how old the data are
-            that a policy acts on, whichever node was slow. Inputs without any message are left out; on the simulated
-            clock also those with a trainable delay, as there the step itself picks the message.
+        age_s: Input -> age of the newest message at a step's start, since it was sent: the age of the data that a
+            policy acts on. Without inputs that had no message; on the simulated clock also without those that have a
+            trainable delay, as there the step picks the message.
     """
 
     steps: int
@@ -52,11 +52,11 @@ class StepLog:
         self._overruns = 0
 
     def read(self, name: str, begin: int, sent: int | None) -> None:
-        """Add the age of the newest message that a step finds on an input.
+        """Add the age of the newest message of an input.
 
         Args:
             begin: The step's start [ticks].
-            sent: When the newest message was sent [ticks]; None: no new message, the step uses the previous one again.
+            sent: Time at which the newest message was sent [ticks]; None: the step uses the previous message again.
         """
         if sent is not None:
             self._sent[name] = sent

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from sim2real.graph.node import BaseNode, to_ticks
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.match import matched
 from sim2real.runtime.wall_clock.handover import Reply
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Array, Number
@@ -31,12 +32,12 @@ class Result(NamedTuple):
     """The results of a step.
 
     Attributes:
-        changed: Those of ``rng``, ``params`` and ``state`` that the step replaced.
-        ts: The start that the step set itself [s], or None.
+        changed: The replaced ones of ``rng``, ``params`` and ``state``.
+        ts: The start that the step has set [s], or None.
         leaves: The output, as ``Format.pack`` returns it.
     """
 
-    changed: dict[str, Any]
+    changed: dict[str, PyTree]
     ts: Number | None
     leaves: list[np.ndarray]
 
@@ -46,18 +47,18 @@ class Stepper:
 
     def __init__(self, node: BaseNode) -> None:
         self.node = node
-        self._compiled: Any = None
-        self._signature: Any = None
+        self._compiled: jax.stages.Compiled | None = None
+        self._signature: tuple[object, ...] | None = None
 
     def prepare(self, data: NodeData, jit: bool) -> None:
         """Compile the step for data of this form, unless it is compiled already; a step with side effects is not run.
 
         Args:
             data: The node's data at the start of an episode.
-            jit: Whether to compile; nodes with ``jittable = False`` never are.
+            jit: Whether to compile; nodes with ``jittable = False`` are never compiled.
 
         Raises:
-            UsageError: When the step's results do not have the form of the node's state or default output.
+            UsageError: The step's results do not have the form of the node's state or default output.
         """
         jit = jit and self.node.jittable
         arguments = (data.step_state(0, 0), data.ages(0))
@@ -69,7 +70,7 @@ class Stepper:
         if jit:
             default = data.form.unpack(data.form.default)
 
-            def call(step_state: StepState, ages: Mapping[str, Array]) -> tuple[dict[str, Any], Any]:
+            def call(step_state: StepState, ages: Mapping[str, Array]) -> tuple[dict[str, PyTree], PyTree]:
                 return self._matched(step_state, *self._call(step_state, ages), default)
 
             traced = jax.jit(call).trace(*arguments)
@@ -94,30 +95,31 @@ class Stepper:
             leaves = data.form.pack(output)
         return Result(changed, changed.pop("ts", None), leaves)
 
-    def answer(self, data: NodeData, given: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> Result:
-        """Return the results of a step to which a caller has replied; the node is run if the caller gave no output.
+    def answer(self, data: NodeData, offered: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> Result:
+        """Return the results of a step after the caller's reply; the node runs if the reply has no output.
 
         Args:
+            offered: The step state before the reply.
             ages: As in ``run``.
         """
-        before = {} if reply.step_state is None else _changed(given, reply.step_state)
+        before = {} if reply.step_state is None else _changed(offered, reply.step_state)
         if reply.leaves is not None:
             return Result(before, before.pop("ts", None), reply.leaves)
-        made = self.run(data, reply.step_state or given, ages)
-        return Result({**before, **made.changed}, made.ts, made.leaves)
+        result = self.run(data, reply.step_state or offered, ages)
+        return Result({**before, **result.changed}, result.ts, result.leaves)
 
-    def show(self, recorder: Recorder | None, given: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> None:
-        """Let a recorder see what the next step is given, if it wants to.
+    def show(self, recorder: Recorder | None, offered: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> None:
+        """Give the next step's input to a recorder that keeps such inputs.
 
         Args:
-            given: What the step gets, with whole windows.
+            offered: The step state before the reply, with whole windows.
             ages: As in ``run``.
         """
         if isinstance(recorder, StepStateRecorder) and recorder.keep:
-            recorder.given(self.node.name, _served(self.node, reply.step_state or given, ages))
+            recorder.given(self.node.name, _with_delays(self.node, reply.step_state or offered, ages))
 
-    def _call(self, step_state: StepState, ages: Mapping[str, Array]) -> tuple[dict[str, Any], Any]:
-        result = self.node.step(_served(self.node, step_state, ages))
+    def _call(self, step_state: StepState, ages: Mapping[str, Array]) -> tuple[dict[str, PyTree], PyTree]:
+        result = self.node.step(_with_delays(self.node, step_state, ages))
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[0], StepState)):
             raise UsageError(
                 f"node {self.node.name!r}: step returned {type(result).__name__}",
@@ -126,21 +128,19 @@ class Stepper:
         return _changed(step_state, result[0]), result[1]
 
     def _matched(
-        self, given: StepState, changed: dict[str, Any], output: T, default: object
-    ) -> tuple[dict[str, Any], T]:
+        self, before: StepState, changed: dict[str, PyTree], output: T, default: object
+    ) -> tuple[dict[str, PyTree], T]:
         """Return a step's results in the dtypes of the node's state and default output."""
         name = self.node.name
         for field in _CARRIED:
             if field in changed:
                 what = f"the {field} that step returns"
-                changed[field] = matched(name, what, changed[field], "the one it got", getattr(given, field))
+                changed[field] = matched(name, what, changed[field], "the one it got", getattr(before, field))
         return changed, matched(name, "the output of step", output, "that of init_output", default)
 
 
 def overwritten(ts: Number | None, begin: int, now: int, node: str) -> int:
-    """Return the start that a step has set itself [ticks]; -1 if it has not changed it (rule 4).
-
-    Times are compared in float32, the type of ``StepState.ts``.
+    """Return the start that a step has set [ticks]; -1 if it has not changed its start (rule 4).
 
     Args:
         ts: The step's ``ts`` afterwards [s]; None if it was not replaced.
@@ -148,7 +148,7 @@ def overwritten(ts: Number | None, begin: int, now: int, node: str) -> int:
         now: The time after the step [ticks].
 
     Raises:
-        Sim2RealError: Unless ``begin <= ts < now``.
+        Sim2RealError: Unless ``begin <= ts < now``, compared in float32, the type of ``StepState.ts``.
     """
     if ts is None:
         return -1
@@ -163,12 +163,12 @@ def overwritten(ts: Number | None, begin: int, now: int, node: str) -> int:
     return min(max(to_ticks(ts_s), begin), now - 1)
 
 
-def _changed(given: StepState, new: StepState) -> dict[str, Any]:
+def _changed(before: StepState, new: StepState) -> dict[str, PyTree]:
     """Return the fields that a step replaced; the others need not be outputs of the compiled program."""
-    return {f: getattr(new, f) for f in (*_CARRIED, "ts") if getattr(new, f) is not getattr(given, f)}
+    return {f: getattr(new, f) for f in (*_CARRIED, "ts") if getattr(new, f) is not getattr(before, f)}
 
 
-def _served(node: BaseNode, step_state: StepState, ages: Mapping[str, Array]) -> StepState:
+def _with_delays(node: BaseNode, step_state: StepState, ages: Mapping[str, Array]) -> StepState:
     """Return the step state with trainable delays applied to the inputs that have ``ages``."""
     if not ages:
         return step_state

@@ -1,4 +1,4 @@
-"""An interpreter of the index tables in plain Python: does what the compiled program does, to test the tables."""
+"""An interpreter of the index tables in plain Python, which tests the tables without the compiled program."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from sim2real.graph.node import BaseNode
 from sim2real.graph.testing.nodes import hash_step
-from sim2real.runtime.compilation.wiring import SlotTable, Wiring
+from sim2real.runtime.compilation.wiring import InputTable, SlotTable, Wiring
 
 Windows = dict[str, tuple[list[int], list[int]]]
 """Input name -> (seq of each message in the window, value of each), oldest first."""
@@ -24,61 +24,76 @@ def interpret(
     episode: int,
     step: Callable[[str, int, Windows], int],
     defaults: Mapping[str, int],
-    given: Mapping[str, list[int]] | None = None,
+    recorded: Mapping[str, list[int]] | None = None,
 ) -> dict[str, list[int]]:
     """Play one episode and return the outputs of each node, by seq.
 
-    Messages are looked up as in the compiled program, by their age in a buffer of the sender's last outputs, and each
-    is checked against the ``seq`` that the tables also have.
-
     Args:
         step: Makes a step: (node, seq, windows) -> output.
-        given: Outputs of nodes that do not run.
+        recorded: Outputs of nodes that do not run.
 
     Raises:
-        TableError: When a window has another message than the table says, or a node's steps are not in order.
+        TableError: A window has another message than its table, or a node's steps are not in order.
     """
-    rings = {n: [(-1, defaults[n])] * length for n, length in wiring.rings.items()}
-    made: dict[str, list[int]] = {n: [] for n in nodes}
-
-    def one(name: str, table: SlotTable, at: tuple[int, ...]) -> None:
-        seq = int(table.seq[at])
-        if seq < 0:
-            return
-        if seq != len(made[name]):
-            raise TableError(f"node {name!r}: step {seq} comes when {len(made[name])} steps are made (row {at})")
-        windows = {}
-        for input_name, t in table.inputs.items():
-            connection = nodes[name].inputs[input_name]
-            sender, width = connection.output_node.name, connection.total_window
-            seqs = t.seq[at].tolist()
-            if given and sender in given:
-                windows[input_name] = seqs, [given[sender][s] if s >= 0 else defaults[sender] for s in seqs]
-                continue
-            ring, age = rings[sender], int(t.age[at])
-            shown = ring[len(ring) - age - width : len(ring) - age]
-            if [s for s, _ in shown] != seqs:
-                where = f"node {name!r}, input {input_name!r}, step {seq}"
-                raise TableError(f"{where}: the ring shows {[s for s, _ in shown]}, the table says {seqs}")
-            windows[input_name] = seqs, [x for _, x in shown]
-        output = step(name, seq, windows)
-        made[name].append(output)
-        if rings[name]:
-            rings[name] = [*rings[name][1:], (seq, output)]
-
+    player = _Player(nodes, wiring, step, defaults, recorded or {})
     for row in range(wiring.rows):
         last = wiring.last if row == wiring.rows - 1 else wiring.ticks
         done = 0
+        # Before each slot, the world makes the ticks up to the slot's offset; after the last slot, the rest of the row.
         for name, table, offset in zip(
             (*wiring.slots, ""), (*wiring.tables, None), (*wiring.offsets, wiring.ticks), strict=True
         ):
             if wiring.world is not None and wiring.world_table is not None:
                 for tick in range(done, min(offset, last)):
-                    one(wiring.world, wiring.world_table, (episode, row, tick))
+                    player.play(wiring.world, wiring.world_table, (episode, row, tick))
             done = max(done, min(offset, last))
             if table is not None:
-                one(name, table, (episode, row))
-    return made
+                player.play(name, table, (episode, row))
+    return player.outputs
+
+
+class _Player:
+    """The state of an episode: each node's outputs, and the ring of its last ones."""
+
+    def __init__(
+        self,
+        nodes: Mapping[str, BaseNode],
+        wiring: Wiring,
+        step: Callable[[str, int, Windows], int],
+        defaults: Mapping[str, int],
+        recorded: Mapping[str, list[int]],
+    ) -> None:
+        self.nodes, self.step, self.defaults, self.recorded = nodes, step, defaults, recorded
+        self.rings = {n: [(-1, defaults[n])] * length for n, length in wiring.rings.items()}
+        self.outputs: dict[str, list[int]] = {n: [] for n in nodes}
+
+    def play(self, name: str, table: SlotTable, at: tuple[int, ...]) -> None:
+        """Make the step in a table's entry; do nothing if the entry has none."""
+        seq = int(table.seq[at])
+        if seq < 0:
+            return
+        if seq != len(self.outputs[name]):
+            raise TableError(f"node {name!r}: step {seq} follows {len(self.outputs[name])} steps (row {at})")
+        windows = {i: self.window(name, i, t, at) for i, t in table.inputs.items()}
+        output = self.step(name, seq, windows)
+        self.outputs[name].append(output)
+        if self.rings[name]:
+            self.rings[name] = [*self.rings[name][1:], (seq, output)]
+
+    def window(self, name: str, input_name: str, table: InputTable, at: tuple[int, ...]) -> tuple[list[int], list[int]]:
+        """Return the messages of an input, looked up by age as in the compiled program, and checked by ``seq``."""
+        connection = self.nodes[name].inputs[input_name]
+        sender, width = connection.output_node.name, connection.total_window
+        seqs = table.seq[at].tolist()
+        if sender in self.recorded:
+            messages = self.recorded[sender]
+            return seqs, [messages[s] if s >= 0 else self.defaults[sender] for s in seqs]
+        ring, age = self.rings[sender], int(table.age[at])
+        window = ring[len(ring) - age - width : len(ring) - age]
+        if [s for s, _ in window] != seqs:
+            where = f"node {name!r}, input {input_name!r}, entry {at}"
+            raise TableError(f"{where}: the ring has messages {[s for s, _ in window]}, the table {seqs}")
+        return seqs, [x for _, x in window]
 
 
 def interpret_hashes(
@@ -103,5 +118,5 @@ def interpret_hashes(
         current[name], out = hash_step(current[name], seq, [windows[i] for i in sorted(windows)])
         return out
 
-    made = interpret(nodes, wiring, episode, step, {n: int(x) for n, x in outputs.items()})
-    return {n: np.array(values, np.uint32) for n, values in made.items()}
+    played = interpret(nodes, wiring, episode, step, {n: int(x) for n, x in outputs.items()})
+    return {n: np.array(values, np.uint32) for n, values in played.items()}

@@ -18,7 +18,7 @@ class PPOConfig:
     """
 
     num_seeds: int = 1
-    """Number of policies that are trained in parallel with different random numbers; the best one is kept."""
+    """Number of policies that are trained in parallel with different random numbers; the best one is saved."""
     num_envs: int = 256
     """Number of copies of the environment per seed; in an evaluation each plays one episode."""
     rollout_steps: int = 32
@@ -26,8 +26,8 @@ class PPOConfig:
     total_steps: int = 1_000_000
     """Total number of rows per seed, over all copies; rounded up to whole updates and evaluations."""
     target: float | None = None
-    """Success, 0 to 1, at which training ends: at the first evaluation where the best seed, whose policy is kept,
-    reaches it; default: train to the end."""
+    """Success, 0 to 1, at which training ends: at the first evaluation in which the best seed reaches it; default:
+    train to the end."""
     epochs: int = 4
     """Number of passes over the rows of a rollout in one update."""
     minibatches: int = 32
@@ -35,11 +35,11 @@ class PPOConfig:
     learning_rate: float = 2e-3
     """Adam's step size at the start."""
     schedule: Literal["linear", "adaptive"] = "linear"
-    """How the step size goes on: linearly down to 5 % of it, or adapted after each minibatch so that the policy moves
-    by about target_kl from the one that played: divided by 1.5 above twice that, multiplied below half of it, within
-    1e-5 and 1e-2."""
+    """Schedule of the step size. 'linear': down to 5 % of learning_rate. 'adaptive': after each minibatch divided by
+    1.5 if the KL divergence from the policy that played exceeds twice target_kl, multiplied by 1.5 if it is below half
+    of target_kl, within 1e-5 and 1e-2."""
     target_kl: float = 0.01
-    """KL divergence from the policy that played, within an update, that an adaptive step size aims at [nat]."""
+    """KL divergence from the policy that played, within an update, for an adaptive step size [nat]."""
     gamma: float = 0.99
     """Discount per policy step."""
     gae_lambda: float = 0.95
@@ -57,26 +57,27 @@ class PPOConfig:
     reward_scale: float = 0.05
     """Factor on the reward during training; it should bring discounted returns near 1 to 50."""
     hidden: tuple[int, ...] = (64, 64)
-    """Widths of the hidden layers of actor and value network; of a gru its own, then those of the layers after it."""
+    """Widths of the hidden layers of actor and value network; of a gru the unit's width, then those of the layers after
+    it."""
     network: str = "mlp"
-    """Actor and value network: 'mlp', a perceptron; 'gru', which remembers; or package.module:Class of a module of
+    """Actor and value network: 'mlp', a perceptron; 'gru', a recurrent network; or package.module:Class of a module of
     flax.linen or a Network of your own."""
     critic: str | None = None
-    """Value network, if it is another one than the actor."""
+    """Value network; default: the same as the actor."""
     squash: bool = False
     """Bound actions by tanh, a squashed Gaussian; default: clip them, which reaches full actions sooner."""
     privileged: bool = False
-    """The value function sees the world's true state and the episode's parameters besides the observation, as it is
-    needed in simulation only; the policy sees the observation alone."""
+    """Give the value function the world's true state and the episode's parameters besides the observation. Only the
+    policy, which gets the observation alone, runs on the robot."""
     teacher: bool = False
-    """The policy sees the true state and the parameters, too: a teacher, to distil a student from; no robot can run
+    """Give the policy the true state and the parameters, too: a teacher, to distil a student from; no robot can run
     it."""
     log_std_init: float = -0.5
     """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10
     """Number of evaluations, evenly spaced, the last one at the end; progress is reported after each."""
     devices: int = 1
-    """Number of this host's devices that seeds and copies are divided among; the results are the same."""
+    """Number of this host's devices that share seeds and copies; the results are the same."""
     eval_steps: int = 250
     """Rows of an evaluation; no episode may be longer. The first training episodes are staggered over as many rows."""
 
@@ -121,7 +122,7 @@ class PPOConfig:
         return -(-self.total_steps // (self.steps_per_update * self.evaluations))
 
     @property
-    def rollouts_per_test(self) -> int:
+    def rollouts_per_evaluation(self) -> int:
         """Number of rollouts in which every episode ends."""
         return -(-self.eval_steps // self.rollout_steps)
 

@@ -1,4 +1,4 @@
-"""Settings that are tried side by side in one program: every one with every seed. Imports no JAX, nor numpy."""
+"""A grid of settings that are trained side by side in one program, each with every seed. Imports no JAX, nor numpy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
 
 if TYPE_CHECKING:
-    import jax
+    from sim2real.types import Array
 
 SWEPT = tuple(f.name for f in fields(PPOConfig) if type(f.default) is float)
 """Settings that are numbers in the program. The others set its shapes or its parts."""
@@ -40,54 +40,54 @@ class Sweep:
             name, sign, listed = text.partition("=")
             name = name.strip().replace("-", "_").removeprefix("ppo.")
             try:
-                found = tuple(float(word) for word in listed.split(","))
+                numbers = tuple(float(word) for word in listed.split(","))
             except ValueError:
-                sign, found = "", ()
-            if not sign or len(set(found)) < len(found) or name in values:
+                sign, numbers = "", ()
+            if not sign or len(set(numbers)) < len(numbers) or name in values:
                 raise UsageError(
                     f"sweep {text!r} is no list of different numbers for one setting",
                     hint="write NAME=VALUE,VALUE..., one --sweep a setting, such as --sweep learning_rate=1e-3,3e-3",
                 )
             if name not in SWEPT:
-                known = any(f.name == name for f in fields(PPOConfig))
-                why = "sets the shape or the parts of the program" if known else "is no setting of PPO"
-                raise UsageError(f"{name} cannot be swept: it {why}", hint=f"settings that can: {', '.join(SWEPT)}")
-            values[name] = found
+                exists = any(f.name == name for f in fields(PPOConfig))
+                reason = "sets the shape or the parts of the program" if exists else "is no setting of PPO"
+                raise UsageError(f"{name} cannot be swept: it {reason}", hint=f"settings that can: {', '.join(SWEPT)}")
+            values[name] = numbers
         return Sweep(values)
 
     @property
     def grid(self) -> list[dict[str, float]]:
-        """The settings to try: all combinations, in order; one without any where nothing is swept."""
+        """All combinations of the values, in order; one empty combination without a sweep."""
         names = list(self.values)
         return [dict(zip(names, numbers, strict=True)) for numbers in itertools.product(*self.values.values())]
 
     def names(self, num_seeds: int) -> list[str]:
-        """Return who is who on the seed axis, such as ``learning_rate=0.001, seed 0``."""
-        points = [f"{named(point)}, " if point else "" for point in self.grid]
+        """Return the name of each place on the seed axis, such as ``learning_rate=0.001, seed 0``."""
+        points = [f"{format_point(point)}, " if point else "" for point in self.grid]
         return [f"{point}seed {seed}" for point in points for seed in range(num_seeds)]
 
     def configs(self, config: PPOConfig) -> list[PPOConfig]:
         """Return the settings of each point of the grid.
 
         Raises:
-            UsageError: A value is out of its range, or does nothing.
+            UsageError: A value is out of its range, or has no effect.
         """
         if "target_kl" in self.values and config.schedule != "adaptive":
             raise UsageError("target_kl does nothing with a linear step size", hint="add --ppo.schedule adaptive")
         return [replace(config, **point) for point in self.grid]
 
 
-def named(point: Mapping[str, float]) -> str:
-    """Return a point of the grid in words, such as ``learning_rate=0.001``."""
+def format_point(point: Mapping[str, float]) -> str:
+    """Return a point of the grid as a text, such as ``learning_rate=0.001``."""
     return ", ".join(f"{name}={value:g}" for name, value in point.items())
 
 
-def with_numbers(config: PPOConfig, numbers: Mapping[str, jax.Array | int]) -> PPOConfig:
-    """Return settings some of which are arguments of the program, in place of constants.
+def with_numbers(config: PPOConfig, numbers: Mapping[str, Array | int]) -> PPOConfig:
+    """Return settings in which some numbers are traced arguments of the program.
 
-    ``dataclasses.replace`` would compare them with their bounds, which is done before the program is made.
+    ``dataclasses.replace`` would compare the traced numbers with their bounds; they were checked before.
     """
-    own = copy.copy(config)
+    changed = copy.copy(config)
     for name, value in numbers.items():
-        object.__setattr__(own, name, value)
-    return own
+        object.__setattr__(changed, name, value)
+    return changed

@@ -57,7 +57,7 @@ except Sim2RealError as error:
 
 def test_it_never_waits_for_the_threads_that_it_watches():
     """An emulated servo comes between: a real one waits for nobody. Where its priority is not allowed none is taken."""
-    assert clock._PRIORITY < emulator._REAL_TIME_PRIORITY < guardian_process._PRIORITY == clock._HIGHEST
+    assert clock._PRIORITY < emulator._REAL_TIME_PRIORITY < guardian_process._PRIORITY == clock._GUARDIAN_PRIORITY
 
 
 @pytest.fixture

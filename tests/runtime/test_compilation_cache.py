@@ -25,13 +25,13 @@ print(folder, counts.count("cache_hits"), counts.count("cache_misses"))
 @pytest.fixture
 def alone(monkeypatch, tmp_path):
     """An environment as a user has it: no cache is configured for JAX."""
-    for name in ("JAX_COMPILATION_CACHE_DIR", "SIM2REAL_CACHE", *cache._ALWAYS):
+    for name in ("JAX_COMPILATION_CACHE_DIR", "SIM2REAL_CACHE", *cache._SETTINGS):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.setitem(sys.modules, "jax", None)  # this process has a cache of its own
     yield tmp_path
     cache.release()
-    for name in ("JAX_COMPILATION_CACHE_DIR", *cache._ALWAYS):
+    for name in ("JAX_COMPILATION_CACHE_DIR", *cache._SETTINGS):
         os.environ.pop(name, None)
 
 

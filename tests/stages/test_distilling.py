@@ -94,4 +94,4 @@ def test_a_student_is_trained_and_names_its_teacher(root, tmp_path):
 
 def test_a_student_cannot_be_a_teacher(capsys):
     assert cli.main([*TINY, "--distil", "x", "--ppo.teacher"]) == 2
-    assert "a student sees what a robot shows" in capsys.readouterr().err
+    assert "a student observes only what a robot measures" in capsys.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.stages.train.explain import disturbance_rows
+from sim2real.stages.train.show import disturbance_rows
 from sim2real.stages.train.training_setup import prepare
 from sim2real.train.environment.variation import VariationConfig
 

@@ -25,7 +25,7 @@ TINY = [
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Two runs: one that was interrupted after its second evaluation, and one that was not."""
-    root, report = tmp_path_factory.mktemp("runs"), stage._report
+    root, report = tmp_path_factory.mktemp("runs"), stage.show_progress
 
     def stop(bar, progress, watch):
         report(bar, progress, watch)
@@ -33,7 +33,7 @@ def runs(tmp_path_factory):
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stage, "_report", stop)
+        patch.setattr(stage, "show_progress", stop)
         assert cli.main([*TINY, "--runs", str(root)]) == 130
     assert cli.main([*TINY, "--runs", str(root / "whole")]) == 0
     return root
@@ -111,7 +111,9 @@ def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
 
 def test_a_sweep_names_what_it_tried_and_no_checkpoint_is_written_where_that_is_said(tmp_path, capsys, monkeypatch):
     report, left = stage._report, []
-    monkeypatch.setattr(stage, "_report", lambda *given: (report(*given), left.extend(tmp_path.rglob(CHECKPOINT))))
+    monkeypatch.setattr(
+        stage, "show_progress", lambda *given: (report(*given), left.extend(tmp_path.rglob(CHECKPOINT)))
+    )
     options = ("--sweep", "gamma=0.9,0.99", "--ppo.num-seeds", "2", "--no-checkpoint")
     assert cli.main([*TINY, "--runs", str(tmp_path), *options]) == 0
     said = capsys.readouterr().out

@@ -190,7 +190,7 @@ class Wrong:
         (Sorted, r"Sorted uses sort of float32, which is not exported to ONNX[\s\S]*hint: primitives that are: .*tanh"),
         (Averaged, r"Averaged has variables besides its parameters: batch_stats[\s\S]*hint: .*LayerNorm"),
         (lambda n: Wrong(n, shape=5), r"returns float32 of shape \(5,\) for an input of shape \(3,\), .*\(2,\)"),
-        (lambda n: Wrong(n, carry=np.int32(0)), "must carry on what it began with, arrays of float32"),
+        (lambda n: Wrong(n, carry=np.int32(0)), "must keep the form of its initial carry, arrays of float32"),
         (lambda n, more: n, "cannot be made of its number of outputs alone: .*'more'"),
         (lambda n: n, "makes a int, neither a flax.linen.Module nor a Network"),
         ("transformer", "there is no network 'transformer'"),

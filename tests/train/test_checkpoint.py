@@ -87,7 +87,7 @@ def test_any_damage_is_noticed_before_training_goes_on(saved, tmp_path):
         else:
             del bent[rng.integers(len(whole)) :]
         file.write_bytes(bent)
-        with pytest.raises(Sim2RealError, match=r"cannot go on from .*bent[\s\S]*hint: train again"):
+        with pytest.raises(Sim2RealError, match=r"cannot continue from .*bent[\s\S]*hint: train again"):
             load_checkpoint(file, identity, None, None)
 
 
@@ -95,5 +95,5 @@ def test_a_file_that_is_damaged_or_missing_is_named(saved, tmp_path):
     damaged = tmp_path / "damaged"
     damaged.write_bytes(saved.read_bytes()[:300])
     for path in (damaged, tmp_path / "missing"):
-        with pytest.raises(Sim2RealError, match=rf"cannot go on from {path}[\s\S]*hint: train again"):
+        with pytest.raises(Sim2RealError, match=rf"cannot continue from {path}[\s\S]*hint: train again"):
             train(Bandit(), CONFIG, KEY, resume=path)

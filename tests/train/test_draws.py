@@ -9,7 +9,7 @@ from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.errors import UsageError
-from sim2real.train.environment.draws import COUNT, draw_robots, widened
+from sim2real.train.environment.draws import COUNT, draw_robots, widen_posterior
 from sim2real.train.environment.variation import VariationConfig
 
 NAMES = ("gain", "gravity", "sensor_delay", "actuator_delay", "zero")
@@ -115,6 +115,6 @@ def test_what_cannot_be_drawn_is_refused(found):
 
 
 def test_the_posterior_keeps_its_other_numbers(found):
-    wide = widened(found, 1.0)
+    wide = widen_posterior(found, found.posterior, 1.0)
     np.testing.assert_array_equal(wide.mean, found.posterior.mean)
     np.testing.assert_allclose(wide.covariance[:2, :2], found.posterior.covariance[:2, :2])

@@ -6,7 +6,7 @@ import optax
 import pytest
 
 from sim2real.train.config import PPOConfig
-from sim2real.train.ppo.optimiser import LEAST_RATE, MOST_RATE, adapt_rate, get_rate, make_optimiser, set_rate
+from sim2real.train.ppo.optimiser import MAX_RATE, MIN_RATE, adapt_rate, get_rate, make_optimiser, set_rate
 
 
 @pytest.mark.parametrize(
@@ -17,8 +17,8 @@ from sim2real.train.ppo.optimiser import LEAST_RATE, MOST_RATE, adapt_rate, get_
         (1e-3, 0.005, 1e-3),
         (1e-3, 0.0049, 1.5e-3),
         (1e-3, 0.0, 1e-3),
-        (1.2e-5, 1.0, LEAST_RATE),
-        (9e-3, 1e-4, MOST_RATE),
+        (1.2e-5, 1.0, MIN_RATE),
+        (9e-3, 1e-4, MAX_RATE),
     ],
 )
 def test_the_rate_moves_by_half_of_it_within_bounds(rate, kl, expected):

@@ -36,8 +36,8 @@ class Scalar(Coin):
 @pytest.mark.parametrize(
     ("env", "message"),
     [
-        (Constant(), "more than the policy in a Constant: it has no `privileged`"),
-        (Scalar(), r"must be a vector, it has shape \(\)"),
+        (Constant(), "a Constant has no privileged entries"),
+        (Scalar(), r"must return a vector, it has shape \(\)"),
     ],
 )
 def test_an_environment_that_shows_nothing_more_is_refused(env, message):
@@ -52,7 +52,7 @@ class Infinite(Coin):
 
 def test_what_is_no_number_is_named():
     config = dataclasses.replace(CONFIG, privileged=True, total_steps=1, num_envs=8, epochs=1)
-    with pytest.raises(Sim2RealError, match=r"entries \[1\] of what the value function sees besides[\s\S]*privileged"):
+    with pytest.raises(Sim2RealError, match=r"entries \[1\] of the privileged observation[\s\S]*privileged"):
         train(Infinite(), config, jax.random.key(0))
 
 

@@ -28,7 +28,7 @@ import json, os, sys
 from dataclasses import replace
 from pathlib import Path
 from sim2real.train.scale.hosts import HostsConfig
-from sim2real.train.scale.processes import in_words, join, leads
+from sim2real.train.scale.processes import join, leads, lost_process_errors
 
 number, folder = int(sys.argv[1]), Path(sys.argv[3])
 join(HostsConfig(coordinator=sys.argv[2], processes=2, process=number, timeout_s=20))
@@ -47,7 +47,7 @@ def stop(progress):
 
 def ended(config, report=None):
     try:
-        with in_words():
+        with lost_process_errors():
             train(Bandit(), config, key, report)
     except Sim2RealError as error:
         return str(error)
@@ -171,14 +171,19 @@ def test_who_is_ended_by_jax_ends_in_words_and_the_coordinator_listens_where_it_
         for process in every:
             process.kill()
     assert [process.returncode for process in every[1:]] == [1, 1], "no SIGABRT"
-    for number, said in ((1, ends[1][0]), (2, ends[2][1])):
-        assert f"process {number} of 3 lost another one of this training: JAX ended it, and says why above" in said
-        assert "hint: the reason is in the output of the process that ended first; `--resume newest`" in said
+    for number, output in ((1, ends[1][0]), (2, ends[2][1])):
+        assert (
+            f"process {number} of 3 lost another one of this training: JAX ended this process, for the reason above"
+            in output
+        )
+        assert "hint: the reason is in the output of the process that ended first; `--resume newest`" in output
 
 
 def test_each_process_says_who_can_join_and_where_the_coordinator_is_not_reached(monkeypatch):
     own = HostsConfig(coordinator="10.0.0.5:52700", processes=2, process=0)
-    assert "whoever reaches 10.0.0.5:52700 can join or end the training: use a network that you trust" in str(own)
+    assert "any program that reaches 10.0.0.5:52700 can join or end the training: use a network that you trust" in str(
+        own
+    )
     assert "trust" not in str(replace(own, process=1))
     assert "the coordinator's interfaces" in str(HostsConfig(found=True))
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_: [(0, 0, 0, "", ("127.0.1.1", 0))])
@@ -216,7 +221,7 @@ def test_processes_of_a_launcher_find_each_other(launcher):
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"found": True, "processes": 2}, "exclude it"),
+        ({"found": True, "processes": 2}, "excludes"),
         ({"coordinator": "here:1", "processes": 2}, "need all of"),
         ({"coordinator": "here", "processes": 2, "process": 0}, "must be HOST:PORT, got 'here'"),
         ({"coordinator": "here:1", "processes": 2, "process": 2}, r"must lie in \[0, 2\), got 2"),

@@ -72,7 +72,7 @@ def test_what_cannot_be_pushed_is_refused(loop):
         def step(self, step_state):
             return step_state, None
 
-    with pytest.raises(UsageError, match="a Wall cannot be pushed: nothing says where in its state velocities are"):
+    with pytest.raises(UsageError, match="a Wall cannot be pushed: it has no `velocity`"):
         Pushes.of(VariationConfig(push=1.0), Wall("wall", 50.0), 50.0)
     with pytest.raises(UsageError, match="must not exceed the policy's rate, 50 Hz, got 60"):
         Pushes.of(VariationConfig(push=1.0, push_hz=60.0), loop[0]["world"], 50.0)

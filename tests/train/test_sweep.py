@@ -11,7 +11,7 @@ from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
 from sim2real.train.ppo.initial_state import swept_numbers
 from sim2real.train.ppo.trainer import train
-from sim2real.train.sweep import SWEPT, Sweep, named
+from sim2real.train.sweep import SWEPT, Sweep, format_point
 
 CONFIG = PPOConfig(
     num_seeds=2, num_envs=16, minibatches=2, rollout_steps=4, total_steps=512, hidden=(4,), evaluations=2, eval_steps=3,
@@ -46,7 +46,7 @@ def test_the_best_is_of_all(swept):
 def test_a_grid_is_named_in_its_order():
     sweep = Sweep.parse(["learning-rate=1e-3,3e-3", "ppo.gamma=0.9"])
     assert sweep.names(2)[1:3] == ["learning_rate=0.001, gamma=0.9, seed 1", "learning_rate=0.003, gamma=0.9, seed 0"]
-    assert named(sweep.grid[1]) == "learning_rate=0.003, gamma=0.9"
+    assert format_point(sweep.grid[1]) == "learning_rate=0.003, gamma=0.9"
     np.testing.assert_array_equal(swept_numbers(sweep, 2)["learning_rate"], np.float32([1e-3, 1e-3, 3e-3, 3e-3]))
     assert Sweep.parse([]).grid == [{}]
 

@@ -57,9 +57,9 @@ def test_parameters_of_any_size_are_told_apart():
 def test_what_is_no_teacher_here_is_refused(teacher, student):
     with pytest.raises(UsageError, match=r"network 'gru' remembers[\s\S]*hint: train the teacher with"):
         check_teacher(Sign(), CONFIG, student.best)
-    with pytest.raises(UsageError, match=r"a student sees what a robot shows[\s\S]*hint: .*without --ppo.teacher"):
+    with pytest.raises(UsageError, match=r"a student observes only what a robot[\s\S]*hint: .*without --ppo.teacher"):
         check_teacher(Sign(), dataclasses.replace(CONFIG, teacher=True), teacher.best)
-    with pytest.raises(UsageError, match=r"the teacher sees 3 entries, 1 of them .* here it is 3, 2,"):
+    with pytest.raises(UsageError, match=r"the teacher observes 3 entries, 1 of them .* here it is 3, 2,"):
         check_teacher(Coin(), CONFIG, teacher.best)
-    with pytest.raises(UsageError, match="a Bandit: it has no `privileged`"):
+    with pytest.raises(UsageError, match="a Bandit has no privileged entries"):
         TeacherEnvironment(Bandit())

@@ -10,7 +10,7 @@ from sim2real.graph.schedule import draw
 from sim2real.robots.control_loop.loop import delay_bounds, simulated_loop
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.runtime.compilation.wiring import wire
-from sim2real.train.environment.timelines import Recorded, Stretches, draw_timelines
+from sim2real.train.environment.timelines import RecordedTiming, Stretches, draw_timelines
 
 RATE_HZ, SECONDS, CALM_S = 50.0, 40, 0.001
 COUNT = int(RATE_HZ * SECONDS)
@@ -26,7 +26,7 @@ def recorded(every, long_s, pauses=True):
     period = Spread.of(np.full(3, 1 / RATE_HZ))
     nodes = {n: NodeTiming(COUNT, period, period, Spread.of(s), {}) for n, s in steps.items()}
     transport = {"agent/sensor": np.full(COUNT, 2e-4), "actuator/agent": np.full(COUNT, np.nan)}
-    return Recorded.of(Timing(nodes, (), steps_s=steps, transport_s=transport), RATE_HZ, 0, pauses)
+    return RecordedTiming.of(Timing(nodes, (), steps_s=steps, transport_s=transport), RATE_HZ, 0, pauses)
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def loop():
         bounds = delay_bounds({"sensor_delay": 0.02, "actuator_delay": 0.02}, 0.01, 0.002)
         own = [BaseNode(n, RATE_HZ, delay=0.002, delay_dist=times.computation[n]) for n in NAMES]
         nodes = simulated_loop(*own, BaseWorld("world", 100.0), bounds)
-        times.transport_to(nodes)
+        times.set_transport(nodes)
         return nodes
 
     return make
@@ -55,14 +55,14 @@ def test_hiccups_keep_their_rate_and_hit_all_nodes_at_once(loop):
     assert sensor.mean() == pytest.approx(1 / 25, rel=0.15)
     size = min(sensor.shape[1], agent.shape[1])
     np.testing.assert_array_equal(sensor[:, :size], agent[:, :size])
-    assert (drawn.cut, drawn.again) == (0, 0)
+    assert (drawn.cut, drawn.redrawn) == (0, 0)
     assert drawn.longest_pause_s > 1.3 / RATE_HZ
 
 
 def test_a_lost_period_is_played_and_not_cut(loop):
     times = recorded(200, 0.03)
     drawn = draw_timelines(loop(times), "agent", 5.0, 16, 3, times)
-    assert drawn.cut == drawn.again == 0
+    assert drawn.cut == drawn.redrawn == 0
     assert drawn.longest_pause_s > 1.9 / RATE_HZ
     wiring = CompiledGraph(loop(times), "agent", drawn.timeline).wiring
     assert wiring.slots.count("agent") == 1
@@ -74,7 +74,7 @@ def test_an_episode_ends_before_a_pause_that_rows_do_not_hold(loop):
     drawn = draw_timelines(nodes, "agent", 5.0, 16, 3, times)
     whole = drawn.timeline.vertices["agent"].count
     assert 0 < drawn.cut == (drawn.steps < whole).sum() < 16
-    assert drawn.again > 0
+    assert drawn.redrawn > 0
     assert (drawn.steps >= whole // 2).all()
     assert computed(drawn, "sensor").max() < 0.15, "calm from the pause on"
     graph = CompiledGraph(nodes, "agent", drawn.timeline)
@@ -129,7 +129,7 @@ def test_recordings_of_one_robot_have_rings_of_one_length():
         bounds = delay_bounds({"sensor_delay": delay_s, "actuator_delay": 0.0104}, 0.01, 0.002)
         own = [BaseNode(n, RATE_HZ, delay=0.002, delay_dist=times.computation[n]) for n in NAMES]
         nodes = simulated_loop(*own, BaseWorld("world", 100.0), bounds)
-        times.transport_to(nodes)
+        times.set_transport(nodes)
         timeline = draw_timelines(nodes, "agent", 1.0, 4, 3, times).timeline
         rings.append([wire(nodes, "agent", timeline, reusable=reusable).rings for reusable in (False, True)])
     (one, same), (other, again) = rings

@@ -29,7 +29,7 @@ class Bounds(NamedTuple):
     alpha: Number
 
     def at(self, dist: TrainableDist, delay: Number | None) -> TrainableDist:
-        """Return a distribution at a delay [s], clipped to these bounds; None: at these numbers' own."""
+        """Return a distribution at a delay [s], clipped to these bounds; None: at ``alpha``."""
         if delay is None:
             return dist.replace(alpha=jnp.asarray(self.alpha))
         alpha = (jnp.asarray(delay, jnp.float32) - self.low) / self.span
@@ -46,10 +46,10 @@ DelayBounds = Mapping[str, Mapping[str, Bounds]]
 
 def bounds_of(nodes: Mapping[str, BaseNode]) -> dict[str, dict[str, Bounds]]:
     """Return the bounds of all trainable delays."""
-    found: dict[str, dict[str, Bounds]] = {}
+    bounds: dict[str, dict[str, Bounds]] = {}
     for name, node in nodes.items():
         for input_name, connection in node.inputs.items():
             if isinstance(dist := connection.delay_dist, TrainableDist):
                 numbers = (np.float32(dist.min), np.float32(dist.max - dist.min), dist.alpha)
-                found.setdefault(name, {})[input_name] = Bounds(*numbers)
-    return found
+                bounds.setdefault(name, {})[input_name] = Bounds(*numbers)
+    return bounds

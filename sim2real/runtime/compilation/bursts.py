@@ -15,8 +15,7 @@ from sim2real.graph.windows import overfull
 def make_room(nodes: Mapping[str, BaseNode], timeline: Timeline) -> dict[tuple[str, str], int]:
     """Lengthen, in place, the windows with a trainable delay that are too short for the bursts of a timeline.
 
-    Otherwise ``sim2real.graph.windows.check_bursts`` refuses such a timeline. Windows that are long enough stay as they
-    are.
+    Otherwise ``sim2real.graph.windows.check_bursts`` refuses such a timeline.
 
     Returns:
         (node, input) -> number of messages that were added to the window, for the windows that were too short.

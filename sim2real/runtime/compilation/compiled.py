@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from sim2real.runtime.compilation.walk import Walk
 from sim2real.runtime.compilation.wiring import Wiring, wire, wire_pattern
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.program_arguments import data_of, with_data
+from sim2real.types import Json, PyTree
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Number
@@ -48,22 +49,22 @@ class CompiledGraph:
     - ``observe`` and ``advance``: the same row by row. In some rows the supervisor makes no step.
 
     Running past the end of the timeline, stepping before a reset, and mixing the three ways are errors. Under ``jit``
-    and ``vmap`` the position in the timeline may not be known when the program is traced; past the end, and in an
-    episode that does not exist, the state then stays unchanged, and every step state and record has ``seq`` -1.
+    and ``vmap`` the position in the timeline may be traced; past the end, and in an episode that does not exist, the
+    state then stays unchanged, and every step state and record has ``seq`` -1.
 
     Args:
-        nodes: The nodes, by name or as a list. Those that are not in the timeline are left out.
+        nodes: The nodes, by name or as a list; nodes that are not in the timeline have no effect.
         supervisor: The node whose steps the caller of ``reset`` and ``step`` makes, usually the policy; or its name.
         timeline: Timelines of one or more episodes.
-        given: Nodes that are not run because their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
-        reusable: Whether the program should be that of the robot's other timelines too, given as ``data``.
+        given: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
+        reusable: Whether other timelines of the robot, given as ``data``, shall have the same program.
 
     Attributes:
         rows_per_pass: Unroll factor of ``rollout``'s loop over rows.
-        walk: Where the supervisor makes its steps.
+        walk: The steps of the supervisor in the rows.
 
     Raises:
-        UsageError: When nodes, connections and timeline do not fit each other.
+        UsageError: Nodes, connections and timeline do not fit each other.
     """
 
     def __init__(
@@ -71,7 +72,7 @@ class CompiledGraph:
         nodes: Mapping[str, BaseNode] | Sequence[BaseNode],
         supervisor: str | BaseNode,
         timeline: Timeline,
-        given: Mapping[str, Any] | None = None,
+        given: Mapping[str, PyTree] | None = None,
         reusable: bool = False,
     ) -> None:
         self.nodes = nodes_of(nodes, timeline)
@@ -82,13 +83,13 @@ class CompiledGraph:
         self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given), reusable)
         self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes, reusable=reusable)
         self.walk = Walk(self.program, self.supervisor)
-        # Unrolling halves how often a GPU copies the carried state: 100,000 pendulums on an H200 take 0.63 of the time
-        # with two rows (three: 0.66, four: 0.68). On a CPU it only makes compilation longer.
+        # Unrolling halves a GPU's copies of the carried state (docs/reference/choices.md); on a CPU it costs time to
+        # compile.
         self.rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
 
     @cached_property
     def repetition(self) -> Repetition | None:
-        """Runs whole episodes in a pattern that they all repeat; None without one, and where outputs are given."""
+        """The program of whole episodes in a pattern that they all repeat; None without a pattern, or with ``given``."""
         pattern = None if self.given else wire_pattern(self.nodes, self.supervisor, self.timeline)
         if pattern is not None and np.diff(pattern.full) < 2:
             return None
@@ -96,14 +97,14 @@ class CompiledGraph:
             return pattern and Repetition(self.nodes, pattern, self.episodes)
 
     @property
-    def data(self) -> Any:
-        """The numbers that follow from timelines, delays and nodes' own data; see ``HoldsData``."""
+    def data(self) -> PyTree:
+        """The numbers of timelines and delays, and the data of the nodes; see ``HoldsData``."""
         return self.program.data, {n: data_of(node) for n, node in self.nodes.items()}
 
-    def with_data(self, data: Any) -> CompiledGraph:
+    def with_data(self, data: PyTree) -> CompiledGraph:
         """Return a copy with other data, which may be traced; its rollouts run in rows."""
-        graph, (numbers, own) = copy.copy(self), data
-        graph.nodes = {n: with_data(node, own[n]) for n, node in self.nodes.items()}
+        graph, (numbers, of_nodes) = copy.copy(self), data
+        graph.nodes = {n: with_data(node, of_nodes[n]) for n, node in self.nodes.items()}
         graph.program = self.program.with_data(graph.nodes, numbers)
         graph.walk, graph.repetition = Walk(graph.program, self.supervisor), None
         return graph
@@ -129,13 +130,13 @@ class CompiledGraph:
 
     @property
     def turns(self) -> np.ndarray:
-        """Where the supervisor makes a step, bool of shape ``(episodes, rows)``."""
+        """Mask of the rows with a step of the supervisor, bool of shape ``(episodes, rows)``."""
         return np.any([self.wiring.tables[turn].seq >= 0 for turn in self.walk.turns], axis=0)
 
     def init(
         self,
         rng: jax.Array,
-        params: Mapping[str, Any] | None = None,
+        params: Mapping[str, PyTree] | None = None,
         order: Sequence[str] = (),
         eps: Number = 0,
     ) -> GraphState:
@@ -161,32 +162,29 @@ class CompiledGraph:
         return gs.replace(eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
 
     def reset(self, gs: GraphState) -> tuple[GraphState, StepState]:
-        """Run to the supervisor's first step.
-
-        Args:
-            gs: What ``init`` returned.
+        """Run from the state of ``init`` to the supervisor's first step.
 
         Returns:
-            The graph's state, whose ``seq`` has the number of the supervisor's next step; and what the supervisor sees.
+            The graph's state, whose ``seq`` has the number of the supervisor's next step; and its step state.
         """
         self._check_row_start(gs, "reset")
         return self.walk.to_first(gs)
 
     def step(
-        self, gs: GraphState, step_state: StepState | None = None, output: Any = None
+        self, gs: GraphState, step_state: StepState | None = None, output: PyTree = None
     ) -> tuple[GraphState, StepState]:
-        """Make the supervisor's step, and run to its next one.
+        """Make the supervisor's step, and run from there to its next one.
 
         Args:
-            gs: What ``reset`` or ``step`` returned.
+            gs: The state that ``reset`` or ``step`` returned.
             step_state: The supervisor's step state after the step; None: unchanged.
-            output: The step's output; None: the supervisor makes the step itself, from ``step_state``.
+            output: The step's output; None: the supervisor's ``step`` is called with ``step_state``.
 
         Returns:
-            The graph's state, and what the supervisor sees at its next step.
+            The graph's state, and the supervisor's next step state.
 
         Raises:
-            UsageError: Before ``reset``, or when the episode has no further step.
+            UsageError: ``reset`` was not called, or the episode has no further step.
         """
         self.walk.first_turn()
         k = self._awaited(gs, "step")
@@ -198,13 +196,13 @@ class CompiledGraph:
                     hint="start again with init() and reset(), or draw longer timelines",
                 )
         turn = self.walk.turn_of(gs, k)
-        before = self.walk.seen(gs, turn) if step_state is None else step_state
-        after, made = self.program.call(self.supervisor, before) if output is None else (before, output)
-        gs = self.program.commit(gs, self.supervisor, after, made, k >= 0)
+        before = self.walk.step_state(gs, turn) if step_state is None else step_state
+        after, output = self.program.call(self.supervisor, before) if output is None else (before, output)
+        gs = self.program.commit(gs, self.supervisor, after, output, k >= 0)
         return self.walk.to_next(gs, turn, k < 0)
 
     def run(self, gs: GraphState) -> GraphState:
-        """Let the supervisor make its next step itself, and run to the step after it.
+        """Make the supervisor's next step by its own ``step``, and run to the step after it.
 
         A state from ``init`` is reset first. With a scan, call ``reset`` before the loop: it adds an entry to ``seq``,
         and a loop's carry must keep its structure.
@@ -226,8 +224,8 @@ class CompiledGraph:
         """Run the rows of an episode, the supervisor making its own steps.
 
         Args:
-            gs: What ``init`` or another rollout returned.
-            rows: Number of rows; default: all that are left, or the whole episode if ``gs.step`` is traced. A whole
+            gs: The state that ``init`` or another rollout returned.
+            rows: Number of rows; default: all remaining rows, or the whole episode if ``gs.step`` is traced. A whole
                 episode runs in a pattern if there is one, see ``repetition``: to the world's last tick, in another
                 order of the records' places.
 
@@ -235,7 +233,7 @@ class CompiledGraph:
             The last state, and the records by node.
 
         Raises:
-            UsageError: When fewer than ``rows`` rows are left, or a node in ``record`` does not run.
+            UsageError: Fewer than ``rows`` rows remain, or a node in ``record`` does not run.
         """
         self._check_row_start(gs, "rollout")
         fresh = rows is None and not _traced(gs.step) and not int(gs.step)
@@ -247,7 +245,7 @@ class CompiledGraph:
         left = self.rows if _traced(gs.step) else self.rows - int(gs.step)
         rows = left if rows is None else rows
         if not 1 <= rows <= left:
-            raise UsageError(f"{left} of this graph's {self.rows} rows are left, {rows} were asked for")
+            raise UsageError(f"{left} of this graph's {self.rows} rows are left, rows={rows}")
         self._check_record(record)
         inside = not _traced(gs.step)
         end, records = scan_rows(lambda state: self._run_row(state, inside), gs, record, rows, self.rows_per_pass)
@@ -270,7 +268,7 @@ class CompiledGraph:
                 raise UsageError(f"no node {name!r} runs that could be recorded. Nodes: {', '.join(running)}")
 
     def observe(self, gs: GraphState, inside: bool = False) -> tuple[GraphState, StepState, Number]:
-        """Run a row up to the supervisor's step, and return what the supervisor sees.
+        """Run a row up to the supervisor's step.
 
         Args:
             inside: Promise that the row is not past the end of the timeline, because episodes end earlier, and that
@@ -280,7 +278,7 @@ class CompiledGraph:
             The graph's state; the supervisor's step state; and whether the supervisor makes a step in this row.
 
         Raises:
-            UsageError: When the supervisor makes several steps in one row.
+            UsageError: The supervisor makes several steps in one row.
         """
         self._check_row_start(gs, "observe")
         turn = self.walk.only_turn()
@@ -289,11 +287,10 @@ class CompiledGraph:
         step_state = self.program.step_state(gs, turn, inside)
         return gs.replace(seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
 
-    def advance(self, gs: GraphState, step_state: StepState, output: Any, inside: bool = False) -> GraphState:
+    def advance(self, gs: GraphState, step_state: StepState, output: PyTree, inside: bool = False) -> GraphState:
         """Take the supervisor's step and run the rest of the row; the counterpart of ``observe``.
 
         Args:
-            gs: What ``observe`` returned.
             output: The step's output; ignored in a row without a step.
             inside: As in ``observe``.
 
@@ -307,15 +304,15 @@ class CompiledGraph:
         gs = self.program.run_slots(gs, turn + 1, len(self.wiring.slots), {}, inside)
         return self.program.run_world(gs, {}, inside)
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> dict[str, Json]:
         """Return figures of the compiled program.
 
         Returns:
             ``episodes``, ``rows``, ``ticks_per_row``, ``slots`` (the nodes whose steps a row computes, in order),
             ``supervisor_slots``, ``supervisor_steps``, ``longest_gap`` (most rows between two steps of the supervisor),
             ``discarded`` (fraction of the computed steps whose result is not used), ``rings`` (number of outputs kept,
-            by node), ``bursts`` (``node/input`` -> the most messages that one step consumes, the first step left out,
-            and the length of its window), ``bytes_per_copy`` (size of the carried state).
+            by node), ``bursts`` (``node/input`` -> the most messages that one step after the first consumes, and the
+            length of its window), ``bytes_per_copy`` (size of the carried state).
         """
         return report_of(self.walk, jax.eval_shape(self.init, jax.random.key(0)))
 
@@ -352,10 +349,10 @@ class CompiledGraph:
 
 
 def _known(gs: GraphState) -> bool:
-    """Return whether it is known that the timelines have the state's episode and row: both were checked."""
+    """Return whether episode and row are numbers, which were checked against the timelines, and not traced."""
     return not (_traced(gs.step) or _traced(gs.eps))
 
 
-def _traced(x: Any) -> bool:
+def _traced(x: PyTree) -> bool:
     """Return whether a value is traced, or an array with several values."""
     return isinstance(x, Tracer) or np.ndim(x) > 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -13,26 +12,27 @@ from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import NEVER
+from sim2real.types import PyTree
 
 
 def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timeline) -> dict[str, BaseNode]:
     """Return the nodes of a timeline by name.
 
     Raises:
-        UsageError: When two nodes have the same name, or a node of the timeline is missing.
+        UsageError: Two nodes have the same name, or a node of the timeline is missing.
     """
-    found = by_name(nodes)
-    lost = [n for n in timeline.vertices if n not in found]
-    if lost:
-        raise UsageError(f"the timeline holds node {lost[0]!r}, which was not given. Nodes: {', '.join(found)}")
-    return {n: node for n, node in found.items() if n in timeline.vertices}
+    named = by_name(nodes)
+    missing = [n for n in timeline.vertices if n not in named]
+    if missing:
+        raise UsageError(f"the timeline holds node {missing[0]!r}, which was not given. Nodes: {', '.join(named)}")
+    return {n: node for n, node in named.items() if n in timeline.vertices}
 
 
 def supervisor_of(supervisor: BaseNode | str, nodes: Mapping[str, BaseNode]) -> str:
     """Return the supervisor's name; ``supervisor`` is the name or the node.
 
     Raises:
-        UsageError: When it is neither, or is not the object that has its name in the graph.
+        UsageError: It is neither, or is not the object that has its name in the graph.
     """
     if not isinstance(supervisor, str | BaseNode):
         raise UsageError(f"the supervisor is one node, or its name, got {supervisor!r}")
@@ -41,16 +41,17 @@ def supervisor_of(supervisor: BaseNode | str, nodes: Mapping[str, BaseNode]) -> 
     return supervisor if isinstance(supervisor, str) else supervisor.name
 
 
-def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[str, Any]) -> None:
+def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[str, PyTree]) -> None:
     """Check that nodes, connections and timeline fit each other, and that the nodes can be compiled.
 
     Args:
         nodes: The nodes of the timeline, by name.
-        given: Nodes that do not run because their outputs are known: node -> recorded outputs, leaves ``(E, N, ...)``.
+        given: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
 
     Raises:
-        UsageError: Naming the first node or connection that does not fit.
+        UsageError: A node or connection does not fit; the message names the first one.
     """
+    # Nodes, and recorded outputs.
     for name, node in nodes.items():
         if not node.jittable and name not in given:
             raise UsageError(
@@ -65,6 +66,8 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[
         )
     for name, recorded in given.items():
         _check_given(name, recorded, timeline)
+
+    # Every input of a node has messages in the timeline, and the reverse.
     wanted = {(n, i) for n, node in nodes.items() for i, c in node.inputs.items() if c.output_node.name in nodes}
     for name, input_name in sorted(wanted - set(timeline.edges)):
         raise UsageError(
@@ -75,6 +78,8 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[
         raise UsageError(
             f"the timeline has messages for input {input_name!r} of node {name!r}, which has no such input"
         )
+
+    # Steps and messages are in the order of time.
     for name, vertex in timeline.vertices.items():
         if (np.diff(vertex.start, axis=1) < 0).any():
             raise UsageError(f"the steps of node {name!r} are not in the order of time")
@@ -88,7 +93,7 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[
             )
 
 
-def _check_given(name: str, recorded: Any, timeline: Timeline) -> None:
+def _check_given(name: str, recorded: PyTree, timeline: Timeline) -> None:
     """Check that there is a recorded output for every step of every episode."""
     steps = int(timeline.vertices[name].count.max(initial=0))
     for path, leaf in jax.tree_util.tree_flatten_with_path(recorded)[0]:

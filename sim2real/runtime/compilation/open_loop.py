@@ -1,15 +1,14 @@
-"""A graph in which no computed message returns to an earlier node, run node by node, with its timing as an argument.
+"""A graph without a loop of computed messages, run node by node, with its timing as an argument.
 
-Identification replays recorded commands: the world hears them, the sensor hears the world. Such a graph needs no rows
+Identification replays recorded commands to the world, and the world's outputs to the sensor. Such a graph needs no rows
 and no rings of outputs (``sim2real.runtime.compilation.compiled``): each node makes all of its steps, then its readers
-make theirs and look messages up by ``seq``. The program depends on the number of steps alone: it serves every log.
+make their steps and look messages up by ``seq``. The program depends only on the number of steps: it serves every log.
 """
 
 from __future__ import annotations
 
 import graphlib
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,11 +23,12 @@ from sim2real.runtime.compilation.fit import check_fit
 from sim2real.runtime.compilation.wiring import messages_read
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.match import matched
+from sim2real.types import PyTree
 
-Tables = dict[str, Any]
+Tables = dict[str, PyTree]
 """Node -> ``seq`` and ``ts`` of its steps, leaves ``(E, K)``, and for each of its ``inputs`` the window that a step
 reads: ``seq``, ``sent``, ``received``, ``lead``, leaves ``(E, K, W)``. Behind an episode's last step ``seq`` is -1."""
-Step = Callable[[StepState], tuple[StepState, Any]]
+Step = Callable[[StepState], tuple[StepState, PyTree]]
 
 
 class OpenLoopGraph:
@@ -36,25 +36,25 @@ class OpenLoopGraph:
 
     Args:
         supervisor: Name of the node that ``init_graph_state`` initialises first.
-        given: Nodes that are not run because their outputs are known.
+        given: Nodes that do not run, as their outputs are recorded.
 
     Attributes:
         order: The computed nodes, senders before readers.
         world: The fastest of them that is a world; None without a world.
 
     Raises:
-        UsageError: When computed nodes hear each other in a loop.
+        UsageError: Computed nodes form a loop.
     """
 
     def __init__(self, nodes: Mapping[str, BaseNode], supervisor: str, given: Collection[str]) -> None:
         self.nodes, self.supervisor, self.given = dict(nodes), supervisor, frozenset(given)
-        heard = {
+        senders = {
             n: {c.output_node.name for c in node.inputs.values()} - self.given
             for n, node in self.nodes.items()
             if n not in self.given
         }
         try:
-            self.order = tuple(graphlib.TopologicalSorter(heard).static_order())
+            self.order = tuple(graphlib.TopologicalSorter(senders).static_order())
         except graphlib.CycleError as error:
             raise UsageError(
                 f"nodes hear each other in a loop: {' -> '.join(error.args[1])}",
@@ -63,14 +63,14 @@ class OpenLoopGraph:
         worlds = [self.nodes[n] for n in self.order if isinstance(self.nodes[n], BaseWorld)]
         self.world = max(worlds, key=lambda n: n.rate).name if worlds else None
 
-    def tables(self, timeline: Timeline, given: Mapping[str, Any]) -> Tables:
+    def tables(self, timeline: Timeline, given: Mapping[str, PyTree]) -> Tables:
         """Return the timing of all computed steps.
 
         Args:
             given: Node -> recorded outputs, leaves ``(E, N, ...)``.
 
         Raises:
-            UsageError: When nodes and timeline do not fit, or a window is too short for a burst of messages.
+            UsageError: Nodes and timeline do not fit, or a window is too short for a burst of messages.
         """
         check_fit(self.nodes, timeline, given)
         check_bursts(self.nodes, timeline)
@@ -84,11 +84,11 @@ class OpenLoopGraph:
             tables[name] = {"seq": seq.astype(np.int32), "ts": ts, "inputs": inputs}
         return tables
 
-    def begin(self, params: Mapping[str, Any], defaults: Mapping[str, Any], eps: Any) -> GraphState:
+    def begin(self, params: Mapping[str, PyTree], defaults: Mapping[str, PyTree], eps: PyTree) -> GraphState:
         """Return the state in which an episode starts.
 
         Args:
-            params: Parameters of some nodes; the others' come from ``init_params``.
+            params: Parameters of some nodes; the other nodes' come from ``init_params``.
             defaults: Default outputs that replace those of ``init_output``: node -> a message.
             eps: The episode's number, which steps receive.
         """
@@ -102,46 +102,46 @@ class OpenLoopGraph:
         self,
         gs: GraphState,
         tables: Tables,
-        given: Mapping[str, Any],
+        given: Mapping[str, PyTree],
         record: str,
-        known: Mapping[str, Any] | None = None,
-    ) -> Any:
+        known: Mapping[str, PyTree] | None = None,
+    ) -> PyTree:
         """Run an episode and return a node's outputs, leaves ``(K, ...)``.
 
         Args:
-            gs: What ``begin`` returned.
-            tables: Of this episode: leaves ``(K, ...)``.
+            gs: The state that ``begin`` returned.
+            tables: Those of this episode: leaves ``(K, ...)``.
             given: Node -> its recorded messages, leaves ``(N, ...)``.
             known: Outputs of nodes that were computed elsewhere: node -> leaves ``(1 + K, ...)``, the default first.
         """
         sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in given.items()} | dict(known or {})
         for name in self.order:
             if name not in sent:
-                made = self._scan(name, gs, tables[name], sent, self._called(name, gs))
+                outputs = self._scan(name, gs, tables[name], sent, self._step_of(name, gs))
                 if name == record:
-                    return made
-                sent[name] = _with_default(gs.aux[OUTPUTS][name], made)
+                    return outputs
+                sent[name] = _with_default(gs.aux[OUTPUTS][name], outputs)
         raise UsageError(f"no node {record!r} runs that could be recorded. Nodes: {', '.join(self.order)}")
 
-    def drive(self, gs: GraphState, tables: Tables, given: Mapping[str, Any], step: Step) -> Any:
+    def drive(self, gs: GraphState, tables: Tables, given: Mapping[str, PyTree], step: Step) -> PyTree:
         """Run the world's ticks with another function in place of its step, for physics outside of the program.
 
         Args:
-            gs: What ``begin`` returned.
+            gs: The state that ``begin`` returned.
             tables: As in ``run``.
-            given: As in ``run``; the world may hear no other nodes.
+            given: As in ``run``, for all senders of the world.
             step: Maps the world's step state to the next one and to a result.
 
         Returns:
             The results, leaves ``(ticks, ...)``.
 
         Raises:
-            UsageError: When there is no world, or it hears a node that is not given.
+            UsageError: There is no world, or one of its senders is not in ``given``.
         """
         if self.world is None:
             raise UsageError("drive() is for graphs with a world, this one has none")
-        world, heard = self.world, [c.output_node.name for c in self.nodes[self.world].inputs.values()]
-        if live := [n for n in heard if n not in given]:
+        world, senders = self.world, [c.output_node.name for c in self.nodes[self.world].inputs.values()]
+        if live := [n for n in senders if n not in given]:
             raise UsageError(
                 f"drive() needs all messages that the world {world!r} hears, and {live[0]!r} is not given",
                 hint="give its recorded outputs",
@@ -150,29 +150,26 @@ class OpenLoopGraph:
         return self._scan(world, gs, tables[world], sent, step, ahead=True)
 
     def _scan(
-        self, name: str, gs: GraphState, table: Tables, sent: Mapping[str, Any], step: Step, ahead: bool = False
-    ) -> Any:
-        """Make all steps of a node; ``ahead`` looks up the messages of all steps before the first one is made."""
+        self, name: str, gs: GraphState, table: Tables, sent: Mapping[str, PyTree], step: Step, ahead: bool = False
+    ) -> PyTree:
+        """Make all steps of a node; ``ahead`` looks up the messages of all steps before the first step."""
 
-        def one(carry: Any, now: Tables) -> tuple[Any, Any]:
+        def one(carry: PyTree, now: Tables) -> tuple[PyTree, PyTree]:
             rng, state, params = carry
             inputs = now["inputs"] if ahead else self._inputs(name, gs, now, sent)
-            new, made = step(StepState(rng, state, params, inputs, gs.eps, now["seq"], now["ts"]))
-            after = matched(name, "the state that step returns", new.state, "the one it got", state)
-            return (
-                new.rng,
-                after,
-                matched(name, "the params that step returns", new.params, "the ones it got", params),
-            ), made
+            new, output = step(StepState(rng, state, params, inputs, gs.eps, now["seq"], now["ts"]))
+            state = matched(name, "the state that step returns", new.state, "the one it got", state)
+            params = matched(name, "the params that step returns", new.params, "the ones it got", params)
+            return (new.rng, state, params), output
 
         if ahead:
             table = {**table, "inputs": jax.vmap(lambda now: self._inputs(name, gs, now, sent))(table)}
         return jax.lax.scan(one, (gs.rng[name], gs.state[name], gs.params[name]), table)[1]
 
-    def _called(self, name: str, gs: GraphState) -> Step:
+    def _step_of(self, name: str, gs: GraphState) -> Step:
         """Return a node's step, with its output in the form of its default output."""
 
-        def step(step_state: StepState) -> tuple[StepState, Any]:
+        def step(step_state: StepState) -> tuple[StepState, PyTree]:
             try:
                 new, output = self.nodes[name].step(step_state)
             except Exception as error:
@@ -182,8 +179,8 @@ class OpenLoopGraph:
 
         return step
 
-    def _inputs(self, name: str, gs: GraphState, now: Tables, sent: Mapping[str, Any]) -> dict[str, InputState]:
-        """Return what one step reads."""
+    def _inputs(self, name: str, gs: GraphState, now: Tables, sent: Mapping[str, PyTree]) -> dict[str, InputState]:
+        """Return the inputs of one step."""
         node, inputs = self.nodes[name], {}
         for input_name, t in now["inputs"].items():
             connection = node.inputs[input_name]
@@ -192,13 +189,13 @@ class OpenLoopGraph:
             dist = gs.delays.get(name, {}).get(input_name)
             if dist is not None:
                 period_s = 1.0 / node.rate
-                served = dist.apply(state, t["lead"], connection.window, period_s, now["ts"], connection.skip)
-                state = served.replace(delay_dist=dist)
+                delayed = dist.apply(state, t["lead"], connection.window, period_s, now["ts"], connection.skip)
+                state = delayed.replace(delay_dist=dist)
             inputs[input_name] = state
         return inputs
 
 
-def _with_default(default: Any, rows: Any) -> Any:
+def _with_default(default: PyTree, rows: PyTree) -> PyTree:
     """Return messages ``(N, ...)`` behind the default output: message k is at place k + 1, an empty slot at place 0."""
     return jax.tree_util.tree_map(lambda first, rest: jnp.concatenate([first[None], jnp.asarray(rest)]), default, rows)
 

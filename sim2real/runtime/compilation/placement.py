@@ -1,9 +1,9 @@
-"""Chooses where in the compiled program each step of a timeline is computed: in which row, and in which slot of it.
+"""The row and the slot of the compiled program in which each step of a timeline is computed.
 
 The program is a loop over **rows**. A row is one boundary, at which steps of the nodes are computed in a fixed sequence
 of **slots**, followed by n world ticks. The world ticks on a fixed grid and always runs. A step may be computed at any
-time after the last tick whose output it sees and before the first tick that its own output affects, so there is
-usually a boundary in between, also if boundaries are several ticks apart. Pure numpy, before anything is compiled.
+time after the last tick that it depends on and before the first tick that depends on its output, so there is usually a
+boundary in between, also if boundaries are several ticks apart. Pure numpy, before anything is compiled.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from sim2real.graph.windows import newest_message
 from sim2real.runtime.compilation.slots import Heard, Steps, arrange
 
 _UNREAD = np.int64(2**40)
-"""Tick at which an output is needed that nobody reads: later than any."""
+"""Tick at which an output without a reader is needed: later than any."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the steps are computed.
+    """The rows and slots of all steps.
 
     Attributes:
         ticks: Number of world ticks in a row; 1 without a world.
         rows: Number of rows in an episode.
-        row: Each step's row; steps with a row after the last one are not computed.
-        slot: Each step's slot in its row.
-        slots: The node of each slot, in the order in which slots run.
+        row: Row of each step; steps with a row after the last one are not computed.
+        slot: Slot of each step in its row.
+        slots: Node of each slot, in the order in which slots run.
         offsets: Number of the row's ticks before each slot: 0, except in a pattern (``pattern.py``).
         last: Number of ticks in the last row.
     """
@@ -53,7 +53,7 @@ class Placer:
 
     Args:
         supervisor: The supervisor's name; a row is at most as long as its period.
-        given: Nodes whose outputs are known beforehand, so that they are not computed.
+        given: Nodes with recorded outputs, which are not computed.
 
     Attributes:
         nodes: The nodes of the timeline, senders before readers.
@@ -78,7 +78,7 @@ class Placer:
         """Place all steps.
 
         Raises:
-            UsageError: When the timeline is shorter than one row, or steps wait for each other's messages.
+            UsageError: The timeline is shorter than one row, or steps wait for each other's messages.
         """
         if self.world is None:
             row = self._rows_of_supervisor()
@@ -95,7 +95,7 @@ class Placer:
         return np.broadcast_to(np.arange(shape[1], dtype=np.int64), shape)
 
     def valid(self, name: str) -> np.ndarray:
-        """Return which of a node's steps belong to the episode, shape ``(E, N)``, bool."""
+        """Return the mask of a node's steps that belong to the episode, shape ``(E, N)``, bool."""
         return self.steps(name) < self.timeline.vertices[name].count[:, None]
 
     def live(self) -> Iterator[tuple[str, Edge, np.ndarray]]:
@@ -112,25 +112,26 @@ class Placer:
         ticks need two slots in rows of four ticks, and one in rows of three.
         """
         rate = self.nodes[self.world or ""].rate
-        most = min(world_ticks, max(1, int(np.ceil(rate / self.nodes[self.supervisor].rate))))
-        lowest, highest = self.slack(2 * most)
-        found = []
-        for n in range(most, 0, -1):
+        longest = min(world_ticks, max(1, int(np.ceil(rate / self.nodes[self.supervisor].rate))))
+        lowest, highest = self.slack(2 * longest)
+        placements = []
+        for n in range(longest, 0, -1):
+            # Every slack interval must contain a boundary, a multiple of n.
             if n > 1 and not all((-(-lowest[o] // n) * n <= highest[o])[self.valid(o)].all() for o in self.others):
                 continue
-            found.append(self.fill(n, world_ticks // n, self._rows(lowest, highest, n)))
-        if not found:
+            placements.append(self.fill(n, world_ticks // n, self._rows(lowest, highest, n)))
+        if not placements:
             raise UsageError("these timelines have no tick of the world", hint="draw longer timelines")
-        return min(found, key=lambda p: (p.slots.count(self.supervisor), len(p.slots) / p.ticks))
+        return min(placements, key=lambda p: (p.slots.count(self.supervisor), len(p.slots) / p.ticks))
 
-    def slack(self, most: int) -> tuple[Steps, Steps]:
+    def slack(self, max_ticks: int) -> tuple[Steps, Steps]:
         """Return the earliest and the latest tick before which each step can be computed.
 
         Args:
-            most: Largest number of ticks from a step's start to the latest.
+            max_ticks: Largest number of ticks from a step's start to the latest.
         """
         lowest = self._earliest()
-        return lowest, self._latest(lowest, most)
+        return lowest, self._latest(lowest, max_ticks)
 
     def fill(self, ticks: int, rows: int, row: Steps) -> Placement:
         """Return the placement for given rows of the steps; steps after the last row need no slot."""

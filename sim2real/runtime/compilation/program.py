@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.runtime.compilation.bounds import DelayBounds, bounds_of
 from sim2real.runtime.compilation.wiring import SlotTable, Wiring
 from sim2real.runtime.match import check_match, matched
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Number
@@ -34,16 +35,16 @@ class Rollout(NamedTuple):
     """
 
     seq: Number
-    output: Any
+    output: PyTree
 
 
 class RowProgram:
     """Traces rows; its tables, constants or those of ``with_data``, are looked up at the state's ``eps`` and ``step``.
 
     Args:
-        given: Nodes that are not run: node -> recorded outputs, leaves ``(E, N, ...)``.
-        ages: For each slot: input -> smallest and largest age in the table. Without an entry, any age is possible that
-            the sender's ring has.
+        given: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
+        ages: For each slot: input -> smallest and largest age in the table. Without an entry, all ages of the sender's
+            ring are possible.
         reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
     """
 
@@ -51,7 +52,7 @@ class RowProgram:
         self,
         nodes: Mapping[str, BaseNode],
         wiring: Wiring,
-        given: Mapping[str, Any],
+        given: Mapping[str, PyTree],
         episodes: int,
         ages: Sequence[Mapping[str, Ages]] | None = None,
         reusable: bool = False,
@@ -67,17 +68,17 @@ class RowProgram:
         self._ages = ages or [{} for _ in wiring.tables]
 
     @property
-    def data(self) -> Any:
+    def data(self) -> PyTree:
         """The tables, and the bounds of trainable delays; see ``HoldsData``."""
         return self._tables, self._world, self.bounds
 
-    def with_data(self, nodes: Mapping[str, BaseNode], data: Any) -> RowProgram:
+    def with_data(self, nodes: Mapping[str, BaseNode], data: PyTree) -> RowProgram:
         """Return the program with other nodes and data, which may be traced."""
         program = copy.copy(self)
         program.nodes, (program._tables, program._world, program.bounds) = nodes, data
         return program
 
-    def check_given(self, outputs: Mapping[str, Any]) -> None:
+    def check_given(self, outputs: Mapping[str, PyTree]) -> None:
         """Check that recorded outputs have the form of their nodes' default outputs."""
         for name, recorded in self._given.items():
             one = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), recorded)
@@ -124,21 +125,21 @@ class RowProgram:
             # Unrolled on a GPU, where a loop adds latency. On a CPU a loop costs the pendulum nothing, and MuJoCo's
             # worlds compile in half the time.
             unroll = 1 if jax.default_backend() == "cpu" else self.wiring.ticks
-            gs, made = jax.lax.scan(partial(self.run_tick, name), gs, self.world_row(gs), unroll=unroll)
+            gs, ticks = jax.lax.scan(partial(self.run_tick, name), gs, self.world_row(gs), unroll=unroll)
             if here is not None:
-                made = made._replace(seq=jnp.where(here, made.seq, -1))
+                ticks = ticks._replace(seq=jnp.where(here, ticks.seq, -1))
             outputs.setdefault(name, []).extend(
-                jax.tree_util.tree_map(lambda leaf, i=i: leaf[i], made) for i in range(self.wiring.ticks)
+                jax.tree_util.tree_map(lambda leaf, i=i: leaf[i], ticks) for i in range(self.wiring.ticks)
             )
         gs = gs.replace(step=gs.step + 1)
         return gs if here is None else select(here, gs, before)
 
-    def world_row(self, gs: GraphState) -> Any:
+    def world_row(self, gs: GraphState) -> PyTree:
         """Return the entries of the world's table for a row, leaves ``(ticks, ...)``."""
         return _at(self._world, gs)
 
     def run_tick(
-        self, name: str, gs: GraphState, now: Mapping[str, Any], ages: Mapping[str, Ages] | None = None
+        self, name: str, gs: GraphState, now: Mapping[str, PyTree], ages: Mapping[str, Ages] | None = None
     ) -> tuple[GraphState, Rollout]:
         """Run one tick of the world.
 
@@ -149,7 +150,7 @@ class RowProgram:
         new, output = self.call(name, step_state)
         return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
 
-    def call(self, name: str, step_state: StepState) -> tuple[StepState, Any]:
+    def call(self, name: str, step_state: StepState) -> tuple[StepState, PyTree]:
         """Call a node's step; an exception gets a note with the node's name."""
         try:
             return self.nodes[name].step(step_state)
@@ -176,12 +177,10 @@ class RowProgram:
         """Return whether the timelines have the state's episode and row; XLA clamps an index that they lack."""
         return (gs.step < self.wiring.rows) & (gs.eps >= 0) & (gs.eps < self.episodes)
 
-    def commit(self, gs: GraphState, name: str, new: StepState, output: Any, ran: Number | None) -> GraphState:
+    def commit(self, gs: GraphState, name: str, new: StepState, output: PyTree, ran: Number | None) -> GraphState:
         """Put the results of a node's step into the graph's state.
 
         Args:
-            new: The step state that the step returned.
-            output: The output that it returned.
             ran: Bool scalar, whether the step counts; None: it does, which saves masking.
         """
 
@@ -191,42 +190,47 @@ class RowProgram:
             fresh = matched(name, f"the {field} that step returns", fresh, "the one it got", old)
             return fresh if ran is None else select(ran, fresh, old)
 
-        changed: dict[str, Any] = {
+        changed: dict[str, PyTree] = {
             field: {**getattr(gs, field), name: merge(field, getattr(new, field), getattr(gs, field)[name])}
             for field in ("state", "rng")
         }
         if new.params is not gs.params[name]:
             changed["params"] = {**gs.params, name: merge("params", new.params, gs.params[name])}
         if name in gs.buffer:
-            kept = gs.buffer[name]
-            fresh = matched(name, "the output of step", output, "that of init_output", kept[-1])
-            pushed = (*kept[1:], fresh)
-            changed["buffer"] = {**gs.buffer, name: pushed if ran is None else select(ran, pushed, kept)}
+            ring = gs.buffer[name]
+            fresh = matched(name, "the output of step", output, "that of init_output", ring[-1])
+            pushed = (*ring[1:], fresh)
+            changed["buffer"] = {**gs.buffer, name: pushed if ran is None else select(ran, pushed, ring)}
         return gs.replace(**changed)
 
-    def _step_state(self, gs: GraphState, name: str, table: Mapping[str, Any], ages: Mapping[str, Ages]) -> StepState:
+    def _step_state(
+        self, gs: GraphState, name: str, table: Mapping[str, PyTree], ages: Mapping[str, Ages]
+    ) -> StepState:
         inputs = {}
         for input_name, t in table["inputs"].items():
             connection = self.nodes[name].inputs[input_name]
             width, age = connection.total_window, t["age"]
             sender = connection.output_node.name
+            # Messages: recorded ones by seq, computed ones by their age in the sender's ring.
             if sender in self._given:
                 data = self._look_up(gs, sender, t["seq"])
             else:
-                kept = gs.buffer[sender]
-                data = _window(kept, age, width, *ages.get(input_name, (0, len(kept) - width)))
-            dist = gs.delays.get(name, {}).get(input_name)
+                ring = gs.buffer[sender]
+                data = _window(ring, age, width, *ages.get(input_name, (0, len(ring) - width)))
             state = InputState(t["seq"], t["sent"], t["received"], data)
+
+            # A trainable delay picks or interpolates within the window.
+            dist = gs.delays.get(name, {}).get(input_name)
             if dist is not None:
                 period = 1.0 / self.nodes[name].rate
-                own = self.bounds[name][input_name].opened(dist)
-                served = own.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
-                state = served.replace(delay_dist=dist)
+                opened = self.bounds[name][input_name].opened(dist)
+                delayed = opened.apply(state, t["lead"], connection.window, period, table["ts"], connection.skip)
+                state = delayed.replace(delay_dist=dist)
             inputs[input_name] = state
         rng, state, params = (part[name] for part in (gs.rng, gs.state, gs.params))
         return StepState(rng, state, params, inputs, gs.eps, table["seq"], table["ts"])
 
-    def _look_up(self, gs: GraphState, sender: str, seq: jax.Array) -> Any:
+    def _look_up(self, gs: GraphState, sender: str, seq: jax.Array) -> PyTree:
         """Return the recorded messages with these ``seq (W,)``; the default output where it is -1."""
 
         def one(recorded: jax.Array, default: jax.Array) -> jax.Array:
@@ -236,17 +240,16 @@ class RowProgram:
         return jax.tree_util.tree_map(one, self._given[sender], gs.buffer[sender])
 
 
-def _window(kept: tuple[T, ...], age: jax.Array, width: int, least: int, most: int) -> T:
-    """Return a window of ``width`` of a node's last outputs, oldest first; ``age`` newer ones are left out.
+def _window(ring: tuple[T, ...], age: jax.Array, width: int, min_age: int, max_age: int) -> T:
+    """Return a window of ``width`` of a node's last outputs, oldest first, without the ``age`` newest ones.
 
-    ``age`` is from ``least`` to ``most``. The outputs are kept as separate arrays and chosen by selects, which XLA
-    fuses with other elementwise operations. One stacked array would cost a GPU a concatenation, a copy and a gather per
-    leaf.
+    The outputs are separate arrays, chosen by selects, which XLA fuses with other elementwise operations. One stacked
+    array would cost a GPU a concatenation, a copy and a gather per leaf.
     """
-    begin = len(kept) - width
-    window = list(kept[begin - least : len(kept) - least])
-    for a in range(least + 1, most + 1):
-        window = [select(age == a, kept[begin - a + i], window[i]) for i in range(width)]
+    begin = len(ring) - width
+    window = list(ring[begin - min_age : len(ring) - min_age])
+    for a in range(min_age + 1, max_age + 1):
+        window = [select(age == a, ring[begin - a + i], window[i]) for i in range(width)]
     return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *window)
 
 
@@ -268,8 +271,8 @@ def scan_rows(
 
     def body(state: GraphState, _: None) -> tuple[GraphState, dict[str, Rollout]]:
         state, outputs = row(state)
-        kept = {n: outputs.get(n, []) for n in record}
-        return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *k) for n, k in kept.items() if k}
+        recorded = {n: outputs.get(n, []) for n in record}
+        return state, {n: jax.tree_util.tree_map(lambda *x: jnp.stack(x), *r) for n, r in recorded.items() if r}
 
     gs, records = jax.lax.scan(body, gs, length=rows, unroll=unroll)
     # (rows, per row, ...) -> (C, ...); counted, as -1 cannot be inferred for a leaf of size 0
@@ -283,7 +286,7 @@ def select(mask: Number, new: T, old: T) -> T:
     MJX's data is one leaf: its own ``where`` skips fields that need no merging.
     """
 
-    def one(a: Any, b: Any) -> Any:
+    def one(a: PyTree, b: PyTree) -> PyTree:
         if a is b:
             return b
         return b.where(mask, a) if _is_mjx_data(b) else jnp.where(mask, a, b)
@@ -291,7 +294,7 @@ def select(mask: Number, new: T, old: T) -> T:
     return jax.tree_util.tree_map(one, new, old, is_leaf=_is_mjx_data)
 
 
-def has_mjx_data(tree: Any) -> bool:
+def has_mjx_data(tree: PyTree) -> bool:
     """Return whether a state of MJX is among the leaves of a tree."""
     return any(_is_mjx_data(leaf) for leaf in jax.tree_util.tree_leaves(tree, is_leaf=_is_mjx_data))
 
@@ -300,7 +303,7 @@ def _is_mjx_data(leaf: object) -> bool:
     return type(leaf).__module__.startswith("mujoco.mjx") and hasattr(leaf, "where")
 
 
-def _pytree(table: SlotTable | None) -> dict[str, Any]:
+def _pytree(table: SlotTable | None) -> dict[str, PyTree]:
     if table is None:
         return {}
     inputs = {n: {f: getattr(t, f) for f in t.__dataclass_fields__} for n, t in table.inputs.items()}

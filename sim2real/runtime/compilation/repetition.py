@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
 from sim2real.runtime.compilation.program import Ages, Rollout, RowProgram, scan_rows
 from sim2real.runtime.compilation.wiring import InputTable, Wiring
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,7 +29,7 @@ class Repetition:
 
     def __init__(self, nodes: Mapping[str, BaseNode], wiring: Wiring, episodes: int) -> None:
         self.nodes, self.wiring = nodes, wiring
-        self.world: Any = wiring.world
+        self.world = wiring.world or ""
         ages = [{n: _range(t.age[s.seq >= 0]) for n, t in s.inputs.items()} for s in wiring.tables]
         self.program = RowProgram(nodes, wiring, {}, episodes, ages)
         inputs = wiring.world_table.inputs if wiring.world_table else {}
@@ -47,9 +48,12 @@ class Repetition:
             The last state, and the records by node. In its buffers, outputs that the loop does not carry are the
             default ones.
         """
+        # Carry only the outputs that a later row reads.
         wiring, (begin, end), before = self.wiring, self.wiring.full, gs.buffer
-        default = {n: kept[-1] for n, kept in before.items()}
+        default = {n: ring[-1] for n, ring in before.items()}
         gs = gs.replace(buffer={n: (default[n],) * count for n, count in self._carried.items() if count})
+
+        # Rows before, within and after the range in which each slot makes a step, then the last row.
         parts = []
         for rows, ticks, full in (
             (begin, wiring.ticks, False),
@@ -60,11 +64,11 @@ class Repetition:
             if rows > 0:
                 gs, part = scan_rows(partial(self._row, default, ticks, full), gs, record, rows, 1)
                 parts.append(part)
-        buffer = {n: (*kept, *gs.buffer[n])[-len(kept) :] for n, kept in before.items()}
+        buffer = {n: (*ring, *gs.buffer[n])[-len(ring) :] for n, ring in before.items()}
         return gs.replace(buffer=buffer), jax.tree_util.tree_map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
     def _row(
-        self, default: Mapping[str, Any], ticks: int, full: bool, gs: GraphState
+        self, default: Mapping[str, PyTree], ticks: int, full: bool, gs: GraphState
     ) -> tuple[GraphState, dict[str, list[Rollout]]]:
         """Run one row with its first ``ticks`` ticks; ``full``: each slot makes a step."""
         wiring, carried = self.wiring, gs.buffer
@@ -76,8 +80,8 @@ class Repetition:
         for slot, (begin, end) in enumerate(self._stretches()):
             for i in range(min(begin, ticks), min(end, ticks)):
                 entries = jax.tree_util.tree_map(lambda leaf, i=i: leaf[i], now)
-                gs, made = self.program.run_tick(self.world, gs, entries, self._tick_ages[i])
-                outputs.setdefault(self.world, []).append(made)
+                gs, tick = self.program.run_tick(self.world, gs, entries, self._tick_ages[i])
+                outputs.setdefault(self.world, []).append(tick)
             gs = self.program.run_slots(gs, slot, min(slot + 1, len(wiring.slots)), outputs, inside=True, full=full)
         buffer = {n: gs.buffer[n][-count:] for n, count in self._carried.items() if count}
         return gs.replace(step=gs.step + 1, buffer=buffer), outputs
@@ -88,7 +92,7 @@ class Repetition:
         return zip((0, *ends[:-1]), ends, strict=True)
 
     def _needed(self) -> Iterator[tuple[str, int]]:
-        """Yield (sender, how many outputs from before the row are read) of each input of each slot and tick."""
+        """Yield (sender, number of outputs from before the row that are read) of each input of each slot and tick."""
         wiring = self.wiring
         ran = [table.seq >= 0 for table in wiring.tables]
         world = wiring.world_table.inputs if wiring.world_table else {}

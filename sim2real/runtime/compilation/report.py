@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 
 from sim2real.runtime.compilation.walk import Walk
+from sim2real.types import Json, PyTree
 
 
-def report_of(walk: Walk, state: Any) -> dict[str, Any]:
-    """Return what ``CompiledGraph.report`` describes.
-
-    Args:
-        walk: Where the supervisor makes its steps, and the program.
-        state: The carried state, or its shapes.
-    """
+def report_of(walk: Walk, state: PyTree) -> dict[str, Json]:
+    """Return the result of ``CompiledGraph.report``; ``state`` is the carried state, or its shapes."""
     program, w = walk.program, walk.program.wiring
     windows = {(n, i): program.nodes[n].inputs[i].total_window for n, i in w.bursts}
     return {

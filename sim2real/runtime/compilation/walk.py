@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Walk:
-    """Knows where in the rows the supervisor makes its steps, and runs from one to the next.
+    """Finds the supervisor's steps in the rows, and runs from one to the next.
 
     The supervisor may have several slots in a row; its i-th one is called turn i.
 
@@ -51,43 +51,35 @@ class Walk:
 
     def last_row(self, steps: np.ndarray) -> np.ndarray:
         """Return the row of the last of an episode's first ``steps (E,)`` steps that is computed, ``(E,)``."""
-        there = (np.arange(self.places.shape[1]) < steps[:, None]) & (self.places < self.end)
-        return np.where(there, self.places, 0).max(axis=1, initial=0) // max(1, len(self.turns))
+        computed = (np.arange(self.places.shape[1]) < steps[:, None]) & (self.places < self.end)
+        return np.where(computed, self.places, 0).max(axis=1, initial=0) // max(1, len(self.turns))
 
     def first_turn(self) -> int:
-        """Return the supervisor's first slot.
-
-        Raises:
-            UsageError: When it has none.
-        """
+        """Return the supervisor's first slot; raise a ``UsageError`` if it has none."""
         if self.turns:
             return self.turns[0]
         if self.supervisor == self.program.wiring.world:
             raise UsageError(
-                f"the supervisor {self.supervisor!r} is the world: it ticks in every row, and nobody takes its place",
+                f"the supervisor {self.supervisor!r} is the world: it ticks in every row, and its steps have no turn",
                 hint="make the node that acts the supervisor, or use rollout(), which works with any",
             )
         raise UsageError(f"the outputs of the supervisor {self.supervisor!r} are given: it makes no steps")
 
     def only_turn(self) -> int:
-        """Return the supervisor's only slot.
-
-        Raises:
-            UsageError: When it has none, or several.
-        """
+        """Return the supervisor's only slot; raise a ``UsageError`` if it has none, or several."""
         first = self.first_turn()
         if len(self.turns) > 1:
             raise UsageError(
                 f"the supervisor {self.supervisor!r} makes up to {len(self.turns)} steps in a row of these timelines",
-                hint="draw timelines without bursts, leave the episodes with a hiccup out, or use reset() and step()",
+                hint="draw timelines without bursts, remove the episodes with a hiccup, or use reset() and step()",
             )
         return first
 
     def to_first(self, gs: GraphState) -> tuple[GraphState, StepState]:
         """Run from the start of an episode to the supervisor's first step."""
         gs = self.program.run_slots(gs, 0, self.first_turn(), {})
-        found = self.program.seq(gs, self.turns[0]) >= 0
-        return self._stand(*self._search(gs, jnp.int32(0), found, int(self.places[:, 0].max())))
+        arrived = self.program.seq(gs, self.turns[0]) >= 0
+        return self._at_step(*self._search(gs, jnp.int32(0), arrived, int(self.places[:, 0].max())))
 
     def turn_of(self, gs: GraphState, k: Number) -> jax.Array:
         """Return the turn at which the supervisor makes step ``k``."""
@@ -99,20 +91,20 @@ class Walk:
         Args:
             gs: The graph's state, with the supervisor's step done.
             turn: The turn of that step.
-            ended: Bool scalar: the episode has no further step, and the state stays as it is.
+            ended: Bool scalar: the episode has no further step, and the state stays unchanged.
         """
-        return self._stand(*self._search(gs, turn, ended, int(np.diff(self.places, axis=1).max(initial=1))))
+        return self._at_step(*self._search(gs, turn, ended, int(np.diff(self.places, axis=1).max(initial=1))))
 
-    def seen(self, gs: GraphState, turn: jax.Array) -> StepState:
-        """Return what the supervisor sees at a turn; ``seq`` is -1 if it makes no step there."""
+    def step_state(self, gs: GraphState, turn: jax.Array) -> StepState:
+        """Return the supervisor's step state at a turn; ``seq`` is -1 if it makes no step there."""
         step_state = self.program.step_state(gs, self.turns[0])
         for i, slot in enumerate(self.turns[1:], start=1):
             step_state = select(turn == i, self.program.step_state(gs, slot), step_state)
         return step_state
 
-    def _stand(self, gs: GraphState, turn: jax.Array) -> tuple[GraphState, StepState]:
-        """Return the state with the supervisor's next step noted in ``seq``, and what the supervisor sees."""
-        step_state = self.seen(gs, turn)
+    def _at_step(self, gs: GraphState, turn: jax.Array) -> tuple[GraphState, StepState]:
+        """Return the state, whose ``seq`` has the supervisor's next step, and the supervisor's step state."""
+        step_state = self.step_state(gs, turn)
         return gs.replace(seq={self.supervisor: step_state.seq}), step_state
 
     def _hop(self, gs: GraphState, i: int) -> GraphState:
@@ -124,27 +116,30 @@ class Walk:
         gs = self.program.run_world(gs, {}, inside=True)
         return self.program.run_slots(gs, 0, self.turns[0], {})
 
-    def _search(self, gs: GraphState, turn: jax.Array, found: Number, hops: int) -> tuple[GraphState, jax.Array]:
+    def _search(self, gs: GraphState, turn: jax.Array, arrived: Number, hops: int) -> tuple[GraphState, jax.Array]:
         """Run from turn to turn until the supervisor makes a step; return the state and the turn.
 
-        Always runs ``hops`` turns, the most that any step needs: once the step is found, and after the last row, the
-        state is masked. As a loop, so that the program has the size of one row however many are run.
+        The loop always runs ``hops`` turns, the most that any step needs. After the step, and after the last row, the
+        state is masked.
         """
         turns = len(self.turns)
 
-        def sweep(carry: Any, _: None) -> tuple[Any, None]:
-            gs, turn, found = carry
+        def sweep(
+            carry: tuple[GraphState, jax.Array, jax.Array], _: None
+        ) -> tuple[tuple[GraphState, jax.Array, jax.Array], None]:
+            gs, turn, arrived = carry
             for i in range(turns):
-                active = ~found & self.program.within(gs)
+                active = ~arrived & self.program.within(gs)
                 active = active if turns == 1 else active & (turn == i)
                 gs = select(active, self._hop(gs, i), gs)
-                arrived = (i + 1) % turns
-                turn = jnp.where(active, arrived, turn)
-                found = found | (active & (self.program.seq(gs, self.turns[arrived]) >= 0))
-            return (gs, turn, found), None
+                following = (i + 1) % turns
+                turn = jnp.where(active, following, turn)
+                arrived = arrived | (active & (self.program.seq(gs, self.turns[following]) >= 0))
+            return (gs, turn, arrived), None
 
-        sweeps = hops if turns == 1 else -(-hops // turns) + (hops > 0)  # one more, as it starts at any turn
-        carry = (gs, jnp.asarray(turn, jnp.int32), jnp.asarray(found))
+        # One sweep more than the hops need, as the first may start at any turn.
+        sweeps = hops if turns == 1 else -(-hops // turns) + (hops > 0)
+        carry = (gs, jnp.asarray(turn, jnp.int32), jnp.asarray(arrived))
         if sweeps == 1:
             carry, _ = sweep(carry, None)
         elif sweeps:

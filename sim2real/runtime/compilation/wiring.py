@@ -1,4 +1,4 @@
-"""Turns timelines into index tables: which step each slot of each row computes, and which messages the step reads.
+"""Turns timelines into index tables: the step that each slot of each row computes, and the messages that it reads.
 
 A row is a fixed sequence of **slots**, in which steps of the nodes are computed, followed by n world ticks. In a
 pattern (``pattern.py``) the slots stand between the ticks. ``placement.py`` decides which step is computed where. Pure
@@ -29,7 +29,7 @@ class InputTable:
     """The messages in an input's window, for every episode and row (and tick of the row, for a world).
 
     Attributes:
-        age: Shape ``(E, R, ...)``, int32: how many outputs the sender has made since the newest message in the window.
+        age: Shape ``(E, R, ...)``, int32: number of the sender's outputs since the newest message in the window.
         seq: Shape ``(E, R, ..., W)``, int32: -1 in empty slots.
         sent: Like ``seq``, float32 [s].
         received: Like ``seq``, float32 [s].
@@ -66,12 +66,12 @@ class Wiring:
         world: Name of the world that ticks in every row; None without a world.
         ticks: Number of world ticks in a row.
         rows: Number of rows.
-        slots: The node of each slot, in the order in which slots run.
+        slots: Node of each slot, in the order in which slots run.
         tables: One for each slot.
         world_table: The world's; arrays ``(E, R, ticks, ...)``.
-        rings: Node -> how many of its last outputs are kept.
+        rings: Node -> number of its last outputs that the program carries.
         discarded: Fraction of the slots, over all rows, that compute no step.
-        bursts: (node, input) -> the most messages that one step consumes, the first step left out.
+        bursts: (node, input) -> the most messages that one step after the first consumes.
         offsets: Number of the row's ticks before each slot.
         last: Number of ticks in the last row.
     """
@@ -115,12 +115,12 @@ def wire(
 
     Args:
         supervisor: The supervisor's name; a row is at most as long as its period.
-        given: Nodes whose outputs are known beforehand: they get no slot; readers look up their messages by ``seq``.
-        reusable: Whether rings are made longer than these timelines need, so that most timelines of a robot have rings
-            of the same lengths.
+        given: Nodes with recorded outputs: they get no slot; readers look up their messages by ``seq``.
+        reusable: Whether rings are longer than these timelines need, so that most timelines of a robot have rings of
+            the same lengths.
 
     Raises:
-        UsageError: When the supervisor is not in the timeline, the timeline is shorter than one row, or a window with a
+        UsageError: The supervisor is not in the timeline, the timeline is shorter than one row, or a window with a
             trainable delay is too short for a burst of messages.
     """
     if supervisor not in timeline.vertices:
@@ -222,7 +222,7 @@ class _Tables:
     def _table(self, name: str, seq: np.ndarray, moment: np.ndarray, ticks: np.ndarray) -> SlotTable:
         """Return the table of steps ``seq (E, C)``.
 
-        ``moment (C,)`` is when the program computes each, ``ticks (C,)`` how many ticks the world has then made.
+        ``moment (C,)`` is the time at which the program computes each, ``ticks (C,)`` the world's number of ticks then.
         """
         ts = np.where(seq >= 0, np.take_along_axis(self.timeline.vertices[name].start, seq.clip(0), 1), 0)
         inputs = {}
@@ -230,26 +230,26 @@ class _Tables:
             if key[0] != name:
                 continue
             if edge.sender in self.placer.given:
-                made = None
+                count = None
             elif edge.sender == self.world:
-                made = np.broadcast_to(ticks, seq.shape)
+                count = np.broadcast_to(ticks, seq.shape)
             else:
-                made = search_rows(self.done[edge.sender], np.broadcast_to(moment, seq.shape))
-            inputs[key[1]] = self._input_table(key, seq, ts, made)
+                count = search_rows(self.done[edge.sender], np.broadcast_to(moment, seq.shape))
+            inputs[key[1]] = self._input_table(key, seq, ts, count)
         return SlotTable(seq.astype(np.int32), (ts / TICKS_PER_S).astype(np.float32), inputs)
 
     def _input_table(
-        self, key: tuple[str, str], seq: np.ndarray, ts: np.ndarray, made: np.ndarray | None
+        self, key: tuple[str, str], seq: np.ndarray, ts: np.ndarray, count: np.ndarray | None
     ) -> InputTable:
         """Return the messages that steps read on an input.
 
-        ``seq (E, C)`` and ``ts (E, C)`` [ticks] are the steps and their starts; ``made (E, C)`` is how many steps the
-        sender has then made, None if its outputs are given.
+        ``seq (E, C)`` and ``ts (E, C)`` [ticks] are the steps and their starts; ``count (E, C)`` is the number of the
+        sender's steps before each, None if its outputs are recorded.
         """
         connection, edge = self.nodes[key[0]].inputs[key[1]], self.placer.edges[key]
         sender: Vertex = self.timeline.vertices[edge.sender]
         newest = np.take_along_axis(self.placer.newest[key], seq.clip(0), 1)
-        age = np.zeros_like(seq) if made is None else np.where(seq >= 0, made - 1 - newest, 0)
+        age = np.zeros_like(seq) if count is None else np.where(seq >= 0, count - 1 - newest, 0)
         if (age < 0).any():
             raise UsageError(
                 f"input {key[1]!r} of node {key[0]!r} would read a message that has not been computed",
@@ -274,7 +274,7 @@ class _Tables:
                 if sender in self.placer.given:
                     continue
                 room = int(t.age.max(initial=0))
-                # 2, 4, 8 ...; a robot that was late once reads older messages, another recording of it none.
+                # 2, 4, 8 ...; a recording with a late step reads older messages than another recording of the robot.
                 if self.reusable and (room or not connection.blocking):
                     room = max(2, 1 << (room - 1).bit_length())
                 rings[sender] = max(rings[sender], room + connection.total_window)

@@ -54,8 +54,8 @@ class MessageChannel:
         """Deliver a message, which arrives now; called by the sender.
 
         Args:
-            seq: The sender's step that made it.
-            sent: When it was sent [ticks].
+            seq: Number of the sender's step.
+            sent: Time at which it was sent [ticks].
             leaves: The message, as ``Format.pack`` returns it.
         """
         with self._condition:
@@ -78,7 +78,7 @@ class MessageChannel:
             Arrival of the last one [ticks]; 0 if there is none.
 
         Raises:
-            Stopped: When the graph stopped meanwhile.
+            Stopped: The graph stopped meanwhile.
         """
         if self._quota is None:
             return 0
@@ -94,6 +94,7 @@ class MessageChannel:
     def take(self, k: int, begin: int) -> list[Message]:
         """Return the messages that step ``k``, which starts at ``begin`` [ticks], consumes (rule 6)."""
         with self._condition:
+            # Count the messages at the head of the queue that belong to this step.
             if not self._queue:
                 due = 0
             elif self._quota is not None:
@@ -115,7 +116,7 @@ class MessageChannel:
         return (self._record(m, -1) for m in (*self._taken, *self._queue))
 
     def _due(self, upto: int) -> int:
-        """Return how many queued messages have a ``seq`` below ``upto``."""
+        """Return the number of queued messages with a ``seq`` below ``upto``."""
         return min(len(self._queue), max(0, upto - self._queue[0].seq)) if self._queue else 0
 
     def _record(self, m: Message, seq_in: int) -> MessageRecord:

@@ -12,11 +12,11 @@ from sim2real.runtime.failure import GraphTimeout, Stopped
 
 
 class Reply(NamedTuple):
-    """The caller's answer to a step state that it was offered.
+    """The caller's answer to an offered step state.
 
     Attributes:
         step_state: The step state after the step; None: unchanged.
-        leaves: The step's output, as ``Format.pack`` returns it; None: the node makes the step itself.
+        leaves: The step's output, as ``Format.pack`` returns it; None: the node's ``step`` is called.
     """
 
     step_state: StepState | None = None
@@ -24,7 +24,7 @@ class Reply(NamedTuple):
 
     @property
     def own(self) -> bool:
-        """Whether the node makes the step itself, from ``step_state``."""
+        """Whether the node's ``step`` is called with ``step_state``."""
         return self.leaves is None
 
 
@@ -32,7 +32,7 @@ class Handover:
     """The supervisor offers its step state and waits; the caller observes it and replies.
 
     Args:
-        own: Whether the node makes its steps itself at first, without waiting for a caller.
+        own: Whether the node makes its own steps at first, without waiting for a caller.
     """
 
     def __init__(self, own: bool) -> None:
@@ -45,11 +45,11 @@ class Handover:
 
     @property
     def own(self) -> bool:
-        """Whether the node makes its steps itself."""
+        """Whether the node makes its own steps."""
         return self._own
 
     def set_own(self, own: bool) -> None:
-        """Choose who makes the steps from now on, the one on offer included: the node itself, or the caller."""
+        """Let the node, or else the caller, make the steps from now on, the one on offer included."""
         with self._condition:
             self._own = own
             if own:
@@ -66,8 +66,8 @@ class Handover:
         """Offer a step and wait for the reply; called by the supervisor's thread.
 
         Raises:
-            Stopped: When the graph stopped meanwhile.
-            GraphTimeout: When there was no reply in time.
+            Stopped: The graph stopped meanwhile.
+            GraphTimeout: There was no reply in time.
         """
         with self._condition:
             if not self._own:
@@ -88,26 +88,26 @@ class Handover:
             return Reply()
 
     def finished(self) -> None:
-        """Count a step that has been made, sent and recorded; called by the supervisor's thread."""
+        """Count a step after it was sent and recorded; called by the supervisor's thread."""
         with self._condition:
             self._finished += 1
             self._condition.notify_all()
 
     def observe(self, timeout_s: float) -> StepState | None:
-        """Wait for a step on offer and return it; None if the time was up or the graph stopped. For the caller."""
+        """Wait for a step on offer and return it; None after a timeout or when the graph stopped. For the caller."""
         with self._condition:
             self._condition.wait_for(lambda: self._offered is not None or self._closed, timeout_s)
             return None if self._closed else self._offered
 
     def reply(self, reply: Reply) -> int:
-        """Reply to the step on offer, for the caller; return the value of ``finished`` once that step is finished."""
+        """Reply to the step on offer, for the caller; return the number of finished steps after it."""
         with self._condition:
             self._offered, self._reply = None, reply
             self._condition.notify_all()
             return self._finished + 1
 
     def settle(self, finished: int, timeout_s: float) -> bool:
-        """Wait until ``finished`` steps are finished, for the caller; return whether they are."""
+        """Wait until ``finished`` steps are finished, for the caller; return False after a timeout."""
         with self._condition:
             self._condition.wait_for(lambda: self._finished >= finished or self._closed, timeout_s)
             return self._finished >= finished

@@ -22,14 +22,14 @@ from sim2real.runtime.wall_clock.handover import Handover, Reply
 
 
 class Shared:
-    """What the threads of one episode share: the clock, the signal to stop, and the first failure.
+    """The common state of an episode's threads: the clock, the signal to stop, and the first failure.
 
     Args:
         recorder: Receives all steps and messages, or None.
         graph_state: The state at the episode's start.
         wake: Called when the graph stops: wakes threads that wait for messages or for the caller.
-        spin: How long before each step a thread polls the clock instead of sleeping [ticks].
-        answer_timeout_s: How long the supervisor waits for its caller [s].
+        spin: Time before each step in which a thread polls the clock instead of sleeping [ticks].
+        answer_timeout_s: Longest wait of the supervisor for its caller [s].
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Shared:
         self._delivered = False
 
     def stop(self, timeout_s: float) -> None:
-        """Tell every thread to end; each node's ``stop`` gets ``timeout_s`` [s]."""
+        """Signal every thread to end; each node's ``stop`` gets ``timeout_s`` [s]."""
         self.timeout_s = timeout_s
         self._end()
 
@@ -90,11 +90,11 @@ class NodeThread(threading.Thread):
 
     Attributes:
         ready: Set once the startup has succeeded or failed.
-        over: Set when nobody needs to wait for the thread any more: it has ended, or its step hangs.
+        over: Set when the thread has ended, or its step hangs: other threads need not wait for it any more.
         made_safe: Whether another thread has called the node's ``stop``.
         failed: Whether the graph stopped because a step of this node hangs.
-        during: What the thread is doing: ``startup``, ``step 12`` or ``stop``.
-        since_s: When the running startup or step began, on the machine's monotonic clock [s]; None while neither runs.
+        during: The call in progress: ``startup``, ``step 12`` or ``stop``.
+        since_s: Begin of the running startup or step, on the machine's monotonic clock [s]; None while neither runs.
     """
 
     def __init__(
@@ -119,7 +119,8 @@ class NodeThread(threading.Thread):
     def run(self) -> None:
         """Run until the graph stops; the ``stop`` of a node whose startup was called is called in every case."""
         try:
-            if not self.shared.stopping.is_set():  # stopped before the startup: nothing was switched on
+            # A graph that was stopped before the startup has switched on no hardware.
+            if not self.shared.stopping.is_set():
                 self._live()
         finally:
             self.ready.set()

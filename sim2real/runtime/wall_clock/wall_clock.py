@@ -32,10 +32,10 @@ class WallClockRun:
     Args:
         graph_state: The state at the episode's start.
         recorder: Receives all steps and messages, or None.
-        own: Whether the supervisor makes its steps itself.
-        spin_s: How long before each step a thread polls the clock instead of sleeping [s].
-        timeout_s: How long the supervisor waits for its caller [s].
-        step_timeout_s: How long a step may take, see ``step_limits``.
+        own: Whether the supervisor makes its own steps.
+        spin_s: Time before each step in which a thread polls the clock instead of sleeping [s].
+        timeout_s: Longest wait of the supervisor for its caller [s].
+        step_timeout_s: Longest time of a step, see ``step_limits``.
     """
 
     def __init__(
@@ -97,12 +97,14 @@ class WallClockRun:
                     self._shared.fail(
                         GraphTimeout(
                             f"node {name!r} has not finished its startup after {timeout_s:g} s",
-                            hint="see what it waits for, or start with a longer timeout_s",
+                            hint="check the device that it waits for, or start with a longer timeout_s",
                         )
                     )
         self.check()
         with self._stop_lock:
             self._refuse_if_stopped()
+
+        # All nodes are ready: start the clock.
         self._clock.begin(_LEAD_S)
         for node in self._nodes.values():
             node.set_clock(self._clock.now_s, self._clock.origin_ns)
@@ -134,7 +136,7 @@ class WallClockRun:
         return step_state
 
     def reply(self, reply: Reply) -> int:
-        """Reply to the step on offer; return how many steps are finished once that one is."""
+        """Reply to the step on offer; return the number of finished steps after it."""
         return self._handover.reply(reply)
 
     def settle(self, finished: int, timeout_s: float) -> None:
@@ -153,7 +155,7 @@ class WallClockRun:
             self._handover.set_own(False)
 
     def wait(self, timeout_s: float | None) -> bool:
-        """Wait until the graph stops; return False if the time was up before."""
+        """Wait until the graph stops; return False after a timeout."""
         ended = self._shared.stopping.wait(timeout_s)
         self.check()
         return ended
@@ -181,12 +183,13 @@ class WallClockRun:
         return {name: thread.log.summary() for name, thread in self._threads.items()}
 
     def _wake(self) -> None:
-        """Wake threads that wait for messages or for the caller: neither will come any more."""
+        """Wake threads that wait for messages or for the caller."""
         self._handover.close()
         for channel in self._channels.values():
             channel.stop()
 
     def _end(self, deadline: float) -> None:
+        # Wait for the threads.
         begin = time.monotonic()
         for thread in self._threads.values():
             if thread.ident is not None:
@@ -195,6 +198,8 @@ class WallClockRun:
                     thread.join(max(0.0, deadline - time.monotonic()))
         self._watchdog.finish()
         self._process.close()
+
+        # Make the nodes safe whose threads did not end.
         for name, thread in self._threads.items():
             if thread.is_alive() and not thread.failed:
                 if not thread.made_safe:
@@ -204,7 +209,7 @@ class WallClockRun:
                     GraphTimeout(
                         f"node {name!r} is still in its {thread.during} {waited_s:.1f} s after the stop; "
                         "its stop() was called from outside",
-                        hint="give what it waits for a timeout of its own",
+                        hint="give its device or its wait a timeout",
                     )
                 )
         for node in self._nodes.values():
@@ -224,7 +229,7 @@ class WallClockRun:
         except Exception as error:  # as a note, if a node has failed: that failure must still reach the caller
             self._shared.fail(Sim2RealError(f"the recorder failed at the end: {type(error).__name__}: {error}"))
 
-    def _missing(self, what: str) -> NoReturn:
+    def _missing(self, message: str) -> NoReturn:
         if self.ended:
             raise Sim2RealError("the graph was stopped while a step was awaited", hint="call reset() to start it again")
-        raise GraphTimeout(what, hint="is one of its blocking inputs silent?")
+        raise GraphTimeout(message, hint="is one of its blocking inputs silent?")

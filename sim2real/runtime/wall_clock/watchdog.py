@@ -11,22 +11,22 @@ from sim2real.runtime.clock import keep_time
 from sim2real.runtime.failure import GraphTimeout
 from sim2real.runtime.wall_clock.node_thread import NodeThread, Shared
 
-LEAST_S, PERIODS = 1.0, 10.0
-"""By default a step counts as hanging after ``PERIODS`` periods of its node, but not before ``LEAST_S`` [s]: on a busy
-laptop a step may well be delayed by a few hundred milliseconds."""
+MIN_LIMIT_S, PERIODS = 1.0, 10.0
+"""By default a step counts as hanging after ``PERIODS`` periods of its node, but not before ``MIN_LIMIT_S`` [s]: on a
+busy laptop a step can be delayed by a few hundred milliseconds."""
 LAST_RESORT_S = 1.0
-"""How long to wait for a node's ``stop`` that is called from another thread than the node's [s]."""
+"""Longest wait for a node's ``stop`` that another thread than the node's calls [s]."""
 _GRACE_S = 0.2
-"""How long a startup may go on after the graph was stopped, before the node's ``stop`` is called [s]."""
+"""Longest time of a startup after the graph was stopped, before the node's ``stop`` is called [s]."""
 
 
 def step_limits(nodes: Mapping[str, BaseNode], limit_s: float | None) -> dict[str, float]:
-    """Return how long a step of each node may take [s].
+    """Return the longest time of a step of each node [s].
 
     ``limit_s`` is the limit for all nodes; 0: no limit; None: the default, ten periods of the node but at least 1 s.
     """
     if limit_s is None:
-        return {name: max(LEAST_S, PERIODS / node.rate) for name, node in nodes.items()}
+        return {name: max(MIN_LIMIT_S, PERIODS / node.rate) for name, node in nodes.items()}
     return dict.fromkeys(nodes, limit_s or float("inf"))
 
 
@@ -34,7 +34,7 @@ class Watchdog(threading.Thread):
     """Stops the graph when a step takes too long, and calls ``stop`` of a node whose own thread is busy.
 
     Args:
-        limits: Node name -> how long a step may take [s].
+        limits: Node name -> longest time of a step [s].
     """
 
     def __init__(self, threads: Iterable[NodeThread], limits: Mapping[str, float], shared: Shared) -> None:
@@ -62,7 +62,7 @@ class Watchdog(threading.Thread):
             self.join()
 
     def _look(self, thread: NodeThread, now: float, stopped_s: float) -> float:
-        """Act if a thread has exceeded its limit; return how long it may still go on before the next check [s]."""
+        """Act if a thread has exceeded its limit; return the time until the next check [s]."""
         limit = self._limits[thread.node.name]
         since, during = thread.since_s, thread.during
         if since is None:
@@ -77,7 +77,7 @@ class Watchdog(threading.Thread):
             self._shared.fail(
                 GraphTimeout(
                     f"node {thread.node.name!r} hangs: its {during} has taken {limit:g} s, so the graph stopped",
-                    hint="give what it waits for a timeout of its own, or AsyncGraph a longer step_timeout_s",
+                    hint="give its device or its wait a timeout, or AsyncGraph a longer step_timeout_s",
                 )
             )
         thread.make_safe_from_outside(LAST_RESORT_S)

@@ -1,9 +1,9 @@
-"""Observations on which what will run is compared with what was trained, before a bundle is written."""
+"""Observations for the comparison of a bundle's runner with JAX, before the bundle is written."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -19,13 +19,37 @@ from sim2real.robots.control_loop.loop_robot import LoopRobot
 from sim2real.robots.control_loop.policy_node import in_numpy
 from sim2real.stages.terminal.console import note
 from sim2real.train.networks.policy import Policy
+from sim2real.types import Array, PyTree
 
-MOST = 1000
-"""Observations of one source that are compared."""
+MAX_OBSERVATIONS = 1000
+"""Number of observations of one source that are compared."""
 
 
-def logged(identification: Identification | None, run_dir: Path) -> Recording | None:
-    """Return the recording that was identified from, where it is still there: training does not need it."""
+@runtime_checkable
+class _Agent(Protocol):
+    """A supervisor with the methods of a ``TrainingTask``."""
+
+    name: str
+
+    def init_params(self, rng: jax.Array | None, graph_state: GraphState) -> PyTree:
+        """Return the parameters."""
+        ...
+
+    def init_state(self, rng: jax.Array | None, graph_state: GraphState) -> PyTree:
+        """Return the state."""
+        ...
+
+    def observe(self, step_state: StepState) -> jax.Array:
+        """Return the observation, shape ``(O,)``."""
+        ...
+
+    def act(self, step_state: StepState, action: Array) -> tuple[StepState, PyTree]:
+        """Return the new step state and the output."""
+        ...
+
+
+def load_recording(identification: Identification | None, run_dir: Path) -> Recording | None:
+    """Return the recording of an identification; None without its file, which training does not need."""
     if identification is None or not identification.logs:
         return None
     path = run_dir / identification.logs[0].path
@@ -37,31 +61,36 @@ def logged(identification: Identification | None, run_dir: Path) -> Recording | 
 
 
 def observations_of(robot: LoopRobot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
-    """Return what a policy would have seen of a recording's measurements, had it been asked, ``(N, O)``.
+    """Return the observations ``(N, O)`` that a policy would get from a recording's measurements.
 
     Args:
-        runner: The policy, whose actions are part of what it sees later.
+        runner: The policy, whose actions are part of its later observations.
     """
-    agent: Any = robot.make_agent()  # with observe and act, as training asks of it
-    sensor = robot.roles.sensor
+    agent, sensor = robot.make_agent(), robot.roles.sensor
+    if not isinstance(agent, _Agent):
+        raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
+
+    # Arrange the recorded readings as the leaves of a message.
     leaves, form = jax.tree_util.tree_flatten(robot.at_rest)
     columns = [recording.episode.outputs[sensor][name] for name in named_leaves(robot.at_rest)]
     columns = [c.astype(np.float32).reshape(-1, *np.shape(leaf)) for c, leaf in zip(columns, leaves, strict=True)]
+
+    # Play the agent over them.
     params = in_numpy(agent.init_params(None, GraphState()))
     state = StepState(params=params, state=in_numpy(agent.init_state(None, GraphState(params={agent.name: params}))))
-    seen, none = [], np.zeros(1, np.float32)
+    observations, zero = [], np.zeros(1, np.float32)
     runner.reset()
-    for k in range(min(MOST, len(columns[0]))):
+    for k in range(min(MAX_OBSERVATIONS, len(columns[0]))):
         message = jax.tree_util.tree_unflatten(form, [c[k : k + 1] for c in columns])
-        state = state.replace(inputs={sensor: InputState(np.array([k], np.int32), none, none, message)})
-        seen.append(np.asarray(agent.observe(state), np.float32))
-        state, _ = agent.act(state, runner(seen[-1]))
-    return np.array(seen)
+        state = state.replace(inputs={sensor: InputState(np.array([k], np.int32), zero, zero, message)})
+        observations.append(np.asarray(agent.observe(state), np.float32))
+        state, _ = agent.act(state, runner(observations[-1]))
+    return np.array(observations)
 
 
 def reference_of(policy: Policy, observations: np.ndarray) -> PolicyReference:
-    """Return what JAX does on observations ``(N, O)``, as those of one episode."""
+    """Return JAX's actions for observations ``(N, O)``, as those of one episode."""
     # On the processor: an accelerator multiplies matrices with less precision, by 1e-3 of the range.
-    policy, given = jax.device_put((policy, observations), jax.devices("cpu")[0])
-    actions = jax.jit(lambda policy, given: jax.lax.scan(policy.step, policy.initial_carry(), given)[1])(policy, given)
+    policy, x = jax.device_put((policy, observations), jax.devices("cpu")[0])
+    actions = jax.jit(lambda policy, x: jax.lax.scan(policy.step, policy.initial_carry(), x)[1])(policy, x)
     return PolicyReference(observations, np.asarray(actions))

@@ -1,4 +1,4 @@
-"""Going on with a training that was interrupted."""
+"""Continuing a training that was interrupted."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from sim2real.artifacts.run.manifest import RUNNING, plain, read_manifest, sha256
 from sim2real.artifacts.run.run_folder import StageFolder, attempts, run_folders
@@ -14,80 +13,77 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.pipeline.find_run import find_run
 from sim2real.stages.terminal.console import note, shown
 from sim2real.stages.train.config import TrainConfig
+from sim2real.types import Json
 
 CHECKPOINT = "checkpoint.safetensors"
 NEWEST = "newest"
 _HOSTS = ("hosts.found", "hosts.coordinator", "hosts.processes", "hosts.process", "hosts.timeout_s")
 _MAY_DIFFER = ("resume", "parameters", "ppo.target", "tensorboard", "checkpoint", *_HOSTS)
-"""Settings that do not change how training goes; which parameters they are is told by their digest, and how many
-devices share it by the program."""
+"""Settings that do not change the numbers of a training. The digest of the parameters is compared instead of their
+path, and the program instead of the number of devices."""
 
 
 def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFolder | None:
-    """Return the interrupted training that ``config.resume`` names, None where it names none.
-
-    Args:
-        config: The settings of the training that goes on.
+    """Return the interrupted training that ``config.resume`` names; None without ``config.resume``.
 
     Raises:
-        UsageError: There is none, or it had other settings.
+        UsageError: There is no such training, or it had other settings.
         Sim2RealError: It was interrupted before its first evaluation.
     """
     if config.resume is None:
         return None
-    found = _named(pipeline, config.resume, root)
-    if found is None:
+    interrupted = _newest_unfinished(pipeline, config.resume, root)
+    if interrupted is None:
         raise UsageError(
             f"there is no interrupted training of {pipeline!r} in {config.resume if config.resume != NEWEST else root}",
-            hint=f"name the run folder or the folder of the training, or train anew with `sim2real train {pipeline}`",
+            hint=f"name the run folder or the folder of the training, or start one with `sim2real train {pipeline}`",
         )
-    _refuse_other_settings(found, config)
-    if not (found.folder / CHECKPOINT).is_file():
+    _check_same_settings(interrupted, config)
+    if not (interrupted.folder / CHECKPOINT).is_file():
         raise Sim2RealError(
-            f"{found.folder} was interrupted before its first evaluation: there is nothing to go on with",
-            hint=f"train anew with `sim2real train {pipeline}`; --ppo.evaluations says how often it is saved",
+            f"{interrupted.folder} was interrupted before its first evaluation: it has no checkpoint",
+            hint=f"start again with `sim2real train {pipeline}`; --ppo.evaluations sets the number of checkpoints",
         )
-    return found
+    return interrupted
 
 
 def check_same_parameters(interrupted: StageFolder, path: Path | None) -> None:
-    """Compare the parameters to train on with those of the interrupted training.
-
-    Raises:
-        UsageError: They are others.
-    """
+    """Raise a ``UsageError`` if the parameters at ``path`` differ from those of the interrupted training."""
     before = interrupted.manifest.get("inputs", {}).get("parameters", {}).get("sha256")
     if before != (None if path is None else sha256(path)):
         raise UsageError(
             f"{interrupted.folder} trains on other parameters than {path or 'the nominal ones'}",
-            hint="name the ones that it began with by --parameters, or train anew",
+            hint="give the parameters of the interrupted training by --parameters, or drop --resume",
         )
 
 
 @contextmanager
 def resumable(folder: Path) -> Iterator[Path]:
-    """Yield the checkpoint's file in a stage's folder; say how to go on where training is interrupted."""
+    """Yield the checkpoint's file in a stage's folder; print the command to continue if training is interrupted."""
     file = folder / CHECKPOINT
     try:
         yield file
     except (KeyboardInterrupt, SystemExit):
         if file.is_file():
-            note(f"the same command with `--resume {shown(folder)}` goes on from the last evaluation")
+            note(f"the same command with `--resume {shown(folder)}` continues from the last evaluation")
         raise
     file.unlink(missing_ok=True)  # a finished training needs none
 
 
-def _named(pipeline: str, target: str, root: Path) -> StageFolder | None:
+def _newest_unfinished(pipeline: str, target: str, root: Path) -> StageFolder | None:
     """Return the newest unfinished training in a run, in a pipeline's runs, or the one of a stage's folder."""
+    # List the trainings at the target.
     manifest = read_manifest(Path(target))
     if manifest is not None and manifest["stage"] == "train":
-        own = [StageFolder(Path(target), manifest)]
+        trainings = [StageFolder(Path(target), manifest)]
         if manifest["pipeline"] != pipeline:
             raise UsageError(f"{target} is a training of {manifest['pipeline']}, not of {pipeline}")
     else:
         runs = run_folders(root, pipeline) if target == NEWEST else [find_run(root, target, pipeline)]
-        own = [attempt for run in runs for attempt in attempts(run, "train")]
-    unfinished = [attempt for attempt in own if not attempt.finished]
+        trainings = [attempt for run in runs for attempt in attempts(run, "train")]
+
+    # Drop finished ones, and those that still run.
+    unfinished = [attempt for attempt in trainings if not attempt.finished]
     busy = [a.folder for a in unfinished if a.manifest["status"] == RUNNING]
     if busy and len(busy) == len(unfinished):
         raise UsageError(
@@ -98,21 +94,21 @@ def _named(pipeline: str, target: str, root: Path) -> StageFolder | None:
     return max(unfinished, key=lambda a: str(a.manifest.get("started", "")), default=None)
 
 
-def _refuse_other_settings(found: StageFolder, config: TrainConfig) -> None:
-    there, here = _flat(found.manifest.get("config") or {}), _flat(plain(config))
+def _check_same_settings(interrupted: StageFolder, config: TrainConfig) -> None:
+    there, here = _flat(interrupted.manifest.get("config") or {}), _flat(plain(config))
     names = [n for n in {**there, **here} if there.get(n) != here.get(n) and n not in _MAY_DIFFER]
     if names:
-        said = ", ".join(f"{n} = {there.get(n)} there and {here.get(n)} here" for n in names)
-        command = shlex.join(["sim2real", *map(str, found.manifest.get("command", [])[1:])])
+        differences = ", ".join(f"{n} = {there.get(n)} there and {here.get(n)} here" for n in names)
+        command = shlex.join(["sim2real", *map(str, interrupted.manifest.get("command", [])[1:])])
         raise UsageError(
-            f"{found.folder} is a training with other settings: {said}",
-            hint=f"go on with those it began with, it was: {command}",
+            f"{interrupted.folder} is a training with other settings: {differences}",
+            hint=f"continue with the settings of its command: {command}",
         )
 
 
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flat(settings: Mapping[str, Json], prefix: str = "") -> dict[str, Json]:
     """Return nested settings with dots in their names."""
-    flat: dict[str, Any] = {}
+    flat: dict[str, Json] = {}
     for name, value in settings.items():
         flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return flat

@@ -1,4 +1,4 @@
-"""Teachers: found among runs, compared with the robot of their student, and described in their own bundle."""
+"""Teachers: the search among runs, the comparison with the student's robot, and the contract in their bundle."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from sim2real.policy.contract import ObservationTerm, PolicyContract
 from sim2real.stages.pipeline.find_run import find_run
 from sim2real.train.networks.policy import Policy
 
-_KNOWN = "simulation"
-"""Name of the part of an observation that only simulation knows."""
+_PRIVILEGED = "simulation"
+"""Name of an observation's privileged part, which only the simulation has."""
 
 
 def find_teacher(pipeline: str, target: str, root: Path) -> tuple[Bundle, Path]:
@@ -28,39 +28,39 @@ def find_teacher(pipeline: str, target: str, root: Path) -> tuple[Bundle, Path]:
     """
     path = Path(target)
     if any((path / name).is_file() for name in ("policy.json", "bundle/policy.json")):
-        found = Bundle.load(path)
-        return found, found.path or path
+        bundle = Bundle.load(path)
+        return bundle, bundle.path or path
     run = find_run(root, target, pipeline)
     bundles = (Bundle.load(a.output("bundle")) for a in attempts(run, "train") if a.finished and "bundle" in a.outputs)
-    for found in bundles:
-        if found.spec.privileged and found.path is not None:
-            return found, found.path
+    for bundle in bundles:
+        if bundle.spec.privileged and bundle.path is not None:
+            return bundle, bundle.path
     raise UsageError(
         f"no teacher was trained in {run}",
         hint=f"train one with `sim2real train {pipeline} --ppo.teacher`, or name the folder of a policy's bundle",
     )
 
 
-def teacher_of(bundle: Bundle, student: PolicyContract) -> Policy:
+def teacher_policy(bundle: Bundle, student: PolicyContract) -> Policy:
     """Return the policy of a teacher.
 
     Raises:
-        UsageError: It sees or does something else than the student, besides what only simulation knows.
+        UsageError: Its observation, without the privileged part, or its rate differs from the student's.
     """
-    shown = [(t.name, t.units, t.history) for t in bundle.contract.observation if t.name != _KNOWN]
-    seen = [(t.name, t.units, t.history) for t in student.observation]
-    if shown != seen or bundle.contract.rate_hz != student.rate_hz:
+    terms = [(t.name, t.units, t.history) for t in bundle.contract.observation if t.name != _PRIVILEGED]
+    student_terms = [(t.name, t.units, t.history) for t in student.observation]
+    if terms != student_terms or bundle.contract.rate_hz != student.rate_hz:
         raise UsageError(
-            f"the teacher in {bundle.path} sees {shown} at {bundle.contract.rate_hz:g} Hz, the student {seen} at "
-            f"{student.rate_hz:g} Hz",
+            f"the teacher in {bundle.path} observes {terms} at {bundle.contract.rate_hz:g} Hz, the student "
+            f"{student_terms} at {student.rate_hz:g} Hz",
             hint="train the teacher on the student's robot",
         )
     return Policy.from_weights(bundle.weights, bundle.spec)
 
 
-def as_taught(contract: PolicyContract, policy: Policy) -> PolicyContract:
-    """Return the contract of a policy: that of a teacher names what only simulation knows."""
+def policy_contract(contract: PolicyContract, policy: Policy) -> PolicyContract:
+    """Return the contract of a policy; that of a teacher has the privileged part of the observation too."""
     if not policy.spec.privileged:
         return contract
-    known = ObservationTerm(_KNOWN, ("?",) * policy.spec.privileged)
-    return replace(contract, observation=(*contract.observation, known))
+    privileged = ObservationTerm(_PRIVILEGED, ("?",) * policy.spec.privileged)
+    return replace(contract, observation=(*contract.observation, privileged))

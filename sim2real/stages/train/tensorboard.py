@@ -1,19 +1,22 @@
-"""Curves of a training for TensorBoard, while it goes on."""
+"""Curves of a training for TensorBoard, written during the training."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sim2real.errors import Sim2RealError
 from sim2real.train.ppo.result import Progress
 
+if TYPE_CHECKING:
+    from tensorboardX import SummaryWriter
+
 
 @contextmanager
 def event_files(folder: Path, names: Sequence[str]) -> Iterator[Callable[[Progress], None]]:
-    """Yield what writes the figures of an evaluation into event files, one for each policy.
+    """Yield a function that writes the figures of an evaluation into event files, one for each policy.
 
     Args:
         names: The policies, such as ``seed 0``, in the order of the figures.
@@ -21,7 +24,7 @@ def event_files(folder: Path, names: Sequence[str]) -> Iterator[Callable[[Progre
     Raises:
         Sim2RealError: tensorboardX is not installed.
     """
-    make = _writer()
+    make = _import_writer()
     with ExitStack() as stack:
         writers = [stack.enter_context(make(str(folder / name.replace(", ", "_").replace(" ", "_")))) for name in names]
 
@@ -35,7 +38,7 @@ def event_files(folder: Path, names: Sequence[str]) -> Iterator[Callable[[Progre
         yield write
 
 
-def _writer() -> Any:
+def _import_writer() -> type[SummaryWriter]:
     """Import the writer, which is an extra."""
     try:
         from tensorboardX import SummaryWriter

@@ -1,4 +1,4 @@
-"""What a training runs on: the environment, made of what was identified and of how long everything took."""
+"""The environment of a training, from an identification and the robot's timing."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from sim2real.stages.train.episode_variation import with_disturbances
 from sim2real.train.environment.draws import draw_robots
 from sim2real.train.environment.graph_environment import GraphEnvironment, TrainingTask
 from sim2real.train.environment.pushes import Pushes
-from sim2real.train.environment.timelines import Drawn, Recorded, draw_timelines
+from sim2real.train.environment.timelines import RecordedTiming, TimelineDraw, draw_timelines
 
-_SHOWN = 5000
-"""So many times are kept for pictures."""
+_MAX_TIMES = 5000
+"""Number of times that are kept for pictures."""
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """Everything that a training needs.
+class TrainingSetup:
+    """The environment of a training.
 
     Attributes:
-        robot: The robot, in the world that is trained in.
+        robot: The robot, in the world of the training.
         values: Parameters by name.
-        env: One copy of the environment.
-        episodes: What episodes are drawn from.
+        env: One copy.
+        episodes: The distributions that episodes are drawn from.
     """
 
     robot: Robot
@@ -58,68 +58,78 @@ class Prepared:
 def prepare(
     pipeline: Pipeline,
     config: TrainConfig,
-    found: Identification | None = None,
+    identification: Identification | None = None,
     timing: Timing | None = None,
     changed: Mapping[str, float] | None = None,
     robot: Robot | None = None,
-) -> Prepared:
+) -> TrainingSetup:
     """Make the environment.
 
     Args:
-        config: What to train on, and in what episodes differ.
-        found: What identify found; the nominal model needs none.
-        timing: How long everything takes on the robot; default: as in the recording that was identified from. The
-            nominal model has no delays.
-        changed: Parameters with other values than the model's; the nominal model has delays where both are among them.
-        robot: The pipeline's robot in its world, with changes of its own; default: without.
+        timing: The robot's timing; default: that of the identification's recording. The nominal model has no delays.
+        changed: Parameters with other values than the model's; the nominal model has delays if both are among them.
+        robot: The pipeline's robot in its world, changed by the caller; default: unchanged.
 
     Raises:
-        UsageError: When the identified model is asked for without an identification, in another world, or a parameter
-            is not known.
-        Sim2RealError: When the identification is of another robot or was not accepted, or its timing cannot be trained
-            with.
+        UsageError: The configuration names the identified model without an identification, or another world, or a
+            parameter is unknown.
+        Sim2RealError: The identification is of another robot or was not accepted, or its timing is unusable.
     """
-    if config.model == "nominal":
-        found = None
-    elif found is None:
-        raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
-    else:
-        check_parameters(found, pipeline)
-        require_accepted(found, config)
-    robot = robot or moving_robot(pipeline, _world(config, found))
-    values = _changed(robot.nominal() if found is None or found.posterior is None else found.values, changed or {})
+    identification = _checked(pipeline, config, identification)
+    robot = robot or moving_robot(pipeline, _world(config, identification))
+
+    # Draw parameters and delays.
+    has_posterior = identification is not None and identification.posterior is not None
+    values = _replaced(identification.values if identification and has_posterior else robot.nominal(), changed or {})
     rng = np.random.default_rng(config.seed)
-    draws = draw_robots(values, found, config.vary, config.randomise, rng)
+    draws = draw_robots(values, identification, config.vary, config.randomise, rng)
     draws = {n: d for n, d in draws.items() if n not in (changed or ())}
+
+    # Make the nodes, with the robot's computation times, transport times and noise.
     recorded = None
-    if found is not None:
-        timing = timing or timing_of(found)
-        recorded = Recorded.of(timing, robot.rate_hz, config.seed, config.vary.pauses)
+    if identification is not None:
+        timing = timing or timing_of(identification)
+        recorded = RecordedTiming.of(timing, robot.rate_hz, config.seed, config.vary.pauses)
     delayed = recorded is not None or set(DELAYS) <= set(values)
     nodes, task = robot.training(values, draws, recorded.computation if recorded else {}, delayed)
     if recorded:
-        recorded.transport_to(nodes)
-    noise = _disturb(nodes[robot.roles.sensor], found, config)
+        recorded.set_transport(nodes)
+    noise = _set_noise(nodes[robot.roles.sensor], identification, config)
+
+    # Draw timelines, and compile them into index tables.
     drawn = draw_timelines(nodes, robot.roles.supervisor, config.episode_s, config.timelines, config.seed, recorded)
     graph = CompiledGraph(nodes, robot.roles.supervisor, drawn.timeline, reusable=True)
-    _move_start(task, config)
+
+    # Add starts and pushes.
+    _set_start(task, config)
     pushes = Pushes.of(config.vary, nodes[robot.roles.world], robot.rate_hz)
     env = GraphEnvironment(graph, task, drawn.steps, pushes, config.vary.curriculum if config.vary.grows else None)
-    episodes = _episodes(found, values, draws, noise, drawn, timing, config)
+    episodes = _episodes(identification, values, draws, noise, drawn, timing, config)
     episodes = with_disturbances(episodes, config.vary, task, pushes, config.seed)
     if config.vary.grows and not (episodes.parameters or noise):
         raise UsageError(
-            "vary.curriculum lets episodes differ more and more, and nothing differs between them",
+            "vary.curriculum needs differences between episodes, and all episodes are equal",
             hint="add --vary.uniform 0.3, --vary.push 1, --vary.start-position 0.2, or train on the identified model",
         )
-    return Prepared(robot, values, env, episodes)
+    return TrainingSetup(robot, values, env, episodes)
 
 
-def _move_start(task: TrainingTask, config: TrainConfig) -> None:
-    """Let episodes start where the configuration says.
+def _checked(pipeline: Pipeline, config: TrainConfig, identification: Identification | None) -> Identification | None:
+    """Return an identification that may be trained on; None for the nominal model."""
+    if config.model == "nominal":
+        return None
+    if identification is None:
+        raise UsageError("training on the identified model needs an identification", hint="--model nominal needs none")
+    check_parameters(identification, pipeline)
+    require_accepted(identification, config)
+    return identification
+
+
+def _set_start(task: TrainingTask, config: TrainConfig) -> None:
+    """Give the task the configured offsets of an episode's start.
 
     Raises:
-        UsageError: The task, or its world, does not know how.
+        UsageError: The task, or its world, has no such offsets.
     """
     start = (config.vary.start_position, config.vary.start_velocity)
     if not any(start):
@@ -132,75 +142,70 @@ def _move_start(task: TrainingTask, config: TrainConfig) -> None:
     jax.eval_shape(task.params, jax.random.key(0))
 
 
-def timing_of(found: Identification) -> Timing:
-    """Return the timing of the recording that was identified from.
-
-    Raises:
-        Sim2RealError: When it is not there.
-    """
-    if found.timing is None:
+def timing_of(identification: Identification) -> Timing:
+    """Return the timing of the identification's recording, otherwise raise a ``Sim2RealError``."""
+    if identification.timing is None:
         raise Sim2RealError(
-            "this identification does not say how long the robot's steps take: its timing.json is not beside it",
+            "the timing of this identification is missing: there is no timing.json beside it",
             hint="name the folder that identify wrote, or run `sim2real identify` again",
         )
-    return found.timing
+    return identification.timing
 
 
-def _changed(values: Mapping[str, float], changed: Mapping[str, float]) -> dict[str, float]:
+def _replaced(values: Mapping[str, float], changed: Mapping[str, float]) -> dict[str, float]:
     """Return the model's values with others in place of some.
 
     Raises:
-        UsageError: When one is not known, or only one of two delays is given.
+        UsageError: One is unknown, or only one of two delays is given.
     """
-    known = dict.fromkeys([*values, *DELAYS])
-    if unknown := sorted(set(changed) - set(known)):
-        raise UsageError(f"there is no parameter {unknown[0]!r}. Available: {', '.join(known)}")
-    made = {**values, **changed}
-    given = set(DELAYS) & set(made)
-    if len(given) == 1 and given & set(changed):
-        raise UsageError(f"only {given.pop()!r} was given: a loop has {' and '.join(DELAYS)}")
-    return made
+    available = dict.fromkeys([*values, *DELAYS])
+    if unknown := sorted(set(changed) - set(available)):
+        raise UsageError(f"there is no parameter {unknown[0]!r}. Available: {', '.join(available)}")
+    replaced = {**values, **changed}
+    delays = set(DELAYS) & set(replaced)
+    if len(delays) == 1 and delays & set(changed):
+        raise UsageError(f"only {delays.pop()!r} was given: a loop has {' and '.join(DELAYS)}")
+    return replaced
 
 
-def require_accepted(found: Identification, config: TrainConfig) -> None:
-    """Refuse an identification that is not accepted, unless that was asked for.
-
-    Raises:
-        Sim2RealError: With the reasons, and what to do next.
-    """
-    if found.verdict.status == "accepted" or config.force:
+def require_accepted(identification: Identification, config: TrainConfig) -> None:
+    """Raise a ``Sim2RealError`` for an identification that is not accepted, unless ``config.force`` is set."""
+    verdict = identification.verdict
+    if verdict.status == "accepted" or config.force:
         return
-    reasons = "".join(f"\n  {reason}" for reason in found.verdict.reasons)
-    again = f"{found.verdict.next}, or " if found.verdict.next else ""
+    reasons = "".join(f"\n  {reason}" for reason in verdict.reasons)
+    step = f"{verdict.next}, or " if verdict.next else ""
     raise Sim2RealError(
-        f"the identification is not accepted: {found.verdict.status}{reasons}",
-        hint=f"{again}train on it all the same: --force",
+        f"the identification is not accepted: {verdict.status}{reasons}",
+        hint=f"{step}train on it all the same: --force",
     )
 
 
-def _world(config: TrainConfig, found: Identification | None) -> str | None:
+def _world(config: TrainConfig, identification: Identification | None) -> str | None:
     """Return the world to train in.
 
     Raises:
-        UsageError: When another one is asked for than was identified.
+        UsageError: The identification is of another world than the configured one.
     """
-    if found is not None and config.world not in (None, found.world):
-        own = repr(found.world) if found.world else "the robot's own"
+    if identification is None:
+        return config.world
+    if config.world not in (None, identification.world):
+        world = repr(identification.world) if identification.world else "the robot's own"
         raise UsageError(
-            f"these parameters are of another world, {own}, than {config.world!r}",
+            f"these parameters are of another world, {world}, than {config.world!r}",
             hint=f"identify with --world {config.world}, or train with --model nominal",
         )
-    return config.world if found is None else found.world
+    return identification.world
 
 
-def _disturb(sensor: BaseNode, found: Identification | None, config: TrainConfig) -> tuple[Noise, ...]:
-    """Give the simulated sensor the noise that the log shows; return it."""
+def _set_noise(sensor: BaseNode, identification: Identification | None, config: TrainConfig) -> tuple[Noise, ...]:
+    """Give the simulated sensor the noise of the log; return it."""
     factor = config.vary.noise
-    if found is None or not found.noise or not factor:
+    if identification is None or not identification.noise or not factor:
         return ()
     noise = tuple(
         replace(n, deviation=factor * n.deviation, quantum=factor * n.quantum, bias=factor * n.bias)
-        for n in found.noise
+        for n in identification.noise
     )
     if not isinstance(sensor, SimSensor):
         note(
@@ -213,58 +218,61 @@ def _disturb(sensor: BaseNode, found: Identification | None, config: TrainConfig
 
 
 def _episodes(
-    found: Identification | None,
+    identification: Identification | None,
     values: Mapping[str, float],
     draws: Mapping[str, np.ndarray],
     noise: tuple[Noise, ...],
-    drawn: Drawn,
+    drawn: TimelineDraw,
     timing: Timing | None,
     config: TrainConfig,
 ) -> Episodes:
-    """Return what episodes are drawn from, with one row for the sum of the delays."""
-    known = {p.name: p for p in found.parameters} if found is not None else {}
-    shown = {n: d for n, d in draws.items() if n not in DELAYS}
+    """Return the distributions of the episodes, with one row for the sum of the delays."""
+    # A row for each drawn parameter, with its interval.
+    estimates = {p.name: p for p in identification.parameters} if identification is not None else {}
+    columns = {n: d for n, d in draws.items() if n not in DELAYS}
     rows = [
         Varied(n, p.unit, values[n], p.low95, p.high95, p.verdict == "not identifiable")
-        if (p := known.get(n)) is not None
+        if (p := estimates.get(n)) is not None
         else Varied(n, "", values[n])
-        for n in shown
+        for n in columns
     ]
     if delays := [n for n in DELAYS if n in draws]:
-        trip = known.get(ROUND_TRIP)
-        shown[ROUND_TRIP] = np.sum([draws[n] for n in delays], axis=0)
+        trip = estimates.get(ROUND_TRIP)
+        columns[ROUND_TRIP] = np.sum([draws[n] for n in delays], axis=0)
         ends = (trip.low95, trip.high95) if trip is not None else (None, None)
         rows.append(Varied(ROUND_TRIP, "s", sum(values[n] for n in delays), *ends))
-    taken = {
+
+    # Computation times of each node, drawn and recorded.
+    drawn_s = {
         n: ((v.end - v.start)[np.arange(v.start.shape[1]) < v.count[:, None]] / TICKS_PER_S)
         for n, v in drawn.timeline.vertices.items()
     }
-    recorded = {} if found is None or timing is None else timing.steps_s
-    widening = found.widening if found is not None and config.vary.misfit and not config.vary.uniform else None
+    recorded_s = {} if identification is None or timing is None else timing.steps_s
+    widens = config.vary.misfit and not config.vary.uniform
     return Episodes(
         parameters=tuple(rows),
-        widening=widening or 1.0,
+        widening=(identification.widening if identification and widens else None) or 1.0,
         noise=noise,
         timelines=config.timelines,
         cut=drawn.cut,
-        again=drawn.again,
+        again=drawn.redrawn,
         longest_pause_s=drawn.longest_pause_s,
-        draws={n: np.asarray(d, np.float64) for n, d in shown.items()},
-        recorded_s={n: np.asarray(s, np.float64)[:_SHOWN] for n, s in recorded.items()},
-        drawn_s={n: np.asarray(s, np.float64)[:_SHOWN] for n, s in taken.items() if n in recorded},
-        off=_off(found, noise),
+        draws={n: np.asarray(d, np.float64) for n, d in columns.items()},
+        recorded_s={n: np.asarray(s, np.float64)[:_MAX_TIMES] for n, s in recorded_s.items()},
+        drawn_s={n: np.asarray(s, np.float64)[:_MAX_TIMES] for n, s in drawn_s.items() if n in recorded_s},
+        off=_deviations(identification, noise),
     )
 
 
-def _off(found: Identification | None, noise: tuple[Noise, ...]) -> dict[str, np.ndarray]:
-    """Return how far measurements lay off the identified model, where the predictions are there."""
-    off = {}
+def _deviations(identification: Identification | None, noise: tuple[Noise, ...]) -> dict[str, np.ndarray]:
+    """Return the measurements minus the predictions of the identified model, for columns with predictions."""
+    deviations = {}
     for n in noise:
         measured, model = f"{n.column}_measured", f"{n.column}_identified"
-        if found is not None and {measured, model} <= set(found.samples):
-            own = np.asarray(found.samples[measured] - found.samples[model], np.float64)
-            off[n.column] = own[np.isfinite(own)][:_SHOWN]
-    return off
+        if identification is not None and {measured, model} <= set(identification.samples):
+            values = np.asarray(identification.samples[measured] - identification.samples[model], np.float64)
+            deviations[n.column] = values[np.isfinite(values)][:_MAX_TIMES]
+    return deviations
 
 
 def find_parameters(
@@ -279,18 +287,17 @@ def find_parameters(
         return None, run_dir
     if config.parameters is not None:
         return Path(config.parameters), run_dir
-    found = warn_of_stale(newest(root, pipeline.name, "identify", run_dir))
-    return found.output("parameters"), run_dir or found.run_dir
+    identified = warn_of_stale(newest(root, pipeline.name, "identify", run_dir))
+    return identified.output("parameters"), run_dir or identified.run_dir
 
 
 def contract_of(
     robot: Robot, task: TrainingTask, values: Mapping[str, float], episodes: Episodes | None = None
 ) -> PolicyContract:
-    """Return what a policy of a robot sees and does, and the delays that it is trained with.
+    """Return the contract of a policy: observation, action, and the delays of its training.
 
     Args:
-        task: Its task, with the actions' bounds.
-        values: Parameters by name, whose delays the policy is trained with.
+        values: Parameters by name.
     """
     return PolicyContract(
         observation=robot.observation,
@@ -307,7 +314,7 @@ def contract_of(
 
 
 def _trained(values: Mapping[str, float], episodes: Episodes) -> dict[str, tuple[float, float]]:
-    """Return the shortest and longest round trip of the episodes, and of each node's steps all but 1 % either way."""
+    """Return the range of the round trip over the episodes, and the 1 and 99 % quantiles of each node's steps [s]."""
     trained: dict[str, tuple[float, float]] = {}
     if set(DELAYS) <= set(values):
         trips = np.append(episodes.draws.get(ROUND_TRIP, []), sum(values[n] for n in DELAYS))

@@ -22,11 +22,11 @@ class TaskState(NamedTuple):
     """The state of a ``TaskEnvironment``.
 
     Attributes:
-        own: The composed environment's.
-        terms: Sum of each term of the reward that has a name, so far.
+        inner: The composed environment's state.
+        terms: Sum of each named reward term so far.
     """
 
-    own: State
+    inner: State
     terms: dict[str, jax.Array]
 
 
@@ -34,10 +34,10 @@ class TaskEnvironment:
     """A composed task on MJX as an environment; the observation is the vector of all its observables, in their order.
 
     Args:
-        environment: The task; it needs a time limit unless its episodes end by themselves.
+        environment: The task; it needs a time limit unless its own termination ends the episodes.
 
     Raises:
-        UsageError: When the action is not a vector with bounds.
+        UsageError: The action is not a vector with bounds.
     """
 
     def __init__(self, environment: MjxEnvironment) -> None:
@@ -58,29 +58,28 @@ class TaskEnvironment:
         return TaskState(state, state.terms), _vector(state)
 
     def step(self, state: TaskState, action: jax.Array, key: jax.Array) -> Step:
-        """Make one control step.
+        """Make one control step; ``action (A,)`` [the actuators' units].
 
-        Args:
-            state: What ``reset`` or ``step`` returned.
-            action: Shape ``(A,)`` [the actuators' units].
-            key: Not used: the state has a key of its own.
+        ``key`` has no effect: the state has its own key.
         """
         del key
-        new = self.environment.step(state.own, action)
-        ends = new.done & ~new.truncated
+        new = self.environment.step(state.inner, action)
+        terminated = new.done & ~new.truncated
         terms = {name: state.terms[name] + term for name, term in new.terms.items()}
         metrics = {f"{REWARD}{name}": term for name, term in terms.items()}
-        return Step(TaskState(new, terms), _vector(new), new.reward, ends, new.truncated, jnp.bool_(True), metrics)
+        return Step(
+            TaskState(new, terms), _vector(new), new.reward, terminated, new.truncated, jnp.bool_(True), metrics
+        )
 
     def privileged(self, state: TaskState) -> jax.Array:
-        """Return what is true in a state, shape ``(P,)``, in MuJoCo's units.
+        """Return the true state, shape ``(P,)``, in MuJoCo's units.
 
         Positions and velocities of all joints, then the fields of the model that hooks set, such as drawn masses, and
-        what the task keeps in ``physics.variables``, by name.
+        the task's ``physics.variables``, by name.
         """
-        own = state.own
-        known = jax.tree.leaves((own.data.qpos, own.data.qvel, own.leaves, own.variables))
-        return jnp.concatenate([jnp.ravel(leaf).astype(jnp.float32) for leaf in known])
+        inner = state.inner
+        leaves = jax.tree.leaves((inner.data.qpos, inner.data.qvel, inner.leaves, inner.variables))
+        return jnp.concatenate([jnp.ravel(leaf).astype(jnp.float32) for leaf in leaves])
 
 
 def _vector(state: State) -> jax.Array:

@@ -1,4 +1,4 @@
-"""The robots that training draws: parameters and delays together, as far apart as the recordings leave open."""
+"""Draws of parameters and delays for the episodes of a training, within the uncertainty of the identification."""
 
 from __future__ import annotations
 
@@ -13,67 +13,68 @@ from sim2real.errors import UsageError
 from sim2real.train.environment.variation import VariationConfig
 
 COUNT = 1024
-"""How many robots are drawn."""
+"""Number of draws."""
 
 
 def draw_robots(
     values: Mapping[str, float],
-    found: Identification | None,
+    identification: Identification | None,
     vary: VariationConfig,
     randomise: float,
     rng: np.random.Generator,
 ) -> dict[str, np.ndarray]:
-    """Draw parameters and delays of robots: name -> ``(K,)``; those that are the same for all are left out.
+    """Draw parameters and delays: name -> ``(K,)``, without parameters that are equal in all draws.
 
     Args:
         values: Parameter -> the value to train on.
-        found: What was identified; None: the values are a data sheet's.
-        randomise: Factor on how much; 0: only what ``vary.range`` says.
+        identification: None: the values are those of a data sheet.
+        randomise: Factor on the deviations; 0: draw only the parameters in ``vary.range``.
 
     Raises:
-        UsageError: When ``vary.range`` names no parameter.
+        UsageError: ``vary.range`` names an unknown parameter.
     """
-    drawn: dict[str, np.ndarray] = {}
+    draws: dict[str, np.ndarray] = {}
     if vary.uniform and randomise:
         share = min(vary.uniform * randomise, 0.99)
-        drawn = {n: v * rng.uniform(1.0 - share, 1.0 + share, COUNT) for n, v in values.items() if v}
-    elif found is not None and found.posterior is not None and randomise:
-        wider = found.widening if vary.misfit and found.widening is not None else 1.0
-        sampled = widened(found, wider).sample(rng, COUNT, randomise)
-        kinds = {p.name: p.kind for p in found.parameters}
-        drawn = {n: v for n, v in sampled.items() if kinds.get(n) in ("dynamics", "delay")}
+        draws = {n: v * rng.uniform(1.0 - share, 1.0 + share, COUNT) for n, v in values.items() if v}
+    elif identification is not None and identification.posterior is not None and randomise:
+        factor = identification.widening if vary.misfit and identification.widening is not None else 1.0
+        sampled = widen_posterior(identification, identification.posterior, factor).sample(rng, COUNT, randomise)
+        kinds = {p.name: p.kind for p in identification.parameters}
+        draws = {n: v for n, v in sampled.items() if kinds.get(n) in ("dynamics", "delay")}
+
+    # Ranges that the user gives replace the posterior.
     if unknown := sorted(set(vary.range) - set(values)):
         raise UsageError(
             f"vary.range names {', '.join(unknown)}, which this model does not have",
             hint=f"its parameters: {', '.join(values)}",
         )
-    return drawn | {n: rng.uniform(low, high, COUNT) for n, (low, high) in vary.range.items()}
+    return draws | {n: rng.uniform(low, high, COUNT) for n, (low, high) in vary.range.items()}
 
 
-def widened(found: Identification, factor: float) -> Posterior:
-    """Return the posterior with what differs from recording to recording, and with deviations times a factor.
+def widen_posterior(identification: Identification, posterior: Posterior, factor: float) -> Posterior:
+    """Return the identification's posterior, and its alternatives, with deviations times a factor.
 
-    So do its alternatives. A log tells only the sum of all delays. How they share it is left as it is: it changes
-    nothing that a policy sees, and bounds on each delay would bend the sum.
-
-    Args:
-        found: What was identified, with a posterior.
+    The variance between recordings is added after that. All delays move together, as a log determines only their sum:
+    how they share it does not affect a policy, and bounds on each delay would distort the sum.
     """
-    posterior = found.posterior
-    assert posterior is not None
-    others = tuple(replace(o, posterior=_widened(o.posterior, found, factor)) for o in posterior.others)
-    return replace(_widened(posterior, found, factor), others=others)
+    others = tuple(replace(o, posterior=_widen(o.posterior, identification, factor)) for o in posterior.others)
+    return replace(_widen(posterior, identification, factor), others=others)
 
 
-def _widened(posterior: Posterior, found: Identification, factor: float) -> Posterior:
+def _widen(posterior: Posterior, identification: Identification, factor: float) -> Posterior:
     covariance = posterior.covariance * factor**2
-    names = list(posterior.names)
-    delays = [i for i, n in enumerate(names) if any(p.name == n and p.kind == "delay" for p in found.parameters)]
+    names, parameters = list(posterior.names), identification.parameters
+
+    # Give each delay the same share of the sum of all delays.
+    delays = [i for i, n in enumerate(names) if any(p.name == n and p.kind == "delay" for p in parameters)]
     share = np.eye(len(names))
     if delays:
         share[np.ix_(delays, delays)] = 1.0 / len(delays)
     covariance = share @ covariance @ share.T
-    for quantity in found.aggregate:
+
+    # Add the variance between recordings, on the scale of the posterior.
+    for quantity in identification.aggregate:
         if quantity.name in names:
             i = names.index(quantity.name)
             slope = float(TRANSFORMS[posterior.transform[i]][2](np.float64(quantity.mean)))

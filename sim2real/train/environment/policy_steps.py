@@ -1,8 +1,8 @@
-"""An environment in which every step is one of the policy: rows without one are played along with the step before."""
+"""An environment in which every call of ``step`` is a step of the policy, for learners other than our PPO."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,17 +18,17 @@ T = TypeVar("T")
 
 
 class PolicySteps:
-    """A ``GraphEnvironment`` for learners that know nothing of rows.
+    """A ``GraphEnvironment`` without rows in which the policy makes no step.
 
-    In some rows of a graph the policy makes no step: where it paused, or where its rate does not divide the world's.
-    Our own PPO is told which rows these are. Here such a row belongs to the policy's step before it: its reward is
-    added to that step's, and the observation is the one that the policy sees next. An episode ends at the policy's
-    last step in the timeline, whose observation is the final one.
+    A graph has such rows where the policy paused, or where its rate does not divide the world's; ``Step.valid`` marks
+    them for our PPO. Here such a row belongs to the policy's step before it: its reward is added to that step's, and
+    the observation is that of the next step. An episode ends at the policy's last step in the timeline, whose
+    observation is the final one.
 
-    Where the policy makes a step in every row, nothing is changed, and nothing is computed twice.
+    If the policy makes a step in every row, the environment inside is used unchanged, at no cost.
 
     Raises:
-        UsageError: When the policy makes fewer than two steps in a timeline.
+        UsageError: The policy makes fewer than two steps in a timeline.
     """
 
     def __init__(self, env: GraphEnvironment) -> None:
@@ -59,38 +59,33 @@ class PolicySteps:
         idle = jnp.asarray(self.action_low, jnp.float32)
 
         def play(now: tuple[EnvState, jax.Array], _: None) -> tuple[tuple[EnvState, jax.Array], None]:
-            made = self.env.step(now[0], idle, key)
-            # Nobody has acted: what was earned so far is no part of the episode's return.
-            state = made.state._replace(total=now[0].total, good=now[0].good)
-            return _select(now[0].step_state.seq >= 0, now, (state, made.observation)), None
+            result = self.env.step(now[0], idle, key)
+            # The policy has not acted yet: rewards so far are no part of the episode's return.
+            state = result.state._replace(total=now[0].total, good=now[0].good)
+            return choose(jnp.asarray(now[0].step_state.seq >= 0), now, (state, result.observation)), None
 
         return jax.lax.scan(play, (state, observation), length=self._wait)[0]
 
     def step(self, state: EnvState, action: jax.Array, key: jax.Array) -> Step:
-        """Make a step of the policy, and run to its next one.
-
-        Args:
-            state: What ``reset`` or ``step`` returned.
-            action: Shape ``(A,)`` [the action's units].
-        """
-        made = self._ended(self.env.step(state, action, key))
+        """Make a step of the policy with ``action (A,)`` [the action's units], and run to its next one."""
+        result = self._truncated(self.env.step(state, action, key))
 
         def play(now: Step, _: None) -> tuple[Step, None]:
-            following = self._ended(self.env.step(now.state, action, key))
+            following = self._truncated(self.env.step(now.state, action, key))
             following = following._replace(reward=now.reward + following.reward, valid=now.valid)
             over = now.terminated | now.truncated | (now.state.step_state.seq >= 0)
-            return _select(over, now, following), None
+            return choose(over, now, following), None
 
-        return jax.lax.scan(play, made, length=self._gap)[0] if self._gap else made
+        return jax.lax.scan(play, result, length=self._gap)[0] if self._gap else result
 
-    def _ended(self, made: Step) -> Step:
-        """Return a row, truncated where it leads to the policy's last step."""
+    def _truncated(self, row: Step) -> Step:
+        """Return a row, truncated if it leads to the policy's last step."""
         if self._always:
-            return made
-        graph = made.state.graph
-        return made._replace(truncated=made.truncated | (graph.step >= jnp.asarray(self._last)[graph.eps]))
+            return row
+        graph = row.state.graph
+        return row._replace(truncated=row.truncated | (graph.step >= jnp.asarray(self._last)[graph.eps]))
 
 
-def _select(condition: Any, yes: T, no: T) -> T:
-    """Return one of two trees; a function of one copy."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+def choose(condition: jax.Array, new: T, old: T) -> T:
+    """Return ``new`` if ``condition``, shape ``()``, is true, else ``old``; for one copy."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)

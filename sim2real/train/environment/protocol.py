@@ -5,18 +5,18 @@ ignored, and the observation is already that of the next policy step::
 
     row          0        1        2        3
     valid        yes      no       yes      yes
-    observation  o0  ->   o1  ->   o1  ->   o3       o1: what the policy sees in row 2
+    observation  o0  ->   o1  ->   o1  ->   o3       o1: the policy's input in row 2
     reward       r0       r1       r2       r3       r1 is added to r0, without a discount
     terminated   no       no       no       yes      row 3's observation is the final one; reset before the next row
 
-An episode ends in a row with ``terminated`` (the value of what follows is 0) or ``truncated`` (it is the value of the
-observation that is returned in that row). If both are set, the row counts as terminated.
+An episode ends in a row with ``terminated`` (the value after it is 0) or ``truncated`` (the value after it is that of
+the observation returned in that row). If both are set, the row counts as terminated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -24,22 +24,23 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
+from sim2real.types import PyTree
 
 
 class Step(NamedTuple):
     """The result of one row.
 
     Attributes:
-        state: The environment's next state, a pytree of arrays with the structure that ``reset`` returned.
+        state: The next state, with the structure that ``reset`` returned.
         observation: Shape ``(O,)``: observation of the next policy step, also after the episode's last row.
-        reward: Shape ``()``: reward of this row.
-        terminated: Shape ``()``, bool: the episode ended by itself.
+        reward: Shape ``()``.
+        terminated: Shape ``()``, bool: the task ended the episode, e.g. after a fall.
         truncated: Shape ``()``, bool: the episode was cut, e.g. by a time limit.
         valid: Shape ``()``, bool: the policy made a step in this row.
         metrics: Name -> shape ``()``: values of the whole episode; used only in the row that ends it.
     """
 
-    state: Any
+    state: PyTree
     observation: jax.Array
     reward: jax.Array
     terminated: jax.Array
@@ -66,47 +67,39 @@ class TrainingEnvironment(Protocol):
         """Shape ``(A,)``: upper bounds of the action [the action's units]."""
         ...
 
-    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+    def reset(self, key: jax.Array) -> tuple[PyTree, jax.Array]:
         """Return the state at the start of an episode and the first observation, shape ``(O,)``."""
         ...
 
-    def step(self, state: Any, action: jax.Array, key: jax.Array) -> Step:
-        """Play one row.
-
-        Args:
-            state: What ``reset`` or ``step`` returned.
-            action: Shape ``(A,)``, within the bounds [the action's units].
-        """
+    def step(self, state: PyTree, action: jax.Array, key: jax.Array) -> Step:
+        """Play one row; ``action (A,)`` within the bounds [the action's units]."""
         ...
 
 
 @runtime_checkable
 class PrivilegedEnvironment(Protocol):
-    """An environment that can show a value function more than the policy sees."""
+    """An environment with privileged entries: quantities of the simulation that the policy does not observe."""
 
-    def privileged(self, state: Any) -> jax.Array:
-        """Return what is true in a state, shape ``(P,)``: the world's, and the episode's parameters."""
+    def privileged(self, state: PyTree) -> jax.Array:
+        """Return the world's true state and the episode's parameters, shape ``(P,)``."""
         ...
 
 
-def get_privileged(env: TrainingEnvironment, config: PPOConfig) -> Callable[[Any], jax.Array] | None:
-    """Return what shows the value function more than the policy sees; None: it is not asked for.
+def get_privileged(env: TrainingEnvironment, config: PPOConfig) -> Callable[[PyTree], jax.Array] | None:
+    """Return the function from a state to its privileged entries; None if ``config.privileged`` is off.
 
     Raises:
-        UsageError: It is asked for, and the environment cannot.
+        UsageError: The environment has no privileged entries.
     """
-    return sees_more(env).privileged if config.privileged else None
+    return require_privileged(env).privileged if config.privileged else None
 
 
-def sees_more(env: TrainingEnvironment) -> PrivilegedEnvironment:
-    """Return an environment that can show more than the policy sees.
-
-    Raises:
-        UsageError: It cannot.
-    """
+def require_privileged(env: TrainingEnvironment) -> PrivilegedEnvironment:
+    """Return the environment if it has privileged entries, otherwise raise a ``UsageError``."""
     if not isinstance(env, PrivilegedEnvironment):
         raise UsageError(
-            f"a value function cannot see more than the policy in a {type(env).__name__}: it has no `privileged`",
+            f"a {type(env).__name__} has no privileged entries for a value function or a teacher: it has no "
+            "`privileged`",
             hint="give it a method privileged(state) -> (P,), or train without --ppo.privileged and --ppo.teacher",
         )
     return env
@@ -114,22 +107,18 @@ def sees_more(env: TrainingEnvironment) -> PrivilegedEnvironment:
 
 @runtime_checkable
 class WideningEnvironment(Protocol):
-    """An environment whose episodes may differ more from each other as training goes on."""
+    """An environment with a curriculum: the differences between its episodes grow during training."""
 
     curriculum: tuple[float, float] | None
-    """Share of their differences at the first and at the last update; None: always all."""
+    """Share of the differences at the first and at the last update; None: always all."""
 
-    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[Any, jax.Array]:
-        """Return what ``reset`` does, for an episode with a share of the differences, shape ``()``."""
+    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[PyTree, jax.Array]:
+        """Do as ``reset``, for an episode with a share ``width ()`` of the differences."""
         ...
 
 
 def get_width(env: TrainingEnvironment, config: PPOConfig, update: jax.Array) -> jax.Array | None:
-    """Return the share of their differences that an update's new episodes have, shape ``()``; None: always all.
-
-    Args:
-        update: Shape ``()``: number of updates before.
-    """
+    """Return the share of the differences, shape ``()``, after ``update`` updates; None without a curriculum."""
     if not isinstance(env, WideningEnvironment) or env.curriculum is None:
         return None
     first, last = env.curriculum
@@ -138,12 +127,8 @@ def get_width(env: TrainingEnvironment, config: PPOConfig, update: jax.Array) ->
 
 def get_reset(
     env: TrainingEnvironment, config: PPOConfig, update: jax.Array
-) -> Callable[[jax.Array], tuple[Any, jax.Array]]:
-    """Return what starts the episodes of an update.
-
-    Args:
-        update: Shape ``()``: number of updates before.
-    """
+) -> Callable[[jax.Array], tuple[PyTree, jax.Array]]:
+    """Return the reset of the episodes that start after ``update ()`` updates."""
     width = get_width(env, config, update)
     if width is None or not isinstance(env, WideningEnvironment):
         return env.reset
@@ -151,23 +136,28 @@ def get_reset(
 
 
 def check_environment(env: TrainingEnvironment) -> None:
-    """Check shapes and dtypes of everything that ``env`` returns, by tracing it; nothing is compiled or run.
+    """Check shapes and dtypes of all that an environment returns, by tracing it; nothing is compiled or run.
 
     Raises:
-        UsageError: Naming the part that does not follow the protocol.
+        UsageError: A part does not follow the protocol.
     """
+    # Bounds of the action.
     size, low, high = env.observation_size, np.asarray(env.action_low), np.asarray(env.action_high)
     if low.ndim != 1 or low.shape != high.shape or not (np.isfinite([low, high]).all() and (low < high).all()):
         raise UsageError(
             f"action bounds must be two finite vectors with low < high, got low={low} and high={high}",
             hint="leave out actions that cannot move, and give every other one its physical limits",
         )
+
+    # Observations of reset and step.
     key = jax.eval_shape(lambda: jax.random.key(0))
     start, observation = jax.eval_shape(env.reset, key)
     step = jax.eval_shape(env.step, start, jax.ShapeDtypeStruct(low.shape, np.float32), key)
     for name, leaf in (("reset's", observation), ("step's", step.observation)):
         if leaf.shape != (size,):
             raise UsageError(f"{name} observation has shape {leaf.shape}, observation_size promises ({size},)")
+
+    # Numbers and flags of a step, then the state.
     scalars = {"reward": step.reward, **{f"metrics[{name!r}]": leaf for name, leaf in step.metrics.items()}}
     flags = {"terminated": step.terminated, "truncated": step.truncated, "valid": step.valid}
     for name, leaf in (scalars | flags).items():

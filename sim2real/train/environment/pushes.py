@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -12,29 +12,29 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
 from sim2real.train.environment.variation import VariationConfig
+from sim2real.types import PyTree
 
 
 @runtime_checkable
 class PushableWorld(Protocol):
     """A world whose joints can be pushed."""
 
-    def velocity(self, state: Any) -> jax.Array:
+    def velocity(self, state: PyTree) -> jax.Array:
         """Return the joints' velocities, shape ``()`` or ``(joints,)`` [rad/s, or m/s]."""
         ...
 
-    def with_velocity(self, state: Any, velocity: jax.Array) -> Any:
+    def with_velocity(self, state: PyTree, velocity: jax.Array) -> PyTree:
         """Return the state with other velocities of the joints."""
         ...
 
 
 @dataclass(frozen=True)
 class Pushes:
-    """Pushes of each joint by itself, at the moments of policy steps.
+    """Pushes of each joint, independent of the others, at the times of policy steps.
 
     Attributes:
         node: Name of the world's node.
-        world: The world.
-        size: Largest change of a velocity [rad/s, or m/s]; all up to it are as likely, in both directions.
+        size: Largest change of a velocity [rad/s, or m/s]; changes are uniform within it, in both directions.
         chance: Probability that a joint is pushed in a row.
     """
 
@@ -45,19 +45,16 @@ class Pushes:
 
     @staticmethod
     def of(vary: VariationConfig, world: BaseNode, rate_hz: float) -> Pushes | None:
-        """Return the pushes that a configuration asks for; None: none.
-
-        Args:
-            rate_hz: The policy's rate [Hz].
+        """Return the configured pushes for a policy of ``rate_hz``; None if there are none.
 
         Raises:
-            UsageError: The world has no place for them, or they come faster than policy steps.
+            UsageError: The world cannot be pushed, or pushes are more frequent than policy steps.
         """
         if not vary.push:
             return None
         if not isinstance(world, PushableWorld):
             raise UsageError(
-                f"a {type(world).__name__} cannot be pushed: nothing says where in its state velocities are",
+                f"a {type(world).__name__} cannot be pushed: it has no `velocity` and `with_velocity`",
                 hint="give the world velocity(state) and with_velocity(state, velocity), or leave out --vary.push",
             )
         if vary.push_hz > rate_hz:
@@ -65,10 +62,10 @@ class Pushes:
         return Pushes(world.name, world, vary.push, vary.push_hz / rate_hz)
 
     def kicks(self, key: jax.Array, shape: tuple[int, ...], width: jax.Array | None = None) -> jax.Array:
-        """Draw by how much velocities change in a row; 0 where a joint is not pushed.
+        """Draw the changes of the velocities in a row, 0 for a joint that is not pushed.
 
         Args:
-            width: Share of the size; None: all of it.
+            width: Share of ``size``; None: all of it.
         """
         k_whether, k_how = jax.random.split(key)
         size = self.size if width is None else self.size * width
@@ -76,11 +73,7 @@ class Pushes:
         return jnp.where(hit, size * jax.random.uniform(k_how, shape, minval=-1.0, maxval=1.0), 0.0)
 
     def apply(self, graph_state: GraphState, key: jax.Array, width: jax.Array | None = None) -> GraphState:
-        """Return the graph's state after the pushes of a row.
-
-        Args:
-            width: Share of the size; None: all of it.
-        """
+        """Return the graph's state after the pushes of a row; ``width`` as in ``kicks``."""
         state = graph_state.state[self.node]
         before = jnp.asarray(self.world.velocity(state))
         after = before + self.kicks(key, before.shape, width).astype(before.dtype)

@@ -1,11 +1,11 @@
-"""What a training task may say besides what ``TrainingTask`` asks of each: its end, the truth, a reward's terms."""
+"""Optional methods of a training task: termination, privileged entries, a curriculum; and the terms of a reward."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import reduce
 from operator import add
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -13,16 +13,17 @@ import jax.numpy as jnp
 from sim2real.artifacts.bundle import REWARD as REWARD
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
+from sim2real.types import PyTree
 
 Rewards = jax.Array | Mapping[str, jax.Array]
 """The reward of a row, shape ``()``, or its terms by name, whose sum it is."""
 
 
 def checked_end(ended: jax.Array, task: object) -> jax.Array:
-    """Return what a task's ``terminated`` returned, if it is one bool.
+    """Return the result of a task's ``terminated``, checked to be one bool.
 
     Raises:
-        UsageError: It is a number or a vector, which would end episodes that have not ended.
+        UsageError: It is a number or a vector, which would terminate other episodes too.
     """
     ended = jnp.asarray(ended)
     if ended.shape != () or ended.dtype != jnp.bool_:
@@ -35,7 +36,7 @@ def checked_end(ended: jax.Array, task: object) -> jax.Array:
 
 
 def terms_of(reward: Rewards) -> dict[str, jax.Array]:
-    """Return the terms of a reward by name; none where it is a single number."""
+    """Return the terms of a reward by name; none if it is a single number."""
     return dict(reward) if isinstance(reward, Mapping) else {}
 
 
@@ -63,17 +64,17 @@ class EndingTask(Protocol):
 
 @runtime_checkable
 class PrivilegedTask(Protocol):
-    """A task that knows what a value function may see besides the policy's observation."""
+    """A task with privileged entries: inputs of a value function besides the policy's observation."""
 
     def privileged(self, graph_state: GraphState) -> jax.Array:
-        """Return what is true in the graph's state, shape ``(P,)``, in any units."""
+        """Return true quantities of the graph's state, shape ``(P,)``, in any units."""
         ...
 
 
 @runtime_checkable
 class WideningTask(Protocol):
-    """A task whose episodes may differ from each other by a share of what they might."""
+    """A task with a curriculum: its episodes can have a share of their differences."""
 
-    def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, Any]:
+    def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, PyTree]:
         """Draw the parameters of the nodes for an episode with a share of the differences; None: all of them."""
         ...

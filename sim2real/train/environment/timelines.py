@@ -1,4 +1,4 @@
-"""Timelines for training, drawn from how long everything took on the robot, with its pauses."""
+"""Timelines for training, drawn from the times measured on the robot, with its pauses."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from sim2real.graph.windows import bursty_episodes
 from sim2real.runtime.compilation.placement import Placement, Placer
 
 STRETCH_S = 1.0
-"""Length of what is taken from a recording in one piece [s]: hiccups of a computer last tens of milliseconds."""
-_PAUSES = (np.inf, 3.0, 2.0, 1.5, 1.25)
-"""Longest pauses between two policy steps that are tried, in periods."""
-_LONG = 0.25
-"""Steps that took longer than this share of the policy's period are left out where an episode is over."""
-_SHORTEST = 0.5
-"""Timelines with a pause in this share of the episode, from its start, are drawn again."""
-_ROUNDS = 20
+"""Length of a stretch of a recording [s]: hiccups of a computer last tens of milliseconds."""
+_MAX_PAUSES = (np.inf, 3.0, 2.0, 1.5, 1.25)
+"""Limits on the pause between two policy steps, tried in this order, in periods."""
+_LONG_STEP = 0.25
+"""Steps longer than this share of the policy's period are replaced after an episode's end."""
+_MIN_SHARE = 0.5
+"""Timelines whose first pause lies in this share of the episode, from its start, are redrawn."""
+_MAX_ROUNDS = 20
 
 
 @dataclass
 class Stretches:
-    """Where in the recording the stretches begin: at the same moments for all nodes and connections.
+    """Starts of the stretches in the recording: the same for all nodes and connections.
 
-    A hiccup of the computer hits all nodes at once. So what the nodes did at the same time stays together.
+    A hiccup of the computer hits all nodes at once, so times that were measured together are drawn together.
 
     Attributes:
-        seed: Of the moments.
-        pauses: Whether long steps are kept at all.
-        calm_s: Shape ``(E,)``: from when on an episode has no long steps [s]; None: never.
+        seed: Seed of the starts.
+        pauses: Whether the long steps of the recording are used.
+        calm_s: Shape ``(E,)``: time from which on an episode has no long steps [s]; None: never.
     """
 
     seed: int
@@ -44,17 +44,18 @@ class Stretches:
     calm_s: np.ndarray | None = field(default=None)
 
     def begins(self, episodes: int, count: int) -> np.ndarray:
-        """Return where stretches begin, as a share of the recording, ``(episodes, count)``."""
-        return np.random.default_rng(self.seed).random((count, episodes)).T  # in this order: more of them begin alike
+        """Return the starts as a share of the recording, shape ``(episodes, count)``."""
+        # Drawn stretch by stretch: a larger count keeps the first stretches.
+        return np.random.default_rng(self.seed).random((count, episodes)).T
 
 
 class RecordedTimes(DelayDistribution):
-    """Recorded times, taken in stretches that all nodes share.
+    """Recorded times, drawn in stretches that all nodes share.
 
     Args:
-        samples: Shape ``(N,)``: what each step or message took [s], in their order.
-        rate_hz: How many there are a second [Hz].
-        long_s: Longer ones are replaced by the median from ``calm_s`` on [s].
+        samples: Shape ``(N,)``: the time of each step or message [s], in their order.
+        rate_hz: Number of samples in a second [Hz].
+        long_s: Longer times are replaced by the median from ``calm_s`` on [s].
     """
 
     def __init__(self, samples: np.ndarray, rate_hz: float, stretches: Stretches, long_s: float) -> None:
@@ -64,7 +65,7 @@ class RecordedTimes(DelayDistribution):
         return f"RecordedTimes({self.samples.size} samples, {self.rate_hz:g} Hz)"
 
     def sample(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-        """Return times [s] for E episodes, shape ``(E, N)``; the stretches say which."""
+        """Return times [s] for E episodes, shape ``(E, N)``; the stretches hold the random numbers."""
         del rng
         episodes, length = shape
         size = min(max(1, round(STRETCH_S * self.rate_hz)), self.samples.size)
@@ -82,13 +83,12 @@ class RecordedTimes(DelayDistribution):
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """How long everything took on the robot, as nodes of a simulation can be told.
+class RecordedTiming:
+    """The computation and transport times of the robot as delay distributions of simulated nodes.
 
     Attributes:
-        stretches: Where times are taken from.
-        computation: Node -> distribution of what its steps take.
-        transport: (reader, input) -> distribution of what its messages take.
+        computation: Node -> distribution of its steps' computation times.
+        transport: (reader, input) -> distribution of its messages' transport times.
     """
 
     stretches: Stretches
@@ -96,84 +96,91 @@ class Recorded:
     transport: Mapping[tuple[str, str], DelayDistribution]
 
     @staticmethod
-    def of(timing: Timing, rate_hz: float, seed: int, pauses: bool = True) -> Recorded:
+    def of(timing: Timing, rate_hz: float, seed: int, pauses: bool = True) -> RecordedTiming:
         """Return the times of a recording.
 
         Args:
             rate_hz: The policy's rate [Hz].
-            pauses: Whether the robot's pauses are kept; otherwise steps of more than a quarter of the period are left
-                out.
+            pauses: Whether the robot's pauses are kept; otherwise steps longer than a quarter of the period are
+                dropped.
 
         Raises:
-            Sim2RealError: When most steps of a node took so long that no policy of this rate runs in time.
+            Sim2RealError: Most steps of a node took too long for a policy of this rate.
         """
-        stretches, long_s = Stretches(seed, pauses), _LONG / rate_hz
+        stretches, long_s = Stretches(seed, pauses), _LONG_STEP / rate_hz
         timing.computation(long_s)
         span_s = max((n.steps * (n.period.p50 or 0.0) for n in timing.nodes.values()), default=0.0)
 
         def times(samples: np.ndarray) -> RecordedTimes | None:
-            there = samples[np.isfinite(samples) & (samples >= 0.0)]
-            return RecordedTimes(there, there.size / span_s, stretches, long_s) if there.size > 1 and span_s else None
+            valid = samples[np.isfinite(samples) & (samples >= 0.0)]
+            return RecordedTimes(valid, valid.size / span_s, stretches, long_s) if valid.size > 1 and span_s else None
 
         computation = {n: d for n, s in timing.steps_s.items() if (d := times(s)) is not None}
         transport = {tuple(k.split("/", 1)): d for k, s in timing.transport_s.items() if (d := times(s)) is not None}
-        return Recorded(stretches, computation, transport)  # type: ignore[arg-type]  # split leaves two parts
+        return RecordedTiming(stretches, computation, transport)  # type: ignore[arg-type]  # split leaves two parts
 
-    def transport_to(self, nodes: Mapping[str, BaseNode]) -> None:
-        """Make messages of the graph as late as they were; phases stay those of the nodes on the robot."""
+    def set_transport(self, nodes: Mapping[str, BaseNode]) -> None:
+        """Give the connections the recorded transport times; phases stay those of the nodes on the robot."""
         for (reader, name), dist in self.transport.items():
             if reader in nodes and name in nodes[reader].inputs:
                 nodes[reader].inputs[name].delay_dist = dist
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """Timelines, and what became of the robot's pauses.
+class TimelineDraw:
+    """Timelines, and figures of the pauses in them.
 
     Attributes:
-        timeline: The timelines.
-        steps: Shape ``(E,)``: after how many policy steps each episode ends.
-        cut: How many of them end early, before a pause that the program cannot hold.
-        again: How many were drawn again, because that would have been in their first half.
+        steps: Shape ``(E,)``: number of policy steps after which each episode ends.
+        cut: Number of episodes that end early, before a pause that does not fit into the program's rows.
+        redrawn: Number of timelines drawn again, because their first such pause lay in the first half.
         longest_pause_s: Longest time between two policy steps in any of them [s].
     """
 
     timeline: Timeline
     steps: np.ndarray
     cut: int
-    again: int
+    redrawn: int
     longest_pause_s: float
 
 
 def draw_timelines(
-    nodes: Mapping[str, BaseNode], supervisor: str, episode_s: float, count: int, seed: int, recorded: Recorded | None
-) -> Drawn:
+    nodes: Mapping[str, BaseNode],
+    supervisor: str,
+    episode_s: float,
+    count: int,
+    seed: int,
+    recorded: RecordedTiming | None,
+) -> TimelineDraw:
     """Draw timelines.
 
     A row of the program holds one policy step and a fixed number of world ticks. After a pause of several periods a
-    robot makes the steps that it missed one right after the other, and they do not fit into rows. Such an episode ends
+    robot catches up: it makes several steps in quick succession, which do not fit into rows. Such an episode ends
     before the pause.
 
     Args:
-        episode_s: Length of an episode [s].
-        recorded: How long everything takes; None: as the nodes say.
+        recorded: The robot's times; None: draw from the nodes' own delay distributions.
 
     Raises:
-        Sim2RealError: When most timelines have a pause in their first half.
+        Sim2RealError: Most timelines have a pause in their first half.
     """
     if recorded is None:
         timeline = draw(nodes, episode_s, count, np.random.default_rng(seed))
-        return _drawn(timeline, supervisor, timeline.vertices[supervisor].count, 0, 0)
+        return _with_figures(timeline, supervisor, timeline.vertices[supervisor].count, 0, 0)
+
+    # Draw timelines without long steps: they set the cost of a row.
     recorded.stretches.calm_s = np.zeros(count)
-    quiet = draw(nodes, episode_s, count, seed)
+    calm = draw(nodes, episode_s, count, seed)
     if not recorded.stretches.pauses:
-        return _drawn(quiet, supervisor, quiet.vertices[supervisor].count, 0, 0)
-    calm = _shape(nodes, supervisor, quiet)
-    for periods in _PAUSES:
-        drawn = _with_pauses(nodes, supervisor, episode_s, count, seed, recorded, periods)
+        return _with_figures(calm, supervisor, calm.vertices[supervisor].count, 0, 0)
+    calm_cost = _row_cost(nodes, supervisor, calm)
+
+    # Allow the longest pauses whose rows cost no more.
+    for periods in _MAX_PAUSES:
+        drawn = _draw_with_pauses(nodes, supervisor, episode_s, count, seed, recorded, periods)
         if drawn is None or bursty_episodes(nodes, drawn.timeline).any():
             continue
-        if _shape(nodes, supervisor, drawn.timeline) <= calm:
+        if _row_cost(nodes, supervisor, drawn.timeline) <= calm_cost:
             return drawn
     raise Sim2RealError(
         "nearly every timeline drawn from this log holds a pause of the policy",
@@ -181,37 +188,38 @@ def draw_timelines(
     )
 
 
-def _with_pauses(
+def _draw_with_pauses(
     nodes: Mapping[str, BaseNode],
     supervisor: str,
     episode_s: float,
     count: int,
     seed: int,
-    recorded: Recorded,
+    recorded: RecordedTiming,
     periods: float,
-) -> Drawn | None:
-    """Return timelines that end before pauses above so many periods; None: too many of them do so early."""
-    kept: list[Timeline] = []
+) -> TimelineDraw | None:
+    """Return timelines that end before pauses longer than ``periods``; None if too many of them end early."""
+    accepted: list[Timeline] = []
     steps: list[np.ndarray] = []
-    missing, again = count, 0
-    for attempt in range(_ROUNDS):
+    missing, redrawn = count, 0
+    for attempt in range(_MAX_ROUNDS):
         recorded.stretches.seed, recorded.stretches.calm_s = seed + 1000 * attempt, None
-        timeline, last = _cut(nodes, supervisor, episode_s, count, recorded.stretches, periods)
-        good = last >= _SHORTEST * timeline.vertices[supervisor].count
-        good &= np.cumsum(good) <= missing
-        if good.any():
-            kept.append(timeline[good])
-            steps.append(last[good])
-        missing -= int(good.sum())
+        timeline, last = _end_at_pauses(nodes, supervisor, episode_s, count, recorded.stretches, periods)
+        # Accept those that are long enough, up to the number that is missing.
+        long = last >= _MIN_SHARE * timeline.vertices[supervisor].count
+        long &= np.cumsum(long) <= missing
+        if long.any():
+            accepted.append(timeline[long])
+            steps.append(last[long])
+        missing -= int(long.sum())
         if not missing:
-            whole, ends = Timeline.stack(kept), np.concatenate(steps)
-            cut = int((ends < whole.vertices[supervisor].count).sum())
-            return _drawn(whole, supervisor, ends, cut, again)
-        again += missing
+            timeline, ends = Timeline.stack(accepted), np.concatenate(steps)
+            cut = int((ends < timeline.vertices[supervisor].count).sum())
+            return _with_figures(timeline, supervisor, ends, cut, redrawn)
+        redrawn += missing
     return None
 
 
-def _cut(
+def _end_at_pauses(
     nodes: Mapping[str, BaseNode],
     supervisor: str,
     episode_s: float,
@@ -219,10 +227,11 @@ def _cut(
     stretches: Stretches,
     periods: float,
 ) -> tuple[Timeline, np.ndarray]:
-    """Return timelines, calm from their first pause on, and how many policy steps come before it ``(E,)``."""
+    """Return timelines, calm from their first pause on, and the number of policy steps before it ``(E,)``."""
     last = np.full(count, np.iinfo(np.int64).max)
     rate_hz = nodes[supervisor].rate
     while True:
+        # Find the first pause of each timeline; calming one moves the steps after it, so repeat until none is earlier.
         timeline = draw(nodes, episode_s, count, stretches.seed)
         vertex = timeline.vertices[supervisor]
         gaps = np.diff(vertex.start[:, : int(vertex.count.min())], axis=1)
@@ -232,17 +241,17 @@ def _cut(
             return timeline, np.minimum(last, vertex.count)
         last = np.where(earlier, first.min(axis=1), last)
         before = np.take_along_axis(vertex.start, np.minimum(last, gaps.shape[1])[:, None] - 1, axis=1)[:, 0]
-        own = np.full(count, np.inf) if stretches.calm_s is None else stretches.calm_s
-        stretches.calm_s = np.where(earlier, np.minimum(own, before / TICKS_PER_S), own)
+        calm_s = np.full(count, np.inf) if stretches.calm_s is None else stretches.calm_s
+        stretches.calm_s = np.where(earlier, np.minimum(calm_s, before / TICKS_PER_S), calm_s)
 
 
-def _shape(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> tuple[int, float]:
-    """Return what rows cost: the policy's slots in each, and slots for each tick of the world."""
-    placed: Placement = Placer(nodes, supervisor, timeline, frozenset()).place()
-    return placed.slots.count(supervisor), len(placed.slots) / placed.ticks
+def _row_cost(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> tuple[int, float]:
+    """Return the policy's slots in a row, and the slots for each tick of the world."""
+    placement: Placement = Placer(nodes, supervisor, timeline, frozenset()).place()
+    return placement.slots.count(supervisor), len(placement.slots) / placement.ticks
 
 
-def _drawn(timeline: Timeline, supervisor: str, steps: np.ndarray, cut: int, again: int) -> Drawn:
+def _with_figures(timeline: Timeline, supervisor: str, steps: np.ndarray, cut: int, redrawn: int) -> TimelineDraw:
     vertex = timeline.vertices[supervisor]
     gaps = np.diff(vertex.start[:, : int(vertex.count.min())], axis=1)
-    return Drawn(timeline, np.asarray(steps), cut, again, float(gaps.max(initial=0)) / TICKS_PER_S)
+    return TimelineDraw(timeline, np.asarray(steps), cut, redrawn, float(gaps.max(initial=0)) / TICKS_PER_S)

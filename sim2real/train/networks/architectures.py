@@ -1,7 +1,4 @@
-"""What an actor or a critic may be: a perceptron, a GRU or a user's own network, as pure functions of one input.
-
-Ours need no module system; ``flax.linen`` is there for a user's own.
-"""
+"""Networks of actors and critics: a perceptron, a GRU or a user's own network, as pure functions of one input."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -18,39 +15,35 @@ import numpy as np
 from flax import linen
 
 from sim2real.errors import UsageError
+from sim2real.types import Array, PyTree
 
-Layers = tuple[tuple[jax.Array, jax.Array], ...]
+Layers = tuple[tuple[Array, Array], ...]
+"""A pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer, float32."""
 
 
 @runtime_checkable
 class Network(Protocol):
     """A network with a fixed number of outputs; stateless ones carry an empty tuple from step to step."""
 
-    def init(self, rng: np.random.Generator, inputs: int, gain: float) -> Any:
+    def init(self, rng: np.random.Generator, inputs: int, gain: float) -> PyTree:
         """Return parameters, a pytree of float32 arrays.
 
         Args:
-            gain: By how much to scale the last layer: 0.01 for an actor, whose first actions should be near 0.
+            gain: Scale of the last layer: 0.01 for an actor, whose first actions should be near 0.
         """
         ...
 
-    def initial_carry(self) -> Any:
-        """Return what is carried into an episode's first step: a pytree of arrays, ``()`` if nothing is."""
+    def initial_carry(self) -> PyTree:
+        """Return the carry into an episode's first step: a pytree of arrays, ``()`` if the network is stateless."""
         ...
 
-    def apply(self, params: Any, carry: Any, x: jax.Array) -> tuple[Any, jax.Array]:
-        """Return what is carried on, and the output, shape ``(outputs,)``.
-
-        Args:
-            params: What ``init`` returned, trained.
-            carry: What ``initial_carry`` or the step before returned.
-            x: Shape ``(inputs,)``.
-        """
+    def apply(self, params: PyTree, carry: PyTree, x: jax.Array) -> tuple[PyTree, jax.Array]:
+        """Return the next carry, and the output, shape ``(outputs,)``, for an input of shape ``(inputs,)``."""
         ...
 
 
-Factory = Callable[[int], Any]
-"""Makes a ``Network`` or a module of flax.linen with this number of outputs."""
+Factory = Callable[[int], Network | linen.Module]
+"""Makes a network with the given number of outputs."""
 
 
 def orthogonal(rng: np.random.Generator, n_in: int, n_out: int, gain: float) -> np.ndarray:
@@ -65,14 +58,10 @@ def init_mlp(rng: np.random.Generator, sizes: tuple[int, ...], last_gain: float)
 
     Args:
         sizes: Widths of the input, of each hidden layer and of the output.
-
-    Returns:
-        One pair ``(kernel (n_in, n_out), bias (n_out,))`` per layer, float32.
     """
     gains = [np.sqrt(2.0)] * (len(sizes) - 2) + [last_gain]
-    drawn = zip(sizes[:-1], sizes[1:], gains, strict=True)
-    layers: Any = tuple((orthogonal(rng, *sized), np.zeros(sized[1], np.float32)) for sized in drawn)
-    return layers
+    shapes = zip(sizes[:-1], sizes[1:], gains, strict=True)
+    return tuple((orthogonal(rng, *shape), np.zeros(shape[1], np.float32)) for shape in shapes)
 
 
 def apply_mlp(layers: Layers, x: jax.Array) -> jax.Array:
@@ -88,7 +77,7 @@ class MLP:
     """Tanh layers and a linear last one.
 
     Attributes:
-        widths: Of the hidden layers and of the output.
+        widths: Widths of the hidden layers and of the output.
     """
 
     widths: tuple[int, ...]
@@ -98,15 +87,11 @@ class MLP:
         return init_mlp(rng, (inputs, *self.widths), gain)
 
     def initial_carry(self) -> tuple[()]:
-        """Return nothing."""
+        """Return an empty carry."""
         return ()
 
-    def apply(self, params: Layers, carry: Any, x: jax.Array) -> tuple[Any, jax.Array]:
-        """Return nothing, and the output, shape ``(outputs,)``.
-
-        Args:
-            x: Shape ``(inputs,)``.
-        """
+    def apply(self, params: Layers, carry: PyTree, x: jax.Array) -> tuple[PyTree, jax.Array]:
+        """Return the carry unchanged, and the output, shape ``(outputs,)``."""
         return carry, apply_mlp(params, x)
 
 
@@ -119,13 +104,13 @@ class GRU:
         r, z = sigmoid(x W + h U + b);  n = tanh(x W_n + b_n + r * (h U_n));  h' = (1 - z) n + z h
 
     Attributes:
-        widths: Of the unit, of each tanh layer after it, and of the output.
+        widths: Widths of the unit, of each tanh layer after it, and of the output.
     """
 
     widths: tuple[int, ...]
 
-    def init(self, rng: np.random.Generator, inputs: int, gain: float) -> dict[str, Any]:
-        """Return orthogonal kernels; the update gate's bias is 1, so that it remembers before it has learnt to."""
+    def init(self, rng: np.random.Generator, inputs: int, gain: float) -> dict[str, PyTree]:
+        """Return orthogonal kernels; the update gate's bias is 1, so that the unit remembers from the start."""
         width = self.widths[0]
         bias = np.repeat(np.array([0.0, 1.0, 0.0], np.float32), width)
         kernels = [np.concatenate([orthogonal(rng, n, width, 1.0) for _ in range(3)], 1) for n in (inputs, width)]
@@ -135,17 +120,13 @@ class GRU:
         """Return zeros, shape ``(width,)``."""
         return np.zeros(self.widths[0], np.float32)
 
-    def apply(self, params: dict[str, Any], carry: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Return the unit's state, shape ``(width,)``, and the output, shape ``(outputs,)``.
-
-        Args:
-            params: What ``init`` returned.
-            x: Shape ``(inputs,)``.
-        """
-        seen = jnp.split(x @ params["kernel"] + params["bias"], 3)
-        kept = jnp.split(carry @ params["recurrent"], 3)
-        reset, update = (jax.nn.sigmoid(a + b) for a, b in zip(seen[:2], kept[:2], strict=True))
-        candidate = jnp.tanh(seen[2] + reset * kept[2])
+    def apply(self, params: dict[str, PyTree], carry: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Return the unit's state, shape ``(width,)``, and the output, shape ``(outputs,)``."""
+        # The parts of both gates and of the candidate that depend on the input, and on the state.
+        of_input = jnp.split(x @ params["kernel"] + params["bias"], 3)
+        of_state = jnp.split(carry @ params["recurrent"], 3)
+        reset, update = (jax.nn.sigmoid(a + b) for a, b in zip(of_input[:2], of_state[:2], strict=True))
+        candidate = jnp.tanh(of_input[2] + reset * of_state[2])
         carry = (1.0 - update) * candidate + update * carry
         return carry, apply_mlp(params["layers"], carry)
 
@@ -155,18 +136,18 @@ class FlaxNetwork:
     """A module of flax.linen, called as ``module(x)``, or ``module(carry, x)`` where it has ``initialize_carry``.
 
     Attributes:
-        module: The module; its parameters are all that it has.
+        module: The module; it may have no variables besides its parameters.
         inputs: Number of entries of its input.
     """
 
     module: linen.Module
     inputs: int
 
-    def init(self, rng: np.random.Generator, inputs: int, gain: float) -> Any:
-        """Return the module's own parameters; how it begins, its last layer too, is its own affair.
+    def init(self, rng: np.random.Generator, inputs: int, gain: float) -> PyTree:
+        """Return the parameters as the module initialises them; ``gain`` has no effect.
 
         Raises:
-            UsageError: It has variables that are no parameters.
+            UsageError: The module has variables that are no parameters.
         """
         del gain
         key, x = jax.random.key(int(rng.integers(2**31))), jnp.zeros(inputs)
@@ -179,30 +160,34 @@ class FlaxNetwork:
             )
         return jax.tree.map(np.asarray, variables["params"])
 
-    def initial_carry(self) -> Any:
-        """Return what the module's ``initialize_carry`` returns, ``()`` if it has none."""
-        if not self._recurrent:
+    def initial_carry(self) -> PyTree:
+        """Return the result of the module's ``initialize_carry``, ``()`` if it has no such method."""
+        if not isinstance(self.module, _RecurrentModule):
             return ()
-        module: Any = self.module
-        return jax.tree.map(np.asarray, module.initialize_carry(jax.random.key(0), (self.inputs,)))
+        return jax.tree.map(np.asarray, self.module.initialize_carry(jax.random.key(0), (self.inputs,)))
 
-    def apply(self, params: Any, carry: Any, x: jax.Array) -> tuple[Any, jax.Array]:
-        """Return what is carried on, and the output, shape ``(outputs,)``.
-
-        Args:
-            x: Shape ``(inputs,)``.
-        """
+    def apply(self, params: PyTree, carry: PyTree, x: jax.Array) -> tuple[PyTree, jax.Array]:
+        """Return the next carry, and the output, shape ``(outputs,)``."""
         variables = {"params": params}
-        made: Any = self.module.apply(variables, carry, x) if self._recurrent else self.module.apply(variables, x)
-        return made if self._recurrent else (carry, made)
+        result: PyTree = self.module.apply(variables, *((carry, x) if self._recurrent else (x,)))
+        return result if self._recurrent else (carry, result)
 
     @property
     def _recurrent(self) -> bool:
-        return hasattr(self.module, "initialize_carry")
+        return isinstance(self.module, _RecurrentModule)
+
+
+@runtime_checkable
+class _RecurrentModule(Protocol):
+    """A module of flax.linen that carries a state from step to step."""
+
+    def initialize_carry(self, rng: jax.Array, input_shape: tuple[int, ...]) -> PyTree:
+        """Return the carry into the first step."""
+        ...
 
 
 def is_recurrent(network: Network) -> bool:
-    """Return whether a network carries anything from step to step."""
+    """Return whether a network carries arrays from step to step."""
     return bool(jax.tree.leaves(network.initial_carry()))
 
 
@@ -212,28 +197,31 @@ def make_network(
     """Return a network.
 
     Args:
-        kind: ``"mlp"``, ``"gru"``, ``"package.module:Class"``, or what makes one of its own.
-        exported: Whether a robot is to run it, as it does an actor; refused here if it could not, before it is trained.
+        kind: ``"mlp"``, ``"gru"``, ``"package.module:Class"``, or a factory.
+        exported: Whether a robot will run the network, as it runs an actor. A network that cannot be exported is then
+            refused before it is trained.
 
     Raises:
-        UsageError: There is no such network, it is none, or it cannot be exported.
+        UsageError: There is no such network, the factory makes no network, or it cannot be exported.
     """
     if kind in ("mlp", "gru"):
         if kind == "gru" and not hidden:
             raise UsageError("a GRU needs a width: hidden is empty", hint="--ppo.hidden 64 64")
         return MLP((*hidden, outputs)) if kind == "mlp" else GRU((*hidden, outputs))
+
+    # Make the user's network, and check it by tracing.
     factory = find_factory(kind) if isinstance(kind, str) else kind
     try:
-        made = factory(outputs)
+        module = factory(outputs)
     except TypeError as error:
         raise UsageError(
             f"network {name_of(kind)} cannot be made of its number of outputs alone: {error}",
             hint="give its other arguments defaults, or, in Python, train(..., actor=lambda outputs: ...)",
         ) from error
-    network = FlaxNetwork(made, inputs) if isinstance(made, linen.Module) else made
+    network = FlaxNetwork(module, inputs) if isinstance(module, linen.Module) else module
     if not isinstance(network, Network):
         raise UsageError(
-            f"network {name_of(kind)} makes a {type(made).__name__}, neither a flax.linen.Module nor a Network",
+            f"network {name_of(kind)} makes a {type(module).__name__}, neither a flax.linen.Module nor a Network",
             hint="a Network has init, initial_carry and apply: sim2real.train.networks.architectures.Network",
         )
     _check_network(network, name_of(kind), inputs, outputs)
@@ -246,24 +234,25 @@ def find_factory(name: str) -> Factory:
     """Return the class with a name such as ``package.module:Class``.
 
     Raises:
-        UsageError: It cannot be imported, or is no class: a bundle from elsewhere has such a name, and shall call none
-            of a library's functions.
+        UsageError: It cannot be imported, or is no class: such a name may come from another person's bundle, which
+            must not be able to call a library's functions.
     """
     module, sign, attribute = name.partition(":")
     hint = "write mlp, gru, or package.module:Class; found as Python finds modules, and in the current directory"
     if not (sign and module and attribute):
         raise UsageError(f"there is no network {name!r}", hint=hint)
-    here = str(Path.cwd())  # where an installed command does not look by itself
+    # The path of an installed command lacks the current directory.
+    here = str(Path.cwd())
     sys.path.append(here)
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        factory = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise UsageError(f"network {name!r} cannot be imported: {error}", hint=hint) from error
     finally:
         sys.path.remove(here)
-    if not isinstance(found, type):
-        raise UsageError(f"network {name!r} is a {type(found).__name__}, no class", hint=hint)
-    return found
+    if not isinstance(factory, type):
+        raise UsageError(f"network {name!r} is a {type(factory).__name__}, no class", hint=hint)
+    return factory
 
 
 def name_of(kind: str | Factory) -> str:
@@ -274,7 +263,7 @@ def name_of(kind: str | Factory) -> str:
 
 
 def _check_network(network: Network, name: str, inputs: int, outputs: int) -> None:
-    """Raise unless a network takes and returns what it should, by tracing it."""
+    """Raise unless shapes and dtypes of a traced network are those of the protocol."""
     params = network.init(np.random.default_rng(0), inputs, 1.0)
     carry = network.initial_carry()
     after, y = jax.eval_shape(network.apply, params, carry, jax.ShapeDtypeStruct((inputs,), np.float32))
@@ -282,13 +271,13 @@ def _check_network(network: Network, name: str, inputs: int, outputs: int) -> No
         raise UsageError(
             f"network {name} returns {getattr(y, 'dtype', type(y))} of shape {getattr(y, 'shape', None)} for an input "
             f"of shape ({inputs},), float32 of shape ({outputs},) is needed",
-            hint="it is given one observation, without a batch axis, and made with its number of outputs",
+            hint="its input is one observation, without a batch axis, and the factory gets its number of outputs",
         )
     kinds = [[(np.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(tree)] for tree in (carry, after)]
-    whole = all(dtype == np.float32 for _, dtype in kinds[0])
-    if jax.tree.structure(carry) != jax.tree.structure(after) or kinds[0] != kinds[1] or not whole:
+    floats = all(dtype == np.float32 for _, dtype in kinds[0])
+    if jax.tree.structure(carry) != jax.tree.structure(after) or kinds[0] != kinds[1] or not floats:
         raise UsageError(
-            f"network {name} must carry on what it began with, arrays of float32: {kinds[1]} after {kinds[0]}",
+            f"network {name} must keep the form of its initial carry, arrays of float32: {kinds[1]} after {kinds[0]}",
             hint="apply returns (carry, output), the carry of the structure, shapes and dtypes of initial_carry",
         )
 
@@ -300,7 +289,7 @@ def _check_export(network: Network, name: str, inputs: int) -> None:
     params = network.init(np.random.default_rng(0), inputs, 1.0)
     leaves, tree = jax.tree.flatten((network.initial_carry(), np.zeros(inputs, np.float32)))
     traced = trace(
-        lambda *given: network.apply(params, *jax.tree.unflatten(tree, given)), [np.shape(x) for x in leaves]
+        lambda *inputs: network.apply(params, *jax.tree.unflatten(tree, inputs)), [np.shape(x) for x in leaves]
     )
     count = len(traced.jaxpr.outvars)
     Translation(traced, [f"in_{i}" for i in range(len(leaves))], [f"out_{i}" for i in range(count)], name)

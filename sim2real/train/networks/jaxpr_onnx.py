@@ -1,24 +1,27 @@
-"""A traced function as nodes of ONNX: the primitives that networks of policies are made of, others are refused.
+"""Translation of a traced function into ONNX nodes, for the primitives of policy networks; others are refused."""
 
-Written by hand, not jax2onnx 0.17: its first translation of three layers takes 15 s of processor time, without a batch
-axis it made a model that onnxruntime refuses to load, and it brings netron, sympy, huggingface-hub and an older orbax.
-"""
+# jax2onnx 0.17.1 exports the same networks, but a vmapped flax module only by way of a jaxpr. It adds 23 distributions
+# of 175 MB, needs an older orbax-checkpoint, and its first export takes 8 s (docs/reference/choices.md).
 
 from __future__ import annotations
 
 import string
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 from onnx import NodeProto, helper
 
 from sim2real.errors import UsageError
+from sim2real.types import Array, Json, PyTree
 
-_SAME = {
+_Value = str | np.ndarray
+"""The name of a result, or an array that depends on no input."""
+
+_DIRECT = {
     "tanh": "Tanh", "exp": "Exp", "log": "Log", "neg": "Neg", "abs": "Abs", "sqrt": "Sqrt", "logistic": "Sigmoid",
     "sin": "Sin", "cos": "Cos", "erf": "Erf", "sign": "Sign", "floor": "Floor", "ceil": "Ceil", "not": "Not",
     "copy": "Identity", "copy_p": "Identity", "stop_gradient": "Identity", "add": "Add", "add_any": "Add", "sub": "Sub",
@@ -36,63 +39,70 @@ _LOGICAL = {"not", "and", "or", "xor"}
 
 
 class Translation:
-    """Nodes and constants of a function whose inputs and outputs have names.
+    """Nodes and constants of a traced function, with the given names of its inputs and outputs.
 
     Args:
-        who: What it is, for errors.
+        network: Name of the network, for errors.
 
     Attributes:
         nodes: The nodes, in order.
         constants: Name -> array.
 
     Raises:
-        UsageError: It has a primitive that is not translated.
+        UsageError: The function has a primitive that is not translated.
     """
 
-    def __init__(self, traced: ClosedJaxpr, inputs: Sequence[str], outputs: Sequence[str], who: str) -> None:
+    def __init__(self, traced: ClosedJaxpr, inputs: Sequence[str], outputs: Sequence[str], network: str) -> None:
         self.nodes: list[NodeProto] = []
         self.constants: dict[str, np.ndarray] = {}
-        self._who, self._count = who, 0
-        made = self._run(traced.jaxpr, traced.consts, list(inputs))
-        for value, name in zip(made, outputs, strict=True):
+        self.network, self._count = network, 0
+        results = self._run(traced.jaxpr, traced.consts, list(inputs))
+        for value, name in zip(results, outputs, strict=True):
             self.nodes.append(helper.make_node("Identity", [self._name(value)], [name]))
 
-    def _run(self, jaxpr: Jaxpr, constants: Sequence[Any], inputs: list[Any]) -> list[Any]:
-        """Return the outputs of a function: names of results, or arrays where they depend on no input."""
-        known: dict[Var, Any] = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True))
-        known |= dict(zip(jaxpr.invars, inputs, strict=True))
+    def _run(self, jaxpr: Jaxpr, constants: Sequence[Array], inputs: Sequence[_Value]) -> list[_Value]:
+        """Return the outputs of a function."""
+        values: dict[Var, _Value] = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True))
+        values |= dict(zip(jaxpr.invars, inputs, strict=True))
 
-        def read(atom: Any) -> Any:
-            return np.asarray(atom.val, _kind(atom).dtype) if isinstance(atom, Literal) else known[atom]
+        def read(atom: Var | Literal) -> _Value:
+            return np.asarray(atom.val, _kind(atom).dtype) if isinstance(atom, Literal) else values[atom]
 
         for equation in jaxpr.eqns:
-            given = [read(atom) for atom in equation.invars]
-            known |= zip(equation.outvars, self._apply(equation, given), strict=True)
+            operands = [read(atom) for atom in equation.invars]
+            values |= zip(equation.outvars, self._apply(equation, operands), strict=True)
         return [read(atom) for atom in jaxpr.outvars]
 
-    def _apply(self, equation: JaxprEqn, given: list[Any]) -> list[Any]:
+    def _apply(self, equation: JaxprEqn, operands: list[_Value]) -> list[_Value]:
         """Return the results of one primitive."""
         name, options = str(equation.primitive), equation.params
-        if not any(isinstance(value, str) for value in given):  # it depends on no input: JAX itself computes it
-            made = equation.primitive.bind(*map(jnp.asarray, given), **options)
-            return [np.asarray(value) for value in (made if equation.primitive.multiple_results else [made])]
+
+        # JAX computes constants, which depend on no input.
+        if not any(isinstance(value, str) for value in operands):
+            result = equation.primitive.bind(*map(jnp.asarray, operands), **options)
+            return [np.asarray(value) for value in (result if equation.primitive.multiple_results else [result])]
+
+        # A call is replaced by the nodes of its function.
         body = next((options[key] for key in _BODIES if key in options), None)
         if name in _CALLS and body is not None:
-            return self._run(*((body.jaxpr, body.consts) if isinstance(body, ClosedJaxpr) else (body, ())), given)
+            function = (body.jaxpr, body.consts) if isinstance(body, ClosedJaxpr) else (body, ())
+            return self._run(*function, operands)
+
+        # Other primitives are one node, or have a function here; ONNX differs from JAX in div and pow of integers.
         kinds = {str(_kind(atom).dtype) for atom in (*equation.invars, *equation.outvars)}
         fits = kinds == {"bool"} if name in _LOGICAL else name not in ("div", "pow") or kinds <= _FLOATS
-        if name in _SAME and fits:
-            return [self._node(_SAME[name], *given)]
-        translate = _OTHERS.get(name)
+        if name in _DIRECT and fits:
+            return [self.node(_DIRECT[name], *operands)]
+        translate = _TRANSLATED.get(name)
         if translate is None or not fits:
             raise UsageError(
-                f"network {self._who} uses {name} of {', '.join(sorted(kinds))}, which is not exported to ONNX: no "
+                f"network {self.network} uses {name} of {', '.join(sorted(kinds))}, which is not exported to ONNX: no "
                 "robot could run it",
-                hint=f"primitives that are: {', '.join(sorted({*_SAME, *_OTHERS}))}",
+                hint=f"primitives that are: {', '.join(sorted({*_DIRECT, *_TRANSLATED}))}",
             )
-        return list(translate(self, equation, given))
+        return list(translate(self, equation, operands))
 
-    def _name(self, value: Any) -> str:
+    def _name(self, value: _Value) -> str:
         """Return the name of a result, or of a constant."""
         if isinstance(value, str):
             return value
@@ -100,26 +110,29 @@ class Translation:
         self.constants[name] = np.asarray(value)
         return name
 
-    def _node(self, kind: str, *given: Any, **options: Any) -> str:
+    def node(self, kind: str, *operands: _Value, **options: Json) -> str:
         """Add a node; return the name of its result."""
-        return self._nodes(kind, 1, *given, **options)[0]
+        return self.node_of_several(kind, 1, *operands, **options)[0]
 
-    def _nodes(self, kind: str, results: int, *given: Any, **options: Any) -> list[str]:
-        names = [f"made_{self._count + i}" for i in range(results)]
+    def node_of_several(self, kind: str, results: int, *operands: _Value, **options: Json) -> list[str]:
+        """Add a node; return the names of its results."""
+        names = [f"result_{self._count + i}" for i in range(results)]
         self._count += results
-        self.nodes.append(helper.make_node(kind, [self._name(value) for value in given], names, **options))
+        self.nodes.append(helper.make_node(kind, [self._name(value) for value in operands], names, **options))
         return names
 
 
-_Translate = Callable[[Any, JaxprEqn, list[Any]], Iterator[str] | list[str]]
+_Translate = Callable[[Translation, JaxprEqn, list[_Value]], list[str]]
 
 
-def _kind(atom: Any) -> Any:
-    """Return shape and dtype of an input or a result; an untyped part of JAX."""
+def _kind(atom: Var | Literal) -> ShapedArray:
+    """Return shape and dtype of an input or a result."""
+    if not isinstance(atom.aval, ShapedArray):
+        raise UsageError(f"a value of type {atom.aval} is not exported to ONNX", hint="use arrays of numbers")
     return atom.aval
 
 
-def _given(equation: JaxprEqn) -> Any:
+def _operand(equation: JaxprEqn) -> ShapedArray:
     return _kind(equation.invars[0])
 
 
@@ -127,79 +140,80 @@ def _shape(equation: JaxprEqn) -> np.ndarray:
     return np.array(_kind(equation.outvars[0]).shape, np.int64)
 
 
-def _reshape(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
-    return [to._node("Reshape", given[0], _shape(equation))]
+def _reshape(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
+    return [to.node("Reshape", operands[0], _shape(equation))]
 
 
-def _broadcast(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
+def _broadcast(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
     axes = equation.params["broadcast_dimensions"]
     inside = np.ones(len(_shape(equation)), np.int64)
-    inside[list(axes)] = _given(equation).shape
-    return [to._node("Expand", to._node("Reshape", given[0], inside), _shape(equation))]
+    inside[list(axes)] = _operand(equation).shape
+    return [to.node("Expand", to.node("Reshape", operands[0], inside), _shape(equation))]
 
 
-def _dot(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
+def _dot(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
     (left, right), (batch_left, batch_right) = equation.params["dimension_numbers"]
     ranks = [len(_kind(atom).shape) for atom in equation.invars]
     if not batch_left and left == (ranks[0] - 1,) and right == (0,) and ranks[1] == 2:
-        return [to._node("MatMul", *given)]
+        return [to.node("MatMul", *operands)]
     letters = iter(string.ascii_lowercase)
+    # Contracted axes and batch axes share a letter; the result has the batch axes first, then the free axes.
     one = [next(letters) for _ in range(ranks[0])]
     other = [next(letters) for _ in range(ranks[1])]
-    for mine, own in ((left, right), (batch_left, batch_right)):
-        for i, j in zip(mine, own, strict=True):
+    for axes, other_axes in ((left, right), (batch_left, batch_right)):
+        for i, j in zip(axes, other_axes, strict=True):
             other[j] = one[i]
-    gone = {one[i] for i in (*left, *batch_left)}
-    kept = [one[i] for i in batch_left] + [x for x in (*one, *other) if x not in gone]
-    return [to._node("Einsum", *given, equation=f"{''.join(one)},{''.join(other)}->{''.join(kept)}")]
+    shared = {one[i] for i in (*left, *batch_left)}
+    result = [one[i] for i in batch_left] + [x for x in (*one, *other) if x not in shared]
+    return [to.node("Einsum", *operands, equation=f"{''.join(one)},{''.join(other)}->{''.join(result)}")]
 
 
-def _select(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
-    which, *cases = given
-    if len(cases) != 2 or _given(equation).dtype != np.bool_:
-        raise UsageError(f"network {to._who} selects one of {len(cases)} by a number, which is not exported to ONNX")
-    if not _given(equation).shape:
-        which = to._node("Reshape", which, np.ones(len(_shape(equation)), np.int64))
-    return [to._node("Where", which, cases[1], cases[0])]
+def _select(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
+    which, *cases = operands
+    if len(cases) != 2 or _operand(equation).dtype != np.bool_:
+        raise UsageError(f"network {to.network} selects one of {len(cases)} by a number, which is not exported to ONNX")
+    if not _operand(equation).shape:
+        which = to.node("Reshape", which, np.ones(len(_shape(equation)), np.int64))
+    return [to.node("Where", which, cases[1], cases[0])]
 
 
-def _slice(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
+def _slice(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
     start, limit = (np.array(equation.params[key], np.int64) for key in ("start_indices", "limit_indices"))
     step = np.array(equation.params["strides"] or np.ones(len(start)), np.int64)
-    return [to._node("Slice", given[0], start, limit, np.arange(len(start)), step)]
+    return [to.node("Slice", operands[0], start, limit, np.arange(len(start)), step)]
 
 
 def _reduce(kind: str) -> _Translate:
-    def translate(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
+    def translate(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
         axes = list(equation.params["axes"])
         if not axes:
-            return [to._node("Identity", *given)]
+            return [to.node("Identity", *operands)]
         if kind == "ReduceSum":  # its axes are an input since opset 13, those of the others since 18
-            return [to._node(kind, given[0], np.array(axes, np.int64), keepdims=0)]
-        return [to._node(kind, given[0], axes=axes, keepdims=0)]
+            return [to.node(kind, operands[0], np.array(axes, np.int64), keepdims=0)]
+        return [to.node(kind, operands[0], axes=axes, keepdims=0)]
 
     return translate
 
 
-def _power(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
+def _power(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
     power = equation.params["y"]
     if power == 2:
-        return [to._node("Mul", given[0], given[0])]
-    return [to._node("Pow", given[0], np.asarray(power, _given(equation).dtype))]
+        return [to.node("Mul", operands[0], operands[0])]
+    return [to.node("Pow", operands[0], np.asarray(power, _operand(equation).dtype))]
 
 
-def _convert(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
+def _convert(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
     kind = helper.np_dtype_to_tensor_dtype(np.dtype(equation.params["new_dtype"]))
-    return [to._node("Cast", given[0], to=kind)]
+    return [to.node("Cast", operands[0], to=kind)]
 
 
-def _split(to: Translation, equation: JaxprEqn, given: list[Any]) -> list[str]:
+def _split(to: Translation, equation: JaxprEqn, operands: list[_Value]) -> list[str]:
     sizes = np.array(equation.params["sizes"], np.int64)
-    return to._nodes("Split", len(sizes), given[0], sizes, axis=equation.params["axis"])
+    return to.node_of_several("Split", len(sizes), operands[0], sizes, axis=equation.params["axis"])
 
 
-_ONE = np.float32(1.0)
-_OTHERS: dict[str, _Translate] = {
+_ONE = np.array(1.0, np.float32)
+_TRANSLATED: dict[str, _Translate] = {
     "reshape": _reshape,
     "squeeze": _reshape,
     "expand_dims": _reshape,
@@ -214,22 +228,18 @@ _OTHERS: dict[str, _Translate] = {
     "reduce_prod": _reduce("ReduceProd"),
     "integer_pow": _power,
     "convert_element_type": _convert,
-    "square": lambda to, _, given: [to._node("Mul", given[0], given[0])],
-    "ne": lambda to, _, given: [to._node("Not", to._node("Equal", *given))],
-    "rsqrt": lambda to, _, given: [to._node("Reciprocal", to._node("Sqrt", *given))],
-    "log1p": lambda to, _, given: [to._node("Log", to._node("Add", given[0], _ONE))],
-    "expm1": lambda to, _, given: [to._node("Sub", to._node("Exp", *given), _ONE)],
-    "erfc": lambda to, _, given: [to._node("Sub", _ONE, to._node("Erf", *given))],
-    "clamp": lambda to, _, given: [to._node("Max", to._node("Min", given[1], given[2]), given[0])],
-    "transpose": lambda to, e, given: [to._node("Transpose", *given, perm=list(e.params["permutation"]))],
-    "concatenate": lambda to, e, given: [to._node("Concat", *given, axis=e.params["dimension"])],
+    "square": lambda to, _, operands: [to.node("Mul", operands[0], operands[0])],
+    "ne": lambda to, _, operands: [to.node("Not", to.node("Equal", *operands))],
+    "rsqrt": lambda to, _, operands: [to.node("Reciprocal", to.node("Sqrt", *operands))],
+    "log1p": lambda to, _, operands: [to.node("Log", to.node("Add", operands[0], _ONE))],
+    "expm1": lambda to, _, operands: [to.node("Sub", to.node("Exp", *operands), _ONE)],
+    "erfc": lambda to, _, operands: [to.node("Sub", _ONE, to.node("Erf", *operands))],
+    "clamp": lambda to, _, operands: [to.node("Max", to.node("Min", operands[1], operands[2]), operands[0])],
+    "transpose": lambda to, e, operands: [to.node("Transpose", *operands, perm=list(e.params["permutation"]))],
+    "concatenate": lambda to, e, operands: [to.node("Concat", *operands, axis=e.params["dimension"])],
 }
 
 
-def trace(function: Callable[..., Any], shapes: Sequence[tuple[int, ...]]) -> ClosedJaxpr:
-    """Return a function of float32 arrays, traced.
-
-    Args:
-        function: Takes as many arrays as there are shapes.
-    """
+def trace(function: Callable[..., PyTree], shapes: Sequence[tuple[int, ...]]) -> ClosedJaxpr:
+    """Return a traced function of float32 arrays with these shapes."""
     return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes))

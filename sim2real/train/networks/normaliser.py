@@ -1,4 +1,4 @@
-"""Running statistics of what networks are given."""
+"""Running statistics of the networks' inputs."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 
 from sim2real.policy.runner import OBSERVATION_CLIP
+from sim2real.types import Array
 
-_LEAST_VARIANCE = 1e-6
-"""Of an observation, in its unit squared."""
+_MIN_VARIANCE = 1e-6
+"""Smallest variance of an observation, in its unit squared."""
 
 
 class Normaliser(NamedTuple):
-    """Running mean and variance of the observations, or of what the value function sees besides.
+    """Running mean and variance of the observations, or of the value function's further inputs.
 
     Attributes:
         seen: Shape ``()``: number of observations so far.
@@ -22,50 +23,53 @@ class Normaliser(NamedTuple):
         var: Shape ``(O,)``.
     """
 
-    seen: jax.Array
-    mean: jax.Array
-    var: jax.Array
+    seen: Array
+    mean: Array
+    var: Array
 
 
-def update_normaliser(normaliser: Normaliser, seen: jax.Array, valid: jax.Array) -> Normaliser:
+def update_normaliser(normaliser: Normaliser, observations: jax.Array, valid: jax.Array) -> Normaliser:
     """Return the statistics with more observations added (parallel variance, Chan et al. 1979).
 
     Args:
-        seen: Shape ``(T, N, O)``.
-        valid: Shape ``(T, N)``, bool: which of them count.
+        observations: Shape ``(T, N, O)``.
+        valid: Shape ``(T, N)``, bool: the observations that count.
     """
+    # Mean and variance of the new observations.
     weight = valid.astype(jnp.float32)[..., None]
     count = jnp.maximum(weight.sum(), 1.0)
-    mean = (weight * seen).sum((0, 1), keepdims=True) / count
-    var = (weight * (seen - mean) ** 2).sum((0, 1)) / count
+    mean = (weight * observations).sum((0, 1), keepdims=True) / count
+    var = (weight * (observations - mean) ** 2).sum((0, 1)) / count
+
+    # Those of all observations.
     total = normaliser.seen + count
     delta = mean[0, 0] - normaliser.mean
-    spread = normaliser.var * normaliser.seen + var * count + delta**2 * normaliser.seen * count / total
-    return Normaliser(total, normaliser.mean + delta * count / total, spread / total)
+    squares = normaliser.var * normaliser.seen + var * count + delta**2 * normaliser.seen * count / total
+    return Normaliser(total, normaliser.mean + delta * count / total, squares / total)
 
 
 def deviations(normaliser: Normaliser, privileged: int) -> jax.Array:
     """Return the standard deviations that a policy divides by, shape ``(O,)``.
 
     Args:
-        privileged: How many entries at the end are physical parameters; see ``normalise_parameters``.
+        privileged: Number of entries at the end that are physical parameters; see ``normalise_parameters``.
     """
     if not privileged:
-        return jnp.sqrt(normaliser.var + _LEAST_VARIANCE)
+        return jnp.sqrt(normaliser.var + _MIN_VARIANCE)
     of_parameters = jnp.arange(normaliser.var.shape[0]) >= normaliser.var.shape[0] - privileged
-    return jnp.sqrt(normaliser.var + jnp.where(of_parameters, _least(normaliser), _LEAST_VARIANCE))
+    return jnp.sqrt(normaliser.var + jnp.where(of_parameters, _min_variance(normaliser), _MIN_VARIANCE))
 
 
-def normalise_parameters(normaliser: Normaliser, seen: jax.Array) -> jax.Array:
-    """Return ``seen``, shape ``(O,)``, in deviations from its mean.
+def normalise_parameters(normaliser: Normaliser, values: jax.Array) -> jax.Array:
+    """Return physical parameters ``(O,)`` in deviations from their mean.
 
-    Physical parameters are of any size, and some are the same in all episodes: a deviation counts from a thousandth of
-    the mean on.
+    They have any order of magnitude, and some are equal in all episodes. So the smallest deviation is a thousandth of
+    the mean, not a constant.
     """
-    std = jnp.sqrt(normaliser.var + _least(normaliser))
-    return jnp.clip((seen - normaliser.mean) / std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+    std = jnp.sqrt(normaliser.var + _min_variance(normaliser))
+    return jnp.clip((values - normaliser.mean) / std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
 
-def _least(normaliser: Normaliser) -> jax.Array:
-    """Return the least variance of physical parameters, shape ``(O,)``."""
+def _min_variance(normaliser: Normaliser) -> Array:
+    """Return the smallest variance of physical parameters, shape ``(O,)``."""
     return (1e-3 * normaliser.mean) ** 2 + 1e-20

@@ -1,4 +1,4 @@
-"""A policy with a network of a user as an ONNX model, which a robot runs without JAX and without the network's code."""
+"""Export of a policy with a user's network to ONNX: a robot runs it without JAX and without the network's code."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from sim2real.train.networks.jaxpr_onnx import Translation, trace
 from sim2real.train.networks.policy import Policy
 
 PARITY = 1e-4
-"""Largest difference that an export accepts, as a fraction of the actions' range. A norm of a layer multiplies the last
-bits of inputs that hardly differ: 1.1e-5 was seen behind a GroupNorm of clipped values."""
+"""Largest accepted difference between ONNX and JAX, as a fraction of the actions' range (docs/reference/choices.md)."""
 
 
 def export_graph(policy: Policy) -> bytes | None:
     """Return the policy as a serialised ONNX model; None for networks that a bundle runs without one.
 
-    If onnxruntime is installed, it is compared with JAX on observations as in one episode.
+    If onnxruntime is installed, the model is compared with JAX on observations as in one episode.
 
     Raises:
         UsageError: The network has a primitive that is not exported.
@@ -30,6 +29,7 @@ def export_graph(policy: Policy) -> bytes | None:
     """
     if policy.spec.own:
         return None
+    # Trace one step of a batch of 1; the leaves of the carry are inputs and outputs of the model.
     first, tree = jax.tree.flatten(policy.initial_carry())
     sizes = policy.mean.size, policy.low.size
 
@@ -40,20 +40,18 @@ def export_graph(policy: Policy) -> bytes | None:
     shapes = [(1, sizes[0]), *((1, *np.shape(leaf)) for leaf in first)]
     inputs = ["observation", *(f"carry_{i}" for i in range(len(first)))]
     outputs = ["action", *(f"next_carry_{i}" for i in range(len(first)))]
-    made = Translation(trace(step, shapes), inputs, outputs, policy.spec.name)
-    model = make_model(made.nodes, made.constants, sizes, first)
+    translation = Translation(trace(step, shapes), inputs, outputs, policy.spec.name)
+    model = make_model(translation.nodes, translation.constants, sizes, first)
+
+    # Compare the actions of both.
     if importlib.util.find_spec("onnxruntime") is not None:
         compare(policy, model)
     return model
 
 
 def compare(policy: Policy, model: bytes) -> None:
-    """Compare JAX and ONNX on observations as in one episode.
-
-    Raises:
-        Sim2RealError: They give different actions.
-    """
+    """Raise a ``Sim2RealError`` if JAX and ONNX give different actions on observations as in one episode."""
     arrays = {name: np.asarray(getattr(policy, name)) for name in ("mean", "std", "low", "high")}
-    samples, by_onnx = draw_samples(arrays), OnnxBackend(model)
-    by_jax = jax.lax.scan(policy.step, policy.initial_carry(), jnp.asarray(samples))[1]
-    check_parity(arrays, list(np.asarray(by_jax)), [by_onnx(sample[None])[0] for sample in samples], "JAX", PARITY)
+    samples, backend = draw_samples(arrays), OnnxBackend(model)
+    of_jax = jax.lax.scan(policy.step, policy.initial_carry(), jnp.asarray(samples))[1]
+    check_parity(arrays, list(np.asarray(of_jax)), [backend(sample[None])[0] for sample in samples], "JAX", PARITY)

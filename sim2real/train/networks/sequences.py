@@ -1,25 +1,26 @@
-"""Networks over the rows of a rollout: all at once, or one after the other where they remember."""
+"""Networks over the rows of a rollout: all rows at once, or in the order of time if the network remembers."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 
 from sim2real.train.networks.architectures import Network, is_recurrent
 from sim2real.train.networks.policy import Policy
-from sim2real.train.ppo.rollout import select, spread
+from sim2real.train.ppo.rollout import repeat, select
+from sim2real.types import PyTree
 
 
 class ActorCritic(NamedTuple):
     """The networks of a training.
 
     Attributes:
-        actor: Gives the mean of the actions.
-        critic: Gives the value.
-        name: The actor's, as a bundle has it.
-        teacher: Whom the actor imitates; None: it learns from rewards.
+        actor: Computes the mean of the actions.
+        critic: Computes the value.
+        name: The actor's name in a bundle.
+        teacher: The policy that the actor imitates; None: it learns from rewards.
     """
 
     actor: Network
@@ -29,32 +30,32 @@ class ActorCritic(NamedTuple):
 
 
 class Unrolled(NamedTuple):
-    """What a network made of T rows of N copies.
+    """The outputs of a network for T rows of N copies.
 
     Attributes:
-        carry: What it carries on after the last row; leaves of shape ``(N, ...)``.
-        y: Shape ``(T, N, outputs)``: its output.
-        following: Shape ``(T, N, outputs)``: its output for what followed the row; None: not asked for.
+        carry: The carry after the last row; leaves of shape ``(N, ...)``.
+        y: Shape ``(T, N, outputs)``.
+        following: Shape ``(T, N, outputs)``: outputs for the inputs after each row; None without such inputs.
     """
 
-    carry: Any
+    carry: PyTree
     y: jax.Array
     following: jax.Array | None
 
 
 def unroll(
     network: Network,
-    params: Any,
-    carry: Any,
+    params: PyTree,
+    carry: PyTree,
     x: jax.Array,
     stepped: jax.Array,
     end: jax.Array,
     following: jax.Array | None = None,
 ) -> Unrolled:
-    """Apply a network to rows; it begins anew after an episode's end, and stays as it is in rows without a policy step.
+    """Apply a network to rows, with an initial carry after an episode's end.
 
     Args:
-        carry: What it carries into the first row; leaves of shape ``(N, ...)``.
+        carry: The carry before the first row; leaves of shape ``(N, ...)``.
         x: Shape ``(T, N, inputs)``.
         stepped: Shape ``(T, N)``, bool: rows with a policy step.
         end: Shape ``(T, N)``, bool: rows that end an episode.
@@ -62,16 +63,19 @@ def unroll(
     """
     apply = partial(network.apply, params)
     if not is_recurrent(network):
-        once = jax.vmap(jax.vmap(lambda x: apply(network.initial_carry(), x)[1]))
-        return Unrolled(carry, once(x), None if following is None else once(following))
-    start = spread(network.initial_carry(), x.shape[1])
+        rows = jax.vmap(jax.vmap(lambda x: apply(network.initial_carry(), x)[1]))
+        return Unrolled(carry, rows(x), None if following is None else rows(following))
+    start = repeat(network.initial_carry(), x.shape[1])
 
-    def row(carry: Any, now: tuple[Any, ...]) -> tuple[Any, tuple[jax.Array, jax.Array | None]]:
+    def row(
+        carry: PyTree, now: tuple[jax.Array, jax.Array, jax.Array, jax.Array | None]
+    ) -> tuple[PyTree, tuple[jax.Array, jax.Array | None]]:
         x, stepped, end, following = now
-        moved, y = jax.vmap(apply)(carry, x)
-        moved = select(stepped, moved, carry)
-        after = None if following is None else jax.vmap(apply)(moved, following)[1]
-        return select(end, start, moved), (y, after)
+        # A row without a policy step leaves the carry unchanged, the end of an episode resets it.
+        new, y = jax.vmap(apply)(carry, x)
+        new = select(stepped, new, carry)
+        after = None if following is None else jax.vmap(apply)(new, following)[1]
+        return select(end, start, new), (y, after)
 
     carry, (y, after) = jax.lax.scan(row, carry, (x, stepped, end, following))
     return Unrolled(carry, y, after)

@@ -1,14 +1,58 @@
-"""Proximal policy optimisation (PPO) of several seeds in one compiled program."""
+"""Proximal policy optimisation (PPO) of several seeds in one compiled program.
 
-from typing import TYPE_CHECKING, Any
+``train`` compiles one program that trains every seed from one evaluation to the next, and calls it
+``config.evaluations`` times. Written as a loop of Python for one seed, the program is::
+
+    for update_number in range(config.updates_per_evaluation):
+        # Collect: play rollout_steps rows of all copies with the current policy, with exploration noise.
+        policy = make_policy(env, config, networks, state.params, state.normaliser)
+        key_rollout, _, _ = keys(state)
+        copies, rows = collect(env, config, policy, state.copies, state.update, key_rollout)
+
+        # Update: advantages of the rows, then epochs x minibatches gradient steps, then the normaliser.
+        state, figures = update(env, config, networks, state, copies, rows)
+
+    # Evaluate: play one episode per copy, without exploration noise.
+    policy = make_policy(env, config, networks, state.params, state.normaliser)
+    figures |= evaluate(env, config, policy, key)
+
+and ``update`` does::
+
+    batch, critic_carry = prepare(state, policy, rows, config, networks)   # values, log densities, advantages by gae()
+    for shuffle in shuffles:                                               # config.epochs of them
+        for minibatch in batch[shuffle]:                                   # config.minibatches, all rows of some copies
+            gradient = jax.grad(loss)(params, minibatch, config, networks)
+            params, optimiser = optimiser.update(gradient, optimiser, params)
+    normaliser = update_normaliser(normaliser, rows.observation, rows.valid)
+
+After each call the host checks the figures, writes a checkpoint, and reports progress (``trainer.train``).
+
+| file | content |
+|---|---|
+| ``trainer.py`` | ``train``; the compiled program; the loop on the host |
+| ``initial_state.py`` | networks, optimiser and copies before the first update |
+| ``rollout.py`` | ``collect``, ``evaluate`` |
+| ``update.py`` | ``TrainState``, ``prepare``, ``update`` |
+| ``losses.py`` | ``gae``, ``loss`` |
+| ``optimiser.py`` | Adam, its step size |
+| ``teacher.py`` | teachers, and imitation of them |
+| ``health.py`` | errors for figures that are not finite |
+| ``result.py`` | ``Progress``, ``TrainResult`` |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sim2real.train.ppo.result import TrainResult
     from sim2real.train.ppo.trainer import train as train
 
 __all__ = ["train"]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> Callable[..., TrainResult]:
     """Import ``train`` on first use: it imports JAX."""
     if name in __all__:
         from sim2real.train.ppo import trainer

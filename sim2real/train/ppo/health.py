@@ -1,4 +1,4 @@
-"""What may be wrong with the figures of a training, in words."""
+"""Errors for figures of a training that are not finite."""
 
 from __future__ import annotations
 
@@ -9,39 +9,40 @@ from sim2real.train.config import PPOConfig
 
 FINITE = {
     "finite_observation": ("the observation", "reset or step"),
-    "finite_privileged": ("what the value function sees besides the observation", "privileged"),
+    "finite_privileged": ("the privileged observation", "privileged"),
 }
-"""Figures that say which entries were finite: what they are of, and what makes it."""
+"""Figures that mark which entries were finite: name -> the array, and the environment's method that makes it."""
 
 
 def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfig, names: list[str]) -> None:
-    """Raise if a value is not finite or no episode ended; causes are checked before their consequences.
+    """Raise if a value is not finite or no episode ended.
 
     Args:
         values: Name -> shape ``(num_seeds,)``; those in ``FINITE`` have a second axis, of the entries.
-        names: Who is who, such as ``seed 0``.
+        names: Name of each place on the seed axis, such as ``seed 0``.
 
     Raises:
         Sim2RealError: A value is not finite.
         UsageError: No evaluation episode ended.
     """
+    # Causes come before their consequences: observations, rewards, then losses.
     for seed, name in enumerate(names):
         when = f"({name}, within {env_steps} rows)"
-        for part, (what, maker) in FINITE.items():
+        for part, (array, method) in FINITE.items():
             entries = np.flatnonzero(~values[part][seed]) if part in values else np.empty(0)
             if entries.size:
                 raise Sim2RealError(
-                    f"entries {entries.tolist()} of {what} are not finite {when}",
-                    hint=f"the environment's {maker} makes them: check what these entries divide by or integrate",
+                    f"entries {entries.tolist()} of {array} are not finite {when}",
+                    hint=f"the environment's {method} makes them: check their divisions and integrations",
                 )
         if not np.isfinite(values["reward"][seed]):
             raise Sim2RealError(
                 f"the reward is not finite {when}", hint="check what the environment's reward divides by"
             )
-        lost = sorted(name for name in ("loss", "kl", "entropy") if not np.isfinite(values[name][seed]))
-        if lost:
+        diverged = sorted(name for name in ("loss", "kl", "entropy") if not np.isfinite(values[name][seed]))
+        if diverged:
             raise Sim2RealError(
-                f"the training's {' and '.join(lost)} is not finite {when}, observations and rewards are",
+                f"the training's {' and '.join(diverged)} is not finite {when}, observations and rewards are",
                 hint=f"lower learning_rate (now {config.learning_rate}) or reward_scale (now {config.reward_scale})",
             )
         if values["finished"][seed] == 0:
@@ -49,6 +50,6 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
                 f"no evaluation episode ended within eval_steps={config.eval_steps} rows",
                 hint="raise eval_steps above the longest episode, or let the environment truncate",
             )
-        bad = sorted(name for name, value in values.items() if not np.isfinite(value[seed]).all())
-        if bad:
-            raise Sim2RealError(f"metrics {', '.join(bad)} of finished episodes are not finite {when}")
+        metrics = sorted(name for name, value in values.items() if not np.isfinite(value[seed]).all())
+        if metrics:
+            raise Sim2RealError(f"metrics {', '.join(metrics)} of finished episodes are not finite {when}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +17,10 @@ from sim2real.train.networks.policy import Policy
 from sim2real.train.networks.sequences import ActorCritic
 from sim2real.train.ppo.optimiser import make_optimiser, set_rate
 from sim2real.train.ppo.rollout import Copies
-from sim2real.train.ppo.teacher import check_teacher, size_of
+from sim2real.train.ppo.teacher import check_teacher, count_privileged
 from sim2real.train.ppo.update import TrainState
 from sim2real.train.sweep import Sweep
+from sim2real.types import Array, PyTree
 
 if TYPE_CHECKING:
     import optax
@@ -27,27 +28,29 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def make_start(
+def make_initial_state(
     env: TrainingEnvironment, configs: Sequence[PPOConfig], key: jax.Array, networks: ActorCritic
 ) -> TrainState:
     """Return the states before the first update, with a leading axis; compiles nothing.
 
-    The environments' states are zeros; the first rollout resets them.
-
     Args:
-        configs: Settings; they may differ in numbers alone. The leading axis has all seeds of the first, then those of
-            the next.
-        key: Source of all randomness; seed i depends on it and on i alone.
+        configs: Settings that differ only in numbers. The leading axis has all seeds of the first, then those of the
+            next.
+        key: Seed i depends on it and on i alone.
     """
     first = configs[0]
-    shapes = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))
-    more = privileged_size(env, first)
     keys = jnp.stack([jax.random.fold_in(key, seed) for seed in range(first.num_seeds)])
-    data = np.asarray(jax.random.key_data(keys))
-    sizes = env.observation_size, np.shape(env.action_low)[0], more
-    starts = [_networks(config, networks, np.random.default_rng(own), sizes) for config in configs for own in data]
-    params, optimiser, normaliser, privileged = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *starts)
-    members = len(starts)
+    key_data = np.asarray(jax.random.key_data(keys))
+
+    # Networks, optimiser and normalisers of each place on the leading axis.
+    sizes = env.observation_size, np.shape(env.action_low)[0], privileged_size(env, first)
+    rngs = ((config, np.random.default_rng(seed)) for config in configs for seed in key_data)
+    learners = [_new_learner(config, networks, rng, sizes) for config, rng in rngs]
+    params, optimiser, normaliser, privileged = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *learners)
+
+    # The environments' states are zeros; the first rollout resets them.
+    shapes = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))
+    members = len(learners)
     count = members, first.num_envs
     carries = (net.initial_carry() for net in (networks.actor, networks.critic))
     copies = Copies(*_blank(shapes, count), *(_repeated(carry, count) for carry in carries))
@@ -55,8 +58,8 @@ def make_start(
     return TrainState(params, optimiser, normaliser, privileged, copies, jnp.zeros(members, jnp.int32), keys)
 
 
-def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, np.ndarray]:
-    """Return setting -> its value for each place on the leading axis, float32."""
+def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, Array]:
+    """Return setting -> its value for each place on the seed axis, float32."""
     return {n: np.repeat(np.array([point[n] for point in sweep.grid], np.float32), num_seeds) for n in sweep.values}
 
 
@@ -70,9 +73,9 @@ def make_networks(
     """Return the networks of a training.
 
     Args:
-        actor: Makes the actor; default: as ``config`` says.
-        critic: Makes the value function; default: as ``config`` says, and that the actor.
-        teacher: Whom the actor shall imitate; None: it learns from rewards.
+        actor: Default: ``config.network``.
+        critic: Default: ``config.critic``, or the actor's network.
+        teacher: A policy to imitate; None: learn from rewards.
 
     Raises:
         UsageError: There is no such network, or it does not fit.
@@ -80,19 +83,20 @@ def make_networks(
     if teacher is not None:
         check_teacher(env, config, teacher)
     kind = actor or config.network
-    judge = critic or config.critic or kind
+    critic_kind = critic or config.critic or kind
     size, actions = env.observation_size, np.shape(env.action_low)[0]
+    critic_size = size + (privileged_size(env, config) or 0)
     return ActorCritic(
         actor=make_network(kind, config.hidden, size, actions),
-        critic=make_network(judge, config.hidden, size + (privileged_size(env, config) or 0), 1, exported=False),
+        critic=make_network(critic_kind, config.hidden, critic_size, 1, exported=False),
         name=name_of(kind),
         teacher=teacher,
     )
 
 
 def privileged_size(env: TrainingEnvironment, config: PPOConfig) -> int | None:
-    """Return how much the value function sees besides the observation; None: it is not asked for."""
-    return size_of(env) if config.privileged else None
+    """Return the number of the value function's further inputs; None if ``config`` has none."""
+    return count_privileged(env) if config.privileged else None
 
 
 def _repeated(carry: T, count: tuple[int, ...]) -> T:
@@ -100,26 +104,25 @@ def _repeated(carry: T, count: tuple[int, ...]) -> T:
     return jax.tree.map(lambda leaf: np.broadcast_to(leaf, (*count, *np.shape(leaf))), carry)
 
 
-def _networks(
+def _new_learner(
     config: PPOConfig, networks: ActorCritic, rng: np.random.Generator, sizes: tuple[int, int, int | None]
-) -> tuple[dict[str, Any], optax.OptState, Normaliser, Normaliser | None]:
+) -> tuple[dict[str, PyTree], optax.OptState, Normaliser, Normaliser | None]:
     """Return networks, optimiser and normalisers; ``sizes``: of observation, action and privileged observation."""
-    size, actions, more = sizes
+    size, actions, privileged = sizes
     params = {
         "actor": networks.actor.init(rng, size, 0.01),
         "log_std": np.full(actions, config.log_std_init, np.float32),
-        "value": networks.critic.init(rng, size + (more or 0), 1.0),
+        "value": networks.critic.init(rng, size + (privileged or 0), 1.0),
     }
     optimiser = _blank(jax.eval_shape(make_optimiser(config).init, params), ())
     if config.schedule == "adaptive":
         optimiser = set_rate(optimiser, np.float32(config.learning_rate))
-    return params, optimiser, _normaliser(size), None if more is None else _normaliser(more)
+    return params, optimiser, _new_normaliser(size), None if privileged is None else _new_normaliser(privileged)
 
 
-def _normaliser(size: int) -> Any:
-    """Return statistics of nothing, in numpy."""
-    blank: Any = (np.asarray(np.float32(0)), np.zeros(size, np.float32), np.ones(size, np.float32))
-    return Normaliser(*blank)
+def _new_normaliser(size: int) -> Normaliser:
+    """Return the statistics before the first observation, in numpy."""
+    return Normaliser(np.asarray(np.float32(0)), np.zeros(size, np.float32), np.ones(size, np.float32))
 
 
 def _blank(shapes: T, leading: tuple[int, ...]) -> T:

@@ -1,4 +1,4 @@
-"""Adam, and how its step size goes on during training."""
+"""Adam, and the schedule of its step size."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import optax
 from sim2real.train.config import PPOConfig
 
 ADAM_EPS = 1e-5
-LEAST_RATE, MOST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
+MIN_RATE, MAX_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
 """Bounds of an adaptive step size, and the factor of a change: those of rsl_rl."""
 
 
@@ -39,12 +39,12 @@ def set_rate(state: optax.OptState, rate: jax.Array | np.floating) -> optax.OptS
 
 
 def adapt_rate(rate: jax.Array, kl: jax.Array, target_kl: float) -> jax.Array:
-    """Return the next step size: smaller where the policy moved too far, larger where it hardly moved.
+    """Return the next step size: smaller if the policy moved too far, larger if it hardly moved.
 
     Args:
         rate: Shape ``()``.
-        kl: Shape ``()``: KL divergence from the policy that played [nat]; 0, before anything moved, changes nothing.
-        target_kl: What it should be [nat].
+        kl: Shape ``()``: KL divergence from the policy that played [nat]; 0, as before the first step, keeps the rate.
+        target_kl: Wanted KL divergence [nat].
     """
-    smaller, larger = jnp.maximum(rate / RATE_FACTOR, LEAST_RATE), jnp.minimum(rate * RATE_FACTOR, MOST_RATE)
+    smaller, larger = jnp.maximum(rate / RATE_FACTOR, MIN_RATE), jnp.minimum(rate * RATE_FACTOR, MAX_RATE)
     return jnp.where(kl > 2 * target_kl, smaller, jnp.where((kl > 0) & (kl < target_kl / 2), larger, rate))

@@ -1,4 +1,4 @@
-"""How a training goes, and what it ends with."""
+"""Progress and result of a training."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ class Progress:
 
     Attributes:
         evaluation: Number of this evaluation, from 1.
-        evaluations: Number of evaluations in all.
         env_steps: Number of rows so far, per seed.
         elapsed_s: Time that training took so far, compilation included [s].
         values: Name -> shape ``(num_seeds,)``: ``return``, the environment's metrics, losses.
@@ -36,17 +35,16 @@ class TrainResult:
         policies: The policies at the end; leaves have a leading seed axis.
         best: The policy with the highest success rate over all seeds and evaluations; of equals, the highest return.
         best_seed: Its seed; of a sweep, its place on the seed axis.
-        members: For each place on the seed axis, the settings that were swept; empty ones where none were. All seeds of
-            the first settings come first.
-        history: Name -> shape ``(evaluations, num_seeds)``: the values of ``Progress``; fewer evaluations than were
-            asked for where the target was reached.
+        members: Swept settings of each place on the seed axis, empty without a sweep; all seeds of the first settings
+            come first.
+        history: Name -> shape ``(evaluations, num_seeds)``: the values of ``Progress``; shorter than
+            ``config.evaluations`` if the target was reached.
         env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation.
         elapsed_s: Shape ``(evaluations,)``: time that training took so far [s].
-        observations: Shape ``(N, O)``: what the policies that ended training saw last, of the best one's place on the
-            seed axis.
-        env_steps_per_s: Rows of all seeds per second of ``train_s``, those of evaluations not counted.
+        observations: Shape ``(N, O)``: the copies' last observations, of the best policy's place on the seed axis.
+        env_steps_per_s: Rows of all seeds per second of ``train_s``, without those of evaluations.
         compile_s: Time to trace and compile [s].
-        train_s: Time to train and evaluate [s]; of a resumed training, since then.
+        train_s: Time to train and evaluate [s]; of a resumed training, since it was resumed.
     """
 
     policies: Policy
@@ -67,7 +65,7 @@ def history_of(log: list[Progress]) -> dict[str, np.ndarray]:
     return {name: np.stack([progress.values[name] for progress in log]) for name in log[0].values}
 
 
-def best_of(history: dict[str, np.ndarray]) -> tuple[int, int]:
+def find_best(history: dict[str, np.ndarray]) -> tuple[int, int]:
     """Return the index of the best evaluation and seed: by success, then by return, then the latest."""
     returns = history["return"]
     success = history.get("success", np.zeros_like(returns))

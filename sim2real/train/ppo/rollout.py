@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,32 +12,32 @@ from sim2real.train.config import PPOConfig
 from sim2real.train.environment.protocol import TrainingEnvironment, get_privileged, get_reset, metric_names
 from sim2real.train.networks.policy import Policy
 from sim2real.train.ppo.teacher import advice
+from sim2real.types import PyTree
+
+T = TypeVar("T")
 
 
 class Copies(NamedTuple):
     """N copies of an environment between two rows.
 
     Attributes:
-        state: Their states; leaves of shape ``(N, ...)``.
-        observation: Shape ``(N, O)``: their observations.
-        carry: What the actor carries from step to step; leaves of shape ``(N, ...)``.
-        critic_carry: The same of the value function.
+        state: Leaves of shape ``(N, ...)``.
+        observation: Shape ``(N, O)``.
+        carry: The actor's memory; leaves of shape ``(N, ...)``.
+        critic_carry: The value function's memory.
     """
 
-    state: Any
+    state: PyTree
     observation: jax.Array
-    carry: Any = ()
-    critic_carry: Any = ()
-
-
-T = TypeVar("T")
+    carry: PyTree = ()
+    critic_carry: PyTree = ()
 
 
 class Rows(NamedTuple):
     """T rows of N copies; see ``protocol.Step``.
 
     Attributes:
-        observation: Shape ``(T, N, O)``: the policy's observation.
+        observation: Shape ``(T, N, O)``.
         u: Shape ``(T, N, A)``: the policy's sample, before it is clipped and scaled to an action.
         reward: Shape ``(T, N)``: the reward times ``reward_scale``.
         terminated: Shape ``(T, N)``.
@@ -45,9 +45,9 @@ class Rows(NamedTuple):
         valid: Shape ``(T, N)``.
         following: Shape ``(T, N, O)``: the observation after the row, before any reset.
         metrics: Name -> shape ``(T, N)``: the environment's, after the row.
-        privileged: Shape ``(T, N, P)``: what the value function sees besides the observation; None: nothing.
+        privileged: Shape ``(T, N, P)``: the value function's further inputs; None if it has none.
         privileged_following: Shape ``(T, N, P)``: the same after the row.
-        advice: Shape ``(T, N, A)``: what a teacher would have done; None: there is none.
+        advice: Shape ``(T, N, A)``: the teacher's actions; None without a teacher.
     """
 
     observation: jax.Array
@@ -63,14 +63,14 @@ class Rows(NamedTuple):
     advice: jax.Array | None = None
 
 
-class Tested(NamedTuple):
-    """What N copies have shown in a test: one episode each.
+class Evaluation(NamedTuple):
+    """One episode of each of N copies, as far as it is played.
 
     Attributes:
         running: Shape ``(N,)``, bool: the episode has not ended yet.
-        terminated: Shape ``(N,)``, bool: it ended by itself.
-        figures: Name -> shape ``(N,)``: ``return``, the sum of the rewards, and the environment's metrics, which may
-            have a ``return`` of their own, as they were at the end.
+        terminated: Shape ``(N,)``, bool: it ended by a termination.
+        figures: Name -> shape ``(N,)``: ``return``, the sum of the rewards, and the environment's metrics at the
+            episode's end; a metric ``return`` replaces the sum.
     """
 
     running: jax.Array
@@ -78,33 +78,22 @@ class Tested(NamedTuple):
     figures: dict[str, jax.Array]
 
 
-def pick(condition: jax.Array, new: T, old: T) -> T:
-    """Return ``new`` or ``old``.
-
-    Args:
-        condition: Shape ``()``, bool: whether it is ``new``.
-        old: Like ``new``.
-    """
+def choose(condition: jax.Array, new: T, old: T) -> T:
+    """Return ``new`` if ``condition``, shape ``()``, is true, else ``old``."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def select(mask: jax.Array, new: T, old: T) -> T:
-    """Return ``new`` where ``mask`` is true, else ``old``, for each of N copies.
+    """Return ``new`` where ``mask (N,)`` is true, else ``old``, for each of N copies; leaves ``(N, ...)``."""
 
-    Args:
-        mask: Shape ``(N,)``, bool.
-        new: Leaves of shape ``(N, ...)``.
-        old: Like ``new``.
-    """
-
-    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+    def one(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
 
-    return jax.tree.map(pick, new, old)
+    return jax.tree.map(one, new, old)
 
 
-def spread(carry: T, count: int) -> T:
-    """Return what is carried into a first step for each of N copies."""
+def repeat(carry: T, count: int) -> T:
+    """Return an initial carry for each of N copies, leaves ``(N, ...)``."""
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf))), carry)
 
 
@@ -116,119 +105,146 @@ def collect(
     update: jax.Array,
     key: jax.Array,
     teacher: Policy | None = None,
-    testing: jax.Array | bool = False,
+    evaluating: jax.Array | bool = False,
 ) -> tuple[Copies, Rows]:
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
-    As a reset may cost more than a row, each copy has one reset state for the whole rollout, from which all its new
-    episodes start. In the first rollout every copy starts with a reset. The first episodes are cut after different
-    numbers of rows; otherwise all copies would stay at the same time of their episodes, and each update would see only
-    one phase of the task.
-
     Args:
-        env: The environment; vmapped here.
-        policy: The policy; it does not change during the rollout.
-        copies: The copies after the last rollout; ignored if ``update`` is 0.
-        update: Shape ``()``, int32: number of updates so far, in a test of rollouts.
-        key: Source of resets, noise and the environment's own randomness.
-        teacher: Whose advice is asked for in every row, while the policy acts.
-        testing: Shape ``()``, bool: play without exploration noise, cut no episode, and have all differences between
-            episodes, as at the end of a curriculum; default: false.
+        env: One copy; vmapped here.
+        copies: The copies after the last rollout; if ``update`` is 0 all of them are reset.
+        update: Shape ``()``, int32: number of updates so far; in an evaluation, of rollouts.
+        teacher: Its actions are recorded in every row, while the policy acts.
+        evaluating: Shape ``()``, bool: play without exploration noise, cut no episode, and draw episodes as at the end
+            of the curriculum.
 
     Returns:
         The copies after the rollout, and the rows.
     """
     count, rows = config.num_envs, config.rollout_steps
     key_reset, key_noise, key_step = jax.random.split(key, 3)
-    widened = jnp.where(testing, config.updates, update)
-    begun = jax.vmap(get_reset(env, config, widened))(jax.random.split(key_reset, count))
-    fresh = Copies(*begun, spread(policy.initial_carry(), count), copies.critic_carry)
+
+    # Draw one initial state per copy for the whole rollout, as a reset may cost more than a row.
+    reset = get_reset(env, config, jnp.where(evaluating, config.updates, update))
+    initial = jax.vmap(reset)(jax.random.split(key_reset, count))
+    fresh = Copies(*initial, repeat(policy.initial_carry(), count), copies.critic_carry)
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)
+
+    # Draw the exploration noise of all rows.
     noise = jax.random.normal(key_noise, (rows, count, policy.low.shape[0]))
-    std = jnp.where(testing, 0.0, jnp.exp(policy.log_std))
-    see = get_privileged(env, config)
-    cut = jnp.where(testing, 0, 1 + jnp.arange(count) * config.eval_steps // count)
+    noise = jnp.where(evaluating, 0.0, jnp.exp(policy.log_std)) * noise
 
-    def row(now: Copies, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Copies, Rows]:
-        noise, keys, number = x
-        carry, mean = jax.vmap(policy.get_mean)(now.carry, now.observation)
-        u = mean + std * noise
-        step = jax.vmap(env.step)(now.state, jax.vmap(policy.to_action)(u), keys)
-        truncated = step.truncated | (number == cut)
-        following = Copies(step.state, step.observation, select(step.valid, carry, now.carry), now.critic_carry)
-        out = Rows(
-            observation=now.observation,
-            u=u,
-            reward=config.reward_scale * step.reward,
-            terminated=step.terminated,
-            truncated=truncated,
-            valid=step.valid,
-            following=step.observation,
-            metrics=step.metrics,
-            privileged=None if see is None else jax.vmap(see)(now.state),
-            privileged_following=None if see is None else jax.vmap(see)(step.state),
-            advice=None if teacher is None else jax.vmap(partial(advice, env, teacher))(now.state, now.observation),
-        )
-        return select(step.terminated | truncated, fresh, following), out
-
+    # Cut the first episodes after different numbers of rows. Otherwise all copies would stay at the same time of their
+    # episodes, and each update would learn from only one phase of the task.
+    cut = jnp.where(evaluating, 0, 1 + jnp.arange(count) * config.eval_steps // count)
+    row = partial(_play_row, env, config, policy, teacher, fresh, cut)
     numbers = update * rows + jnp.arange(1, rows + 1)
     return jax.lax.scan(row, copies, (noise, jax.random.split(key_step, (rows, count)), numbers))
 
 
-def untested(env: TrainingEnvironment, config: PPOConfig) -> Tested:
-    """Return what is known before a test."""
+def _play_row(
+    env: TrainingEnvironment,
+    config: PPOConfig,
+    policy: Policy,
+    teacher: Policy | None,
+    fresh: Copies,
+    cut: jax.Array,
+    now: Copies,
+    x: tuple[jax.Array, jax.Array, jax.Array],
+) -> tuple[Copies, Rows]:
+    """Play one row of all copies.
+
+    Args:
+        fresh: The copies at the start of an episode.
+        cut: Shape ``(N,)``, int32: number of the row after which a copy's first episode ends.
+        x: Exploration noise ``(N, A)``, keys ``(N,)``, and the row's number from 1 ``()``.
+    """
+    noise, keys, number = x
+
+    # Act: the network's mean, the noise, then the environment.
+    carry, mean = jax.vmap(policy.get_mean)(now.carry, now.observation)
+    u = mean + noise
+    step = jax.vmap(env.step)(now.state, jax.vmap(policy.to_action)(u), keys)
+    truncated = step.truncated | (number == cut)
+
+    # Record the row, with the further inputs of the value function and the teacher's actions if they are used.
+    privileged = get_privileged(env, config)
+    out = Rows(
+        observation=now.observation,
+        u=u,
+        reward=config.reward_scale * step.reward,
+        terminated=step.terminated,
+        truncated=truncated,
+        valid=step.valid,
+        following=step.observation,
+        metrics=step.metrics,
+        privileged=None if privileged is None else jax.vmap(privileged)(now.state),
+        privileged_following=None if privileged is None else jax.vmap(privileged)(step.state),
+        advice=None if teacher is None else jax.vmap(partial(advice, env, teacher))(now.state, now.observation),
+    )
+
+    # Start another episode where this one ended; a row without a policy step leaves the actor's memory unchanged.
+    following = Copies(step.state, step.observation, select(step.valid, carry, now.carry), now.critic_carry)
+    return select(step.terminated | truncated, fresh, following), out
+
+
+def new_evaluation(env: TrainingEnvironment, config: PPOConfig) -> Evaluation:
+    """Return an evaluation without rows."""
     names = metric_names(env)
     zeros, no = jnp.zeros(config.num_envs), jnp.zeros(config.num_envs, bool)
-    return Tested(~no, no, dict.fromkeys(["return", *names], zeros))
+    return Evaluation(~no, no, dict.fromkeys(["return", *names], zeros))
 
 
-def watch(tested: Tested, rows: Rows, config: PPOConfig) -> Tested:
-    """Return what is known after more rows of a test."""
+def add_rows(evaluation: Evaluation, rows: Rows, config: PPOConfig) -> Evaluation:
+    """Return the evaluation after more rows; rows behind a copy's first episode do not count."""
     end = rows.terminated | rows.truncated
-    runs = tested.running & (jnp.cumsum(end, axis=0) - end == 0)  # (T, N): before each row
+    runs = evaluation.running & (jnp.cumsum(end, axis=0) - end == 0)  # (T, N): before each row
     last = runs & end
+
+    # Rewards are summed over the episode, metrics are read in its last row.
     figures = {"return": rows.reward / config.reward_scale} | rows.metrics
-    own = "return" in rows.metrics
-    kept = {n: jnp.where(runs if n == "return" and not own else last, v, 0.0).sum(0) for n, v in figures.items()}
-    return Tested(
-        running=tested.running & ~last.any(0),
-        terminated=tested.terminated | (last & rows.terminated).any(0),
-        figures={name: tested.figures[name] + value for name, value in kept.items()},
+    summed = {"return"} - set(rows.metrics)
+    added = {n: jnp.where(runs if n in summed else last, v, 0.0).sum(0) for n, v in figures.items()}
+    return Evaluation(
+        running=evaluation.running & ~last.any(0),
+        terminated=evaluation.terminated | (last & rows.terminated).any(0),
+        figures={name: evaluation.figures[name] + value for name, value in added.items()},
     )
 
 
-def figures_of(tested: Tested) -> dict[str, jax.Array]:
-    """Return the figures' means over the episodes that ended, each of shape ``()``.
+def averages(evaluation: Evaluation) -> dict[str, jax.Array]:
+    """Return the means over the episodes that ended, each of shape ``()``.
 
-    With them ``finished``, the share of the episodes that ended, and ``terminated``, that of those which did by
-    themselves.
+    ``finished`` is the share of the episodes that ended, ``terminated`` the share of those that a termination ended.
     """
-    share = jnp.mean(jnp.where(tested.running, 0.0, 1.0))
-    figures = {"terminated": jnp.where(tested.terminated, 1.0, 0.0)} | tested.figures
-    return {n: jnp.mean(jnp.where(tested.running, 0.0, v)) / share for n, v in figures.items()} | {"finished": share}
+    running = evaluation.running
+    share = jnp.mean(jnp.where(running, 0.0, 1.0))
+    figures = {"terminated": jnp.where(evaluation.terminated, 1.0, 0.0)} | evaluation.figures
+    return {n: jnp.mean(jnp.where(running, 0.0, v)) / share for n, v in figures.items()} | {"finished": share}
 
 
 def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
     """Play one episode per copy without exploration noise, and average over the episodes that ended.
 
     Args:
-        env: The environment; vmapped here.
+        env: One copy; vmapped here.
 
     Returns:
-        ``return`` (sum of the unscaled rewards, unless the environment's metrics have one), the environment's metrics,
-        ``finished``: the fraction of the episodes that ended within ``eval_steps`` rows, and ``terminated``: the
-        fraction of those that ended by themselves. Each of shape ``()``.
+        ``return`` (sum of the unscaled rewards, or the environment's metric of that name), the environment's metrics,
+        ``finished``: the share of the episodes that ended within ``eval_steps`` rows, and ``terminated``: the share of
+        those that a termination ended. Each of shape ``()``.
     """
     reset = get_reset(env, config, jnp.int32(0))
     shapes = jax.eval_shape(lambda: jax.vmap(reset)(jax.random.split(jax.random.key(0), config.num_envs)))
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), Copies(*shapes))
-    blank = blank._replace(carry=spread(policy.initial_carry(), config.num_envs))
+    blank = blank._replace(carry=repeat(policy.initial_carry(), config.num_envs))
 
-    def rollout(carry: tuple[Copies, Tested], x: tuple[jax.Array, jax.Array]) -> tuple[tuple[Copies, Tested], None]:
-        (copies, tested), (number, own) = carry, x
-        played, rows = collect(env, config, policy, copies, number, own, testing=True)
-        return (played, watch(tested, rows, config)), None
+    def rollout(
+        carry: tuple[Copies, Evaluation], x: tuple[jax.Array, jax.Array]
+    ) -> tuple[tuple[Copies, Evaluation], None]:
+        (copies, evaluation), (number, key) = carry, x
+        copies, rows = collect(env, config, policy, copies, number, key, evaluating=True)
+        return (copies, add_rows(evaluation, rows, config)), None
 
-    start, numbers = (blank, untested(env, config)), jnp.arange(config.rollouts_per_test)
-    (_, tested), _ = jax.lax.scan(rollout, start, (numbers, jax.random.split(key, len(numbers))))
-    return figures_of(tested)
+    start, numbers = (blank, new_evaluation(env, config)), jnp.arange(config.rollouts_per_evaluation)
+    (_, evaluation), _ = jax.lax.scan(rollout, start, (numbers, jax.random.split(key, len(numbers))))
+    return averages(evaluation)

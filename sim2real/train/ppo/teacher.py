@@ -1,9 +1,8 @@
-"""A teacher, a policy that sees what only simulation knows, and what a student of it needs."""
+"""Teachers: policies that observe the simulation's true state, and the checks before a student imitates one."""
 
 from __future__ import annotations
 
 import copy
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,117 +11,115 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.runtime.program_arguments import data_of, with_data
 from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import Step, TrainingEnvironment, WideningEnvironment, sees_more
+from sim2real.train.environment.protocol import Step, TrainingEnvironment, WideningEnvironment, require_privileged
 from sim2real.train.networks.architectures import is_recurrent
 from sim2real.train.networks.policy import Policy
+from sim2real.types import PyTree
 
 
 class TeacherEnvironment:
-    """An environment whose policy sees, after its observation, what is true in simulation.
+    """An environment whose observation ends with the privileged entries of the environment inside.
 
     Raises:
-        UsageError: It does not say what is true.
+        UsageError: The environment inside has no privileged entries.
     """
 
     def __init__(self, env: TrainingEnvironment) -> None:
-        self._env, self._knows = env, sees_more(env)
-        self.privileged_size = size_of(env)
+        self._env, self._truth = env, require_privileged(env)
+        self.privileged_size = count_privileged(env)
         self.observation_size = env.observation_size + self.privileged_size
         self.action_low, self.action_high = env.action_low, env.action_high
         self.curriculum = env.curriculum if isinstance(env, WideningEnvironment) else None
 
     @property
-    def data(self) -> Any:
+    def data(self) -> PyTree:
         """The environment's data; see ``HoldsData``."""
         return data_of(self._env)
 
-    def with_data(self, data: Any) -> TeacherEnvironment:
+    def with_data(self, data: PyTree) -> TeacherEnvironment:
         """Return a copy of the environment with other data, which may be traced."""
         env = copy.copy(self)
         env._env = with_data(self._env, data)
-        env._knows = sees_more(env._env)
+        env._truth = require_privileged(env._env)
         return env
 
-    def reset(self, key: jax.Array) -> tuple[Any, jax.Array]:
+    def reset(self, key: jax.Array) -> tuple[PyTree, jax.Array]:
         """Return the state at the start of an episode and the first observation."""
         state, observation = self._env.reset(key)
-        return state, self._seen(state, observation)
+        return state, self._extend(state, observation)
 
-    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[Any, jax.Array]:
-        """Start an episode that differs from others by a share, shape ``()``, of what it might."""
+    def reset_at(self, key: jax.Array, width: jax.Array) -> tuple[PyTree, jax.Array]:
+        """Start an episode with a share, shape ``()``, of the differences between episodes."""
         if not isinstance(self._env, WideningEnvironment):
             return self.reset(key)
         state, observation = self._env.reset_at(key, width)
-        return state, self._seen(state, observation)
+        return state, self._extend(state, observation)
 
-    def step(self, state: Any, action: jax.Array, key: jax.Array) -> Step:
-        """Play one row.
+    def step(self, state: PyTree, action: jax.Array, key: jax.Array) -> Step:
+        """Play one row; ``action (A,)`` within the bounds [the action's units]."""
+        step = self._env.step(state, action, key)
+        return step._replace(observation=self._extend(step.state, step.observation))
 
-        Args:
-            state: What ``reset`` or ``step`` returned.
-            action: Shape ``(A,)``, within the bounds [the action's units].
-        """
-        made = self._env.step(state, action, key)
-        return made._replace(observation=self._seen(made.state, made.observation))
+    def privileged(self, state: PyTree) -> jax.Array:
+        """Return the privileged entries, shape ``(P,)``."""
+        return self._truth.privileged(state)
 
-    def privileged(self, state: Any) -> jax.Array:
-        """Return what is true in a state, shape ``(P,)``."""
-        return self._knows.privileged(state)
-
-    def _seen(self, state: Any, observation: jax.Array) -> jax.Array:
+    def _extend(self, state: PyTree, observation: jax.Array) -> jax.Array:
         return jnp.concatenate([observation, self.privileged(state)])
 
 
-def size_of(env: TrainingEnvironment) -> int:
-    """Return how many entries are true in simulation and unknown to a robot.
+def count_privileged(env: TrainingEnvironment) -> int:
+    """Return the number of privileged entries: true in simulation, not measured by a robot.
 
     Raises:
-        UsageError: The environment does not say what is true.
+        UsageError: The environment has no privileged entries.
     """
     state = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))[0]
-    shape = jax.eval_shape(sees_more(env).privileged, state).shape
+    shape = jax.eval_shape(require_privileged(env).privileged, state).shape
     if len(shape) != 1:
-        raise UsageError(f"what the environment's `privileged` returns must be a vector, it has shape {shape}")
+        raise UsageError(f"the environment's `privileged` must return a vector, it has shape {shape}")
     return shape[0]
 
 
-def seen_by(policy: Policy, env: TrainingEnvironment) -> TrainingEnvironment:
-    """Return the environment as a policy sees it."""
+def environment_for(policy: Policy, env: TrainingEnvironment) -> TrainingEnvironment:
+    """Return the environment with the observation that a policy expects."""
     return TeacherEnvironment(env) if policy.spec.privileged else env
 
 
-def advice(env: TrainingEnvironment, teacher: Policy, state: Any, observation: jax.Array) -> jax.Array:
-    """Return what a teacher would do, shape ``(A,)``, within [-1, 1] of the action's range.
+def advice(env: TrainingEnvironment, teacher: Policy, state: PyTree, observation: jax.Array) -> jax.Array:
+    """Return the teacher's action, shape ``(A,)``, within [-1, 1] of the action's range.
 
     Args:
-        observation: Shape ``(O,)``: what the student sees.
+        observation: Shape ``(O,)``: the student's.
     """
     if teacher.spec.privileged:
-        observation = jnp.concatenate([observation, sees_more(env).privileged(state)])
+        observation = jnp.concatenate([observation, require_privileged(env).privileged(state)])
     return teacher.bound(teacher.get_mean(teacher.initial_carry(), observation)[1])
 
 
 def check_teacher(env: TrainingEnvironment, config: PPOConfig, teacher: Policy) -> None:
-    """Compare a teacher with what it shall teach in.
+    """Compare a teacher with the student's environment.
 
     Raises:
-        UsageError: It is none for this student; the message says in what.
+        UsageError: The teacher does not fit this student.
     """
-    known = size_of(env) if teacher.spec.privileged else 0
+    privileged = count_privileged(env) if teacher.spec.privileged else 0
     if config.teacher:
         raise UsageError(
-            "a student sees what a robot shows, not what only simulation knows", hint="train it without --ppo.teacher"
+            "a student observes only what a robot measures, not the simulation's true state",
+            hint="train it without --ppo.teacher",
         )
     if is_recurrent(teacher.network):
         raise UsageError(
-            f"a teacher of network {teacher.spec.name!r} remembers; here it is asked in states that it did not lead to",
-            hint="train the teacher with --ppo.network mlp: it sees the truth and need not remember",
+            f"a teacher of network {teacher.spec.name!r} remembers, and the student leads to states that the teacher "
+            "has no memory of",
+            hint="train the teacher with --ppo.network mlp: it observes the true state and need not remember",
         )
-    sizes = (teacher.mean.size, teacher.spec.privileged), (env.observation_size + known, known)
+    sizes = (teacher.mean.size, teacher.spec.privileged), (env.observation_size + privileged, privileged)
     bounds = [np.asarray(a, np.float32) for a in (teacher.low, teacher.high, env.action_low, env.action_high)]
     if sizes[0] != sizes[1] or not np.array_equal(bounds[:2], bounds[2:]):
         raise UsageError(
-            f"the teacher sees {sizes[0][0]} entries, {sizes[0][1]} of them in simulation only, and acts within "
+            f"the teacher observes {sizes[0][0]} entries, {sizes[0][1]} of them in simulation only, and acts within "
             f"{bounds[0]} to {bounds[1]}; here it is {sizes[1][0]}, {sizes[1][1]}, {bounds[2]} and {bounds[3]}",
             hint="train the teacher on this robot in this world",
         )

@@ -1,10 +1,10 @@
-"""One PPO update: a rollout, advantage estimates, and minibatch steps."""
+"""One PPO update: the batch of a rollout with its advantages, then minibatch steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,23 +20,22 @@ from sim2real.train.ppo.losses import Batch, gae, loss
 from sim2real.train.ppo.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
 from sim2real.train.ppo.rollout import Copies, Rows
 from sim2real.train.ppo.teacher import TeacherEnvironment
-from sim2real.train.scale.mesh import spread
+from sim2real.train.scale.mesh import divide_minibatches
+from sim2real.types import PyTree
 
 
 class TrainState(NamedTuple):
-    """Everything that training carries from update to update, for one seed.
+    """The state of one seed's training between two updates.
 
     Attributes:
-        params: ``{"actor": ..., "log_std": (A,), "value": ...}``: those of the networks, and of the noise.
-        optimiser: State of the optimiser.
+        params: ``{"actor": ..., "log_std": (A,), "value": ...}``: the networks' parameters, and the noise.
         normaliser: Statistics of the observations so far.
-        privileged: Statistics of what the value function sees besides; None: it sees the observation alone.
-        copies: The environments.
+        privileged: Statistics of the value function's further inputs; None if it has none.
         update: Shape ``()``, int32: number of updates so far.
         key: The seed's key; it never changes. ``keys`` derives the keys of an update from it.
     """
 
-    params: dict[str, Any]
+    params: dict[str, PyTree]
     optimiser: optax.OptState
     normaliser: Normaliser
     privileged: Normaliser | None
@@ -45,84 +44,92 @@ class TrainState(NamedTuple):
     key: jax.Array
 
 
-_Learnt = tuple[Any, optax.OptState]
+_Learner = tuple[PyTree, optax.OptState]
 """Parameters, and the state of the optimiser."""
 
 
 def make_policy(
-    env: TrainingEnvironment, config: PPOConfig, networks: ActorCritic, params: dict[str, Any], normaliser: Normaliser
+    env: TrainingEnvironment,
+    config: PPOConfig,
+    networks: ActorCritic,
+    params: dict[str, PyTree],
+    normaliser: Normaliser,
 ) -> Policy:
-    """Return the policy with the given parameters and normaliser.
-
-    Args:
-        params: As in ``TrainState``.
-    """
-    known = env.privileged_size if isinstance(env, TeacherEnvironment) else 0
+    """Return the policy with parameters as in ``TrainState``."""
+    privileged = env.privileged_size if isinstance(env, TeacherEnvironment) else 0
     return Policy(
         params=params["actor"],
         log_std=params["log_std"],
-        mean=normaliser.mean,
-        std=deviations(normaliser, known),
+        mean=jnp.asarray(normaliser.mean),
+        std=deviations(normaliser, privileged),
         low=jnp.asarray(env.action_low, jnp.float32),
         high=jnp.asarray(env.action_high, jnp.float32),
         network=networks.actor,
-        spec=NetworkSpec(networks.name, config.squash, known),
+        spec=NetworkSpec(networks.name, config.squash, privileged),
     )
 
 
 def prepare(
     state: TrainState, policy: Policy, rows: Rows, config: PPOConfig, networks: ActorCritic
-) -> tuple[Batch, Any]:
+) -> tuple[Batch, PyTree]:
     """Return the batch of a rollout: normalised observations, values, log densities and advantages.
 
     Args:
-        state: The state before the rollout; its value network and normalisers are used.
+        state: The state before the rollout.
         policy: The policy that played the rows.
 
     Returns:
-        The batch, and what the value function carries on after the last row.
+        The batch, and the value function's carry after the last row.
     """
+    # Normalise the inputs of both networks, in each row and after it.
+    x, x_following = _over_rows(policy.normalise, rows.observation), _over_rows(policy.normalise, rows.following)
+    critic = _critic_input(state, x, rows.privileged)
+    critic_following = _critic_input(state, x_following, rows.privileged_following)
 
-    def over_rows(function: Callable[..., jax.Array], *leaves: jax.Array) -> jax.Array:
-        return jax.vmap(jax.vmap(function))(*leaves)
-
-    def judged(x: jax.Array, privileged: jax.Array | None) -> jax.Array:
-        """Return what the value function is given."""
-        if privileged is None or state.privileged is None:
-            return x
-        known = over_rows(partial(normalise_parameters, state.privileged), privileged)
-        return jnp.concatenate([x, known], axis=-1)
-
-    x, x_following = over_rows(policy.normalise, rows.observation), over_rows(policy.normalise, rows.following)
-    critic, critic_following = judged(x, rows.privileged), judged(x_following, rows.privileged_following)
+    # Compute the means of the actions, and the values, by networks that may remember.
     end, copies, squash = rows.terminated | rows.truncated, state.copies, policy.spec.squash
-    played = unroll(networks.actor, policy.params, copies.carry, x, rows.valid, end).y
-    judge = unroll(
+    mean = unroll(networks.actor, policy.params, copies.carry, x, rows.valid, end).y
+    values = unroll(
         networks.critic, state.params["value"], copies.critic_carry, critic, rows.valid, end, critic_following
     )
-    value, following = judge.y[..., 0], jnp.asarray(judge.following)[..., 0]
+    value, following = values.y[..., 0], jnp.asarray(values.following)[..., 0]
+
+    # The rollout has rows first, minibatches have copies first.
     batch = Batch(
         x=x,
         critic=None if state.privileged is None else critic,
         u=rows.u,
-        log_prob=over_rows(lambda u, mean: log_prob(u, mean, policy.log_std, squash), rows.u, played),
+        log_prob=_over_rows(lambda u, mean: log_prob(u, mean, policy.log_std, squash), rows.u, mean),
         value=value,
         advantage=gae(rows, value, following, config.gamma, config.gae_lambda),
         weight=rows.valid.astype(jnp.float32),
         advice=rows.advice,
-        noise=(rows.u - played) * jnp.exp(-policy.log_std) if squash else None,
+        noise=(rows.u - mean) * jnp.exp(-policy.log_std) if squash else None,
         end=end,
         actor_carry=(),
         critic_carry=(),
     )
     batch = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), batch)
-    return batch._replace(actor_carry=copies.carry, critic_carry=copies.critic_carry), judge.carry
+    return batch._replace(actor_carry=copies.carry, critic_carry=copies.critic_carry), values.carry
+
+
+def _over_rows(function: Callable[..., jax.Array], *leaves: jax.Array) -> jax.Array:
+    """Apply a function of one row of one copy to leaves ``(T, N, ...)``."""
+    return jax.vmap(jax.vmap(function))(*leaves)
+
+
+def _critic_input(state: TrainState, x: jax.Array, privileged: jax.Array | None) -> jax.Array:
+    """Return the value function's input ``(T, N, O + P)`` from normalised observations ``(T, N, O)``."""
+    if privileged is None or state.privileged is None:
+        return x
+    normalised = _over_rows(partial(normalise_parameters, state.privileged), privileged)
+    return jnp.concatenate([x, normalised], axis=-1)
 
 
 def keys(state: TrainState) -> jax.Array:
     """Return three keys of the next update: for its rollout, for its shuffles, and for an evaluation before it.
 
-    They depend on the seed and the number of the update alone, so the number of evaluations does not affect training.
+    They depend only on the seed and the number of the update, so the number of evaluations does not affect training.
     """
     return jax.random.split(jax.random.fold_in(state.key, state.update), 3)
 
@@ -137,24 +144,22 @@ def update(
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """Update the networks and the normaliser after a rollout.
 
-    Each minibatch has all rows of some of the copies: shuffling N indices is cheap, a copy's rows are adjacent in
-    memory, and networks that remember need them in their order. The normaliser is updated after the networks: log
-    densities are those of the policy that played the rows.
-
     Args:
-        rows: What they played, by the policy of that state.
+        state: The state before the rollout; its policy played the rows.
+        copies: The copies after the rollout.
 
     Returns:
         The next state, and figures of the update: the parts of the loss and the mean ``reward`` and ``value`` per row,
         unscaled, each of shape ``()``; ``finite_observation``, shape ``(O,)``, bool; and ``finite_privileged``, shape
-        ``(P,)``, bool, where the value function sees more.
+        ``(P,)``, bool, if the value function has further inputs.
     """
+    # Compute values, log densities and advantages of all rows, before any network changes.
     policy = make_policy(env, config, networks, state.params, state.normaliser)
     batch, critic_carry = prepare(state, policy, rows, config, networks)
     copies = copies._replace(critic_carry=critic_carry)
     optimiser = make_optimiser(config)
 
-    def minibatch(carry: _Learnt, part: Batch) -> tuple[_Learnt, dict[str, jax.Array]]:
+    def minibatch(carry: _Learner, part: Batch) -> tuple[_Learner, dict[str, jax.Array]]:
         params, optimiser_state = carry
         (total, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params, part, config, networks)
         if config.schedule == "adaptive":
@@ -163,15 +168,20 @@ def update(
         change, optimiser_state = optimiser.update(gradient, optimiser_state, params)
         return (optax.apply_updates(params, change), optimiser_state), parts | {"loss": total}
 
-    def epoch(carry: _Learnt, shuffle: jax.Array) -> tuple[_Learnt, dict[str, jax.Array]]:
-        # Shuffled once, not in each minibatch: devices exchange copies here alone, then gradients.
+    def epoch(carry: _Learner, shuffle: jax.Array) -> tuple[_Learner, dict[str, jax.Array]]:
+        # Shuffled per epoch, not per minibatch: devices exchange copies only here, then gradients.
         index = shuffle.reshape(config.minibatches, -1)
-        return jax.lax.scan(minibatch, carry, spread(jax.tree.map(lambda leaf: leaf[index], batch), config))
+        parts = divide_minibatches(jax.tree.map(lambda leaf: leaf[index], batch), config)
+        return jax.lax.scan(minibatch, carry, parts)
 
+    # Each minibatch has all rows of some copies: shuffling N indices is cheap, a copy's rows are adjacent in memory,
+    # and networks that remember need them in their order.
     shuffles = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
         jax.random.split(keys(state)[1], config.epochs)
     )
     (params, optimiser_state), parts = jax.lax.scan(epoch, (state.params, state.optimiser), shuffles)
+
+    # Average the figures, and note which entries of the observations were finite.
     stats = jax.tree.map(jnp.mean, parts) | {
         "reward": jnp.mean(rows.reward) / config.reward_scale,
         "value": jnp.sum(batch.weight * batch.value) / jnp.maximum(batch.weight.sum(), 1.0) / config.reward_scale,
@@ -179,6 +189,8 @@ def update(
     }
     if rows.privileged_following is not None:
         stats |= {"finite_privileged": jnp.isfinite(rows.privileged_following).all((0, 1))}
+
+    # The normaliser comes last: the log densities above are those of the policy that played the rows.
     return TrainState(params, optimiser_state, *_normalisers(state, rows), copies, state.update + 1, state.key), stats
 
 

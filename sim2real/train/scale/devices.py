@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from sim2real.train.config import PPOConfig
 from sim2real.train.scale.mesh import COPIES, SEEDS, mesh_of
+from sim2real.types import Array, PyTree
 
 if TYPE_CHECKING:
     from sim2real.train.ppo.update import TrainState
@@ -24,25 +25,24 @@ class Shardings(NamedTuple):
 
     Attributes:
         state: A sharding for each array of its state.
-        whole: The sharding of what all devices have.
+        whole: The sharding of arrays of which every device has a copy.
     """
 
-    state: Any
+    state: PyTree
     whole: NamedSharding
 
 
 def shardings_of(state: TrainState, config: PPOConfig) -> Shardings | None:
     """Return where each array of a training's state goes; None for one device.
 
-    Seeds are divided first, as they have nothing to tell each other; the devices of a seed divide its copies. The
-    compiler sees to it that they exchange what an update needs. Random numbers do not depend on it.
+    Seeds are divided first, as they are independent; the devices of a seed divide its copies. The compiler inserts the
+    exchange of gradients. Random numbers do not depend on the division.
 
     Args:
-        state: The state, with a leading seed axis; the environments' part has the copies as its second axis.
-        config: Numbers of devices in each process, seeds and copies.
+        state: With a leading seed axis; its ``copies`` have the copies as second axis.
 
     Raises:
-        UsageError: When there are not as many devices, or they cannot divide seeds and copies.
+        UsageError: There are too few devices, or they cannot divide seeds and copies.
     """
     if (mesh := mesh_of(config)) is None:
         return None
@@ -53,26 +53,16 @@ def shardings_of(state: TrainState, config: PPOConfig) -> Shardings | None:
 
 
 def place(state: T, layout: Shardings | None) -> T:
-    """Return a state on its devices; each process, which has all of it, puts its own part.
-
-    Args:
-        state: The state, in this process's memory.
-        layout: Where its arrays go; None: where they are.
-    """
+    """Return a state on its devices; each process, which has the whole state in memory, puts its own part."""
     return state if layout is None else jax.tree.map(_put, state, layout.state)
 
 
-def whole(tree: T, layout: Shardings | None) -> T:
-    """Return arrays of which all devices have a copy.
-
-    Args:
-        tree: The arrays, in this process's memory.
-        layout: Where they go; None: to the one device.
-    """
+def replicate(tree: T, layout: Shardings | None) -> T:
+    """Return arrays of which every device has a copy, from arrays in this process's memory."""
     return jax.tree.map(jnp.asarray if layout is None else lambda leaf: _put(leaf, layout.whole), tree)
 
 
-def _put(leaf: Any, where: NamedSharding) -> jax.Array:
+def _put(leaf: Array, where: NamedSharding) -> jax.Array:
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_put(jax.random.key_data(leaf), where), impl=jax.random.key_impl(leaf))
     array = np.asarray(leaf)
@@ -80,11 +70,7 @@ def _put(leaf: Any, where: NamedSharding) -> jax.Array:
 
 
 def gather(state: T, layout: Shardings | None) -> T:
-    """Return a state that this process can read, also where other processes have a part; all of them call this.
-
-    Args:
-        layout: Where its arrays are; None: here.
-    """
+    """Return a state that this process can read, also the parts of other processes; all of them must call this."""
     if layout is None or jax.process_count() == 1:
         return state
     return jax.jit(lambda state: state, out_shardings=layout.whole)(state)

@@ -1,4 +1,4 @@
-"""Which processes, of one host or of several, make one training together. Imports no JAX, so ``--help`` is instant."""
+"""The processes of one training, on one host or several. Imports no JAX, so ``--help`` is instant."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ class HostsConfig:
     """The processes of a training; each divides its part among its own devices."""
 
     found: bool = False
-    """Join the processes that SLURM, Open MPI or Kubernetes started, as JAX finds them there."""
+    """Join the processes that SLURM, Open MPI or Kubernetes started; JAX reads their addresses from the environment."""
     coordinator: str | None = None
-    """Address of process 0 that all others reach, HOST:PORT with a free port, where they are started by hand."""
+    """Address of process 0 that all others reach, HOST:PORT with a free port, for processes started by hand."""
     processes: int | None = None
-    """Number of processes that are started by hand."""
+    """Number of processes started by hand."""
     process: int | None = None
-    """Which of them this is: 0, 1 ...; process 0 writes all files and shows how training goes."""
+    """Number of this process: 0, 1 ...; process 0 writes all files and shows progress."""
     timeout_s: int = 300
-    """How long to wait for a process that has not come, or that no longer answers [s]."""
+    """Time to wait for a process that has not joined, or that no longer answers [s]."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked before the others are asked."""
+        """Check the settings before any connection is made."""
         by_hand = (self.coordinator, self.processes, self.process)
         if self.found and by_hand != (None, None, None):
-            raise UsageError("hosts.found takes what it finds: hosts.coordinator, processes and process exclude it")
+            raise UsageError("hosts.found excludes hosts.coordinator, hosts.processes and hosts.process")
         if None in by_hand and by_hand != (None, None, None):
             raise UsageError(
                 "processes that are started by hand need all of hosts.coordinator, hosts.processes and hosts.process",
@@ -47,27 +47,27 @@ class HostsConfig:
         return self.found or self.processes is not None
 
     def __str__(self) -> str:
-        """In words, for the output of each process: what JAX says when it ends one is hard to read."""
-        who = "one of the processes that the launcher started"
+        """Describe the processes, for the output of each: JAX's own messages are hard to read."""
+        name = "one of the processes that the launcher started"
         if self.process is not None:
-            who = f"process {self.process} of {self.processes}, which meet at {self.coordinator}"
-        end = f"when one does not come, or answer, within {self.timeout_s} s, all end"
+            name = f"process {self.process} of {self.processes}, which meet at {self.coordinator}"
+        end = f"if one does not join, or answer, within {self.timeout_s} s, all end"
         where = "the coordinator's interfaces" if self.found else self.coordinator
-        trust = f"whoever reaches {where} can join or end the training: use a network that you trust"
-        return "; ".join([who, end, *([] if self.process else [trust]), *self._about_loopback()])
+        trust = f"any program that reaches {where} can join or end the training: use a network that you trust"
+        return "; ".join([name, end, *([] if self.process else [trust]), *self._loopback_warning()])
 
-    def _about_loopback(self) -> list[str]:
-        """Return a warning where process 0 listens on the loopback alone, though its address names a host (Debian)."""
+    def _loopback_warning(self) -> list[str]:
+        """Return a warning if process 0 listens only on the loopback, though its address names a host (Debian)."""
         host = (self.coordinator or "").rpartition(":")[0].strip("[]")
         if self.process != 0 or host == "localhost" or _is_loopback(host):
             return []
         try:
-            found = sorted({str(info[4][0]) for info in socket.getaddrinfo(host, None)})
+            addresses = sorted({str(info[4][0]) for info in socket.getaddrinfo(host, None)})
         except OSError:
-            return []  # the others do not find it either: joining says so
-        if not all(map(_is_loopback, found)):
+            return []  # the other processes cannot resolve it either: joining raises the error
+        if not all(map(_is_loopback, addresses)):
             return []
-        return [f"warning: {host} is {', '.join(found)} here, which no other host reaches: name a network address"]
+        return [f"warning: {host} is {', '.join(addresses)} here, which no other host reaches: name a network address"]
 
 
 def _is_loopback(address: str) -> bool:

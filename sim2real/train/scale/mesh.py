@@ -24,16 +24,18 @@ def mesh_of(config: PPOConfig) -> Mesh | None:
     """Return the devices, those of a seed in a row; None for one device.
 
     Raises:
-        UsageError: When there are not as many devices, or they cannot divide seeds and copies.
+        UsageError: There are too few devices, or they cannot divide seeds and copies.
     """
-    there = jax.local_devices()
-    if config.devices > len(there):
+    available = jax.local_devices()
+    if config.devices > len(available):
         raise UsageError(
-            f"devices={config.devices}, but JAX finds {len(there)} on this host: {there[0].device_kind}",
+            f"devices={config.devices}, but JAX finds {len(available)} on this host: {available[0].device_kind}",
             hint="on a CPU, XLA_FLAGS=--xla_force_host_platform_device_count=8 makes 8 of it, for tests",
         )
     if (total := config.devices * jax.process_count()) == 1:
         return None
+
+    # Divide the seeds by as many devices as possible, then the copies of a seed.
     by_seed = math.gcd(config.num_seeds, total)
     by_copy = total // by_seed
     if config.num_envs % by_copy:
@@ -42,15 +44,15 @@ def mesh_of(config: PPOConfig) -> Mesh | None:
             f"{by_copy} devices a seed do not divide its copies",
             hint=f"make num_envs a multiple of {by_copy}",
         )
-    own = [[d for d in jax.devices() if d.process_index == p] for p in range(jax.process_count())]
-    chosen = [device for devices in own for device in devices[: config.devices]]
-    return Mesh(np.array(chosen).reshape(by_seed, by_copy), (SEEDS, COPIES), (AxisType.Auto,) * 2)
+    by_process = [[d for d in jax.devices() if d.process_index == p] for p in range(jax.process_count())]
+    devices = [device for devices in by_process for device in devices[: config.devices]]
+    return Mesh(np.array(devices).reshape(by_seed, by_copy), (SEEDS, COPIES), (AxisType.Auto,) * 2)
 
 
-def spread(arrays: T, config: PPOConfig) -> T:
+def divide_minibatches(arrays: T, config: PPOConfig) -> T:
     """Return minibatches of which each device of a seed has a part.
 
-    A minibatch takes copies from all devices. Left alone, the compiler has each device compute all of it.
+    A minibatch has copies from all devices. Without this constraint the compiler makes each device compute all of it.
 
     Args:
         arrays: Leaves of shape ``(B, M, ...)``: B minibatches of M copies.
