@@ -1,23 +1,25 @@
-"""What a node sees when it steps, and what a graph carries between steps."""
+"""The step state of a node, and the state of a graph."""
 
 from __future__ import annotations
 
 import dataclasses
 import operator
-from typing import TYPE_CHECKING, Any, Self, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar
 
 import jax
 import numpy as np
 from flax import struct
+
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 T = TypeVar("T", bound="Base")
 Array: TypeAlias = jax.Array | np.ndarray
-"""JAX's arrays where a program is compiled, numpy's where nodes run on a clock."""
+"""JAX's arrays in a compiled program, numpy's if nodes run on a clock."""
 Number: TypeAlias = Array | np.number | np.bool_ | float
-"""A scalar of either, or Python's."""
+"""A scalar of JAX, numpy or Python."""
 Value: TypeAlias = jax.Array | float
 """A quantity in a compiled program: a number, or one for each joint."""
 
@@ -29,33 +31,34 @@ class Base:
     ``a[i]`` indexes the leading axis of every leaf.
     """
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self, **changes: PyTree) -> Self:
         """Return a copy with other values in some fields."""
-        # flax gives each of its dataclasses this very method, where no type checker sees it.
-        return dataclasses.replace(cast(Any, self), **changes)
+        # flax adds this method to each of its dataclasses, where no type checker finds it.
+        instance: PyTree = self
+        return dataclasses.replace(instance, **changes)
 
-    def _map(self: T, op: Callable[..., Any], other: Any) -> T:
+    def _map(self: T, op: Callable[..., PyTree], other: PyTree) -> T:
         same = jax.tree_util.tree_structure(self) == jax.tree_util.tree_structure(other)
         if same:
             return jax.tree_util.tree_map(op, self, other)
         return jax.tree_util.tree_map(lambda leaf: op(leaf, other), self)
 
-    def __add__(self: T, other: Any) -> T:
+    def __add__(self: T, other: PyTree) -> T:
         return self._map(operator.add, other)
 
-    def __sub__(self: T, other: Any) -> T:
+    def __sub__(self: T, other: PyTree) -> T:
         return self._map(operator.sub, other)
 
-    def __mul__(self: T, other: Any) -> T:
+    def __mul__(self: T, other: PyTree) -> T:
         return self._map(operator.mul, other)
 
-    def __truediv__(self: T, other: Any) -> T:
+    def __truediv__(self: T, other: PyTree) -> T:
         return self._map(operator.truediv, other)
 
     def __neg__(self: T) -> T:
         return jax.tree_util.tree_map(operator.neg, self)
 
-    def __getitem__(self: T, index: Any) -> T:
+    def __getitem__(self: T, index: PyTree) -> T:
         return jax.tree_util.tree_map(lambda leaf: leaf[index], self)
 
 
@@ -69,41 +72,39 @@ class InputState(Base):
     """The last W consumed messages of one input, oldest first.
 
     Attributes:
-        seq: Shape ``(W,)``, int32: the sender's step that made each message; -1 marks an empty slot.
-        ts_sent: Shape ``(W,)``: when each message was sent [s from the episode's start]; 0 in an empty slot.
-        ts_recv: Shape ``(W,)``: when each message was received [s].
+        seq: Shape ``(W,)``, int32: number of the sender's step of each message; -1 marks an empty slot.
+        ts_sent: Shape ``(W,)``: time at which each message was sent [s from the episode's start]; 0 in an empty slot.
+        ts_recv: Shape ``(W,)``: time at which each message was received [s].
         data: The messages; leaves of shape ``(W, ...)``.
-        delay_dist: The connection's ``TrainableDist``, None if its delay is not trainable; indexing leaves it whole.
+        delay_dist: The connection's ``TrainableDist``, None if its delay is not trainable; not indexed.
     """
 
     seq: Array
     ts_sent: Array
     ts_recv: Array
-    data: Any
-    delay_dist: Any = None
+    data: PyTree
+    delay_dist: PyTree = None
 
-    def __getitem__(self, index: Any) -> InputState:
+    def __getitem__(self, index: PyTree) -> InputState:
         take = jax.tree_util.tree_map(lambda leaf: leaf[index], (self.seq, self.ts_sent, self.ts_recv, self.data))
         return InputState(*take, delay_dist=self.delay_dist)
 
 
 @struct.dataclass
 class StepState(Base):
-    """Everything that ``BaseNode.step`` may read and replace.
+    """The data that ``BaseNode.step`` may read and replace.
 
     Attributes:
         rng: The node's JAX key; a step that uses it splits it and returns the new one.
-        state: The node's state.
-        params: The node's parameters.
         inputs: Input name -> InputState.
         eps: int32: index of the timeline that is played.
         seq: int32: number of this step of the node, from 0.
-        ts: float32: when the step started [s from the episode's start].
+        ts: float32: start of the step [s from the episode's start].
     """
 
     rng: jax.Array | None = None
-    state: Any = None
-    params: Any = None
+    state: PyTree = None
+    params: PyTree = None
     inputs: dict[str, InputState] = struct.field(default_factory=dict)
     eps: Number = 0
     seq: Number = 0
@@ -119,10 +120,8 @@ class GraphState(Base):
         step: int32: position in the timeline: the row in a compiled graph, the supervisor's step elsewhere; -1 before
             the start.
         rng: JAX keys.
-        params: Parameters.
-        state: States.
-        seq: int32: number of steps that each node has made. In a compiled graph it is empty, except after ``reset``,
-            ``step`` and ``observe``: then it has the number of the supervisor's step that the caller makes next.
+        seq: int32: each node's number of steps. In a compiled graph it is empty, except after ``reset``, ``step`` and
+            ``observe``: then it has the number of the supervisor's step that the caller makes next.
         delays: Node -> input name -> trainable delay, for the connections that have one.
         buffer: The last outputs of each node, oldest first; compiled graphs only.
         aux: For the user; the graph passes it on unchanged.
@@ -131,9 +130,9 @@ class GraphState(Base):
     eps: Number = 0
     step: Number = -1
     rng: dict[str, jax.Array] = struct.field(default_factory=dict)
-    params: dict[str, Any] = struct.field(default_factory=dict)
-    state: dict[str, Any] = struct.field(default_factory=dict)
+    params: dict[str, PyTree] = struct.field(default_factory=dict)
+    state: dict[str, PyTree] = struct.field(default_factory=dict)
     seq: dict[str, Number] = struct.field(default_factory=dict)
-    delays: dict[str, dict[str, Any]] = struct.field(default_factory=dict)
-    buffer: dict[str, Any] = struct.field(default_factory=dict)
-    aux: dict[str, Any] = struct.field(default_factory=dict)
+    delays: dict[str, dict[str, PyTree]] = struct.field(default_factory=dict)
+    buffer: dict[str, PyTree] = struct.field(default_factory=dict)
+    aux: dict[str, PyTree] = struct.field(default_factory=dict)

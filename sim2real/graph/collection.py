@@ -11,36 +11,33 @@ from sim2real.graph.node import BaseNode
 def by_name(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> dict[str, BaseNode]:
     """Return nodes as a dictionary by name, checked.
 
-    Args:
-        nodes: The nodes, as a list or by name.
-
     Raises:
-        UsageError: When an entry is not a node, two nodes have the same name, or a key is not its node's name.
+        UsageError: An entry is not a node, two nodes have the same name, or a key is not its node's name.
     """
     if not isinstance(nodes, Mapping | Sequence) or isinstance(nodes, str):
         raise UsageError(
             f"the nodes of a graph were expected, got {nodes!r}", hint="pass a list or a dictionary of them"
         )
-    found: dict[str, BaseNode] = {}
+    named: dict[str, BaseNode] = {}
     for key, node in nodes.items() if isinstance(nodes, Mapping) else ((None, node) for node in nodes):
         if not isinstance(node, BaseNode):
             raise UsageError(f"a graph is made of nodes, got {node!r}", hint="derive its class from BaseNode")
-        if node.name in found:
+        if node.name in named:
             raise UsageError(f"two nodes are called {node.name!r}", hint="names are unique in a graph")
         if key not in (None, node.name):
             raise UsageError(f"the key {key!r} stands for a node that is called {node.name!r}")
-        found[node.name] = node
-    return found
+        named[node.name] = node
+    return named
 
 
 def check_senders(nodes: Mapping[str, BaseNode], among: Mapping[str, object] | None = None) -> None:
-    """Check that every sender is in the graph: the object itself, not only a node of the same name.
+    """Check that every sender is in the graph: the same object, not only a node of the same name.
 
     Args:
-        among: Check only senders with these names (others are left out of the graph on purpose); None: all senders.
+        among: Check only senders with these names, as others are missing on purpose; None: all senders.
 
     Raises:
-        UsageError: When a sender is missing, or is another object than the node of its name.
+        UsageError: A sender is missing, or is another object than the node of its name.
     """
     for node in nodes.values():
         for c in node.inputs.values():
@@ -56,5 +53,5 @@ def check_senders(nodes: Mapping[str, BaseNode], among: Mapping[str, object] | N
                 raise UsageError(
                     f"{where} another object called {sender.name!r} ({sender!r}) than the one in the graph "
                     f"({nodes[sender.name]!r})",
-                    hint=f"where {sender.name!r} was replaced, connect {node.name!r} to what replaces it",
+                    hint=f"if {sender.name!r} was replaced, connect {node.name!r} to the new node",
                 )

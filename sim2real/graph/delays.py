@@ -1,4 +1,4 @@
-"""How long a computation or a transfer takes: fixed, random, recorded or to be identified.
+"""Distributions of computation and transport times: fixed, random, recorded or to be identified.
 
 Timelines are drawn in numpy, all episodes at once. Wherever a distribution is expected, a number of seconds or a
 distrax distribution is accepted too.
@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from functools import partial
 from numbers import Real
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from flax import struct
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, InputState
 from sim2real.graph.interpolation import between, mean_of
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from jax.typing import ArrayLike
@@ -40,7 +41,7 @@ class DelayDistribution(ABC):
         """Return the delay [s] that a fraction ``q`` of the samples does not exceed."""
 
     def window(self, rate_out: float) -> int:
-        """Return how many more messages the reader's window must hold, for a sender at ``rate_out`` [Hz]."""
+        """Return the number of extra messages in the reader's window, for a sender at ``rate_out`` [Hz]."""
         del rate_out
         return 0
 
@@ -52,7 +53,7 @@ class StaticDist(DelayDistribution):
         dist: A ``distrax.Distribution`` over seconds, or a number of seconds.
     """
 
-    def __init__(self, dist: Any) -> None:
+    def __init__(self, dist: PyTree) -> None:
         self.dist = dist
         self._constant: float | None = None
         if isinstance(dist, Real):
@@ -164,11 +165,11 @@ class TrainableDist(Base, DelayDistribution):
         alpha: Position between the bounds, in [0, 1]; traced.
         min: Smallest delay [s].
         max: Largest delay [s].
-        interp: How the window is read at the delay: ``zoh``, ``linear``, ``linear_real_only``, or ``zoh_mean``
-            (inputs of a world only); ``apply`` says what each does.
+        interp: Interpolation in the window: ``zoh``, ``linear``, ``linear_real_only``, or ``zoh_mean`` (inputs of a
+            world only); see ``apply``.
         burst: Extra messages in the window, for a sender that at times sends faster than its rate.
-        integers: What integers in messages do where floats are interpolated or averaged: ``hold`` (the message that
-            has arrived), or ``round``, for integers that are numbers on a line. Booleans always hold.
+        integers: Interpolation of integers in messages: ``hold`` (the message that has arrived), or ``round``, for
+            integers that are numbers on a line. Booleans always hold.
     """
 
     alpha: jax.Array
@@ -182,19 +183,14 @@ class TrainableDist(Base, DelayDistribution):
     def create(
         cls, delay: float, min: float, max: float, interp: str = "zoh", burst: int = 0, integers: str = "hold"
     ) -> TrainableDist:
-        """Return the distribution with a given delay.
+        """Return the distribution at a delay [s] between the bounds ``min`` and ``max`` [s].
 
         Args:
-            delay: The delay [s].
-            min: Smallest delay [s].
-            max: Largest delay [s].
-            interp: How the window is read at the delay; see ``apply``.
-            burst: Extra messages in the window, for a sender that at times sends faster than its rate: recorded timing
-                usually needs 1 or 2.
-            integers: ``hold``, or ``round`` for integers that are numbers on a line.
+            burst: Recorded timing usually needs 1 or 2; the other arguments are those of the class.
 
         Raises:
-            UsageError: Unless ``0 <= min < max``, ``min <= delay <= max`` and ``interp`` and ``integers`` are known.
+            UsageError: Unless ``0 <= min < max``, ``min <= delay <= max``, and ``interp`` and ``integers`` are names
+                above.
         """
         if interp not in _INTERPOLATIONS:
             raise UsageError(f"unknown interpolation {interp!r}. Available: {', '.join(_INTERPOLATIONS)}")
@@ -223,12 +219,12 @@ class TrainableDist(Base, DelayDistribution):
         return np.full(shape, self.min)
 
     def quantile(self, q: float) -> float:
-        """Return the delay [s], whatever ``q`` is: a new connection takes it as its expected delay."""
+        """Return the delay [s] for every ``q``: a new connection takes it as its expected delay."""
         del q
         return float(self.delay)
 
     def window(self, rate_out: float) -> int:
-        """Return how many more messages the reader's window must hold: ``ceil(rate_out * (max - min)) + burst``."""
+        """Return the number of extra messages in the reader's window: ``ceil(rate_out * (max - min)) + burst``."""
         return math.ceil(round(rate_out * (self.max - self.min), 9)) + self.burst
 
     def apply(
@@ -248,31 +244,31 @@ class TrainableDist(Base, DelayDistribution):
         Floats are interpolated and averaged; other values, and ``seq``, are those of the message that has arrived at
         that time (see ``sim2real.graph.interpolation``).
 
-        Arrival times are recomputed as sent time plus this delay: ``inputs.ts_recv`` has the smallest delay in it.
-
         Args:
-            inputs: The lengthened window, leaves ``(W, ...)``.
+            inputs: The lengthened window, leaves ``(W, ...)``; its arrival times are those at the smallest delay.
             age_s: Shape ``(W,)``: step start minus sent time of each message [s]; large for empty slots.
-            window: The window that the user asked for.
-            period_s: The reader's period [s]; used by ``zoh_mean`` alone.
-            ts_s: The step's start [s from the episode's start]; used by ``linear`` alone.
-            skip: Whether a message that arrives exactly at the start is left to the next step.
-
-        Returns:
-            The inputs with a window of ``window`` messages.
+            window: Number of messages in the returned window.
+            period_s: The reader's period [s]; for ``zoh_mean``.
+            ts_s: The step's start [s from the episode's start]; for ``linear``.
+            skip: Whether a message that arrives exactly at the start belongs to the next step.
         """
-        late = age_s - self.delay  # time since arrival at this delay; negative: not there yet
+        # Arrival times, and the time since arrival, at this delay; negative if a message has not arrived.
+        late = age_s - self.delay
         received = jnp.where(inputs.seq >= 0, inputs.ts_sent + self.delay, inputs.ts_recv)
         inputs = inputs.replace(ts_recv=received)
         if self.interp == "zoh_mean":
             return _mean_over_period(inputs, late, window, period_s, self.integers == "round")
+
+        # Find the last message that has arrived. Times are whole ticks, and float32 resolves half a tick at these ages:
+        # exact ties are recognised.
         width = inputs.seq.shape[0]
-        # Times are whole ticks, and float32 resolves half a tick at these ages: exact ties are recognised.
         arrived = late > HALF_TICK_S if skip else late > -HALF_TICK_S
         last = jnp.maximum(jnp.sum(arrived) - 1, window - 1)
         if self.interp == "zoh":
             start = last - window + 1
             return jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, window), inputs)
+
+        # Interpolate at the times of the last messages, moved so that the newest lies at the step's start.
         late = jnp.where(inputs.seq < 0, ts_s if self.interp == "linear" else 1e9, late)
         steps = jnp.arange(window - 1, -1, -1)
         newest = jnp.take(late, last)
@@ -299,7 +295,7 @@ def _interpolate(inputs: InputState, knots: jax.Array, query: jax.Array, slack: 
 
 
 def _mean_over_period(inputs: InputState, late: Array, window: int, period_s: float, rounded: bool) -> InputState:
-    """Average the messages over the reader's period, each weighted by how long it holds; differentiable in the delay.
+    """Average the messages over the reader's period, each weighted by its holding time; differentiable in the delay.
 
     ``seq`` and times are not averaged: they are those of the message that holds when the period begins. The oldest
     message in the window counts as holding from the start of the period.

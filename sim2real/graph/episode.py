@@ -1,14 +1,15 @@
-"""What a graph did: which steps ran when, on which messages, with which outputs."""
+"""The record of a graph's run: steps, messages and outputs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.types import Json, PyTree
 
 if TYPE_CHECKING:
     from sim2real.graph.base import StepState
@@ -24,11 +25,11 @@ class StepRecord(NamedTuple):
         node: The node's name.
         seq: Number of the step, from 0.
         scheduled: The step's slot (timing rule 2).
-        start: When the step starts by the timing rules.
-        woken: When the thread really began to run it.
-        ts_overwrite: The start that the step set itself; -1 if it did not.
-        end: When the step ended and its output was sent.
-        drift: How far earlier overruns have moved the node's schedule.
+        start: Start by the timing rules.
+        woken: Time at which the thread began to run it.
+        ts_overwrite: The start that the step has set; -1 if it has set none.
+        end: End of the step, at which its output was sent.
+        drift: Shift of the node's schedule by earlier overruns.
     """
 
     node: str
@@ -47,10 +48,8 @@ class MessageRecord(NamedTuple):
     Attributes:
         node: The reader's name.
         input: Name of the reader's input.
-        seq_out: The sender's step that made the message.
-        seq_in: The reader's step that consumed it; -1 if none did.
-        sent: When it was sent.
-        received: When it arrived.
+        seq_out: Number of the sender's step.
+        seq_in: Number of the reader's step that consumed it; -1 if none did.
     """
 
     node: str
@@ -62,17 +61,12 @@ class MessageRecord(NamedTuple):
 
 
 class Recorder(Protocol):
-    """Receives what a running graph reports. Implementations return at once: control loops call them."""
+    """Receives the records of a running graph. Implementations return at once: control loops call them."""
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
-        """Take note of an episode's start.
+        """Take an episode's start, on the wall clock [ns since 1970] and on the monotonic clock [ns]."""
 
-        Args:
-            epoch_ns: The start on the wall clock [ns since 1970].
-            monotonic_ns: The start on the monotonic clock [ns].
-        """
-
-    def step(self, record: StepRecord, output: Any) -> None:
+    def step(self, record: StepRecord, output: PyTree) -> None:
         """Take a step that has ended, and its output: a pytree of numpy arrays or numbers."""
 
     def message(self, record: MessageRecord) -> None:
@@ -81,15 +75,15 @@ class Recorder(Protocol):
 
 @runtime_checkable
 class StepStateRecorder(Recorder, Protocol):
-    """A recorder that also receives what each step is given."""
+    """A recorder that also receives the step state of each step."""
 
     @property
     def keep(self) -> frozenset[str]:
-        """Parts of the step state that it keeps; empty: it wants none."""
+        """Parts of the step state that it keeps; empty: none."""
         ...
 
     def given(self, node: str, step_state: StepState) -> None:
-        """Take what a step of a node is given, before the step is reported."""
+        """Take the step state that a node's step gets, before the record of the step."""
 
 
 KEPT = ("state", "params", "inputs")
@@ -112,15 +106,15 @@ class Steps:
 
     @property
     def begun(self) -> np.ndarray:
-        """When each step began, ``(N,)`` ticks [us]: the time that the step set itself, else its start.
+        """Begin of each step, ``(N,)`` ticks [us]: the time that the step has set, else its start.
 
-        A sensor sets the time at which its sample was taken: of its steps, these are the samples' times.
+        A sensor sets the time at which its sample was taken, so these are the samples' times.
         """
         return np.where(self.ts_overwrite >= 0, self.ts_overwrite, self.start)
 
     @property
     def begun_s(self) -> np.ndarray:
-        """When each step began, ``(N,)`` [s]; see ``begun``."""
+        """Begin of each step, ``(N,)`` [s]; see ``begun``."""
         return self.begun / TICKS_PER_S
 
 
@@ -145,19 +139,19 @@ class Episode:
         steps: Node -> its steps.
         messages: (node, input name) -> the messages on that connection.
         outputs: Node -> field name -> array with one row a step, shape ``(N, ...)``.
-        metadata: What the session's log says about itself (pipeline, configuration, versions, ...).
+        metadata: Metadata of the session's log (pipeline, configuration, versions, ...).
         complete: Whether the session ended properly; False after a crash.
-        units: Node -> field, or entry of one (``"aim[0]"``) -> unit, as far as the recording says.
-        states: Node -> field -> array with one row a step, the state before it; empty where states were not kept.
+        units: Node -> field, or entry of one (``"aim[0]"``) -> unit, if the recording has it.
+        states: Node -> field -> array with one row a step, the state before it; empty if states were not recorded.
         params: The same for parameters.
         inputs: (node, input name) -> ``seq``, ``ts_sent``, ``ts_recv`` and ``data.FIELD``, shape ``(N, W, ...)``: the
-            window that each step saw; empty where inputs were not kept.
+            window of each step; empty if inputs were not recorded.
     """
 
     steps: Mapping[str, Steps]
     messages: Mapping[tuple[str, str], Messages]
     outputs: Mapping[str, Mapping[str, np.ndarray]]
-    metadata: Mapping[str, Any] = field(default_factory=dict)
+    metadata: Mapping[str, Json] = field(default_factory=dict)
     complete: bool = True
     units: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     states: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
@@ -178,11 +172,11 @@ class MemoryRecorder:
     """A recorder that keeps everything in memory and returns it as an ``Episode``.
 
     Args:
-        keep: What is kept of each step beside its output: ``state`` (before the step), ``params``, ``inputs``. On the
-            wall clock it costs the step the time to copy it.
+        keep: Parts of the step state to keep beside the output: ``state`` (before the step), ``params``, ``inputs``.
+            On the wall clock the copy takes time in each step.
 
     Raises:
-        UsageError: On another name.
+        UsageError: ``keep`` has another name.
     """
 
     def __init__(self, keep: Sequence[str] = ()) -> None:
@@ -191,20 +185,20 @@ class MemoryRecorder:
             raise UsageError(f"a recorder cannot keep {', '.join(unknown)}. Available: {', '.join(KEPT)}")
         self._given: dict[str, list[StepState]] = {}
         self._steps: dict[str, list[StepRecord]] = {}
-        self._outputs: dict[str, list[Any]] = {}
+        self._outputs: dict[str, list[PyTree]] = {}
         self._messages: dict[tuple[str, str], list[MessageRecord]] = {}
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
-        """Forget what was recorded before."""
+        """Drop the records of the episode before."""
         del epoch_ns, monotonic_ns
         self._steps, self._outputs, self._messages, self._given = {}, {}, {}, {}
 
     def given(self, node: str, step_state: StepState) -> None:
-        """Keep parts of what a step is given."""
+        """Keep parts of a step state."""
         parts = {part: getattr(step_state, part) if part in self.keep else None for part in KEPT}
         self._given.setdefault(node, []).append(_copied(step_state.replace(rng=None, **parts)))
 
-    def step(self, record: StepRecord, output: Any) -> None:
+    def step(self, record: StepRecord, output: PyTree) -> None:
         """Keep a step and its output."""
         self._steps.setdefault(record.node, []).append(record)
         self._outputs.setdefault(record.node, []).append(output)
@@ -214,7 +208,7 @@ class MemoryRecorder:
         self._messages.setdefault((record.node, record.input), []).append(record)
 
     def episode(self) -> Episode:
-        """Return what was recorded so far."""
+        """Return the records so far."""
         return Episode(
             steps={n: steps_from_records(r) for n, r in self._steps.items()},
             messages={k: messages_from_records(r) for k, r in self._messages.items()},
@@ -234,7 +228,7 @@ class MemoryRecorder:
         return {n: _stack([getattr(step, part) for step in self._of_steps(n)]) for n in self._given}
 
     def _of_steps(self, node: str) -> list[StepState]:
-        """Return what finished steps were given: one that failed is not reported."""
+        """Return the step states of finished steps: a step that failed has no record."""
         return self._given[node][: len(self._steps.get(node, ()))]
 
 
@@ -250,7 +244,7 @@ def messages_from_records(records: list[MessageRecord]) -> Messages:
     return Messages(*(np.array([getattr(r, f) for r in records], np.int64) for f in Messages.__dataclass_fields__))
 
 
-def named_leaves(tree: Any) -> dict[str, Any]:
+def named_leaves(tree: PyTree) -> dict[str, PyTree]:
     """Return the leaves of a message by dotted name (``th``, ``pose.x``), in a fixed order."""
     import jax  # imported late: a log of plain dictionaries is written without JAX
 
@@ -264,18 +258,18 @@ def named_leaves(tree: Any) -> dict[str, Any]:
     return {label(path): leaf for path, leaf in flat}
 
 
-def _copied(tree: Any) -> Any:
+def _copied(tree: PyTree) -> PyTree:
     """Return a tree with numpy copies of its arrays; of a JAX key its numbers."""
     import jax
 
-    def one(leaf: Any) -> np.ndarray:
+    def one(leaf: PyTree) -> np.ndarray:
         key = isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return np.array(jax.random.key_data(leaf) if key else leaf)
 
     return jax.tree_util.tree_map(one, tree)
 
 
-def _stack(outputs: list[Any]) -> dict[str, np.ndarray]:
+def _stack(outputs: list[PyTree]) -> dict[str, np.ndarray]:
     """Return the outputs of N steps as one array per leaf, shape ``(N, ...)``."""
     rows = [named_leaves(o) for o in outputs]
     return {name: np.stack([np.asarray(row[name]) for row in rows]) for name in (rows[0] if rows else {})}

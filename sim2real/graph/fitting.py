@@ -9,7 +9,7 @@ from sim2real.graph.delays import EmpiricalDist, StaticDist
 
 _CONSTANT_S = 1e-7
 """Delays with a smaller standard deviation are fitted by a constant [s]."""
-_LONGEST_BLOCK = 200
+_MAX_LAG = 200
 """Largest lag at which the autocorrelation is computed [delays]."""
 
 
@@ -18,14 +18,14 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
 
     Args:
         samples: Shape ``(n,)``: recorded delays [s].
-        components: Largest number of components; the Bayesian information criterion chooses how many are used.
+        components: Largest number of components; the Bayesian information criterion chooses the number.
 
     Returns:
-        A constant, or a ``distrax.MixtureSameFamily``, clipped at 0 when drawn from.
+        A constant, or a ``distrax.MixtureSameFamily``, whose draws are clipped at 0.
 
     Raises:
-        UsageError: When there are too few samples, or one is negative or not finite.
-        Sim2RealError: When scikit-learn is not installed, which is no part of a plain installation.
+        UsageError: There are too few samples, or one is negative or not finite.
+        Sim2RealError: scikit-learn is not installed; a plain installation lacks it.
     """
     x = _checked(samples)
     if x.std() < _CONSTANT_S:
@@ -42,6 +42,7 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
             "fit_mixture needs scikit-learn, which is not installed", hint="pip install 'sim2real[mixture]'"
         ) from error
 
+    # Fit mixtures of 1, 2, ... components, and choose by the information criterion.
     scaled = ((x - x.mean()) / x.std())[:, None]
     fits = [GaussianMixture(k, random_state=seed, reg_covar=1e-6).fit(scaled) for k in range(1, components + 1)]
     best = min(fits, key=lambda fit: fit.bic(scaled))
@@ -65,7 +66,7 @@ def resample(samples: np.ndarray) -> EmpiricalDist:
         samples: Shape ``(n,)``: recorded delays [s] in the order in which they occurred.
 
     Raises:
-        UsageError: When there are fewer than 2 samples, or one is negative or not finite.
+        UsageError: There are fewer than 2 samples, or one is negative or not finite.
     """
     x = _checked(samples)
     spread = x - x.mean()
@@ -73,7 +74,7 @@ def resample(samples: np.ndarray) -> EmpiricalDist:
     if power < _CONSTANT_S**2 * x.size:
         return EmpiricalDist(x, 1)
     block = 1.0
-    for lag in range(1, min(_LONGEST_BLOCK, x.size // 4)):
+    for lag in range(1, min(_MAX_LAG, x.size // 4)):
         rho = float(spread[:-lag] @ spread[lag:]) / power
         if rho < 0.1:
             break
@@ -82,7 +83,7 @@ def resample(samples: np.ndarray) -> EmpiricalDist:
 
 
 def _checked(samples: np.ndarray) -> np.ndarray:
-    """Return the samples as float64, once they are known to be at least 2 finite delays of at least 0 s."""
+    """Return the samples as float64, checked to be at least 2 finite delays of at least 0 s."""
     x = np.asarray(samples, np.float64)
     if x.ndim != 1 or x.size < 2 or not np.isfinite(x).all() or (x < 0).any():
         raise UsageError(f"recorded delays must be at least 2 finite times of at least 0 s, got shape {x.shape}")

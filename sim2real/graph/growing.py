@@ -1,4 +1,4 @@
-"""Timelines without an end: delays are drawn when a run has come to the end of those that were drawn."""
+"""Timelines without an end: more delays are drawn when a run reaches the end of the timeline."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from sim2real.graph.schedule import computation_delays, derive, transport_delays
 from sim2real.graph.timeline import Timeline
 
 _FIRST_S = 4.0
-"""Shortest length of the first timeline [s]; it holds two steps of the slowest node at least."""
+"""Shortest length of the first timeline [s]; it holds at least two steps of the slowest node."""
 
 
 class Growing:
-    """Draws one episode, twice as long each time; what was drawn before stays as it is.
+    """Draws one episode, twice as long each time; earlier draws stay unchanged.
 
     Args:
         check: Called with each timeline before it is used.
 
     Attributes:
         timeline: The timeline so far.
-        ticks: Its length [ticks]; all steps that start before are in it.
+        ticks: Its length [ticks]; it has all steps that start earlier.
     """
 
     def __init__(
@@ -50,13 +50,13 @@ class Growing:
         if self._duration_s > 1e9:
             raise UsageError("an episode cannot last longer than 30 years")
         for name, node in self._nodes.items():
-            known = self._delays.get(name, np.zeros((1, 0), np.int64))
-            self._delays[name] = computation_delays(node, self._duration_s, 1, self._rng, known)
+            earlier = self._delays.get(name, np.zeros((1, 0), np.int64))
+            self._delays[name] = computation_delays(node, self._duration_s, 1, self._rng, earlier)
         for node in self._nodes.values():
             for c in node.inputs.values():
                 count = self._delays[c.output_node.name].shape[1]
-                known = self._transfers.get((node.name, c.name), np.zeros((1, 0), np.int64))
-                self._transfers[node.name, c.name] = transport_delays(c, (1, count), self._rng, known)
+                earlier = self._transfers.get((node.name, c.name), np.zeros((1, 0), np.int64))
+                self._transfers[node.name, c.name] = transport_delays(c, (1, count), self._rng, earlier)
         self.ticks = to_ticks(self._duration_s)
         self.timeline = derive(self._nodes, self._delays, self._transfers, self.ticks)
         self._check(self._nodes, self.timeline)

@@ -7,19 +7,20 @@ import operator
 from collections.abc import Callable
 from enum import Enum
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import Empty, GraphState, StepState, Value
 from sim2real.graph.delays import DelayDistribution, StaticDist, TrainableDist
 from sim2real.graph.episode import TICKS_PER_S as TICKS_PER_S
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     import jax
 
 
 class Scheduling(Enum):
-    """What an overrun does to the steps after it."""
+    """The effect of an overrun on the steps after it."""
 
     FREQUENCY = "frequency"
     """All later steps are scheduled later by the same amount: the distance between steps is kept."""
@@ -28,28 +29,19 @@ class Scheduling(Enum):
 
 
 class Jitter(Enum):
-    """Which of the messages that have arrived a non-blocking input hands over."""
+    """The arrived messages that a non-blocking input hands over."""
 
     LATEST = "latest"
-    """All of them."""
+    """All arrived messages."""
     BUFFER = "buffer"
     """Only those whose nominal arrival time has passed too."""
 
 
 class Connection:
-    """An input of ``input_node`` fed by the outputs of ``output_node``; made by ``BaseNode.connect``.
-
-    Args:
-        blocking: As in ``BaseNode.connect``, and so are the others.
-        delay: Expected communication delay [s]; None: the 0.99 quantile of ``delay_dist``.
-        delay_dist: Communication delay in simulation: seconds, or a distribution over seconds; None: 0.
-        window: Number of messages that the step sees.
-        skip: Whether messages that arrive exactly at the start are left to the next step.
-        jitter: Which of the messages that have arrived a non-blocking input hands over.
-        name: Key in ``step_state.inputs``.
+    """An input of ``input_node`` fed by the outputs of ``output_node``; made by ``BaseNode.connect``, see there.
 
     Raises:
-        UsageError: When an option makes no sense or two exclude each other.
+        UsageError: An option is out of its range, or two exclude each other.
     """
 
     def __init__(
@@ -58,7 +50,7 @@ class Connection:
         output_node: BaseNode,
         blocking: bool,
         delay: float | None,
-        delay_dist: Any,
+        delay_dist: PyTree,
         window: int,
         skip: bool,
         jitter: Jitter,
@@ -128,10 +120,9 @@ class BaseNode:
             number of seconds; default 0.
         advance: Start as soon as the blocking inputs have arrived, even before the scheduled time. Needs a blocking
             input; with a non-blocking input as well the schedule holds.
-        scheduling: What an overrun does to later steps.
 
     Raises:
-        UsageError: When a rate or a delay makes no sense.
+        UsageError: A rate or a delay is out of its range.
     """
 
     jittable: bool = True
@@ -142,7 +133,7 @@ class BaseNode:
         name: str,
         rate: float,
         delay: float | None = None,
-        delay_dist: Any = None,
+        delay_dist: PyTree = None,
         advance: bool = False,
         scheduling: Scheduling = Scheduling.FREQUENCY,
         color: str | None = None,
@@ -172,7 +163,7 @@ class BaseNode:
         output_node: BaseNode,
         blocking: bool = False,
         delay: float | None = None,
-        delay_dist: Any = None,
+        delay_dist: PyTree = None,
         window: int = 1,
         skip: bool = False,
         jitter: Jitter = Jitter.LATEST,
@@ -185,28 +176,25 @@ class BaseNode:
             delay: Expected communication delay [s], from which phases are computed; default: the 0.99 quantile of
                 ``delay_dist``.
             delay_dist: Communication delay in simulation; may be a ``TrainableDist``; default 0.
-            window: Number of messages that the step sees, the last ones.
-            skip: Ignore this input in the node's phase (needed once in every loop of connections), and leave messages
+            window: Number of last messages in the step state.
+            skip: Ignore this input in the node's phase (needed once in every loop of connections), and give messages
                 that arrive exactly at a step's start to the next step.
-            jitter: What a non-blocking input does with messages that arrive early.
+            jitter: Treatment of messages that arrive early at a non-blocking input.
             name: Key in ``step_state.inputs``; default: the sender's name.
 
-        Returns:
-            The connection.
-
         Raises:
-            UsageError: When the input's name is taken or an option makes no sense.
+            UsageError: The input's name is taken, an option is out of its range, or two exclude each other.
         """
         if not isinstance(output_node, BaseNode):
             raise UsageError(
                 f"node {self.name!r}: connect takes the node that sends, got {output_node!r}",
-                hint="pass the node itself, not its name",
+                hint="pass the node, not its name",
             )
         name = name or output_node.name
         if name in self.inputs:
             raise UsageError(
                 f"node {self.name!r} has an input {name!r} already. Inputs: {', '.join(self.inputs)}",
-                hint="give the second connection a name of its own: connect(..., name='other')",
+                hint="give the second connection another name: connect(..., name='other')",
             )
         connection = Connection(self, output_node, blocking, delay, delay_dist, window, skip, jitter, name)
         self.inputs[name] = connection
@@ -235,22 +223,22 @@ class BaseNode:
         """Set the clock that ``now`` and ``at`` use; called by the runtime.
 
         Args:
-            clock: Returns the time since the episode's start [s]; None when the node does not run.
+            clock: Returns the time since the episode's start [s]; None if the node does not run.
             origin_ns: The episode's start on the machine's monotonic clock [ns].
         """
         self._clock, self._origin_ns = clock, origin_ns
 
-    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the node's parameters."""
         del rng, graph_state
         return Empty()
 
-    def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the node's state at the start of an episode."""
         del rng, graph_state
         return Empty()
 
-    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the default output: the message in a reader's window before the first real one has arrived."""
         del rng, graph_state
         return Empty()
@@ -261,16 +249,16 @@ class BaseNode:
         return {}
 
     def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
-        """Get ready for an episode on the wall clock: open a port, move to a start. Return whether that worked."""
+        """Get ready for an episode on the wall clock: open a port, move to a start. Return False on a failure."""
         del graph_state, timeout
         return True
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Make safe after an episode on the wall clock; called on every way out. Return whether that worked."""
+        """Make safe after an episode on the wall clock; called on every way out. Return False on a failure."""
         del timeout
         return True
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Return the new step state and the output message."""
         raise NotImplementedError(f"node {self.name!r} ({type(self).__name__}) has no step method")
 
@@ -300,7 +288,7 @@ def phase_ticks(node: BaseNode, _path: tuple[str, ...] = ()) -> int:
     """Return the nominal start of a node's first step [ticks] (timing rule 1).
 
     Raises:
-        UsageError: When connections that are not skipped form a loop; the message names it.
+        UsageError: Connections that are not skipped form a loop; the message names it.
     """
     if node.name in _path:
         loop = " -> ".join([*reversed(_path[_path.index(node.name) :]), _path[-1]])
@@ -317,8 +305,8 @@ def phase_ticks(node: BaseNode, _path: tuple[str, ...] = ()) -> int:
     return max([0, *arrivals])
 
 
-def _as_distribution(dist: Any, where: str) -> DelayDistribution:
-    """Return what the user passed as a distribution; ``where`` names the node or connection in errors."""
+def _as_distribution(dist: PyTree, where: str) -> DelayDistribution:
+    """Return seconds or a distribution as a ``DelayDistribution``; ``where`` names the node or connection in errors."""
     if dist is None:
         return StaticDist(0.0)
     if isinstance(dist, DelayDistribution):
@@ -330,7 +318,7 @@ def _as_distribution(dist: Any, where: str) -> DelayDistribution:
 
 
 def _expected_delay(delay: float | None, dist: DelayDistribution, where: str) -> float:
-    """Return the expected delay [s]: the one given, or the 0.99 quantile."""
+    """Return the expected delay [s]: ``delay``, or the 0.99 quantile."""
     value = dist.quantile(0.99) if delay is None else delay
     if not (isinstance(value, Real) and math.isfinite(value) and value >= 0):
         raise UsageError(f"{where}: the expected delay must be finite and at least 0 s, got {value!r}")
@@ -344,7 +332,7 @@ def _rate(rate: object, where: str) -> float:
     return value
 
 
-def _whole(window: Any, where: str) -> int:
+def _whole(window: PyTree, where: str) -> int:
     try:
         count = operator.index(window)
     except TypeError:

@@ -1,4 +1,4 @@
-"""Timelines: which step ran when, and which message went into which step, for E episodes."""
+"""Timelines: the times of steps, and the messages that each step consumes, for E episodes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -17,6 +16,7 @@ from sim2real.graph.episode import Episode, Messages
 from sim2real.graph.node import BaseNode, Connection, to_ticks
 from sim2real.graph.rules import at_delay
 from sim2real.graph.times import NEVER, Edge, Vertex
+from sim2real.types import PyTree
 
 _FORMAT = 2
 
@@ -48,7 +48,7 @@ class Timeline:
         """Return the timeline of some of the nodes, with the edges between them.
 
         Raises:
-            UsageError: When a name is not in the timeline.
+            UsageError: A name is not in the timeline.
         """
         names = set(names)
         missing = names - set(self.vertices)
@@ -65,14 +65,14 @@ class Timeline:
     def from_episode(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
         """Return the timeline of one recorded episode (E = 1).
 
-        Args:
-            nodes: The nodes by name; those that are not in the record, and connections to them, are left out.
+        Messages with a trainable delay arrive at its smallest value, as in a drawn timeline: the record has them at the
+        delay of that time, and windows need them for any delay.
 
-        Messages whose delay is trainable arrive at its least value, as in a timeline that is drawn: the record has them
-        at the delay of that time, and windows need them for any.
+        Args:
+            nodes: The nodes by name; the timeline has those that are in the record, and connections between them.
 
         Raises:
-            UsageError: When the record has none of the nodes.
+            UsageError: The record has none of the nodes.
         """
         vertices, edges = {}, {}
         present = [n for n in nodes if n in episode.steps]
@@ -87,7 +87,7 @@ class Timeline:
             sender = nodes[name].inputs[input_name].output_node.name
             if sender in vertices:
                 edge = _edge(m, len(episode.steps[sender]), len(episode.steps[name]), sender)
-                edges[name, input_name] = _at_least_delay(nodes[name].inputs[input_name], edge, episode, vertices)
+                edges[name, input_name] = _at_smallest_delay(nodes[name].inputs[input_name], edge, episode, vertices)
         return Timeline(vertices, edges)
 
     @staticmethod
@@ -120,7 +120,7 @@ class Timeline:
     def save(self, path: Path) -> None:
         """Write the timeline to an ``.npz`` file."""
         names = {"vertices": list(self.vertices), "edges": [[*key, e.sender] for key, e in self.edges.items()]}
-        arrays: dict[str, Any] = {"format": np.array(_FORMAT), "names": np.array(json.dumps(names))}
+        arrays: dict[str, PyTree] = {"format": np.array(_FORMAT), "names": np.array(json.dumps(names))}
         for n, v in enumerate(self.vertices.values()):
             arrays |= {f"vertex_{n}_start": v.start, f"vertex_{n}_end": v.end, f"vertex_{n}_count": v.count}
         for n, e in enumerate(self.edges.values()):
@@ -132,7 +132,7 @@ class Timeline:
         """Read a timeline from an ``.npz`` file.
 
         Raises:
-            Sim2RealError: When the file is missing or holds no timeline of this format.
+            Sim2RealError: The file is missing or holds no timeline of this format.
         """
         hint = "pass a file made by Timeline.save"
         try:
@@ -164,14 +164,14 @@ class Timeline:
         Args:
             begins: Starts of the segments [ticks].
             length: Length of every segment [ticks].
-            lead: Node -> how long before the segment's start its steps are kept as well, at negative times [ticks].
+            lead: Node -> time before the segment's start from which its steps are kept, at negative times [ticks].
 
         Returns:
-            The segments as E episodes; and for each node, shape ``(E,)``, which step of the original episode is step 0
-            of each segment.
+            The segments as E episodes; and for each node, shape ``(E,)``, the number of the original step that is step
+            0 of each segment.
 
         Raises:
-            UsageError: When the timeline has more than one episode.
+            UsageError: The timeline has more than one episode.
         """
         if self.episodes != 1:
             raise UsageError(f"only a timeline of one episode can be cut, this one has {self.episodes}")
@@ -206,16 +206,16 @@ class Timeline:
 def _edge(messages: Messages, sent: int, steps: int, sender: str) -> Edge:
     """Return an edge (E = 1) with one entry for each of the ``sent`` messages; a damaged record may lack some."""
     received, seq_in = np.full(sent, NEVER), np.full(sent, -1, np.int64)
-    known = messages.seq_out < sent
-    received[messages.seq_out[known]] = messages.received[known]
-    seq_in[messages.seq_out[known]] = messages.seq_in[known]
+    valid = messages.seq_out < sent
+    received[messages.seq_out[valid]] = messages.received[valid]
+    seq_in[messages.seq_out[valid]] = messages.seq_in[valid]
     # Messages are consumed in order: after one that is lost, or that no recorded step consumed, all count as lost.
     lost = np.logical_or.accumulate((seq_in < 0) | (seq_in >= steps))
     return Edge(received[None], np.where(lost, -1, seq_in)[None], sender)
 
 
-def _at_least_delay(connection: Connection, edge: Edge, episode: Episode, vertices: Mapping[str, Vertex]) -> Edge:
-    """Return an edge as drawn timelines have it: at the least value of a delay that is trainable."""
+def _at_smallest_delay(connection: Connection, edge: Edge, episode: Episode, vertices: Mapping[str, Vertex]) -> Edge:
+    """Return an edge as drawn timelines have it: at the smallest value of a trainable delay."""
     if not isinstance(connection.delay_dist, TrainableDist):
         return edge
     steps, reader = episode.steps[connection.input_node.name], vertices[connection.input_node.name]

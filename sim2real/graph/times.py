@@ -1,4 +1,4 @@
-"""When steps and messages were, for E episodes, in ticks [us]: what timelines are made of."""
+"""The times of steps and messages of E episodes, in ticks [us]: the parts of a timeline."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Vertex:
     Attributes:
         start: Shape ``(E, N)``, int64. Entries after an episode's last step are padding and do not decrease.
         end: Shape ``(E, N)``, int64.
-        count: Shape ``(E,)``: how many steps each episode has.
+        count: Shape ``(E,)``: each episode's number of steps.
     """
 
     start: np.ndarray
@@ -33,8 +33,8 @@ class Edge:
     Attributes:
         received: Shape ``(E, M)``, int64: arrivals [ticks]. Message m is the output of the sender's step m, sent at
             the end of that step.
-        seq_in: Shape ``(E, M)``, int64: the reader's step that consumed it; -1 if none did.
-        sender: The sender's name.
+        seq_in: Shape ``(E, M)``, int64: number of the reader's step that consumed it; -1 if none did.
+        sender: Name of the sender.
     """
 
     received: np.ndarray
@@ -51,11 +51,11 @@ def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "rig
         side: As in ``np.searchsorted``.
 
     Returns:
-        Shape ``(E, M)``: where each value belongs in its row.
+        Shape ``(E, M)``: index of each value in its row.
     """
-    low = min(int(rows.min(initial=0)), int(values.min(initial=0)))
     # Rows are searched as one sorted array, each lifted above the one before. NEVER is replaced by a time just above
     # all others, so that the lifted values fit into 64 bits.
+    low = min(int(rows.min(initial=0)), int(values.min(initial=0)))
     real = [a[a < NEVER // 2] for a in (rows, values)]
     high = max(int(a.max(initial=0)) for a in real) + 2
     lift = (np.arange(len(rows), dtype=np.int64) * (high - low + 1))[:, None]

@@ -1,4 +1,4 @@
-"""Which messages are in a reader's window, computed from a timeline."""
+"""The messages in a reader's window, computed from a timeline."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import NEVER, Edge, Vertex, search_rows
 
 _ROUNDING = 2
-"""Each slot is rounded to whole ticks, so the distance of two may be this much smaller than the period [ticks]."""
+"""Each slot is rounded to whole ticks, so the distance of two can be smaller than the period by this [ticks]."""
 
 
 def newest_message(edge: Edge, reader: Vertex) -> np.ndarray:
@@ -31,14 +31,11 @@ def longest_burst(edge: Edge, reader: Vertex) -> int:
 def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex) -> np.ndarray:
     """Return the steps at which a trainable delay may need messages that are no longer in the window.
 
-    The window is long enough for a sender that keeps its rate. When messages come in a burst, the same number of
-    messages spans less time: at the largest delay, the one that a step should read has then been pushed out.
-
-    Args:
-        connection: The connection; without a trainable delay no step is affected.
+    The window is long enough for a sender that keeps its rate. In a burst, the same number of messages spans less time:
+    at the largest delay, the message that a step should read has then left the window.
 
     Returns:
-        Shape ``(E, N)``, bool.
+        Shape ``(E, N)``, bool; False without a trainable delay.
     """
     dist = connection.delay_dist
     if not isinstance(dist, TrainableDist):
@@ -53,7 +50,7 @@ def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex)
 
 
 def bursty_episodes(nodes: Mapping[str, BaseNode], timeline: Timeline) -> np.ndarray:
-    """Return which episodes have a burst that is too long for the window of a trainable delay, ``(E,)``, bool."""
+    """Return the mask of episodes with a burst that is too long for the window of a trainable delay, ``(E,)``, bool."""
     bursty = np.zeros(timeline.episodes, bool)
     for (name, input_name), edge in timeline.edges.items():
         connection = nodes[name].inputs[input_name]
@@ -65,7 +62,7 @@ def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
     """Check that every window is long enough for every trainable delay within its bounds.
 
     Raises:
-        UsageError: Naming the first step where a window is too short, and how many there are.
+        UsageError: A window is too short; the message has the first such step and their number.
     """
     for (name, input_name), edge in timeline.edges.items():
         if name not in nodes or input_name not in nodes[name].inputs:
@@ -79,6 +76,6 @@ def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
                 f"{connection.total_window} does not hold: at {reader.start[episode, step] / TICKS_PER_S:.3f} s of "
                 f"episode {episode} a delay of {connection.delay_dist.max:g} s would need a message that has left it "
                 f"({len(places)} such steps)",
-                hint="leave these episodes out (sim2real.graph.windows.bursty_episodes finds them), or let the "
-                "window hold more: TrainableDist.create(..., burst=2)",
+                hint="drop these episodes (sim2real.graph.windows.bursty_episodes finds them), or lengthen the "
+                "window: TrainableDist.create(..., burst=2)",
             )

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import safetensors.numpy
@@ -32,9 +31,10 @@ from sim2real.policy.runner import (
     layers_of,
     require,
 )  # fmt: skip
+from sim2real.types import Json
 
 FORMAT_VERSIONS = (1, 2)
-"""1: a perceptron whose output is clipped. 2: the file says what the network is; who knows 1 alone must refuse it."""
+"""1: a perceptron whose output is clipped. 2: the file describes the network; a reader of version 1 must refuse it."""
 WEIGHTS, GRAPH, CONTRACT = "policy.safetensors", "policy.onnx", "policy.json"
 SEAL = "sha256"
 """Entry of ``policy.json``: the hash of all others."""
@@ -42,19 +42,19 @@ PARITY = 1e-5
 """Largest difference between the actions of numpy and ONNX that an export accepts, as a fraction of their range."""
 
 
-LARGEST = 1e6
+MAX_WEIGHT = 1e6
 """Largest magnitude accepted in a policy's weights and normaliser; those of trained policies are below 1e3."""
-LEAST_STD = 1e-6
+MIN_STD = 1e-6
 """Smallest standard deviation accepted in a normaliser; those of trained policies are at least 1e-3."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PolicyReference:
-    """What the policy that was trained does, to compare with.
+    """JAX's actions of the trained policy, for a comparison.
 
     Attributes:
         observations: Shape ``(N, O)``.
-        actions: Shape ``(N, A)``: what JAX makes of them.
+        actions: Shape ``(N, A)``.
     """
 
     observations: np.ndarray
@@ -73,16 +73,14 @@ def save_bundle(
     """Write a bundle; ``policy.json`` is written last, so that a folder that has it is complete.
 
     Args:
-        folder: The folder; made if it does not exist. A bundle in it is replaced.
+        folder: Created if it does not exist. A bundle in it is replaced.
         weights: As ``Policy.to_weights`` returns them.
-        contract: Observations, actions and rate of the policy.
-        samples: Shape ``(n, O)``: observations, logged ones if possible, on which numpy and ONNX are compared, as those
-            of one episode, if onnxruntime is installed. None: those of the references, or else drawn from the
-            normaliser.
-        spec: What the network is; default: a perceptron whose output is clipped.
-        graph: The policy as an ONNX model, of a network that is not one of ours.
-        references: Where observations are from, such as ``log`` -> what JAX does there; the runner is compared with it,
-            and how well they agree stands in ``policy.json``.
+        samples: Shape ``(n, O)``: observations of one episode, logged ones if possible, for the comparison of numpy and
+            ONNX if onnxruntime is installed. None: those of the references, or else drawn from the normaliser.
+        spec: Default: a perceptron whose output is clipped.
+        graph: The policy as an ONNX model, for a network that is not in ``OWN``.
+        references: Source of the observations, such as ``log`` -> JAX's actions; the runner is compared with them, and
+            ``policy.json`` has the differences.
 
     Returns:
         The folder.
@@ -90,19 +88,24 @@ def save_bundle(
     Raises:
         Sim2RealError: Weights and contract do not fit each other, or the runner, ONNX and JAX give different actions.
     """
+    # Check the weights, and make the ONNX model.
     spec = spec or NetworkSpec()
     weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
     _check_fit(weights, contract, spec)
     graph = _graph_of(weights, contract, spec, graph)
-    there = importlib.util.find_spec("onnxruntime") is not None
+
+    # Compare the runner with JAX, and numpy with ONNX.
+    has_onnxruntime = importlib.util.find_spec("onnxruntime") is not None
     parity = {}
-    if spec.own or there:
+    if spec.own or has_onnxruntime:
         runner = PolicyRunner(contract, NumpyBackend(weights, spec) if spec.own else OnnxBackend(graph))
         parity = {name: _parity(weights, runner, reference, name) for name, reference in references.items()}
-    if spec.own and there:
+    if spec.own and has_onnxruntime:
         if samples is None and references:
             samples = np.concatenate([reference.observations for reference in references.values()])
         _check_parity(weights, graph, contract, spec, samples)
+
+    # Write the files.
     files = {WEIGHTS: safetensors.numpy.save(weights), GRAPH: graph}
     about = {**_described(weights, contract, spec), "parity": parity}
     about["files"] = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
@@ -115,14 +118,14 @@ def save_bundle(
     return folder
 
 
-def sealed(about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of ``policy.json`` with the hash of all other entries, whatever the layout of the file."""
+def sealed(about: Mapping[str, Json]) -> dict[str, Json]:
+    """Return the content of ``policy.json`` with the hash of all other entries; the file's layout has no effect."""
     entries = {name: value for name, value in about.items() if name != SEAL}
     return entries | {SEAL: hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()}
 
 
-def _described(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec) -> dict[str, Any]:
-    """Return what ``policy.json`` says of the policy itself, and of what wrote it."""
+def _described(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec) -> dict[str, Json]:
+    """Return the entries of ``policy.json`` on the policy and on the versions of the writing software."""
     plain = spec == NetworkSpec()
     return {
         "format_version": FORMAT_VERSIONS[0] if plain else FORMAT_VERSIONS[1],
@@ -166,14 +169,7 @@ def make_runner(
     spec: NetworkSpec | None = None,
     graph: bytes | None = None,
 ) -> PolicyRunner:
-    """Return a policy that was not saved, ready to run.
-
-    Args:
-        weights: As ``Policy.to_weights`` returns them.
-        contract: Observations, actions and rate of the policy.
-        backend: As in ``load_bundle``.
-        spec: As in ``save_bundle``.
-        graph: As in ``save_bundle``.
+    """Return the runner of a policy that was not saved; the arguments are those of ``load_bundle`` and ``save_bundle``.
 
     Raises:
         UsageError: The backend is unknown, not installed or does not run this network.
@@ -194,7 +190,7 @@ def make_runner(
 def _graph_of(
     weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec, graph: bytes | None
 ) -> bytes:
-    """Return the policy as an ONNX model with the contract's names; ``graph``: that of a network not ours."""
+    """Return the policy as an ONNX model with the contract's names; ``graph``: that of a network not in ``OWN``."""
     if (graph is None) != spec.own:
         raise UsageError(f"network {spec.name!r} needs {'no ONNX model' if spec.own else 'an ONNX model'} of its own")
     return build_onnx(weights, contract, spec) if graph is None else with_contract(graph, contract)
@@ -206,7 +202,7 @@ def _check_backend(backend: str | None) -> None:
 
 
 def read_contract(folder: str | Path) -> tuple[PolicyContract, NetworkSpec]:
-    """Return what a bundle's policy expects and promises, and what its network is.
+    """Return the contract of a bundle's policy, and the description of its network.
 
     Raises:
         Sim2RealError: A file is missing, damaged or of a format that this version does not know, or they do not fit.
@@ -215,7 +211,7 @@ def read_contract(folder: str | Path) -> tuple[PolicyContract, NetworkSpec]:
     contract = PolicyContract.from_dict(about)
     spec = NetworkSpec() if about["format_version"] == 1 else NetworkSpec.from_dict(about.get("network"))
     _check_fit(read_weights(folder), contract, spec)
-    # Last, as a reason with a name says more than a hash. Bundles of older versions have none.
+    # Last, as the errors above name the entry. Bundles of older versions have no hash.
     if SEAL in about and about[SEAL] != sealed(about)[SEAL]:
         raise Sim2RealError(
             f"{Path(folder) / CONTRACT} is not what was exported: its entries do not have the hash in its {SEAL!r}",
@@ -238,7 +234,7 @@ def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
         raise Sim2RealError(f"{folder / WEIGHTS} is no safetensors file: {error}") from error
 
 
-def _read_about(folder: Path) -> dict[str, Any]:
+def _read_about(folder: Path) -> dict[str, Json]:
     """Return the content of ``policy.json``, after checking its format version."""
     path = folder / CONTRACT
     try:
@@ -263,7 +259,7 @@ def _read_about(folder: Path) -> dict[str, Any]:
     return about
 
 
-def _read_file(folder: Path, name: str, about: Mapping[str, Any]) -> bytes:
+def _read_file(folder: Path, name: str, about: Mapping[str, Json]) -> bytes:
     """Return the bytes of a file, after checking its hash."""
     try:
         content = (folder / name).read_bytes()
@@ -282,8 +278,10 @@ def _read_file(folder: Path, name: str, about: Mapping[str, Any]) -> bytes:
     return content
 
 
-def _shapes(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec) -> dict[str, Any]:
-    """Return the shape of each array, as the others and the contract ask for it."""
+def _shapes(
+    weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec
+) -> dict[str, tuple[int, ...]]:
+    """Return the shape that each array must have, from the contract and the other arrays."""
     require(weights, BESIDES)
     size, actions = contract.observation_size, len(contract.action)
     expected = {"mean": (size,), "std": (size,), "low": (actions,), "high": (actions,), "log_std": (actions,)}
@@ -313,37 +311,38 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
             )
         if not np.isfinite(weights[name]).all():
             raise Sim2RealError(f"the policy's {name} holds values that are not finite", hint="train the policy again")
-        if np.abs(weights[name]).max(initial=0.0) > LARGEST:
+        if np.abs(weights[name]).max(initial=0.0) > MAX_WEIGHT:
             raise Sim2RealError(
-                f"the policy's {name} holds values up to {np.abs(weights[name]).max():.3g}; {LARGEST:g} is the most",
+                f"the policy's {name} holds values up to {np.abs(weights[name]).max():.3g}; {MAX_WEIGHT:g} is the most",
                 hint="no training ends there: train the policy again, and scale observations that are this large",
             )
-    least = weights["std"][: size - spec.privileged].min()  # parameters that only simulation knows are of any size
-    if least < LEAST_STD:
+    # Privileged entries, at the end, are parameters of any order of magnitude.
+    smallest = weights["std"][: size - spec.privileged].min()
+    if smallest < MIN_STD:
         raise Sim2RealError(
-            f"the policy divides by standard deviations down to {least:g}; {LEAST_STD:g} is the least",
+            f"the policy divides by standard deviations down to {smallest:g}; {MIN_STD:g} is the least",
             hint="train the policy again",
         )
     for side in ("low", "high"):
-        promised = np.array([getattr(term, side) for term in contract.action], np.float32)
-        if not np.array_equal(promised, weights[side]):
-            raise Sim2RealError(f"the policy's {side} bounds are {weights[side]}, the contract's are {promised}")
+        bounds = np.array([getattr(term, side) for term in contract.action], np.float32)
+        if not np.array_equal(bounds, weights[side]):
+            raise Sim2RealError(f"the policy's {side} bounds are {weights[side]}, the contract's are {bounds}")
 
 
 def _parity(
     weights: Mapping[str, np.ndarray], runner: PolicyRunner, reference: PolicyReference, name: str
 ) -> dict[str, float]:
-    """Return how far the runner is off JAX, as a fraction of the actions' range, and on how many observations."""
+    """Return the largest difference from JAX, as a fraction of the actions' range, and the number of observations."""
     runner.reset()
     actions = np.array([runner(observation) for observation in reference.observations])
-    off = np.abs((actions - reference.actions) / (weights["high"] - weights["low"]))
-    if not off.max(initial=0.0) <= PARITY:  # a NaN is no parity
+    difference = np.abs((actions - reference.actions) / (weights["high"] - weights["low"]))
+    if not difference.max(initial=0.0) <= PARITY:  # a NaN is no parity
         raise Sim2RealError(
-            f"the runner disagrees with JAX by {off.max():.2e} of the action range on observations of the {name}, "
+            f"the runner disagrees with JAX by {difference.max():.2e} of the action range on observations of the {name}, "
             f"{PARITY:.0e} is allowed",
-            hint="what was trained is not what would run: a normaliser with tiny deviations loses float32's precision",
+            hint="the runner would act differently from the training: a normaliser with tiny deviations loses precision",
         )
-    return {"samples": len(actions), "largest": float(off.max(initial=0.0))}
+    return {"samples": len(actions), "largest": float(difference.max(initial=0.0))}
 
 
 def _check_parity(
@@ -355,42 +354,38 @@ def _check_parity(
 ) -> None:
     """Raise unless numpy and ONNX give the same actions on the samples."""
     samples = draw_samples(weights) if samples is None else samples
-    by_numpy, by_onnx = PolicyRunner(contract, NumpyBackend(weights, spec)), PolicyRunner(contract, OnnxBackend(graph))
-    check_parity(weights, [by_numpy.act(sample) for sample in samples], [by_onnx.act(sample) for sample in samples])
+    runners = PolicyRunner(contract, NumpyBackend(weights, spec)), PolicyRunner(contract, OnnxBackend(graph))
+    check_parity(weights, *([runner.act(sample) for sample in samples] for runner in runners))
 
 
 def draw_samples(weights: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return observations to compare on, shape ``(64, O)``: those of the training, twice as far apart."""
+    """Return observations for a comparison, shape ``(64, O)``: the distribution of the training, twice as wide."""
     noise = np.random.default_rng(0).normal(size=(64, len(weights["mean"])))
     return (weights["mean"] + 2.0 * weights["std"] * noise).astype(np.float32)
 
 
 def check_parity(
     weights: Mapping[str, np.ndarray],
-    ones: Sequence[np.ndarray],
-    others: Sequence[np.ndarray],
-    who: str = "numpy",
-    most: float = PARITY,
+    actions: Sequence[np.ndarray],
+    of_onnx: Sequence[np.ndarray],
+    backend: str = "numpy",
+    tolerance: float = PARITY,
 ) -> None:
-    """Compare the actions of an export.
+    """Raise a ``Sim2RealError`` if ONNX's actions differ from those of another backend.
 
     Args:
-        ones: Actions ``(A,)`` without ONNX.
-        most: Largest difference, as a fraction of the actions' range.
-
-    Raises:
-        Sim2RealError: They differ by more.
+        tolerance: Largest difference, as a fraction of the actions' range.
     """
-    worst = np.abs(np.subtract(ones, others) / (weights["high"] - weights["low"])).max(initial=0.0)
-    if not worst <= most:
+    worst = np.abs(np.subtract(actions, of_onnx) / (weights["high"] - weights["low"])).max(initial=0.0)
+    if not worst <= tolerance:
         raise Sim2RealError(
-            f"{who} and ONNX disagree by {worst:.2e} of the action range, {most:.0e} is allowed",
+            f"{backend} and ONNX disagree by {worst:.2e} of the action range, {tolerance:.0e} is allowed",
             hint="a normaliser with tiny standard deviations or huge weights loses float32's precision",
         )
 
 
 def _version(name: str) -> str | None:
-    """Return the version of a distribution, or None where it runs uninstalled from its sources."""
+    """Return the version of a distribution, or None if it runs uninstalled from its sources."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

@@ -5,16 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
 
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.types import Json
 
 RATES_HZ = (1e-3, 1e5)
-"""Least and most policy steps per second: beyond them no robot is driven."""
-MOST_DELAY_S = 60.0
+"""Smallest and largest number of policy steps per second."""
+MAX_DELAY_S = 60.0
 """Longest delay, and longest step of a node [s]."""
-MOST_HISTORY = 10_000
-LARGEST_BOUND = 1e9
+MAX_HISTORY = 10_000
+MAX_BOUND = 1e9
 """Largest magnitude of a bound or a limit, in any unit; float32 has steps of 64 there."""
 
 
@@ -23,11 +23,10 @@ class ObservationTerm:
     """A part of the observation vector.
 
     Attributes:
-        name: Its name, e.g. ``"past_actions"``.
         units: The unit of each entry, e.g. ``("1", "1", "rad/s")``; ``"1"`` stands for no unit.
-        history: Number of steps that the vector has of it, newest step first.
-        low: Lower bound of each entry [its unit]; empty: not known. No policy is clipped to it.
-        high: Upper bound of each entry [its unit]; empty: not known.
+        history: Number of steps in the vector, newest step first.
+        low: Lower bound of each entry [its unit]; empty: unknown. Observations are not clipped to it.
+        high: Upper bound of each entry [its unit]; empty: unknown.
     """
 
     name: str
@@ -38,31 +37,30 @@ class ObservationTerm:
 
     def __post_init__(self) -> None:
         """Check that the term has at least one entry."""
-        if isinstance(self.units, str) or not self.units or not 1 <= self.history <= MOST_HISTORY:
+        if isinstance(self.units, str) or not self.units or not 1 <= self.history <= MAX_HISTORY:
             raise UsageError(
                 f"observation term {self.name!r} needs at least one unit and one step of history, "
                 f"got units={self.units!r} and history={self.history!r}",
-                hint=f"units is a tuple with one unit per entry, e.g. ('rad/s',), and history at most {MOST_HISTORY}",
+                hint=f"units is a tuple with one unit per entry, e.g. ('rad/s',), and history at most {MAX_HISTORY}",
             )
         bounds = len(self.low), len(self.high)
         if bounds not in ((0, 0), (self.size, self.size)) or any(
-            not -LARGEST_BOUND <= low < high <= LARGEST_BOUND for low, high in zip(self.low, self.high, strict=True)
+            not -MAX_BOUND <= low < high <= MAX_BOUND for low, high in zip(self.low, self.high, strict=True)
         ):
             raise UsageError(
                 f"observation term {self.name!r} of {self.size} entries has bounds low={self.low}, high={self.high}",
                 hint="give each entry both, finite and with low < high, or none of them any; "
-                f"no bound may be larger than {LARGEST_BOUND:g}",
+                f"no bound may be larger than {MAX_BOUND:g}",
             )
 
     @classmethod
     def within(cls, name: str, units: tuple[str, ...], most: float = math.inf) -> ObservationTerm:
-        """Return a term of the present whose entries are at most ``most`` away from 0.
+        """Return a term without history whose entries have magnitudes up to ``most`` [their units].
 
-        Args:
-            most: The largest magnitude [their units]; infinite: not known.
+        An infinite ``most`` stands for unknown bounds.
         """
-        known = most <= LARGEST_BOUND
-        return cls(name, units, 1, (-most,) * len(units) * known, (most,) * len(units) * known)
+        bounds = (most,) * len(units) if most <= MAX_BOUND else ()
+        return cls(name, units, 1, tuple(-bound for bound in bounds), bounds)
 
     @property
     def size(self) -> int:
@@ -75,8 +73,7 @@ class ActionTerm:
     """One entry of the action vector.
 
     Attributes:
-        name: Its name.
-        unit: Its unit; ``"1"`` stands for none.
+        unit: ``"1"`` stands for none.
         low: Lower bound [unit].
         high: Upper bound [unit].
     """
@@ -88,27 +85,27 @@ class ActionTerm:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
-        if not -LARGEST_BOUND <= self.low < self.high <= LARGEST_BOUND:
+        if not -MAX_BOUND <= self.low < self.high <= MAX_BOUND:
             raise UsageError(
                 f"action {self.name!r} needs finite bounds with low < high, got {self.low} and {self.high}",
-                hint=f"no bound may be larger than {LARGEST_BOUND:g}",
+                hint=f"no bound may be larger than {MAX_BOUND:g}",
             )
 
 
 @dataclasses.dataclass(frozen=True)
 class PolicyContract:
-    """What a policy must be given and what it returns.
+    """The inputs and outputs of a policy, and the conditions that it was trained for.
 
     Attributes:
         observation: The terms of the observation vector in their order.
         action: The entries of the action vector in their order.
         rate_hz: Policy steps per second.
-        delays_s: Name -> expected delay that the policy was trained with [s], e.g. ``{"sensor -> agent": 0.012}``.
-        trained_s: Name -> shortest and longest that episodes of the training had [s]: ``round_trip_delay``, what lies
-            between a command's departure and the motion in a measurement, and node -> duration of its steps. Empty:
-            the training had no delays, or does not say.
+        delays_s: Name -> expected delay of the training [s], e.g. ``{"sensor -> agent": 0.012}``.
+        trained_s: Name -> range of the times in the training's episodes [s]: ``round_trip_delay``, from a command's
+            departure to the motion in a measurement, and node -> duration of its steps. Empty: the training had no
+            delays, or they are unknown.
         limits: Name -> limit that must hold while it runs, e.g. ``{"thdot_rad_s": 40.0}``.
-        hashes: Name -> sha256 of the files that it was made from, e.g. the log and the identified parameters.
+        hashes: Name -> sha256 of the input files of the training, e.g. the log and the identified parameters.
     """
 
     observation: tuple[ObservationTerm, ...]
@@ -130,17 +127,19 @@ class PolicyContract:
                 raise UsageError(f"{kind} {', '.join(double)} appears more than once")
         if not RATES_HZ[0] <= self.rate_hz <= RATES_HZ[1]:
             raise UsageError(f"rate_hz must be above 0, from {RATES_HZ[0]:g} to {RATES_HZ[1]:g}, got {self.rate_hz}")
+
+        # Rate, delays and limits.
         for name, delay in self.delays_s.items():
-            if not 0 <= delay <= MOST_DELAY_S:
-                raise UsageError(f"delay {name!r} must be finite, from 0 to {MOST_DELAY_S:g} s, got {delay}")
-        for name, (least, most) in self.trained_s.items():
-            if not 0 <= least <= most <= MOST_DELAY_S:
+            if not 0 <= delay <= MAX_DELAY_S:
+                raise UsageError(f"delay {name!r} must be finite, from 0 to {MAX_DELAY_S:g} s, got {delay}")
+        for name, (low, high) in self.trained_s.items():
+            if not 0 <= low <= high <= MAX_DELAY_S:
                 raise UsageError(
-                    f"times of {name!r} must be finite and in order, up to {MOST_DELAY_S:g} s, got {least} to {most} s"
+                    f"times of {name!r} must be finite and in order, up to {MAX_DELAY_S:g} s, got {low} to {high} s"
                 )
         for name, limit in self.limits.items():
-            if not abs(limit) <= LARGEST_BOUND:
-                raise UsageError(f"limit {name!r} must be finite and at most {LARGEST_BOUND:g}, got {limit}")
+            if not abs(limit) <= MAX_BOUND:
+                raise UsageError(f"limit {name!r} must be finite and at most {MAX_BOUND:g}, got {limit}")
 
     @property
     def observation_size(self) -> int:
@@ -157,7 +156,7 @@ class PolicyContract:
             for i in range(term.size)
         ]
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Json]:
         """Return the contract as plain data for JSON."""
         data = dataclasses.asdict(self)
         data["observation"] = [
@@ -170,7 +169,7 @@ class PolicyContract:
         return data
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> PolicyContract:
+    def from_dict(cls, data: Mapping[str, Json]) -> PolicyContract:
         """Return the contract from the data that ``to_dict`` returns.
 
         Raises:
@@ -206,26 +205,26 @@ class PolicyContract:
             ) from error
 
 
-def _number(value: Any) -> float:
-    """Return a number of a file; neither a text nor a truth value is one."""
+def _number(value: Json) -> float:
+    """Return a number of a file; a text or a truth value raises a TypeError."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{value!r} is no number")
     return float(value)
 
 
-def _count(value: Any) -> int:
+def _count(value: Json) -> int:
     if type(value) is not int:
         raise TypeError(f"{value!r} is no whole number")
     return value
 
 
-def _text(value: Any) -> str:
+def _text(value: Json) -> str:
     if not isinstance(value, str) or not value:
         raise TypeError(f"{value!r} is no text")
     return value
 
 
-def _list(value: Any) -> list[Any]:
+def _list(value: Json) -> list[Json]:
     if not isinstance(value, list | tuple):
         raise TypeError(f"{value!r} is no list")
     return list(value)

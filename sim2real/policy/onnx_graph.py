@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.network import NetworkSpec
 from sim2real.policy.runner import INITIAL_CARRY, OBSERVATION_CLIP, gru_of, layers_of
+from sim2real.types import Json
 
 if TYPE_CHECKING:
     from onnx import NodeProto, ValueInfoProto
@@ -22,11 +23,11 @@ IR_VERSION = 8  # that of the ONNX release with opset 17, not the newest, so tha
 def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec | None = None) -> bytes:
     """Return the serialised model: ``observation (1, O)`` -> ``action (1, A)``, float32.
 
-    The batch axis is there because ONNX's Gemm takes matrices only. A network that remembers has an input ``carry_0``
-    and an output ``next_carry_0`` besides.
+    The batch axis is needed as ONNX's Gemm takes only matrices. A recurrent network also has an input ``carry_0`` and
+    an output ``next_carry_0``.
 
     Args:
-        spec: Which of them; default: a perceptron whose output is clipped.
+        spec: One of the networks in ``OWN``; default: a perceptron whose output is clipped.
     """
     from onnx import helper
 
@@ -42,11 +43,14 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
         "low": low,
         "half_range": 0.5 * (high - low),
     }
+    # Normalise and clip the observation.
     nodes = [
         helper.make_node("Sub", ["observation", "mean"], ["centred"]),
         helper.make_node("Div", ["centred", "std"], ["scaled"]),
         helper.make_node("Clip", ["scaled", "clip_low", "clip_high"], ["x0" if spec.name == "mlp" else "x"]),
     ]
+
+    # The network: a gated recurrent unit in place of the first layer, then tanh layers and a linear one.
     initial = []
     if spec.name == "gru":
         gru = gru_of(weights)
@@ -60,6 +64,8 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
         nodes.append(helper.make_node("Gemm", [f"x{i}", f"kernel{i}", f"bias{i}"], ["u" if last else f"y{i}"]))
         if not last:
             nodes.append(helper.make_node("Tanh", [f"y{i}"], [f"x{i + 1}"]))
+
+    # Bound the output, and scale it to the action's range.
     bound = ["u"] if spec.squash else ["u", "minus_one", "one"]
     nodes += [
         helper.make_node("Tanh" if spec.squash else "Clip", bound, ["bounded"]),
@@ -82,7 +88,9 @@ def make_model(
 
     Args:
         nodes: From ``observation (1, O)`` and ``carry_<i> (1, ...)`` to ``action (1, A)`` and ``next_carry_<i>``.
-        constants: Name -> array that they take.
+        constants: Name -> array.
+        sizes: Of observation and action.
+        initial: The carry into the first step.
     """
     from onnx import TensorProto, checker, helper, numpy_helper
 
@@ -122,12 +130,12 @@ def with_contract(graph: bytes, contract: PolicyContract) -> bytes:
 def _gru_nodes() -> list[NodeProto]:
     """Return a gated recurrent unit from ``x`` and ``carry_0`` to ``next_carry_0`` and ``x0``.
 
-    ONNX's own GRU has other axes, and a second bias that ours has not.
+    ONNX's GRU has other axes and a second bias.
     """
     from onnx import helper
 
-    def node(kind: str, takes: str, gives: str, **options: Any) -> NodeProto:
-        return helper.make_node(kind, takes.split(), gives.split(), **options)
+    def node(kind: str, inputs: str, outputs: str, **options: Json) -> NodeProto:
+        return helper.make_node(kind, inputs.split(), outputs.split(), **options)
 
     return [
         node("Gemm", "x gru_kernel gru_bias", "seen"),

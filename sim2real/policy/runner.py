@@ -16,7 +16,7 @@ OBSERVATION_CLIP = 10.0
 """Normalised observations are clipped to this many standard deviations, which is part of the bundle's format."""
 
 INITIAL_CARRY = "initial_carry"
-"""Where an ONNX file has what is carried into an episode's first step, in its metadata: a list of arrays, as JSON."""
+"""Entry of an ONNX file's metadata: the carry into an episode's first step, a list of arrays as JSON."""
 BACKENDS = ("numpy", "onnx")
 BESIDES = ("log_std", "mean", "std", "low", "high")
 """Arrays of a policy besides those of its network."""
@@ -30,11 +30,11 @@ class Backend(Protocol):
     """Maps a finite observation, float32 of shape ``(1, O)``, to an action, shape ``(1, A)``."""
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action; a network that remembers goes on from the one before."""
+        """Return the action; a recurrent network continues from the call before."""
         ...
 
     def reset(self) -> None:
-        """Start an episode: forget what was before."""
+        """Start an episode, with the initial carry."""
         ...
 
 
@@ -60,11 +60,7 @@ def gru_of(weights: Mapping[str, T]) -> dict[str, T]:
 
 
 def require(weights: Mapping[str, object], names: Iterable[str]) -> None:
-    """Raise unless all arrays are there.
-
-    Raises:
-        Sim2RealError: It names those that are missing.
-    """
+    """Raise a ``Sim2RealError`` with the names of missing arrays."""
     missing = sorted(set(names) - set(weights))
     if missing:
         raise Sim2RealError(
@@ -78,7 +74,7 @@ class NumpyBackend:
 
     Args:
         weights: As ``Policy.to_weights`` returns them, float32.
-        spec: What the network is, one of ours; default: a perceptron whose output is clipped.
+        spec: One of the networks in ``OWN``; default: a perceptron whose output is clipped.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], spec: NetworkSpec | None = None) -> None:
@@ -108,10 +104,10 @@ class NumpyBackend:
 
 def _gru_step(gru: Mapping[str, np.ndarray], carry: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the next state of a gated recurrent unit (``sim2real.train.networks.architectures.GRU``)."""
-    seen, kept = np.split(x @ gru["kernel"] + gru["bias"], 3, -1), np.split(carry @ gru["recurrent"], 3, -1)
+    of_input, of_state = np.split(x @ gru["kernel"] + gru["bias"], 3, -1), np.split(carry @ gru["recurrent"], 3, -1)
     # The logistic function by tanh, as exp overflows.
-    reset, update = (0.5 * (1.0 + np.tanh(0.5 * (a + b))) for a, b in zip(seen[:2], kept[:2], strict=True))
-    return (1.0 - update) * np.tanh(seen[2] + reset * kept[2]) + update * carry
+    reset, update = (0.5 * (1.0 + np.tanh(0.5 * (a + b))) for a, b in zip(of_input[:2], of_state[:2], strict=True))
+    return (1.0 - update) * np.tanh(of_input[2] + reset * of_state[2]) + update * carry
 
 
 class OnnxBackend:
@@ -139,8 +135,8 @@ class OnnxBackend:
             self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
         except Exception as error:  # its errors share no public base class
             raise Sim2RealError(f"onnxruntime cannot load the policy: {error}") from error
-        about = self._session.get_modelmeta().custom_metadata_map
-        first = json.loads(about.get(INITIAL_CARRY, "[]"))
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        first = json.loads(metadata.get(INITIAL_CARRY, "[]"))
         self._first = {f"carry_{i}": np.array(value, np.float32)[None] for i, value in enumerate(first)}
         self.reset()
 
@@ -170,7 +166,7 @@ class PolicyRunner:
         self._high = np.array([term.high for term in contract.action], np.float32)
 
     def reset(self) -> None:
-        """Start an episode: a policy that remembers forgets the one before."""
+        """Start an episode, with the initial carry of a recurrent policy."""
         self._backend.reset()
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
@@ -187,6 +183,7 @@ class PolicyRunner:
             Sim2RealError: The observation has the wrong shape.
             SafetyStop: The observation or the action is not finite.
         """
+        # Check the observation.
         values = np.asarray(obs, np.float32)
         size = self.contract.observation_size
         if values.shape != (size,):
@@ -198,9 +195,10 @@ class PolicyRunner:
         if not np.isfinite(values).all():
             names = [self.contract.observation_names[i] for i in np.flatnonzero(~np.isfinite(values))]
             raise SafetyStop(f"observation {', '.join(names)} is not finite", hint="check the sensor that feeds it")
+
+        # Compute the action, and clip it: an ONNX file may come from another exporter, without bounds.
         action = self._backend(values[None])[0]
         if not np.isfinite(action).all():
             names = [term.name for term, ok in zip(self.contract.action, np.isfinite(action), strict=True) if not ok]
             raise SafetyStop(f"the policy's action {', '.join(names)} is not finite", hint="train the policy again")
-        # An ONNX file may come from elsewhere: the contract's bounds hold in any case.
         return np.clip(action, self._low, self._high)

@@ -1,4 +1,4 @@
-"""Run this policy where only numpy is: `python run_policy.py`. What it sees and sends, and how often: policy.json."""
+"""Run this policy with numpy alone: `python run_policy.py`. Its observation, action and rate: policy.json."""
 
 import hashlib
 import json
@@ -34,4 +34,4 @@ class BarePolicy:
 
 
 if __name__ == "__main__":
-    print(BarePolicy(Path(__file__).resolve().parent)(np.zeros(())).tolist())  # where all that is seen is 0
+    print(BarePolicy(Path(__file__).resolve().parent)(np.zeros(())).tolist())  # the action for an observation of zeros

@@ -1,4 +1,4 @@
-"""A policy that is let act only while the robot leans less than it may."""
+"""A policy that acts only while the robot's tilt is below a limit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim2real.errors import SafetyStop
 
 
 class Runner(Protocol):
-    """What runs a policy; see ``sim2real.policy.PolicyRunner``."""
+    """A runner of a policy; see ``sim2real.policy.PolicyRunner``."""
 
     def reset(self) -> None:
         """Begin an episode."""
@@ -23,11 +23,11 @@ class Runner(Protocol):
 
 
 class UprightRunner:
-    """A runner that stops the robot when it leans too far.
+    """A runner that stops the robot above a tilt limit.
 
     Args:
-        tilt_rad: Returns how far the robot leans, from an observation ``(O,)`` [rad].
-        limit_rad: How far it may [rad].
+        tilt_rad: Returns the robot's tilt from an observation ``(O,)`` [rad].
+        limit_rad: Largest allowed tilt [rad].
     """
 
     def __init__(self, runner: Runner, tilt_rad: Callable[[np.ndarray], float], limit_rad: float) -> None:
@@ -41,12 +41,12 @@ class UprightRunner:
         """Return the policy's action, shape ``(A,)``.
 
         Raises:
-            SafetyStop: The robot leans further than it may, or its tilt is no number.
+            SafetyStop: The robot's tilt is above the limit, or no number.
         """
         tilt_rad = self._tilt_rad(observation)
         if not abs(tilt_rad) <= self._limit_rad:
             raise SafetyStop(
                 f"the robot leans by {tilt_rad:.3g} rad, {self._limit_rad:.3g} rad are allowed",
-                hint="set it upright; max_tilt_rad sets what is allowed",
+                hint="set it upright; max_tilt_rad sets the limit",
             )
         return self._runner(observation)

@@ -257,7 +257,7 @@ class AsyncGraph:
                 lacks = missing or [f"{n}/{i}" for n, i in edges - set(self._timeline.edges)]
                 raise UsageError(
                     f"the timeline lacks {', '.join(lacks)}",
-                    hint="draw what is missing: sim2real.graph.schedule.draw(nodes, duration_s, recorded=timeline)",
+                    hint="draw the missing parts: sim2real.graph.schedule.draw(nodes, duration_s, recorded=timeline)",
                 )
 
     def _prepare(self, graph_state: GraphState) -> dict[str, NodeData]:

@@ -78,7 +78,7 @@ def test_the_teacher_of_another_robot_is_refused(root, contract):
 def test_a_teacher_is_never_deployed(root, capsys):
     bundle = next((root / "pendulum").glob("*/train/bundle"))
     assert cli.main(["deploy", "pendulum", "--runs", str(root), "--bundle", str(bundle)]) != 0
-    assert f"a teacher: {KNOWN} entries of what it sees are known in simulation only" in capsys.readouterr().err
+    assert f"a teacher: {KNOWN} entries of its observation exist only in simulation" in capsys.readouterr().err
     assert not list(root.glob("*/*/deploy"))
 
 

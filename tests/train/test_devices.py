@@ -41,13 +41,13 @@ for devices in (1, 8):
 
 found["mesh"] = dict(divided[-1].whole.mesh.shape)
 from sim2real.train.scale.devices import place
-from sim2real.train.ppo.trainer import _epoch
-from sim2real.train.ppo.initial_state import make_networks, make_start
+from sim2real.train.ppo.trainer import _train_until_evaluation
+from sim2real.train.ppo.initial_state import make_networks, make_initial_state
 
 config = dataclasses.replace(config, num_seeds=1, num_envs=48, rollout_steps=5, hidden=(7,), devices=2)
 networks = make_networks(Bandit(), config)
-state = make_start(Bandit(), [config], jax.random.key(0), networks)
-program = jax.jit(jax.vmap(lambda state: _epoch(Bandit(), config, networks, state)))
+state = make_initial_state(Bandit(), [config], jax.random.key(0), networks)
+program = jax.jit(jax.vmap(lambda state: _train_until_evaluation(Bandit(), config, networks, state)))
 text = program.lower(place(state, shardings_of(state, config))).compile().as_text()
 found["rows"] = sorted(map(int, set(re.findall(r"= f32\\[(\\d+),7\\]\\S* dot\\(", text))))
 print(json.dumps(found))

@@ -1,11 +1,11 @@
-"""Test suites to inherit: what every node and every runtime must fulfil."""
+"""Test suites to inherit: the requirements on every node and every runtime."""
 
 from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from sim2real.graph.schedule import draw
 from sim2real.graph.testing.nodes import MakeNode, hash_node, random_graph
 from sim2real.graph.testing.reference import Reference
 from sim2real.graph.timeline import Timeline
+from sim2real.types import PyTree
 
 
 def first_step_state(nodes: Mapping[str, BaseNode], name: str, key: jax.Array) -> StepState:
@@ -52,45 +53,46 @@ class NodeConformance(ABC):
     def graph(self) -> tuple[Mapping[str, BaseNode], str]:
         """Return the connected node and its senders, by name; and the name of the node to test."""
 
-    def given(self) -> tuple[BaseNode, StepState, Mapping[str, BaseNode]]:
+    def first_step(self) -> tuple[BaseNode, StepState, Mapping[str, BaseNode]]:
         """Return the node, its first step state, and all nodes by name."""
         nodes, name = self.graph()
         return nodes[name], first_step_state(nodes, name, jax.random.key(0)), nodes
 
     def test_the_step_is_pure(self) -> None:
         """The same step state gives the same results and is not modified."""
-        node, given, _ = self.given()
-        before = copy.deepcopy(jax.tree_util.tree_map(np.asarray, _without_keys(given)))
-        first, second = node.step(given), node.step(given)
+        node, step_state, _ = self.first_step()
+        before = copy.deepcopy(jax.tree_util.tree_map(np.asarray, _without_keys(step_state)))
+        first, second = node.step(step_state), node.step(step_state)
         assert _equal(_without_keys(first), _without_keys(second)), f"node {node.name!r}: two calls differ"
-        assert _equal(before, _without_keys(given)), f"node {node.name!r}: step changed what it was given"
+        assert _equal(before, _without_keys(step_state)), f"node {node.name!r}: step changed its step state"
 
     def test_the_step_keeps_structure_shapes_and_dtypes(self) -> None:
         """State, parameters and key keep structure, shapes and dtypes: a compiled loop carries them."""
-        node, given, _ = self.given()
-        after, _ = node.step(given)
+        node, step_state, _ = self.first_step()
+        after, _ = node.step(step_state)
         for field in ("state", "params", "rng"):
-            _same_form(getattr(given, field), getattr(after, field), f"node {node.name!r}: {field}")
+            _same_form(getattr(step_state, field), getattr(after, field), f"node {node.name!r}: {field}")
 
     def test_the_output_looks_like_the_default_output(self) -> None:
         """Output and default output have the same structure: a reader's window holds both."""
-        node, given, nodes = self.given()
+        node, step_state, nodes = self.first_step()
         gs = GraphState(
-            params={n: x.init_params(jax.random.key(1)) for n, x in nodes.items()}, state={node.name: given.state}
+            params={n: x.init_params(jax.random.key(1)) for n, x in nodes.items()}, state={node.name: step_state.state}
         )
-        _same_form(node.init_output(jax.random.key(2), gs), node.step(given)[1], f"node {node.name!r}: output")
+        _same_form(node.init_output(jax.random.key(2), gs), node.step(step_state)[1], f"node {node.name!r}: output")
 
     def test_what_init_makes_depends_on_the_key_alone(self) -> None:
         """The same key gives the same parameters, state and output."""
-        node, _, nodes = self.given()
+        node, _, nodes = self.first_step()
         one, two = (first_step_state(nodes, node.name, jax.random.key(5)) for _ in range(2))
         assert _equal(_without_keys(one), _without_keys(two)), f"node {node.name!r}: init is not reproducible"
 
     def test_the_step_can_be_compiled(self) -> None:
         """JAX can trace the step, unless ``jittable`` is False."""
-        node, given, _ = self.given()
+        node, step_state, _ = self.first_step()
         if node.jittable:
-            _same_form(jax.eval_shape(node.step, given)[1], node.step(given)[1], f"node {node.name!r}: traced output")
+            traced = jax.eval_shape(node.step, step_state)[1]
+            _same_form(traced, node.step(step_state)[1], f"node {node.name!r}: traced output")
 
 
 T = TypeVar("T")
@@ -102,16 +104,16 @@ class Played(NamedTuple):
     Attributes:
         states: Initial state of each node.
         defaults: Default output of each node.
-        outputs: Node -> its outputs by seq, shape ``(N,)``; a runtime may leave out the last few steps.
+        outputs: Node -> its outputs by seq, shape ``(N,)``; the last few steps may be missing.
     """
 
-    states: Mapping[str, Any]
-    defaults: Mapping[str, Any]
+    states: Mapping[str, PyTree]
+    defaults: Mapping[str, PyTree]
     outputs: Mapping[str, np.ndarray]
 
 
 class RuntimeConformance(ABC):
-    """Tests that every runtime must pass: each step sees exactly the messages that the timing rules say."""
+    """Tests that every runtime must pass: each step gets exactly the messages of the timing rules."""
 
     make: MakeNode = staticmethod(hash_node)
     """Makes the hash nodes, in Python or in JAX."""
@@ -128,7 +130,7 @@ class RuntimeConformance(ABC):
     """Whether the runtime applies trainable delays."""
 
     def test_every_step_sees_what_the_rules_say(self) -> None:
-        """The hash of everything a node has seen equals that of the reference implementation."""
+        """The hash of all messages that a node has read equals that of the reference implementation."""
         for seed in self.seeds:
             self._check(random_graph(seed, make=type(self).make), seed)
 
@@ -147,14 +149,14 @@ class RuntimeConformance(ABC):
         for name, hashes in expected.items():
             got = [int(x) for x in played.outputs.get(name, ())]
             sent = [reference.message(name, h) for h in hashes]
-            assert got == sent[: len(got)], f"seed {seed}: node {name!r} saw other messages"
+            assert got == sent[: len(got)], f"seed {seed}: node {name!r} read other messages"
             assert len(got) >= 0.6 * len(hashes) - 3, f"seed {seed}: node {name!r} made {len(got)} steps"
 
 
 def _without_keys(tree: T) -> T:
     """Return the tree with JAX keys replaced by their raw numbers."""
 
-    def one(leaf: Any) -> Any:
+    def one(leaf: PyTree) -> PyTree:
         is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return jax.random.key_data(leaf) if is_key else leaf
 

@@ -1,9 +1,9 @@
-"""Hash nodes, whose output reveals any wrong message that they were given, and random graphs of them."""
+"""Hash nodes, whose output reveals any wrong message in their inputs, and random graphs of them."""
 
 from __future__ import annotations
 
 import zlib
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from flax import struct
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.delays import EmpiricalDist, TrainableDist
 from sim2real.graph.node import BaseNode, BaseWorld, Jitter, Scheduling
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from jax.typing import ArrayLike
@@ -26,7 +27,7 @@ _PRIME, _OFFSET, _MASK = 16777619, 12345, 2**32 - 1
 class Value(Base):
     """A message with one number."""
 
-    x: Any
+    x: PyTree
 
 
 def mix(a: int, b: int) -> int:
@@ -39,7 +40,7 @@ DTYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "bool", "float3
 
 
 def as_message(out: int, dtype: str) -> int:
-    """Return the number that a message has which a hash node makes of its output; every dtype holds it exactly."""
+    """Return the number in a hash node's message for its output; every dtype holds it exactly."""
     if dtype == "bool":
         return out & 1
     if dtype.startswith("float"):
@@ -72,13 +73,13 @@ class HashInPython(BaseNode):
     jittable = False
     dtype = "uint32"
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: PyTree = None, graph_state: GraphState | None = None) -> PyTree:
         """Return a hash of the node's name."""
         del rng, graph_state
         return jnp.uint32(zlib.crc32(self.name.encode()))
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Value:
-        """Return a random number; all readers must get the same one."""
+    def init_output(self, rng: PyTree = None, graph_state: GraphState | None = None) -> Value:
+        """Return a random number; all readers must get the same number."""
         del graph_state
         return Value(x=self._message(jax.random.bits(rng, (), jnp.uint32)))
 
@@ -130,20 +131,20 @@ class HashWorldInJax(HashInJax, BaseWorld):
 class Contraction(BaseNode):
     """A node with float messages whose state contracts, so that rounding differences between runtimes die out."""
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: PyTree = None, graph_state: GraphState | None = None) -> PyTree:
         """Return a random number."""
         del graph_state
         return jax.random.normal(rng)
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Value:
+    def init_output(self, rng: PyTree = None, graph_state: GraphState | None = None) -> Value:
         """Return a random number."""
         del graph_state
         return Value(x=jax.random.normal(rng))
 
     def step(self, step_state: StepState) -> tuple[StepState, Value]:
         """Move towards the mean of the inputs, plus a term that differs from step to step."""
-        seen = [jnp.mean(window.data.x) for _, window in sorted(step_state.inputs.items())]
-        target = sum(seen) / max(len(seen), 1)
+        means = [jnp.mean(window.data.x) for _, window in sorted(step_state.inputs.items())]
+        target = sum(means) / max(len(means), 1)
         state = 0.5 * step_state.state + 0.4 * target + jnp.sin(1.3 * step_state.seq)
         return step_state.replace(state=state), Value(x=jnp.tanh(state))
 
@@ -155,7 +156,7 @@ class ContractingWorld(Contraction, BaseWorld):
 class MakeNode(Protocol):
     """Makes a node, or a world, of a random graph."""
 
-    def __call__(self, name: str, rate: float, world: bool, **options: Any) -> BaseNode:
+    def __call__(self, name: str, rate: float, world: bool, **options: PyTree) -> BaseNode:
         """Return the node.
 
         Args:
@@ -165,7 +166,7 @@ class MakeNode(Protocol):
         ...
 
 
-def hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
+def hash_node(name: str, rate: float, world: bool, **options: PyTree) -> BaseNode:
     """Return a hash node in plain Python.
 
     Args:
@@ -175,7 +176,7 @@ def hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
     return HashWorldInPython(name, rate) if world else HashInPython(name, rate, **options)
 
 
-def jax_hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
+def jax_hash_node(name: str, rate: float, world: bool, **options: PyTree) -> BaseNode:
     """Return a hash node in JAX.
 
     Args:
@@ -185,7 +186,7 @@ def jax_hash_node(name: str, rate: float, world: bool, **options: Any) -> BaseNo
     return HashWorldInJax(name, rate) if world else HashInJax(name, rate, **options)
 
 
-def contracting_node(name: str, rate: float, world: bool, **options: Any) -> BaseNode:
+def contracting_node(name: str, rate: float, world: bool, **options: PyTree) -> BaseNode:
     """Return a node with float messages.
 
     Args:
@@ -273,7 +274,7 @@ def connect_at_random(rng: np.random.Generator, reader: BaseNode, sender: BaseNo
         )
 
 
-def _delays(rng: np.random.Generator, rate: float, at_least: float) -> dict[str, Any]:
+def _delays(rng: np.random.Generator, rate: float, at_least: float) -> dict[str, PyTree]:
     """Return delay options: constant, or random, or random with hiccups of several periods."""
     kind = rng.random()
     scale = float(rng.uniform(0.05, 0.4)) / rate

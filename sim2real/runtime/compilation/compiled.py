@@ -89,7 +89,7 @@ class CompiledGraph:
 
     @cached_property
     def repetition(self) -> Repetition | None:
-        """The program of whole episodes in a pattern that they all repeat; None without a pattern, or with ``given``."""
+        """The program of whole episodes in a pattern that all repeat; None without a pattern, or with ``given``."""
         pattern = None if self.given else wire_pattern(self.nodes, self.supervisor, self.timeline)
         if pattern is not None and np.diff(pattern.full) < 2:
             return None

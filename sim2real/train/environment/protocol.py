@@ -136,7 +136,7 @@ def get_reset(
 
 
 def check_environment(env: TrainingEnvironment) -> None:
-    """Check shapes and dtypes of all that an environment returns, by tracing it; nothing is compiled or run.
+    """Check shapes and dtypes of an environment's results by tracing it, without compiling or running it.
 
     Raises:
         UsageError: A part does not follow the protocol.

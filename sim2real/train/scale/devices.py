@@ -25,7 +25,7 @@ class Shardings(NamedTuple):
 
     Attributes:
         state: A sharding for each array of its state.
-        whole: The sharding of arrays of which every device has a copy.
+        whole: The sharding of arrays with a copy on every device.
     """
 
     state: PyTree
@@ -58,7 +58,7 @@ def place(state: T, layout: Shardings | None) -> T:
 
 
 def replicate(tree: T, layout: Shardings | None) -> T:
-    """Return arrays of which every device has a copy, from arrays in this process's memory."""
+    """Return arrays with a copy on every device, from arrays in this process's memory."""
     return jax.tree.map(jnp.asarray if layout is None else lambda leaf: _put(leaf, layout.whole), tree)
 
 

@@ -50,7 +50,7 @@ def mesh_of(config: PPOConfig) -> Mesh | None:
 
 
 def divide_minibatches(arrays: T, config: PPOConfig) -> T:
-    """Return minibatches of which each device of a seed has a part.
+    """Return minibatches that the devices of a seed divide.
 
     A minibatch has copies from all devices. Without this constraint the compiler makes each device compute all of it.
 

@@ -87,7 +87,7 @@ def wait_for_all(what: str) -> None:
 
 
 def agree(settings: Mapping[str, Json]) -> None:
-    """Compare the settings of all processes; with different programs they would wait for each other for ever.
+    """Compare the settings of all processes; with different programs they would wait for each other without end.
 
     Raises:
         UsageError: They differ; all processes raise it.
