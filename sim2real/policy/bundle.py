@@ -332,15 +332,15 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
 def _parity(
     weights: Mapping[str, np.ndarray], runner: PolicyRunner, reference: PolicyReference, name: str
 ) -> dict[str, float]:
-    """Return the largest difference from JAX, as a fraction of the actions' range, and the number of observations."""
+    """Return the largest difference from JAX, as a share of the actions' range, and the number of samples."""
     runner.reset()
     actions = np.array([runner(observation) for observation in reference.observations])
     difference = np.abs((actions - reference.actions) / (weights["high"] - weights["low"]))
     if not difference.max(initial=0.0) <= PARITY:  # a NaN is no parity
         raise Sim2RealError(
-            f"the runner disagrees with JAX by {difference.max():.2e} of the action range on observations of the {name}, "
-            f"{PARITY:.0e} is allowed",
-            hint="the runner would act differently from the training: a normaliser with tiny deviations loses precision",
+            f"the runner disagrees with JAX by {difference.max():.2e} of the action range on observations of the "
+            f"{name}, {PARITY:.0e} is allowed",
+            hint="the runner would not act as trained: a normaliser with tiny deviations loses float32's precision",
         )
     return {"samples": len(actions), "largest": float(difference.max(initial=0.0))}
 
@@ -354,8 +354,8 @@ def _check_parity(
 ) -> None:
     """Raise unless numpy and ONNX give the same actions on the samples."""
     samples = draw_samples(weights) if samples is None else samples
-    runners = PolicyRunner(contract, NumpyBackend(weights, spec)), PolicyRunner(contract, OnnxBackend(graph))
-    check_parity(weights, *([runner.act(sample) for sample in samples] for runner in runners))
+    in_numpy, in_onnx = PolicyRunner(contract, NumpyBackend(weights, spec)), PolicyRunner(contract, OnnxBackend(graph))
+    check_parity(weights, [in_numpy.act(sample) for sample in samples], [in_onnx.act(sample) for sample in samples])
 
 
 def draw_samples(weights: Mapping[str, np.ndarray]) -> np.ndarray:

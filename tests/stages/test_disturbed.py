@@ -58,5 +58,5 @@ def test_without_any_of_it_nothing_is_shown_or_done(prepared):
 
 
 def test_a_curriculum_of_nothing_is_refused(prepared):
-    with pytest.raises(UsageError, match="nothing differs between them"):
+    with pytest.raises(UsageError, match="all episodes are equal"):
         prepared(curriculum=(0.0, 1.0))
