@@ -1,4 +1,4 @@
-"""How an identification is scored on later logs; every field is a flag. Imports no JAX."""
+"""Flags of validate. Imports no JAX, so that ``--help`` stays instant."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 @dataclass(frozen=True)
 class ValidateConfig:
-    """Score what was identified on later logs."""
+    """Score an identification on later logs."""
 
     parameters: Annotated[Positional[Path | None], arg(metavar="PARAMETERS")] = None
     """parameters.json, or the folder of an identification."""
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """Log that was not identified from, one flag a log."""
+    """Later log, one flag a log."""
     horizon_s: float = 0.0
-    """How far ahead is predicted [s]; 0: as far as the identification was judged."""
+    """Horizon of the predictions [s]; 0: that of the identification's verdict."""
     free_run_s: float = 10.0
     """Longest simulation from a single initial state [s]."""
     mapping: Annotated[Path | None, arg(metavar="FILE")] = None
     """Mapping of logs of another recorder; default: the pipeline's, or one is proposed."""
     force: bool = False
-    """Score a log that was fitted all the same."""
+    """Score a log even if it was fitted."""
     json: bool = False
     """Print JSON instead of tables."""

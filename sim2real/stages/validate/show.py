@@ -1,0 +1,37 @@
+"""Output of validate: the errors on the later logs and the verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sim2real.stages.terminal.console import note, table
+from sim2real.stages.validate.result import ACCEPTED, FREE_RUN, MAX_ERROR_RATIO
+from sim2real.types import Json
+
+
+def show(result: Mapping[str, Json]) -> None:
+    """Print the errors as a table, then the verdict."""
+    models = list(dict.fromkeys(m for row in result["positions"].values() for m in row["rmse"]))
+    cells = [
+        [name, *(row["rmse"].get(m) for m in models), row["promised"], row[FREE_RUN], row["unit"]]
+        for name, row in result["positions"].items()
+    ]
+    print(table(cells, [f"off {result['horizon_s']:g} s ahead", *models, "promised", FREE_RUN, "unit"]))
+    print(
+        f"all positions: {result['rmse']:.4g} {result['horizon_s']:g} s ahead, "
+        f"{result['free_run_rmse']:.4g} in free runs"
+    )
+    if resting := [name for name, row in result["positions"].items() if not row["moves"]]:
+        note(f"{', '.join(resting)} did not move here, which neither keeps a promise nor breaks one")
+    if not result["better"]:
+        beaten = {n: row["beaten_by"] for n, row in result["positions"].items() if row["beaten_by"]}
+        listed = "; ".join(f"{n} by {', '.join(by)}" for n, by in list(beaten.items())[:3])
+        note(f"verdict: no improvement on this log: beaten are {listed}")
+    elif result["promise_kept"] is False:
+        note(f"verdict: better than the baselines, but more than {MAX_ERROR_RATIO:g} times as far off as was promised")
+    elif result["fitted"]:
+        note("verdict: none: a log that was fitted is no test")
+    else:
+        note("verdict: holds on this log")
+    if result["identified"] != ACCEPTED:
+        note(f"the identification itself was not accepted: {result['identified']}: {'; '.join(result['why'][:1])}")
