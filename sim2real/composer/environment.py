@@ -17,8 +17,7 @@ from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.hooks import Hooks
 from sim2real.composer.observation.updater import Updater
 from sim2real.composer.physics.c.compiled import Compiler
-from sim2real.composer.reward import split_reward
-from sim2real.composer.task import Task
+from sim2real.composer.task import Task, split_reward
 from sim2real.errors import UsageError
 from sim2real.types import PyTree
 
@@ -188,6 +187,7 @@ class Environment(dm_env.Environment):
         """Advance by a control step under an action; starts an episode when there is none, ignoring the action."""
         if self._reset_next_step:
             return self.reset()
+        # Run the hooks and the physics steps; a warning of MuJoCo ends the episode, unless it is an error.
         diverged = False
         self._hooks.run("before_step", self._proxy, action, self._random_state)
         self._updater.prepare_for_next_control_step()
@@ -203,9 +203,11 @@ class Environment(dm_env.Environment):
                 raise
             _log.warning("%s", error)
             diverged = True
+        # Take the last samples after the hooks, which may change the state.
         self._hooks.run("after_step", self._proxy, self._random_state)
         self._updater.update()
         self._steps_taken += 1
+        # A diverged episode has no reward, and discount 0.
         reward, discount, last = 0.0, 0.0, True
         if not diverged:
             reward, discount = self._task.get_reward(self._proxy), self._task.get_discount(self._proxy)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import reduce
+from operator import add
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,8 +20,6 @@ from sim2real.composer.observation.observable.base import Generic
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from sim2real.composer.observation.observable.base import Observable
     from sim2real.composer.physics.base import BasePhysics
     from sim2real.composer.types import Array, RandomState
@@ -43,6 +43,19 @@ def _steps(control_timestep: float, physics_timestep: float) -> int:
             f"a control step of {control_timestep!r} s is shorter than a physics step of {physics_timestep!r} s"
         )
     return steps
+
+
+def split_reward(reward: PyTree) -> tuple[PyTree, dict[str, PyTree]]:
+    """Return what a task's ``get_reward`` returned as a number, the sum of its terms in their order, and the terms.
+
+    Raises:
+        UsageError: There are names, but no terms.
+    """
+    if not isinstance(reward, Mapping):
+        return reward, {}
+    if not reward:
+        raise UsageError("the task's get_reward returned no terms", hint="return a number, or terms by name")
+    return reduce(add, reward.values()), dict(reward)
 
 
 class Task(ABC):

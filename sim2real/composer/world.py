@@ -89,6 +89,7 @@ class ComposedWorld(BaseWorld):
         order: int | None = None,
         **options: PyTree,
     ) -> None:
+        # Compile the task, and check that a tick is a control step.
         self.environment = MjxEnvironment(task, **options)
         ticks = 1.0 / task.control_timestep
         if rate is not None and not math.isclose(rate, ticks, rel_tol=1e-6):
@@ -103,6 +104,7 @@ class ComposedWorld(BaseWorld):
         self._parameters = dict(parameters or {})
         self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
         self._apart, self._derived = False, frozenset[str]()
+        # Set the parameters once, to refuse those that cannot vary.
         physics = self._view()
         self._set(physics, self.init_params())  # refuses what cannot vary
         if self._derives:

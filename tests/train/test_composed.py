@@ -11,7 +11,7 @@ from flax import struct
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
-from sim2real.composer.reward import split_reward
+from sim2real.composer.task import split_reward
 from sim2real.errors import UsageError
 from sim2real.train.environment.composed import TaskEnvironment, TaskState
 from sim2real.train.environment.graph_environment import GraphEnvironment

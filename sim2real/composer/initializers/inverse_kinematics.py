@@ -44,12 +44,14 @@ def reach(
     )
     jacobian, step = np.empty((6, model.nv)), np.zeros(model.nv)
     for _ in range(_STEPS):
+        # Measure the error of the pose.
         mj.mj_fwdPosition(model, data)
         error = _error(data.site_xpos[number], data.site_xmat[number], position, quaternion)
         size = np.linalg.norm(error[:3]) + rotation_weight * np.linalg.norm(error[3:])
         if size < TOLERANCE:
             physics.mark_as_dirty()
             return True
+        # Solve for the step of the joints that reduces it; far from the goal damping keeps the step short.
         mj.mj_jacSite(model, data, jacobian[:3], jacobian[3:], number)
         reduced = jacobian[:, columns]
         damping = _DAMPING if size > _FAR else 0.0

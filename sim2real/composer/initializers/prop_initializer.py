@@ -168,6 +168,7 @@ class PropPlacer(Initializer):
         for _ in range(self._settle_attempts):
             self._place(physics, random_state, cached)
             start = physics.data.time
+            # Run the physics until the props rest; the time of the physics does not count.
             isolator = JointStaticIsolator(physics, self._joints)
             try:
                 while physics.data.time - start < self._max_time:

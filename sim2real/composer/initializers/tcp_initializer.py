@@ -62,6 +62,7 @@ class ToolCenterPointInitializer(Initializer):
                 hint="draw positions of joints with random_state instead, or use composer.Environment",
             )
         site = self._arm.wrist_site if self._hand is None else self._hand.tool_center_point
+        # Draw poses until the arm reaches one without contact; each begins from the same joint positions.
         before = physics.bind(self._arm.joints).qpos.copy()
         for _ in range(self._samples):
             pose = [variation.evaluate(v, random_state=random_state) for v in (self._position, self._quaternion)]
@@ -89,6 +90,7 @@ class ToolCenterPointInitializer(Initializer):
                 target_quat=quaternion,
                 max_ik_attempts=self._attempts,
             )
+        # Solve from the present joint positions, then from random ones.
         low, high = self._limits(physics)
         joints = physics.bind(self._arm.joints)
         for attempt in range(self._attempts):

@@ -33,6 +33,7 @@ def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Value]) -> H
     name = attrs.get("name")
     if name is not None:
         model.check_name(kind, name)
+    # Add the native element with the defaults of its class; MuJoCo cannot look up a class of another model.
     foreign = _foreign(model, attrs["dclass"]) if "dclass" in attrs else None
     defaults = None if foreign else _defaults(model, attrs)
     if tag == "freejoint":
@@ -42,6 +43,7 @@ def add_to_body(model: Tree[H], body: H, tag: str, attrs: dict[str, Value]) -> H
         native = adder() if defaults is None or kind == "body" else adder(defaults)
     if foreign:
         translate.reset(native, getattr(foreign.native, kind))
+    # Set the attributes; MuJoCo's parser reads those that the spec does not hold.
     element = model.enlist(kind, native, tag, _renamed(attrs))
     try:
         if name is not None:
@@ -166,6 +168,7 @@ def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> Non
         translate.reset(native, element.class_defaults, (translate.native_name(kind, key),))
         model.touch()
         return
+    # Reset the element to its defaults, and drop its references.
     _catch_up(element, record.values, key)
     native_only = {
         k: record.values.pop(k) for k in list(record.values) if k not in valid and k not in ("name", "dclass")
@@ -174,6 +177,7 @@ def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> Non
     translate.reset(native, getattr(foreign.native, kind) if foreign else element.class_defaults)
     for reference in [r for r in model.references if r[0] is native]:
         del model.references[reference]
+    # Set the explicit attributes again, those in MuJoCo's spelling last.
     try:
         _lay_down(model, element)
         for extra, value in native_only.items():
@@ -287,10 +291,12 @@ def remove(model: Tree[Handle], element: Handle) -> None:
         native.explicitinertial = False
         model.touch()
         return
+    # Release the references to the element, and to all elements in a body.
     handles: list[Handle] = [element]
     if element.kind == "body":
         handles += [model.handle(kind, child) for kind in TREE_KINDS for child in native.find_all(kind)]
     references.let_go(model, handles)
+    # Rename the elements first, so that MuJoCo does not delete those that refer to them.
     gone = [handle._native for handle in handles]
     for number, one in enumerate(gone):  # MuJoCo deletes what names an element together with it
         frame = one.name[:-1] if one.name.endswith("/") else ""

@@ -183,6 +183,7 @@ class DefaultElement(Element):
                 available = ", ".join(sorted(valid))
                 raise AttributeError(f"{name!r} is not a valid attribute for <{self._tag}>. Available: {available}")
             fixed, _ = translate.from_xml(self.kind, self._tag, {name: value}, ())
+        # Record the value, then set it in every element that follows this class.
         self.root.records.note_default(self._native, self.kind, self._tag, name, value)
         for follower in self._followers(name):
             if follower.kind == "actuator" and follower.tag != "general" and not isinstance(follower, DefaultElement):

@@ -133,9 +133,11 @@ class Element(Handle):
                 return next((j for j in self.find_all("joint", True) if j._native.type == mj.mjtJoint.mjJNT_FREE), None)
             if name == "inertial":
                 return self.root.handle("inertial", native) if native.explicitinertial else None
+        # An attribute that is not explicit reads as None.
         record = self.recorded()
         if name not in record.values and name in schema.attributes(kind, record.tag):
             return None
+        # References read as elements, files as assets, classes as classes of defaults.
         if name in REFERENCES.get(kind, ()):
             return referenced(self, name)
         if name.startswith("file") and record.values.get(name):

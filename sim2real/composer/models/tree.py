@@ -206,6 +206,7 @@ class Tree(Scope, Generic[H]):
         if identifier is None:
             raise UsageError(f"find({kind!r}) needs a name")
         head, _, tail = identifier.partition("/")
+        # A path leads into an attached model.
         if tail:
             attachment = self.attachments.get(head)
             return None if attachment is None else attachment.model.find(kind, tail)

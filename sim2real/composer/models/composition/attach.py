@@ -33,8 +33,10 @@ def attach(site: H, model: Tree[H]) -> H:
         raise UsageError(f"The model {model.model!r} is already attached elsewhere", hint="detach it first")
     if model is parent.root_model:
         raise UsageError(f"Cannot attach model {model.model!r} to itself")
+    # Refuse contradicting options before anything changes.
     merge_options.merged([*parent.root_model.all_models(), *model.all_models()])
     _warn_of_degrees(parent, model)
+    # Add the frame at the pose of the site.
     name = _free_name(parent, model.model)
     model._spec.modelname = name
     host = site._native if site.is_worldbody else site._native.parent

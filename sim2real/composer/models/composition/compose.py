@@ -124,6 +124,7 @@ def copy_spec(model: Tree[Handle], late: frozenset[str] = frozenset()) -> MjSpec
     A reference to an element of another model gets a name that no element of this model has.
     """
     spec = model._spec
+    # Name all elements and set their references for the time of the copy.
     unnamed = list(_unnamed(model))
     dropped = [(native, native.name) for kind in late for native in getattr(spec, translate.plural(kind))]
     try:
@@ -138,6 +139,7 @@ def copy_spec(model: Tree[Handle], late: frozenset[str] = frozenset()) -> MjSpec
     finally:
         for native, name in (*dropped, *((native, "") for native, _ in unnamed)):
             native.name = name
+    # Delete the kinds that are added later.
     for kind in late:
         for native in getattr(out, translate.plural(kind)):
             out.delete(native)

@@ -58,6 +58,7 @@ def _copy(model: T, twins: dict[Tree[Handle], Tree[Handle]], natives: dict[Nativ
     copy = twins[model] = type(model).owning(spec)
     copy.shows_text = model.shows_text
     copy.inherits_angle = model.inherits_angle
+    # Map every element to its copy.
     natives[model._spec.worldbody] = spec.worldbody
     for kind in compose.NAMED_KINDS:
         plural = translate.plural(kind)
@@ -67,9 +68,11 @@ def _copy(model: T, twins: dict[Tree[Handle], Tree[Handle]], natives: dict[Nativ
                 new.name = ""
     for native in model._spec.tendons:
         path_of(model, native)
+    # Copy the records of the model by this map.
     copy.records = model.records.among(natives)
     copy._order = {natives[old]: number for old, number in model._order.items() if old in natives}
     copy._clock = itertools.count(max(copy._order.values(), default=next(copy._clock)) + 1)
+    # Copy the attached models in the same way.
     for name, attachment in model.attachments.items():
         child = _copy(attachment.model, twins, natives)
         child.parent_model = copy

@@ -42,11 +42,13 @@ def _spread(compiled: MjModel, model: Tree[Handle], name: str, part: str, values
         whole = whole[mocap]
         whole[compiled.body_mocapid[list(ids)]] = values.reshape(len(ids), -1)
         return whole.ravel()
+    # Fill the model's own entries; the rest of the world keeps its default.
     kind, size = ("joint", f"n{part[1]}") if part[0] == "q" else ("actuator", "na" if part == "act" else "nu")
     whole = np.array(compiled.qpos0) if part == "qpos" else np.zeros(getattr(compiled, size))
     elements_here = [model.handle(kind, n) for n in getattr(model._spec, f"{kind}s")]
     frames = [e for e in elements_here if e.kind == "joint" and e.parent.is_frame]  # their joints came later
     rows = np.zeros(0)
+    # The values may have been written before the frames got joints.
     for elements in (elements_here, [e for e in elements_here if e not in frames]):
         ids = layout.resolve(compiled, kind, tuple(e.full_identifier for e in elements))
         rows = np.atleast_1d(layout.index(compiled, layout.attributes(kind)[part], ids, False))

@@ -212,9 +212,11 @@ def merged(models: Iterable[Member]) -> Settings:
     owner: dict[tuple[str, str], str] = {}
     for model in models:
         for key, value in model.settings().items():
+            # Skip settings that another model wrote after this one was attached.
             if any(overrides.beats(key, model) for overrides in later):
                 continue
             mine, name = values.get(key, value), key[1]
+            # Combine the values, or refuse different ones.
             if name in _SMALLEST:
                 value = min(mine, value)
             elif name in _LARGEST:

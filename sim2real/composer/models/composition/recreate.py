@@ -81,6 +81,7 @@ def named(model: Tree[Handle], element: str, kind: str, target: Handle | str, to
                 f"Available: {available}",
                 hint="elements of attached models have the names of those in front: arm/hand/finger",
             )
+    # Refuse a removed element by its former name.
     if element_named.is_removed:
         name = element_named.root.removed.get(element_named, "")
         raise UsageError(

@@ -96,6 +96,7 @@ def renamed(model: Tree[Handle]) -> Iterator[None]:
     added: list[tuple[MjSpec, str]] = []
     try:
         for one in model.all_models():
+            # Rename the files, and note the old names.
             for native, asset in list(_named(one)):
                 name = asset.get_vfs_filename()
                 undo.append((native, "file", native.file))
@@ -103,6 +104,7 @@ def renamed(model: Tree[Handle]) -> Iterator[None]:
                     added.append((one._spec, name))
                     one._spec.assets[name] = asset.contents
                 native.file = name
+            # The new names need no folders.
             for key in ("meshdir", "texturedir", "modelfiledir"):
                 undo.append((one._spec, key, getattr(one._spec, key)))
                 setattr(one._spec, key, "")

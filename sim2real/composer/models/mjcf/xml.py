@@ -42,10 +42,12 @@ def _node(element: Value, top: Tree[Handle], self_only: bool) -> ElementTree.Ele
             node.set("class" if key == "dclass" else key, _text(value, top))
     if self_only:
         return node
+    # Add the children; an attachment frame also holds those of the attached model.
     children = element.all_children() if element.kind == "body" else []
     if element.is_frame:
         children += element.root.attachments[element._native.name[:-1]].model.worldbody.all_children()
     node.extend(_node(child, top, False) for child in sorted(children, key=lambda e: _ORDER.index(e.kind)))
+    # Paths of tendons and references of tuples are child elements in MJCF.
     if element.kind == "tendon":
         for part in path_of(element.root, element._native):
             ElementTree.SubElement(node, part.tag, {k: _text(v, top) for k, v in part.values.items()})

@@ -113,6 +113,7 @@ class Graphics:
         wanted = {_flag(name): value for name, value in (flags or {}).items()}
         if depth or segmentation:  # distances too are drawn without light: no shadows, and no smoothing of edges
             wanted |= {_flag("segment"): True, _flag("idcolor"): True}
+        # Bring the thread's context up to date.
         thread = threading.get_ident()
         if thread not in self._contexts:
             self._contexts[thread] = _Context(self._model)
@@ -120,6 +121,7 @@ class Graphics:
         context.update(self._model)
         rect = mj.MjrRect(0, 0, size[1], size[0])
         pixels = np.empty(size, np.float32) if depth else np.empty((*size, 3), np.uint8)
+        # Draw with the flags of this image alone.
         before = scene.flags.copy()
         for flag, value in wanted.items():
             scene.flags[flag] = value
@@ -127,6 +129,7 @@ class Graphics:
         scene.flags[:] = before
         for overlay in overlays:
             overlay.draw(context.mujoco, rect)
+        # Read the pixels back, and decode distances or objects.
         mj.mjr_readPixels(None if depth else pixels, pixels if depth else None, rect, context.mujoco)
         pixels = np.ascontiguousarray(pixels[::-1])  # OpenGL's first row is the lowest one
         if depth:

@@ -179,6 +179,7 @@ class Rollouts:
             Positions ``(..., 1 + ticks, nq)``, velocities and accelerations ``(..., 1 + ticks, nv)``: at the start, and
             after each tick. What diverged is NaN.
         """
+        # Find the leading axes that all arguments share.
         ticks = controls.shape[-3]
         wide = {n: (fields[n], np.ndim(_value(self._model, n))) for n in self._names}
         taken = {n: (v, 1) for n, v in (values or {}).items()}
@@ -191,11 +192,13 @@ class Rollouts:
             shape = a.shape[a.ndim - width :]
             return np.broadcast_to(a, (*axes, *shape)).reshape(count, *shape)
 
+        # Flatten them to one axis of copies.
         rows, law = ({n: flat(*pair) for n, pair in pairs.items()} for pairs in (wide, taken))
         begin = Start(*(flat(a, 1) for a in start))
         control = flat(controls, 3).reshape(count, ticks * self._substeps, -1)
         results = [np.empty((count, 1 + ticks, n)) for n in (self._model.nq, self._model.nv, self._model.nv)]
         lanes = self._lanes(count, ticks * self._substeps)
+        # Run as many copies at a time as fit into memory.
         with _quiet():
             for first in range(0, count, lanes):
                 part = slice(first, min(first + lanes, count))
@@ -212,11 +215,13 @@ class Rollouts:
     ) -> Iterator[np.ndarray]:
         """Yield positions, velocities and accelerations of some copies, as ``__call__``."""
         batch, count, steps = self._batch, len(control), control.shape[1]
+        # Set the fields of each copy, and the constants that follow from them.
         ids = np.arange(count)
         for name, values in fields.items():
             field = batch.expand(name)
             field[:count] = values.reshape(count, *field.shape[1:])
         failed = _failing(count, lambda: batch.set_const(ids)) if self._derives else np.zeros(count, bool)
+        # Set the start, and compute its accelerations without the actuators.
         batch.warning[:] = 0
         batch.reset(ids, stage=mj.mjtStage.mjSTAGE_NONE)
         for name, values in zip(("qpos", "qvel", "qacc_warmstart"), start, strict=True):
@@ -230,6 +235,7 @@ class Rollouts:
         flags[:] = compiled
         batch.bind("qacc_warmstart")[:count] = start.warmstart
         out = {n: np.empty((count, steps, *first.shape[1:])) for n, first in begun.items()}
+        # Roll out, and keep the last physics step of each tick.
         if self._law:
             failed |= self._stepwise(self._law, law, control, out)
         else:

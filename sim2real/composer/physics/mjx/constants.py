@@ -103,10 +103,12 @@ def _subtree_masses(host: MjModel, model: mjx.Model) -> jax.Array:
 def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[str, jax.Array]:
     """Return the inverse inertias that constraints see of bodies, degrees of freedom and tendons; ``(A M^-1 A^T)``."""
     impl: PyTree = data._impl
+    # Invert the matrix of inertia.
     M, J = _inertia_and_jacobians(model, data)
     factor = jax.scipy.linalg.cho_factor(M)
     inverse = jax.scipy.linalg.cho_solve(factor, jnp.eye(host.nv, dtype=M.dtype))
     diagonal = jnp.diag(inverse)
+    # Average over the degrees of freedom of a joint, and over the axes of a body.
     dofs = []
     for kind in host.jnt_type:
         for width in _WIDTHS[int(kind)]:
@@ -114,6 +116,7 @@ def _inverse_weights(host: MjModel, model: mjx.Model, data: mjx.Data) -> dict[st
             dofs += [jnp.mean(diagonal[start : start + width])] * width
     spatial = jnp.einsum("bvi,vw,bwi->bi", J, inverse, J)
     weights = jnp.where((host.body_weldid != 0)[:, None], spatial.reshape(-1, 2, 3).mean(axis=-1), 0.0)
+    # Bodies that only slide have their mass in the place of the inertia.
     simple, mass = np.asarray(host.body_simple) == _ONLY_SLIDES, jnp.maximum(model.body_mass, mj.mjMINVAL)
     constants = {
         "dof_M0": jnp.diag(M),

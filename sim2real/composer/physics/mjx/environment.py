@@ -23,8 +23,7 @@ from sim2real.composer.physics.mjx.random import JaxRandomState, Registry
 from sim2real.composer.physics.mjx.rings import Samples, make_rings
 from sim2real.composer.physics.mjx.tracing import TracedHooks, check_variables
 from sim2real.composer.physics.mjx.warp import warp
-from sim2real.composer.reward import split_reward
-from sim2real.composer.task import Task
+from sim2real.composer.task import Task, split_reward
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -123,26 +122,31 @@ class MjxEnvironment:
             task._root_entity = arena
         self.task, self._attempts, self._legacy = task, max_reset_attempts, legacy_step
         self._hooks, self._registry = TracedHooks(task), Registry()
+        # Compile the model on the host, with the hooks that run there.
         random_state = np.random.RandomState(seed)
         self._hooks.run("initialize_episode_mjcf", random_state)
         self._hooks.refresh()
         self.model = task.root_entity.mjcf_model.root_model.compile()
         self._look_at_compiled(random_state)
+        # Refuse unsupported options before anything is traced.
         observables = task.observables
         gate.check_observables(observables)
         gate.check_model(self.model)
         self._warp = warp.make_engine(self.model, impl, nconmax, njmax)
         if self._warp is None:
             gate.settle_cone(self.model)
+        # Reserve the samples of the observables.
         self.substeps = task.physics_steps_per_control_step
         limit = time_limit / task.control_timestep
         self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
         initial = delayed_observation_padding is ObservationPadding.INITIAL_VALUE
         strip = strip_singleton_obs_buffer_dim
         self._rings = make_rings(observables, self.substeps, strip, initial, self._hooks.call)
+        # Move the model and its initial state to MJX.
         self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
         self.initial = _initial_data(self.model) if self._warp is None else self._warp.start
         views.freeze(self.model)
+        # Trace once without physics to learn what a copy must carry.
         self._changed: tuple[str, ...] = ()
         self._dry = self._stays_dirty = False
         self._steady = True
@@ -226,8 +230,10 @@ class MjxEnvironment:
         def attempt() -> None:
             self._hooks.run("initialize_episode", physics, random_state)
 
+        # Draw initial states until the hooks accept one, and compute all quantities of it.
         failed = physics.retry(attempt, random_state, self._attempts)
         physics.forward(actuation=False)
+        # Take the first samples.
         rings = {r.name: r.reset(physics, random_state) for r in self._rings}
         steps = jnp.zeros((), jnp.int32)
         observation = {r.name: r.read(rings[r.name], steps) for r in self._rings}
@@ -287,14 +293,17 @@ class MjxEnvironment:
             action: Shape ``(nu,)``, unless the task has an ``action_spec`` of its own.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
         """
+        # Run the hooks and the physics steps.
         physics, random_state = self._physics(state, model, law)
         self._hooks.run("before_step", physics, action, random_state)
         rings, diverged = self._substeps(physics, random_state, state, action)
         self._hooks.run("after_step", physics, random_state)
         steps = state.steps + 1
         now = steps * self.substeps
+        # Take the last samples after the hooks, which may change the state.
         rings = {r.name: r.update(rings[r.name], now, physics, random_state, True) for r in self._rings}
         dtype, task = state.reward.dtype, type(self.task).__name__
+        # Compute the reward, the discount and the end of the episode.
         reward, terms = split_reward(self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics))
         discount = jnp.asarray(self._hooks.call(f"{task}.get_discount", self.task.get_discount, physics), dtype)
         ends = self._hooks.call(f"{task}.should_terminate_episode", self.task.should_terminate_episode, physics)
@@ -303,6 +312,7 @@ class MjxEnvironment:
             self._stays_dirty = self._stays_dirty or physics.is_dirty is not False
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
+        # A diverged copy ends its episode, without a reward.
         diverged = diverged | is_unstable(data)
         diverged = diverged if self._warp is None else diverged | warp.overflowed(data)
         earned = (reward, discount, terms)
@@ -335,6 +345,7 @@ class MjxEnvironment:
             dirty = jnp.asarray(physics.is_dirty, bool)
             return (physics.tree(random_state), {**rings, **new}, dirty, diverged), None
 
+        # One physics step needs no loop; several become a scan, so that programs stay small.
         carry = (physics.tree(random_state), state.rings, jnp.asarray(entry, bool), jnp.zeros((), bool))
         if self.substeps == 1 or self._dry:
             carry, _ = substep(carry, jnp.zeros((), jnp.int32))

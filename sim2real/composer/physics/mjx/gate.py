@@ -26,12 +26,14 @@ def check_model(model: MjModel) -> None:
             f"MJX has no no-slip solver: option noslip_iterations is {model.opt.noslip_iterations}",
             hint="set it to 0 in the model that sets it",
         )
+    # MJX switches springs and dampers together.
     passive = [int(model.opt.disableflags) & int(flag) != 0 for flag in _PASSIVE]
     if any(passive) and not all(passive):
         raise UsageError(
             "MJX leaves out springs and dampers where only one of them is disabled",
             hint="disable both, or neither and set stiffness or damping to 0",
         )
+    # MJX has no history of controls and sensor data.
     for kind, count in (("actuator", model.nactuator), ("sensor", model.nsensor)):
         object_type = getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}")
         adr = getattr(model, f"{kind}_historyadr", None)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import jax
 
-from sim2real.composer.physics.mjx.dependence import origins
 from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.physics.mjx.warp import warp_fields
 from sim2real.errors import UsageError
@@ -19,6 +19,40 @@ if TYPE_CHECKING:
 
 _START_FIELDS = ("qpos", "qvel")
 """What a start sets of the state, and what the physics then starts from."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a result comes from.
+
+    Attributes:
+        marked: Whether it depends on a marked argument.
+        argument: Number of the argument's leaf that it is, unchanged; None: it is computed.
+    """
+
+    marked: bool
+    argument: int | None
+
+
+def origins(function: Callable[..., PyTree], arguments: tuple[PyTree, ...], marked: PyTree) -> PyTree:
+    """Return an ``Origin`` for each leaf of what a function returns, in its tree.
+
+    Errs on the side of caution: every result of an operation counts as depending on all its operands.
+
+    Args:
+        marked: Which of them are marked: a bool for each leaf, in the arguments' tree.
+    """
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    program, places = closed.jaxpr, jax.tree_util.tree_structure(shape)
+    tainted = {v for v, m in zip(program.invars, jax.tree_util.tree_leaves(marked), strict=True) if m}
+    for equation in program.eqns:
+        if any(v in tainted for v in equation.invars if not hasattr(v, "val")):
+            tainted.update(equation.outvars)
+    number = {v: i for i, v in enumerate(program.invars)}
+    results = [
+        Origin(False, None) if hasattr(v, "val") else Origin(v in tainted, number.get(v)) for v in program.outvars
+    ]
+    return jax.tree_util.tree_unflatten(places, results)
 
 
 def check(
@@ -44,6 +78,7 @@ def check(
     def tick(state: State, action: jax.Array) -> tuple[State, jax.Array]:
         return environment.step_apart(entered(state, action), action)
 
+    # Mark the state, except the controls, and follow the marks through a tick.
     unmoved = jax.tree_util.tree_map(lambda _: False, action)
     marked = jax.tree_util.tree_map(lambda _: False, state).replace(data=_all_but(state.data, ("ctrl",)))
     while True:  # until what hooks keep from tick to tick is marked, too, where it depends on the state
@@ -59,6 +94,7 @@ def check(
         marked = marked.replace(variables=variables)
     if controls.marked:
         raise _closed(name, "its controls depend on the state")
+    # Check that a tick returns the state and the fields unchanged.
     numbers = iter(range(len(jax.tree_util.tree_leaves(state))))
     places = jax.tree_util.tree_map(lambda _: next(numbers), state)
     for what in ("data", "leaves"):

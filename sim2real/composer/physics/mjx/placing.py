@@ -47,6 +47,7 @@ def place(
             "PropPlacer looks at the contacts of a copy, and MJX-Warp keeps those of all copies together",
             hint='use impl="jax", or ignore_collisions=True',
         )
+    # Place the props in order; contacts with later ones do not count.
     numbers = [_geoms(physics, prop) for prop in props]
     passed = [n for prop in ignored for n in _geoms(physics, prop)]
     for i, prop in enumerate(props):

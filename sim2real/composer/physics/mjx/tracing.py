@@ -192,15 +192,18 @@ def _fingerprint(value: object, visited: set[int] | None = None, depth: int = 0)
         return _numbers(value.get_state())
     if isinstance(value, np.random.Generator):
         return repr(value.bit_generator.state)
+    # Compare deep and cyclic structures by identity from here on.
     if depth > _DEPTH or id(value) in visited:
         return _Same(value)
     visited.add(id(value))
+    # Compare containers by their items.
     if isinstance(value, dict):
         return [(_fingerprint(k, visited, depth + 1), _fingerprint(v, visited, depth + 1)) for k, v in value.items()]
     if isinstance(value, list | tuple | collections.deque):
         return [_fingerprint(v, visited, depth + 1) for v in value]
     if isinstance(value, set | frozenset):
         return sorted(map(repr, value))
+    # Compare objects of libraries by identity, a program's own objects by their attributes.
     if type(value).__module__.partition(".")[0] in _LIBRARIES or isinstance(value, type) or callable(value):
         return _Same(value)
     return [
