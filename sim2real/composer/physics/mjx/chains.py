@@ -19,9 +19,7 @@ _vmap = scan._nvmap
 def hold_links() -> None:
     """Have MJX's walks along the tree of bodies end a fusion of XLA's at each link.
 
-    On a CPU XLA fuses the whole chain, and computes each link's pose where it is used: twice as often with every link.
-    Six in a row (SO-101), 256 copies: 2.9 ms for ``mjx.kinematics`` instead of 151. On a GPU it runs as
-    fast as without, and compiles faster: 25 s instead of 29 for the training of three links on an H200.
+    On a CPU XLA fuses the whole chain, and computes each link's pose at each use: twice as often with every link.
     """
     scan._nvmap = _held
 

@@ -34,7 +34,7 @@ _IS_DERIVED = 11
 def derived(host: MjModel, model: mjx.Model) -> frozenset[str]:
     """Return the names of the fields that ``derive`` computes.
 
-    Without tracing it, which to make an arm's world takes 6 s more.
+    Without a trace of it, which takes seconds.
 
     Raises:
         UsageError: As ``derive`` does.
