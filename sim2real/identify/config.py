@@ -1,4 +1,4 @@
-"""How to identify; every field is a flag of ``sim2real identify``. Imports no JAX, so that ``--help`` stays instant."""
+"""Configuration of a fit; every field is a flag. Does not import JAX, to keep ``--help`` fast."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class FitConfig:
     initial_state: Literal["free", "measured", "rest"] = "free"
     """State at a segment's start: 'free' fits it, 'measured' reads it off the samples, 'rest' has no velocity."""
     skip_s: float = 0.0
-    """First part of a segment that is simulated but not compared, so that states that are not measured settle [s]."""
+    """First part of a segment that is simulated but not compared, so that unmeasured states settle [s]."""
     loss: Loss = "huber"
-    """What a residual costs; 'huber' and 'cauchy' are robust."""
+    """Loss of a residual; 'huber' and 'cauchy' are robust."""
     reach: float = 5.0
     """Residual above which a robust loss grows more slowly than the square [deviations of the measurement]."""
     strategy: str = "CMA_ES"
@@ -29,7 +29,7 @@ class FitConfig:
     population: int = 32
     """Candidates a generation."""
     generations: int = 80
-    """Most generations of a run; 0 leaves the search out and refines from the nominal values."""
+    """Most generations of a run; 0 skips the search and refines from the nominal values."""
     restarts: int = 0
     """Further runs of the search (BIPOP): in turn with a doubled population, and from a random place."""
     std: float = 0.7
@@ -37,24 +37,25 @@ class FitConfig:
     batch: int = 0
     """Random segments on which each generation's candidates are compared; 0 means all."""
     refine: int = 3
-    """How many of the search's best candidates Levenberg-Marquardt refines; 0 leaves it out."""
+    """Number of best candidates that Levenberg-Marquardt refines; 0 skips the refinement."""
     refine_steps: int = 25
     """Most steps of Levenberg-Marquardt in a round, of which there are up to three."""
     long_s: float = 0.0
-    """Length of the segments of a last refinement [s]; 0 leaves it out."""
+    """Length of the segments of a last refinement [s]; 0 skips it."""
     engine: Literal["auto", "c", "compiled"] = "auto"
-    """What simulates: C MuJoCo, or the compiled graph; 'auto' takes C where the world is one of MuJoCo's."""
+    """Simulator: C MuJoCo or the compiled graph; 'auto' takes C if the world is MuJoCo's."""
     jacobian: Literal["auto", "forward", "finite"] = "auto"
-    """Derivatives: forward mode or finite differences; 'auto' takes the latter where a node has no derivative."""
+    """Derivatives: forward mode or finite differences; 'auto' takes the latter if a node has no derivative."""
     difference: float = 3e-3
-    """Step of finite differences; 1 is about a quarter of the bounds' width. Larger ones smooth kinks of friction."""
+    """Step of finite differences; 1 is about a quarter of the bounds' width. Large steps smooth the kinks of
+    friction."""
     devices: int = 1
     """Number of this host's devices that a generation's candidates are divided among; for the compiled engine."""
     seed: int = 0
     """Seed of the search."""
 
     def __post_init__(self) -> None:
-        """Check what can be checked before a log is read."""
+        """Check the values before a log is read."""
         if not 0.0 < self.max_delay_s <= 1.0:
             raise UsageError(f"max_delay_s must lie in (0, 1] s, got {self.max_delay_s}")
         if self.population < 4 or self.generations < 0 or self.restarts < 0:
@@ -63,7 +64,7 @@ class FitConfig:
                 f"{self.population}, {self.generations} and {self.restarts}"
             )
         if self.generations == 0 and self.refine == 0:
-            raise UsageError("generations and refine are both 0: nothing would be identified")
+            raise UsageError("generations and refine are both 0: no parameter would be identified")
         if not 1e-4 <= self.difference <= 1.0:
             raise UsageError(f"difference must lie in [0.0001, 1], got {self.difference}")
         if not (self.reach > 0.0 and self.std > 0.0):

@@ -1,4 +1,4 @@
-"""From recordings to an estimate: search on windows, refine, refine on longer stretches."""
+"""From recordings to an estimate: search on windows, refine, refine on longer segments."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from sim2real.identify.search.search import SearchResult, search
 from sim2real.identify.uncertainty.uncertainty import Uncertainty, centred, uncertainty
 
 _OFF_BOUNDS = 3.0
-"""A search begins within the middle 90 % of the bounds."""
+"""Limit of ``|z|`` at the start of a search: the middle 90 % of the bounds."""
 _CONVERGED = 0.5
-"""A fit without refinement has converged where less is left of the next Gauss-Newton step, in standard errors."""
+"""A fit without refinement has converged if the next Gauss-Newton step is shorter [standard errors]."""
 OnProgress = Callable[[str, float, float, np.ndarray], None]
 """Called with the phase (``search``, ``refine`` or ``compiling``), the share of it done since the last call, and the
 best loss and point so far."""
@@ -37,12 +37,11 @@ class Fit:
     """An estimate.
 
     Attributes:
-        problem: The residuals that were minimised last: on windows, or on longer segments.
+        problem: The residuals of the last refinement: on windows, or on longer segments.
         z: Shape ``(P,)``: the estimate.
-        loss: Its loss there.
-        search: What the search found; None where it was left out.
-        refined: How each refinement ended, in order.
-        windows: Segments that were searched on, and held-out segments of the same length.
+        search: Result of the search; None if it was skipped.
+        refined: Results of the refinements, in order.
+        windows: Segments of the search, and held-out segments of the same length.
         left: Length of the next Gauss-Newton step [standard errors], of the parameter that it moves most.
         converged: Whether the loss has a minimum at the estimate.
     """
@@ -58,7 +57,7 @@ class Fit:
 
     @property
     def values(self) -> dict[str, Value]:
-        """The estimate by name: a number, or a list of one for each recording."""
+        """The estimate by name."""
         return as_numbers(self.problem.table, self.z)
 
     @property
@@ -74,7 +73,7 @@ class Fit:
 
 
 def as_numbers(table: ParameterTable, z: np.ndarray, kept: np.ndarray | None = None) -> dict[str, Value]:
-    """Return values by name as Python numbers, lists where each recording has its own.
+    """Return values by name as Python numbers; lists for parameters that each recording has its own value of.
 
     Args:
         z: Shape ``(P,)``: the unbounded vector.
@@ -92,51 +91,51 @@ def fit(
     table: ParameterTable | None = None,
     long_spans: Sequence[Span] = (),
     report: OnProgress | None = None,
-    begins: Callable[[Problem], None] | None = None,
+    on_begin: Callable[[Problem], None] | None = None,
 ) -> Fit:
     """Identify a model.
 
     Args:
-        spans: Segments to search and refine on, and others to predict.
-        length_s: Their length [s].
-        table: The parameters; default: the model's.
+        spans: Segments to fit, and segments to predict.
+        length_s: Length of a segment [s].
+        table: Default: the model's parameters.
         long_spans: Segments of ``config.long_s`` for the last refinement.
     """
     problem = windows = Problem(model, recordings, spans, length_s, config, table)
-    if begins:
-        begins(problem)
-    # Also from the middle, and with longer delays: a descent may end where a delay, say, stands for an inertia.
-    starts, found = problem.table.starts(), None
+    if on_begin:
+        on_begin(problem)
+    # Refine from the nominal values, too, with short and with long delays: a delay may imitate an inertia.
+    starts, result = problem.table.starts(), None
     z, loss = starts[0], float("nan")
+    # Search globally; its best candidates are further starts of the refinement.
     if config.generations:
-        found = run_search(problem, starts[0], report)
-        starts = np.stack([*found.finalists[: config.refine], starts[0]])
-        z, loss = found.z, found.loss
+        result = run_search(problem, starts[0], report)
+        starts = np.stack([*result.finalists[: config.refine], starts[0]])
+        z, loss = result.z, result.loss
+    # Refine by least squares, first on windows, then on long segments.
     refined = []
     if config.refine:
         refined.append(_refine(problem, starts, report))
     if config.refine and config.long_s and long_spans:
         problem = problem.recut(long_spans, config.long_s)
         refined.append(_refine(problem, refined[-1].z[None], report))
+    # Test whether the end is a minimum.
     if refined:
         z, loss, left, converged = refined[-1].z, refined[-1].loss, refined[-1].left, refined[-1].converged
     else:
         z = centred(problem.table, z)
         left = remaining(problem, z)
         converged = left < _CONVERGED
-    return Fit(problem, z, loss, found, tuple(refined), windows, left, converged)
+    return Fit(problem, z, loss, result, tuple(refined), windows, left, converged)
 
 
 def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Value]:
-    """Estimate fewer parameters, by refinement alone; the others are held at what a model without them has.
+    """Return the estimate of fewer parameters, by refinement; the others have their values in a model without them.
 
     Args:
         problem: The residuals, with all parameters.
         kept: Shape ``(P,)``, bool: which free parameters are estimated.
-        near: Shape ``(P,)``: the estimate of all parameters, one of two starts; the other is the table's own.
-
-    Returns:
-        The estimate by name.
+        near: Shape ``(P,)``: the estimate of all parameters, one of two starts; the other is the table's.
     """
     table = problem.table
     if not kept.any():
@@ -146,13 +145,13 @@ def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Val
 
 
 def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = None) -> SearchResult:
-    """Search as the problem's configuration says.
+    """Search with the configuration of a problem.
 
     Args:
         start: Shape ``(P,)``: middle of the first generation.
     """
     total = problem.config.generations * (1 + problem.config.restarts)
-    # At a bound the map to values is flat: a search that begins there does not get away.
+    # At a bound the map to values is flat, and a search that begins there stays there.
     start = np.clip(start, -_OFF_BOUNDS, _OFF_BOUNDS)
 
     def advance(generations: int, best: float, z: np.ndarray) -> None:
@@ -161,25 +160,25 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
 
     compiling, data, config = _compiling(report, "search", start), problem.data, problem.config
     free = config.initial_state == "free"
-    # How a search shares the delays' sum between both sides of the world means nothing: see ``centred``.
+    # Centre the delays: a log does not determine how their sum is shared between both sides of the world.
     middle = lambda z: centred(problem.table, z) if free else z  # noqa: E731
-    alone = lambda z: problem.loss(middle(z), on_compile=compiling)  # noqa: E731
-    given = (data, np.asarray(data.weight), advance)
-    found = search(
+    loss_of = lambda z: problem.loss(middle(z), on_compile=compiling)  # noqa: E731
+    arguments = (data, np.asarray(data.weight), advance)
+    result = search(
         problem.evaluator.searched(data),
         start,
         config,
-        *given,
+        *arguments,
         problem.residuals.searches,
         compiling,
-        alone,
+        loss_of,
         host=problem.engine.name == "c",
     )
-    finalists = np.array([middle(z) for z in found.finalists])
-    found = replace(found, z=finalists[0], finalists=finalists)
-    if report:  # the loss of the best candidate by itself: before, initial states were those of its generation's middle
-        report("search", 0.0, found.loss, found.z)
-    return found
+    finalists = np.array([middle(z) for z in result.finalists])
+    result = replace(result, z=finalists[0], finalists=finalists)
+    if report:  # this loss is exact; a generation's losses linearise initial states at its middle
+        report("search", 0.0, result.loss, result.z)
+    return result
 
 
 def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> Refined:
@@ -187,7 +186,7 @@ def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> 
 
     def advance(best: float, z: np.ndarray) -> None:
         nonlocal left
-        step = min(share, left / 2.0)  # how many evaluations there will be is not known
+        step = min(share, left / 2.0)  # the number of evaluations is unknown in advance
         left -= step
         if report:
             report("refine", step, best, z)
@@ -196,7 +195,7 @@ def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> 
 
 
 def _compiling(report: OnProgress | None, then: str, z: np.ndarray) -> OnCompile:
-    """Return what reports that programs are compiled, before the phase ``then`` goes on."""
+    """Return a function that reports a compilation, after which the phase ``then`` continues."""
 
     def on_compile(started: bool) -> None:
         if report:

@@ -1,26 +1,26 @@
 """Inertial parameters of a body as an unbounded vector: the log-Cholesky factor of its pseudo-inertia.
 
-Every vector is a physically consistent body (positive mass and density everywhere): Rucker and Wensing, "Smooth
-Parameterization of Rigid-Body Inertia", RA-L 2022.
+Every vector is a physically consistent body, with positive mass and density everywhere (Rucker and Wensing, "Smooth
+Parameterization of Rigid-Body Inertia", RA-L 2022).
 """
 
 from __future__ import annotations
 
-from typing import Any
-
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter
+from sim2real.types import PyTree
 
 THETA = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 """Names of the ten entries, in order."""
 _APART = 1e-4
-"""Share of the inertia by which its principal moments are kept different from each other."""
+"""Smallest difference between principal moments, as a share of the inertia."""
 
 
-def from_log_cholesky(theta: Any) -> tuple[Any, Any, Any]:
+def from_log_cholesky(theta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Return mass [kg], centre of mass ``(3,)`` [m] and inertia about it ``(3, 3)`` [kg m^2].
 
     Args:
@@ -28,6 +28,7 @@ def from_log_cholesky(theta: Any) -> tuple[Any, Any, Any]:
     """
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta
     zero, one = jnp.zeros_like(alpha), jnp.ones_like(alpha)
+    # Build the upper triangular factor U of the pseudo-inertia J = U U'.
     rows = [
         [jnp.exp(d1), s12, s13, t1],
         [zero, jnp.exp(d2), s23, t2],
@@ -36,6 +37,7 @@ def from_log_cholesky(theta: Any) -> tuple[Any, Any, Any]:
     ]
     U = jnp.exp(alpha) * jnp.stack([jnp.stack(r) for r in rows])
     J = U @ U.T
+    # Read mass, first moment and second moments off J.
     mass, moment, sigma = J[3, 3], J[:3, 3], J[:3, :3]
     com = moment / mass
     about_origin = jnp.trace(sigma) * jnp.eye(3) - sigma
@@ -51,8 +53,9 @@ def to_log_cholesky(mass: float, com: np.ndarray, inertia: np.ndarray) -> np.nda
         inertia: About the centre of mass, ``(3, 3)`` [kg m^2].
 
     Raises:
-        UsageError: When no mass distribution has this inertia: a principal moment is as large as the sum of the others.
+        UsageError: When no body has this inertia: one principal moment is at least the sum of the two others.
     """
+    # Build the pseudo-inertia J.
     com, inertia = np.asarray(com, np.float64), np.asarray(inertia, np.float64)
     about_origin = inertia + mass * (com @ com * np.eye(3) - np.outer(com, com))
     sigma = 0.5 * np.trace(about_origin) * np.eye(3) - about_origin
@@ -79,7 +82,7 @@ def inertia_parameters(body: str, mass: float, com: np.ndarray, inertia: np.ndar
         mass: [kg].
         com: Centre of mass, ``(3,)`` [m].
         inertia: About the centre of mass, ``(3, 3)`` [kg m^2].
-        reach: How far each entry may move: 0.7 is a factor of about two in size and four in mass.
+        reach: Largest change of each entry; 0.7 is a factor of about two in size and four in mass.
     """
     theta = to_log_cholesky(mass, com, inertia)
     return [
@@ -88,13 +91,12 @@ def inertia_parameters(body: str, mass: float, com: np.ndarray, inertia: np.ndar
     ]
 
 
-def set_inertia(model: Any, body: int, theta: Any) -> Any:
+def set_inertia(model: PyTree, body: int, theta: jax.Array) -> PyTree:
     """Return an ``mjx.Model`` in which one body has another inertia, along its principal axes.
 
-    ``invweight0``, which MuJoCo's compiler derives from inertias for its constraints, stays as it is.
+    ``invweight0``, which MuJoCo's compiler derives from inertias for its constraints, does not change.
 
     Args:
-        model: The ``mjx.Model``.
         theta: Shape ``(10,)``: see ``THETA``.
     """
     mass, com, inertia = from_log_cholesky(theta)
@@ -110,7 +112,7 @@ def set_inertia(model: Any, body: int, theta: Any) -> Any:
     )
 
 
-def _quaternion(R: Any) -> Any:
+def _quaternion(R: jax.Array) -> jax.Array:
     """Return the unit quaternion (w, x, y, z) of a rotation: the largest of the four forms, so none divides by zero."""
     m = R
     forms = jnp.array(

@@ -1,28 +1,34 @@
-"""What a pipeline says about identification: which fields were measured, and a graph that predicts them."""
+"""The part of a robot that identification uses: its measured fields, and a graph that predicts them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
+
+import jax
+import numpy as np
 
 from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import ParameterTable
+from sim2real.types import Array, PyTree
+
+Rows = TypeVar("Rows", np.ndarray, jax.Array)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """A measured joint: fields of the sensor's output, and how far a measurement may be off.
+    """A measured joint.
 
     Attributes:
         position: Field of the angle or position.
-        velocity: Field of its rate; None where the log has none.
+        velocity: Field of its rate; None if the log has none.
         position_sigma: Deviation of a measured position [position's unit].
-        velocity_sigma: Deviation of a measured velocity; without one, of a velocity estimated from a few positions.
-        index: Entry of the fields, where they are vectors.
+        velocity_sigma: Deviation of a measured velocity, or of one estimated from a few positions.
+        index: Entry of the fields, if they are vectors.
         label: Name for tables; default: the position's field.
-        goal: Field of a command that holds the joint's goal, in the position's unit and under the same index; None
-            where commands are no positions.
+        goal: Field of a command that holds the joint's goal, in the position's unit and under the same index; None if
+            commands are no positions.
     """
 
     position: str
@@ -40,31 +46,30 @@ class Channel:
 
     @property
     def fields(self) -> tuple[tuple[str, float], ...]:
-        """Field and deviation of position and, if measured, of velocity, in the order of residuals."""
+        """Field and deviation of position and velocity, in the order of residuals."""
         both = ((self.position, self.position_sigma), (self.velocity, self.velocity_sigma))
         return tuple((f, s) for f, s in both if f is not None)
 
-    def of(self, rows: Any) -> Any:
+    def of(self, rows: Rows) -> Rows:
         """Return the channel's entry of a field, ``(..., F)`` -> ``(...)``."""
         return rows if self.index is None else rows[..., self.index]
 
 
 class IdentifiableModel(Protocol):
-    """What a pipeline provides for identification.
+    """The interface of a robot for identification.
 
     Attributes:
-        parameters: What may be identified.
         sensor: Node whose outputs are predicted.
         given: Nodes whose recorded outputs drive the model: node -> a message with field names as its leaves.
-        channels: What is measured; initial states have a position and a velocity for each.
-        ahead_s: How much later than recorded the sensor's steps are simulated [s]; ``params`` adds it to the sensor's
-            delay, so that nothing shifts. 0 where samples fall on the world's ticks; a sensor that interpolates between
-            them needs one tick: with a shorter delay it would otherwise read what is not simulated yet.
+        channels: Initial states have a position and a velocity for each.
+        ahead_s: Delay of the sensor's simulated steps behind the recorded ones [s]; ``params`` adds it to the sensor's
+            delay, so the prediction does not shift. 0 if samples fall on the world's ticks; one tick if the sensor
+            interpolates between ticks, as it reads the tick after the sample.
     """
 
     parameters: ParameterTable
     sensor: str
-    given: Mapping[str, Any]
+    given: Mapping[str, PyTree]
     channels: tuple[Channel, ...]
     ahead_s: float
 
@@ -72,6 +77,6 @@ class IdentifiableModel(Protocol):
         """Return sensor, given nodes and world, connected with trainable delays up to ``max_delay_s``."""
         ...
 
-    def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
+    def params(self, values: Mapping[str, Array], start: Array) -> dict[str, PyTree]:
         """Return node parameters for values and an initial state ``(2 * channels,)``: positions, then velocities."""
         ...

@@ -1,24 +1,26 @@
-"""Reading and replacing a leaf in a tree of parameters by its path, ``node.field.field[index]``."""
+"""Read and replace a leaf of a parameter tree by its path, ``node.field.field[index]``."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
-from typing import Any
 
+import jax
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from sim2real.errors import UsageError
+from sim2real.types import PyTree
 
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[-?\d+\])*)$")
 
 
-def get_leaf(tree: Any, path: str) -> Any:
-    """Return what stands at a path of mappings, dataclasses and array indices.
+def get_leaf(tree: PyTree, path: str) -> PyTree:
+    """Return the leaf at a path of mappings, dataclasses and array indices.
 
     Raises:
-        UsageError: When the path leads nowhere; the message lists what there is.
+        UsageError: When the path does not exist; the message lists the names that do.
     """
     for name, index in _steps(path):
         tree = _child(tree, name, path)
@@ -27,34 +29,34 @@ def get_leaf(tree: Any, path: str) -> Any:
     return tree
 
 
-def set_leaf(tree: Any, path: str, value: Any) -> Any:
-    """Return the tree with another value at a path; an indexed entry of an array is replaced alone.
+def set_leaf(tree: PyTree, path: str, value: ArrayLike) -> PyTree:
+    """Return the tree with another value at a path; an index replaces one entry of an array.
 
     Args:
-        tree: Mappings and dataclasses, ``mjx.Model`` among them.
+        tree: Mappings and dataclasses, such as ``mjx.Model``.
         path: Such as ``world.model.dof_damping[0]``.
 
     Raises:
-        UsageError: When the path leads nowhere.
+        UsageError: When the path does not exist.
     """
     return _set(tree, _steps(path), value, path)
 
 
-def _set(tree: Any, steps: list[tuple[str, tuple[int, ...]]], value: Any, path: str) -> Any:
+def _set(tree: PyTree, steps: list[tuple[str, tuple[int, ...]]], value: ArrayLike, path: str) -> PyTree:
     (name, index), *rest = steps
     child = _child(tree, name, path)
     if rest:
         if index:
             raise UsageError(f"the path {path!r} goes on behind an index: only its last step may have one")
-        new = _set(child, rest, value, path)
+        replaced = _set(child, rest, value, path)
     elif index:
-        new = _indexed(child, index, path).at[index].set(value)
+        replaced = _indexed(child, index, path).at[index].set(value)
     else:
-        new = value
+        replaced = value
     if isinstance(tree, Mapping):
-        return {**tree, name: new}
-    own = getattr(tree, "replace", None)  # flax and MJX dataclasses
-    return own(**{name: new}) if callable(own) else replace(tree, **{name: new})
+        return {**tree, name: replaced}
+    method = getattr(tree, "replace", None)  # flax and MJX dataclasses
+    return method(**{name: replaced}) if callable(method) else replace(tree, **{name: replaced})
 
 
 def _steps(path: str) -> list[tuple[str, tuple[int, ...]]]:
@@ -67,14 +69,14 @@ def _steps(path: str) -> list[tuple[str, tuple[int, ...]]]:
     return steps
 
 
-def _indexed(leaf: Any, index: tuple[int, ...], path: str) -> Any:
+def _indexed(leaf: ArrayLike, index: tuple[int, ...], path: str) -> jax.Array:
     array = jnp.asarray(leaf)
     if len(index) != array.ndim or any(not -n <= i < n for i, n in zip(index, array.shape, strict=True)):
         raise UsageError(f"the path {path!r} needs an index into shape {array.shape}, got {list(index)}")
     return array
 
 
-def _child(tree: Any, name: str, path: str) -> Any:
+def _child(tree: PyTree, name: str, path: str) -> PyTree:
     if isinstance(tree, Mapping):
         if name in tree:
             return tree[name]

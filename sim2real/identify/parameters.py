@@ -1,4 +1,4 @@
-"""Parameters as data: names, units, bounds, priors, and the map from an unbounded vector to values in the bounds."""
+"""Parameters as data: names, units, bounds, priors, and the map from an unbounded vector to values in bounds."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sim2real.artifacts.estimation.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
 from sim2real.identify.parameter_paths import set_leaf
+from sim2real.types import Array, PyTree
 
 _ABOVE = 0.1
-"""Share of the bounds' width by which a search begins above a lower bound."""
+"""Start of a search above a lower bound, as a share of the bounds' width."""
 
 
 @dataclass(frozen=True)
@@ -26,27 +28,25 @@ class Parameter:
     Attributes:
         name: Unique in its table.
         unit: Unit of nominal value and bounds.
-        nominal: The data sheet's value; for a delay, what a model without delays has.
-        low: Lower bound.
-        high: Upper bound.
-        transform: Scale on which the search moves: ``linear``, ``log`` (positive values) or ``logit`` (shares).
+        nominal: Value of the data sheet; of a delay, the value in a model without delays.
+        transform: Scale of the search: ``linear``, ``log`` (positive values) or ``logit`` (shares).
         kind: ``dynamics``, ``delay``, or ``measurement`` (an encoder's offset, a clock's).
         about: One line for tables and pages.
-        excite: Which motion tells it, for those whose data does not; "": nothing is said.
-        leaf: Where the value belongs in the nodes' parameters, ``node.field.field[index]``; None: the model places it.
+        excite: Motion that determines it, for advice; "": no advice.
+        leaf: Place of the value in the nodes' parameters, ``node.field.field[index]``; None: the model places it.
         prior: A distrax distribution over the value; None: uniform on the scale, within the bounds.
-        per_recording: Whether each recording has a value of its own.
+        per_recording: Whether each recording has its own value.
         free: Whether it is identified; else it stays at ``nominal``.
         side: Of a delay: ``command`` (from the policy to the world) or ``measurement`` (from the world to the policy).
-        term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": of none.
-        off: Its value where that term is left out; default: the nominal one.
-        vanishes: Whether nothing lies below 0, and 0 is possible, as for a friction: on a logarithmic scale an estimate
-            only comes near, and counts as negligible where the model without it is as good.
-        limits: Whether it limits what no motion need reach, as a torque: where the recordings do not feel it, it counts
-            as not reached, and only a lower bound is said.
-        begin: Where a search begins; None: at the nominal value; of a delay, within its bounds. A limit that no motion
-            reaches at the data sheet's value is found from below: there the data feel it.
-        narrowed: Whether its lower bound is above the model's own: there are values below, and they were left out.
+        term: Name of the optional term of the model that it belongs to, such as ``cogging``; "": none.
+        off: Its value in a model without that term; default: the nominal value.
+        vanishes: Whether 0 is possible and smaller values are not, as of a friction. On a logarithmic scale an estimate
+            only approaches 0; it counts as negligible if the model without the parameter is as good.
+        limits: Whether it limits a quantity that no motion need reach, such as a torque. If the recordings do not reach
+            the limit, it counts as not reached, and has only a lower bound.
+        begin: Start of a search; None: the nominal value; of a delay, a value within its bounds. The search of a limit
+            that no motion reaches begins below it, as the residuals depend on it there.
+        narrowed: Whether its lower bound is above the model's.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Parameter:
             raise UsageError(f"parameter {self.name!r}: a logit scale needs bounds within (0, 1)")
         if self.off is not None and not (self.term and math.isfinite(self.off)):
             raise UsageError(
-                f"parameter {self.name!r}: off = {self.off} is what it is where its term {self.term!r} is left out",
+                f"parameter {self.name!r}: off = {self.off} is its value without a term, and its term is {self.term!r}",
                 hint="name the term, and a finite value",
             )
         if self.prior is not None and not callable(getattr(self.prior, "log_prob", None)):
@@ -97,16 +97,16 @@ class Parameter:
         if self.prior is not None and not _has_mode(self.prior):
             raise UsageError(
                 f"parameter {self.name!r}: the prior {type(self.prior).__name__} has no single, finite mode",
-                hint="leave the prior out for a uniform one: the bounds are that",
+                hint="remove the prior: without one it is uniform within the bounds",
             )
 
     @property
     def without(self) -> float:
-        """Its value where its term is left out."""
+        """Its value in a model without its term."""
         return self.nominal if self.off is None else self.off
 
     def to_scale(self, value: float) -> float:
-        """Return where a value stands on the parameter's scale."""
+        """Return a value on the parameter's scale."""
         return float(TRANSFORMS[self.transform][0](value))
 
     def from_scale(self, x: float) -> float:
@@ -116,7 +116,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Column:
-    """One entry of the vector that is searched: a parameter, of one recording where each has its own."""
+    """One entry of the searched vector: a parameter, of one recording if each has its own."""
 
     parameter: Parameter
     recording: int | None = None
@@ -131,9 +131,6 @@ class ParameterTable:
     """Parameters in a fixed order, and the map from an unbounded vector ``z`` of the free ones to values.
 
     A logistic function on each parameter's scale keeps values within their bounds, as evosax does not clip.
-
-    Args:
-        parameters: The parameters; names must differ.
     """
 
     def __init__(self, parameters: Iterable[Parameter], recordings: int = 1) -> None:
@@ -166,21 +163,21 @@ class ParameterTable:
         return ParameterTable(self.parameters, recordings)
 
     def with_fixed(self, values: Mapping[str, float]) -> ParameterTable:
-        """Return the table with some parameters held at these values."""
+        """Return the table with some parameters fixed at values."""
         changed = {p.name: p for p in self.parameters}
         for name, value in values.items():
             changed[name] = replace(self[name], nominal=float(value), free=False)
         return ParameterTable(changed.values(), self.recordings)
 
     def with_nominal(self, values: Mapping[str, float]) -> ParameterTable:
-        """Return the table with other nominal values, from which a search starts; unknown names are ignored."""
+        """Return the table with other nominal values, which are starts of a search; unknown names are ignored."""
         return ParameterTable(
             (replace(p, nominal=float(values[p.name]), begin=None) if p.name in values else p for p in self.parameters),
             self.recordings,
         )
 
     def with_begin(self, values: Mapping[str, float]) -> ParameterTable:
-        """Return the table with other values from which a search starts; unknown names are ignored."""
+        """Return the table with other starts of a search; unknown names are ignored."""
         return ParameterTable(
             (replace(p, begin=float(values[p.name])) if p.name in values else p for p in self.parameters),
             self.recordings,
@@ -190,21 +187,21 @@ class ParameterTable:
         """Return the table with other bounds for some parameters.
 
         Raises:
-            UsageError: When a name is unknown, bounds of a dynamics parameter exclude its nominal value, or those of a
-                delay go beyond the table's, for which the model's windows are made.
+            UsageError: A name is unknown, bounds exclude the nominal value, or bounds of a delay exceed the old, for
+                which the model's windows are made.
         """
         changed = {p.name: p for p in self.parameters}
         for name, (low, high) in bounds.items():
-            own = self[name]
-            p = replace(own, low=float(low), high=float(high), narrowed=float(low) > own.low)
+            before = self[name]
+            p = replace(before, low=float(low), high=float(high), narrowed=float(low) > before.low)
             if p.kind != "delay" and not p.low <= p.nominal <= p.high:
                 raise UsageError(
                     f"the bounds [{low:g}, {high:g}] {p.unit} of {name!r} exclude its nominal value {p.nominal:.4g}",
                     hint="widen the bounds, or correct the nominal value in the pipeline",
                 )
-            if p.kind == "delay" and not own.low <= p.low < p.high <= own.high:
+            if p.kind == "delay" and not before.low <= p.low < p.high <= before.high:
                 raise UsageError(
-                    f"the bounds [{low:g}, {high:g}] s of {name!r} go beyond [{own.low:g}, {own.high:g}] s",
+                    f"the bounds [{low:g}, {high:g}] s of {name!r} go beyond [{before.low:g}, {before.high:g}] s",
                     hint="narrow them, or allow longer delays with --max-delay-s",
                 )
             changed[name] = p
@@ -216,15 +213,15 @@ class ParameterTable:
         return tuple(dict.fromkeys(c.parameter.term for c in self.columns if c.parameter.term))
 
     def with_terms(self, names: Iterable[str]) -> ParameterTable:
-        """Return the table with some optional terms; the parameters of all others are held at what they are without.
+        """Return the table with some optional terms; parameters of other terms are fixed at their values without it.
 
         Raises:
-            UsageError: When there is no such term.
+            UsageError: When a term is unknown.
         """
         names = set(names)
-        known = dict.fromkeys(p.term for p in self.parameters if p.term)
-        if unknown := sorted(names - set(known)):
-            raise UsageError(f"unknown term {unknown[0]!r}. Available: {', '.join(known) or 'none'}")
+        terms = dict.fromkeys(p.term for p in self.parameters if p.term)
+        if unknown := sorted(names - set(terms)):
+            raise UsageError(f"unknown term {unknown[0]!r}. Available: {', '.join(terms) or 'none'}")
         rows = (
             p if not p.term else replace(p, free=True) if p.term in names else replace(p, nominal=p.without, free=False)
             for p in self.parameters
@@ -237,49 +234,50 @@ class ParameterTable:
         Args:
             kept: Shape ``(T,)``, bool: which terms.
         """
-        there = dict(zip(self.terms, kept, strict=True)) | {"": True}
-        return np.array([there[c.parameter.term] for c in self.columns], bool)
+        present = dict(zip(self.terms, kept, strict=True)) | {"": True}
+        return np.array([present[c.parameter.term] for c in self.columns], bool)
 
-    def decode(self, z: Any, kept: Any = None) -> dict[str, Any]:
-        """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` where each has its own; traceable.
+    def decode(self, z: Array, kept: Array | None = None) -> dict[str, jax.Array]:
+        """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` if each has its own; traceable.
 
         Args:
-            kept: Shape ``(P,)``, bool: others are held at what a model without them has; default: all are kept.
+            kept: Shape ``(P,)``, bool: others have their values in a model without them; default: all are kept.
         """
         x = self._low + (self._high - self._low) * jax.nn.sigmoid(jnp.asarray(z))
-        found: dict[str, list[Any]] = {}
+        columns: dict[str, list[jax.Array]] = {}
         for i, c in enumerate(self.columns):
             p, value = c.parameter, from_scale(c.parameter.transform, x[i], jnp)
             if kept is not None:
                 value = jnp.where(kept[i], value, p.without)
-            found.setdefault(p.name, []).append(value)
-        values: dict[str, Any] = {}
+            columns.setdefault(p.name, []).append(value)
+        # Add the fixed parameters, and stack those that each recording has its own value of.
+        values: dict[str, jax.Array] = {}
         for p in self.parameters:
-            own = found.get(p.name)
-            if own is None:
+            column = columns.get(p.name)
+            if column is None:
                 values[p.name] = jnp.full(self.recordings, p.nominal) if p.per_recording else jnp.float32(p.nominal)
             else:
-                values[p.name] = jnp.stack(own) if p.per_recording else own[0]
+                values[p.name] = jnp.stack(column) if p.per_recording else column[0]
         return values
 
-    def of_recording(self, values: Mapping[str, Any], recording: Any) -> dict[str, Any]:
-        """Return the values that hold in one recording, each a scalar."""
-        spread = lambda v: jnp.broadcast_to(jnp.asarray(v), (self.recordings,))  # noqa: E731 - one value holds for all
-        own = {p.name: spread(values[p.name])[recording] for p in self.parameters if p.per_recording}
-        return {p.name: own.get(p.name, values[p.name]) for p in self.parameters}
+    def of_recording(self, values: Mapping[str, Array], recording: Array | int) -> dict[str, Array]:
+        """Return the values of one recording, each a scalar."""
+        broadcast = lambda v: jnp.broadcast_to(jnp.asarray(v), (self.recordings,))  # noqa: E731
+        single = {p.name: broadcast(values[p.name])[recording] for p in self.parameters if p.per_recording}
+        return {p.name: single.get(p.name, values[p.name]) for p in self.parameters}
 
-    def placed(self, params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    def placed(self, params: Mapping[str, PyTree], values: Mapping[str, ArrayLike]) -> dict[str, PyTree]:
         """Return nodes' parameters with each value at its parameter's ``leaf``."""
-        tree: Any = dict(params)
+        tree: dict[str, PyTree] = dict(params)
         for p in self.parameters:
             if p.leaf is not None:
                 tree = set_leaf(tree, p.leaf, values[p.name])
         return tree
 
-    def encode(self, values: Mapping[str, Any]) -> np.ndarray:
-        """Map values to the unbounded vector ``(P,)``; values at or outside a bound end just inside it."""
-        own = [np.ravel(np.asarray(values[c.parameter.name], np.float64)) for c in self.columns]
-        at = [v[min(c.recording or 0, v.size - 1)] for v, c in zip(own, self.columns, strict=True)]
+    def encode(self, values: Mapping[str, ArrayLike]) -> np.ndarray:
+        """Map values to the unbounded vector ``(P,)``; values at or outside a bound map to a point just inside."""
+        arrays = [np.ravel(np.asarray(values[c.parameter.name], np.float64)) for c in self.columns]
+        at = [v[min(c.recording or 0, v.size - 1)] for v, c in zip(arrays, self.columns, strict=True)]
         inside = [min(max(v, c.parameter.low), c.parameter.high) for v, c in zip(at, self.columns, strict=True)]
         x = np.array([c.parameter.to_scale(v) for v, c in zip(inside, self.columns, strict=True)])
         return self.at_scale(x)
@@ -290,7 +288,7 @@ class ParameterTable:
         return np.log(share / (1 - share))
 
     def posterior(self, z: np.ndarray, covariance: np.ndarray) -> Posterior:
-        """Return what training draws from.
+        """Return the distribution from which training draws.
 
         Args:
             z: Shape ``(P,)``: the estimate.
@@ -300,25 +298,25 @@ class ParameterTable:
         return Posterior(self.names, transform, self.scale(z)[0], covariance, self.low, self.high)
 
     def start(self, share: float = 0.25) -> np.ndarray:
-        """Return where a search begins, ``(P,)``: each parameter where it says, delays at a share of their interval.
+        """Return the start of a search, ``(P,)``: each parameter at its ``begin``, delays at a share of their interval.
 
-        Where that is the lower bound, a little above: at a bound nothing moves.
+        Starts at a lower bound are moved up, as the map to values is flat there.
         """
         at = lambda p, share: p.low + share * (p.high - p.low)  # noqa: E731
-        own = {p.name: p.nominal if p.begin is None else p.begin for p in self.parameters}
+        begins = {p.name: p.nominal if p.begin is None else p.begin for p in self.parameters}
         open_delay = lambda p: p.kind == "delay" and p.begin is None  # noqa: E731
-        first = {p.name: at(p, share) if open_delay(p) else own[p.name] for p in self.parameters}
+        first = {p.name: at(p, share) if open_delay(p) else begins[p.name] for p in self.parameters}
         for p in self.parameters:
             if p.kind != "delay" and p.begin is None and p.transform == "linear" and p.nominal == p.low:
                 first[p.name] = at(p, _ABOVE)
         return self.encode(first)
 
     def starts(self) -> np.ndarray:
-        """Return where a descent begins that no search precedes, ``(K, P)``: with short delays, and with long ones."""
+        """Return starts of a descent without a search, ``(K, P)``: with short delays, and with long ones."""
         delayed = any(c.parameter.kind == "delay" for c in self.columns)
         return np.stack([self.start(share) for share in ((0.25, 0.75) if delayed else (0.25,))])
 
-    def prior_residuals(self, z: Any) -> Any:
+    def prior_residuals(self, z: Array) -> jax.Array:
         """Return ``(K,)`` residuals whose half sum of squares is the negative log prior, up to a constant."""
         x = self.decode(z)
         residuals = []
@@ -327,6 +325,7 @@ class ParameterTable:
             if prior is None:
                 continue
             value = x[c.parameter.name] if c.recording is None else x[c.parameter.name][c.recording]
+            # A Normal prior has an exact residual; other priors have the root of the drop of their log density.
             if type(prior).__name__ == "Normal":  # exact; the square root below has no derivative at the mode
                 residuals.append((value - prior.loc) / prior.scale)
             else:
@@ -346,7 +345,7 @@ class ParameterTable:
         return self._low + self.span * share, self.span * share * (1 - share)
 
     def unscale(self, x: np.ndarray) -> np.ndarray:
-        """Return values for points on the parameters' scales ``(..., P)``, kept within the bounds."""
+        """Return values for points on the parameters' scales ``(..., P)``, clipped to the bounds."""
         inside = np.clip(x, self._low, self._high)
         values = [from_scale(c.parameter.transform, inside[..., i]) for i, c in enumerate(self.columns)]
         return np.stack(values, axis=-1)

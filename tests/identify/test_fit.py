@@ -274,7 +274,7 @@ def test_a_part_to_skip_that_makes_no_sense_is_refused(skip_s):
 
 
 def test_skipping_whole_segments_is_an_error(episode):
-    with pytest.raises(UsageError, match=r"segments of 1 s leave nothing to compare after their first 1\.5 s"):
+    with pytest.raises(UsageError, match=r"segments of 1 s have no measurement after their first 1\.5 s"):
         Problem(Model(), [episode], SPANS, LENGTH_S, replace(CONFIG, skip_s=1.5))
 
 

@@ -153,7 +153,7 @@ def test_a_friction_or_a_delay_of_0_is_told_and_accepted(name):
     x[TABLE.names.index(name)] = 0.0
     found = judge(rows(0.1, 1.0), spread(**{name: "at a bound"}), x=x)
     assert (found.status, found.next) == ("accepted", "")
-    assert f"{name} comes out at 0, less than which there is not: held there, the same fit" in found.reasons
+    assert f"{name} is estimated at its lowest possible value, 0; the fit is the same with 0" in found.reasons
 
 
 def test_what_is_negligible_is_told_with_its_upper_bound_and_accepted():
@@ -178,7 +178,7 @@ def test_a_round_trip_at_a_bound_is_told_and_the_shares_of_it_are_not():
     assert any("the sum of the delays is at its upper one" in r for r in found.reasons)
     found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(0.0))
     assert found.status == "accepted"
-    assert any("the sum of the delays comes out at 0" in r for r in found.reasons)
+    assert any("the sum of the delays is estimated at its lowest possible value, 0" in r for r in found.reasons)
 
 
 def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
@@ -206,7 +206,7 @@ def test_delays_are_judged_by_their_sum_which_is_named():
     group, loose = check(DELAYS), spread(**dict.fromkeys(DELAYS, "not identifiable"))
     found = judge(rows(0.1, 1.0), loose, group, trip=trip())
     assert found.status == "accepted"
-    said = "sensor_delay and actuator_delay cannot be told apart from a log; what is known is their sum, 16.6 ms [16.0,"
+    said = "sensor_delay and actuator_delay cannot be separated by a log, which determines their sum, 16.6 ms [16.0,"
     assert any(r.startswith(said) for r in found.reasons)
     found = judge(rows(0.1, 1.0), loose, group, trip=trip(error=0.02))
     assert found.status == "not identifiable"
@@ -227,7 +227,7 @@ def test_the_first_that_applies_is_the_status_and_all_are_reasons():
 
 def test_nothing_held_out_is_told():
     found = judge(rows(0.1, 1.0, held_out=False))
-    assert found.reasons == ("nothing was held out: how well it predicts is not known",)
+    assert found.reasons == ("no data was held out: the error of its predictions is unknown",)
 
 
 def test_extrapolation_is_said():

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 def finite_differences(f: Callable[[Any], Any], step: float = 3e-3) -> Callable[[Any], Any]:
     """Return ``f`` with a forward-mode derivative by central differences along every entry.
 
-    The value and all ``2 P`` neighbours come from one batched evaluation, so that a program holds the function once:
-    a rollout of MuJoCo takes 20 s to trace and compile.
+    One batched evaluation returns the value and all ``2 P`` neighbours, so a program contains ``f`` once: a rollout of
+    MuJoCo takes 20 s to trace and compile.
 
     Args:
         f: Array ``(P,)`` -> array; it may call back to Python.
-        step: Change of an entry; about the cube root of float32's precision, relative to entries near 1.
+        step: Change of an entry; the default is about the cube root of float32's precision, for entries near 1.
     """
     wrapped = jax.custom_jvp(f)
 

@@ -1,4 +1,4 @@
-"""What rolls a segment out: the graph's own program, or C MuJoCo between two programs without physics."""
+"""The engine of rollouts: the graph's program, or C MuJoCo between two programs without physics."""
 
 from __future__ import annotations
 
@@ -21,11 +21,10 @@ _NEEDED = ("open_loop", "fields", "start", "controls", "message")
 
 @dataclass(frozen=True)
 class Choice:
-    """Which engine was taken.
+    """The selected engine.
 
     Attributes:
-        name: ``c`` or ``compiled``.
-        why: In words.
+        why: The reason, as text.
         model: The ``MjModel``, on C.
     """
 
@@ -34,26 +33,22 @@ class Choice:
     model: Any = None
 
     def __str__(self) -> str:
-        """Return both in one line."""
+        """Return engine and reason in one line."""
         return f"{'C MuJoCo' if self.name == 'c' else 'compiled'}: {self.why}"
 
 
 def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any], jacobian: str = "auto") -> Choice:
-    """Choose an engine, and take the physics out of the world where it is C.
-
-    C is taken beside an accelerator, too: a dog's 15 s with 12 joints took 8.4 s a generation of 512 candidates on MJX
-    and an H200, and 3.5 s on the 16 processors beside it; refined, more than 58 s and 13 s. MJX's solver steps on until
-    the slowest of all copies is done.
+    """Choose an engine, and take the physics out of the world if it is C.
 
     Args:
         wanted: ``auto``, ``c`` or ``compiled``.
-        jacobian: How derivatives are taken; only programs differentiate forward.
+        jacobian: Kind of derivatives; only programs differentiate forward.
 
     Raises:
-        UsageError: When C is asked for and cannot be had.
+        UsageError: When C is requested and not possible.
     """
     if wanted == "compiled":
-        return Choice("compiled", "asked for")
+        return Choice("compiled", "requested")
     try:
         if jacobian == "forward":
             raise UsageError("derivatives are taken in forward mode, which C MuJoCo does not have")
@@ -64,21 +59,21 @@ def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any],
             hint = error.hint or "take --engine compiled, or auto"
             raise UsageError(f"engine c: {error.args[0]}", hint=hint) from None
         return Choice("compiled", error.args[0])
-    return Choice("c", "asked for" if wanted == "c" else "the world is MuJoCo's", model)
+    return Choice("c", "requested" if wanted == "c" else "the world is MuJoCo's", model)
 
 
 def check_devices(count: int, engine: Choice) -> None:
-    """Refuse devices that are not there, or that the engine does not use.
+    """Raise an error if devices are missing, or the engine does not use them.
 
     Raises:
-        UsageError: With what there is.
+        UsageError: With the number of devices.
     """
     if count == 1:
         return
     if engine.name == "c":
         raise UsageError(
             f"devices={count}, but C MuJoCo simulates on the processors of this host, on all of them ({engine.why})",
-            hint="leave out --devices, or take --engine compiled",
+            hint="remove --devices, or take --engine compiled",
         )
     if count > (there := jax.local_device_count()):
         raise UsageError(
@@ -94,18 +89,18 @@ def _world(nodes: Mapping[str, BaseNode], given: Mapping[str, Any]) -> Any:
         raise UsageError(f"the world is not one of MuJoCo's: {names}")
     live = [c.output_node.name for c in worlds[0].inputs.values() if c.output_node.name not in given]
     if live:
-        raise UsageError(f"the world {worlds[0].name!r} hears {live[0]!r}, which is not recorded")
+        raise UsageError(f"the world {worlds[0].name!r} has the input {live[0]!r}, which is not recorded")
     return worlds[0]
 
 
 class Outside(NamedTuple):
-    """What C MuJoCo needs to roll a copy out.
+    """Inputs of C MuJoCo for a rollout.
 
     Attributes:
         fields: Fields of the model that differ from the compiled one.
-        start: Where the physics starts.
-        controls: Shape ``(ticks, substeps, nu)``, or what the law takes.
-        law: The numbers that the law takes.
+        start: Initial state of the physics.
+        controls: Shape ``(ticks, substeps, nu)``, or the inputs of the law.
+        law: Parameters of the law.
     """
 
     fields: Mapping[str, Any]
@@ -117,11 +112,11 @@ class Outside(NamedTuple):
 class CRollouts:
     """Rolls a graph's recorded commands out on C MuJoCo.
 
-    The graph's programs compute what the world hears in each tick, with its delays and averages, and what the sensor
-    makes of the world's messages; in between C steps all copies at once, with the parameters that each has.
+    One program computes the world's inputs in each tick, with their delays and averages. C steps all copies, each with
+    its own parameters. A second program computes the sensor's outputs from the world's messages.
 
     Args:
-        graph: The graph, whose world's physics was taken out.
+        graph: The graph, without the physics of its world.
         model: The ``MjModel``.
     """
 
@@ -132,19 +127,19 @@ class CRollouts:
         self._rollouts: dict[tuple[str, ...], Rollouts] = {}
 
     def inputs(self, gs: GraphState, params: Mapping[str, Any], tables: Tables, given: Mapping[str, Any]) -> Outside:
-        """Return what C needs for an episode; traceable.
+        """Return the inputs of C for an episode; traceable.
 
         Args:
-            gs: What the graph's ``begin`` returned.
-            params: The nodes' parameters, as ``begin`` got them.
+            gs: Result of the graph's ``begin``.
+            params: The nodes' parameters, as in ``begin``.
             tables: As in the graph's ``run``.
             given: As in the graph's ``run``.
         """
         world = self._world
-        state, own = gs.state[world.name], params[world.name]
-        law = world.law_values(own) if self._law else {}  # pyright: ignore[reportAttributeAccessIssue]
+        state, world_params = gs.state[world.name], params[world.name]
+        law = world.law_values(world_params) if self._law else {}  # pyright: ignore[reportAttributeAccessIssue]
         controls = self._graph.drive(gs, tables, given, world.controls)
-        return Outside(dict(world.fields(own, state)), world.start(own, state), controls, law)
+        return Outside(dict(world.fields(world_params, state)), world.start(world_params, state), controls, law)
 
     def step(self, inputs: Outside) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return positions, velocities and accelerations ``(..., 1 + ticks, n)`` of copies, rolled out on C."""
@@ -158,10 +153,7 @@ class CRollouts:
         """Return a node's outputs in an episode, leaves ``(K, ...)``; traceable.
 
         Args:
-            gs: What the graph's ``begin`` returned.
-            moved: What ``step`` returned for the episode.
-            tables: As in the graph's ``run``.
-            given: As in the graph's ``run``.
+            moved: Result of ``step`` for the episode.
         """
         world = self._world
         messages = jax.vmap(lambda *at: world.message(gs.state[world.name], *at))(*moved)
@@ -170,14 +162,7 @@ class CRollouts:
     def rollout(
         self, gs: GraphState, params: Mapping[str, Any], tables: Tables, given: Mapping[str, Any], record: str
     ) -> Any:
-        """Return a node's outputs in an episode by a callback to C; no compilation cache keeps a program with it.
-
-        Args:
-            gs: What the graph's ``begin`` returned.
-            params: The nodes' parameters, as ``begin`` got them.
-            tables: As in the graph's ``run``.
-            given: As in the graph's ``run``.
-        """
+        """Return a node's outputs in an episode by a callback to C; no compilation cache holds such a program."""
         inputs = self.inputs(gs, params, tables, given)
         dtype, count = jnp.result_type(float), inputs.controls.shape[0]
         widths = (self._model.nq, self._model.nv, self._model.nv)

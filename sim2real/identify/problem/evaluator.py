@@ -1,4 +1,4 @@
-"""How the residuals of a problem are evaluated: by compiled programs, or on C MuJoCo between two programs."""
+"""Evaluation of a problem's residuals: by compiled programs, or on C MuJoCo between two programs."""
 
 from __future__ import annotations
 
@@ -18,43 +18,35 @@ Stacked = Callable[[np.ndarray], np.ndarray]
 
 
 class Evaluator(Protocol):
-    """Evaluates residuals; arrays are padded as ``Data`` is.
+    """Evaluates residuals; arrays are padded like ``Data``.
 
     Attributes:
-        precision: Relative change of the loss below which a descent sees rounding, or the noise of finite differences.
-        fresh: Whether ``around`` linearises initial states at every point again.
+        precision: Relative change of the loss below which rounding or the noise of finite differences dominates.
+        fresh: Whether ``around`` linearises initial states at every point.
     """
 
     precision: float
     fresh: bool
 
     def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
-        """Return the residuals of the fitted segments and their derivatives at a point.
-
-        Args:
-            z: Shape ``(P,)``: the point.
-        """
+        """Return the residuals of the fitted segments and their derivatives at ``z (P,)``."""
         ...
 
     def loss(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> float:
-        """Return the loss at a point, initial states linearised there.
-
-        Args:
-            z: Shape ``(P,)``: the point.
-        """
+        """Return the loss at ``z (P,)``, with initial states linearised there."""
         ...
 
     def around(self, z: np.ndarray, data: Data) -> tuple[Stacked, Stacked]:
         """Return functions of points ``(P,)`` near ``z`` for a descent.
 
         Returns:
-            The first returns the residuals with the robust loss ``(N,)``, those of priors behind them; the second
-            their Jacobian ``(N, P)``.
+            The first returns the robust residuals ``(N,)``, then those of the priors; the second returns their
+            Jacobian ``(N, P)``.
         """
         ...
 
     def losses(self, candidates: np.ndarray, around: np.ndarray, data: Data) -> np.ndarray:
-        """Return the loss of each candidate, ``(N,)``, their initial states linearised around one point.
+        """Return the loss of each candidate, ``(N,)``, with initial states linearised at one point.
 
         Args:
             candidates: Shape ``(N, P)``.
@@ -63,7 +55,7 @@ class Evaluator(Protocol):
         ...
 
     def searched(self, data: Data) -> Any:
-        """Return the losses of a generation, as ``search`` takes them."""
+        """Return the losses of a generation, in the form that ``search`` takes."""
         ...
 
     def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> np.ndarray:
@@ -77,17 +69,17 @@ class Evaluator(Protocol):
         ...
 
     def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
-        """Return the robust residuals ``(G, S, K, F)`` with some values given.
+        """Return the robust residuals ``(G, S, K, F)`` with some parameters set.
 
         Args:
             z: Shape ``(P,)``: initial states are linearised there.
-            rows: Shape ``(G, P)``: values that replace those at ``z``, where they are no NaN.
+            rows: Shape ``(G, P)``: values of the parameters that are set; NaN keeps the value at ``z``.
         """
         ...
 
 
 class CompiledEvaluator:
-    """Evaluates the residuals by programs that hold the rollouts."""
+    """Evaluates the residuals by programs that contain the rollouts."""
 
     precision, fresh = 1e-6, True
 
@@ -96,7 +88,7 @@ class CompiledEvaluator:
         self._last: tuple[bytes, Data, LinearisedSegments] | None = None
 
     def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
-        """See ``Evaluator``; the last point is kept: descents ask for value, derivative and loss in turn."""
+        """See ``Evaluator``; the last point is cached, as descents need value, derivative and loss in turn."""
         point = np.asarray(z, np.float32)
         if self._last is None or self._last[0] != point.tobytes() or self._last[1] is not data:
             program = self._residuals.program("linearised", self._residuals.linearised)
@@ -108,7 +100,7 @@ class CompiledEvaluator:
         return float(self.linearised(z, data, on_compile).loss)
 
     def around(self, z: np.ndarray, data: Data) -> tuple[Stacked, Stacked]:
-        """See ``Evaluator``: initial states are linearised at every point again."""
+        """See ``Evaluator``: initial states are linearised at every point."""
         return lambda y: stacked(self.linearised(y, data))[0], lambda y: stacked(self.linearised(y, data))[1]
 
     def losses(self, candidates: np.ndarray, around: np.ndarray, data: Data) -> np.ndarray:
@@ -125,8 +117,8 @@ class CompiledEvaluator:
         """See ``Evaluator``."""
         many = jax.vmap(self._residuals.predict, in_axes=(0, 0, 0, None))
         program = self._residuals.program("predict", many)
-        own = {n: _single(v) for n, v in values.items()}
-        return np.asarray(program(own, jnp.asarray(eps, jnp.int32), _single(fit_s), data), np.float64)
+        arrays = {n: _single(v) for n, v in values.items()}
+        return np.asarray(program(arrays, jnp.asarray(eps, jnp.int32), _single(fit_s), data), np.float64)
 
     def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
         """See ``Evaluator``."""
@@ -134,23 +126,23 @@ class CompiledEvaluator:
         return np.asarray(program(_single(z), _single(rows), data), np.float64)
 
     def _with_values(self, z: Any, rows: Any, data: Data) -> Any:
-        own = self._residuals
-        states = own.initial_states(z, data, data.fitted)
+        residuals = self._residuals
+        states = residuals.initial_states(z, data, data.fitted)
 
         def one(row: Any) -> Any:
-            values = replaced(own, z, row)
-            r = jax.vmap(lambda e, s: own.projected(values, e, s, data))(data.fitted, states)
-            return tamed(r, own.config.loss, own.config.reach)
+            values = replaced(residuals, z, row)
+            r = jax.vmap(lambda e, s: residuals.projected(values, e, s, data))(data.fitted, states)
+            return tamed(r, residuals.config.loss, residuals.config.reach)
 
         return jax.vmap(one)(rows)
 
 
 def replaced(residuals: SegmentResiduals, z: Any, row: Any) -> dict[str, Any]:
-    """Return parameters by name at a point, with some values given; traceable.
+    """Return parameters by name at a point, with some of them set; traceable.
 
     Args:
         z: Shape ``(P,)``: the point.
-        row: Shape ``(P,)``: values that replace those at ``z``, where they are no NaN.
+        row: Shape ``(P,)``: values of the parameters that are set; NaN keeps the value at ``z``.
     """
     values = residuals.table.decode(z)
     for i, c in enumerate(residuals.table.columns):
@@ -160,7 +152,7 @@ def replaced(residuals: SegmentResiduals, z: Any, row: Any) -> dict[str, Any]:
 
 
 def stacked(at: LinearisedSegments) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals ``(N,)`` and Jacobian ``(N, P)``, those of the priors behind them."""
+    """Return residuals ``(N,)`` and Jacobian ``(N, P)``, followed by those of the priors."""
     r, J, prior, slope = (np.asarray(a, np.float64) for a in (at.residuals, at.jacobian, at.prior, at.prior_jacobian))
     return np.concatenate([r.reshape(-1), prior]), np.concatenate([J.reshape(-1, J.shape[-1]), slope])
 

@@ -1,7 +1,7 @@
-"""Initial states of segments that C MuJoCo simulates: Gauss-Newton steps on the host, with derivatives by differences.
+"""Initial states of segments on C MuJoCo: Gauss-Newton steps on the host, with finite differences.
 
-Rollouts take the time. Joints of separate kinematic trees move without each other, so that one rollout serves a state
-of each tree; and the states at the last points are kept, as a descent asks for them again.
+Rollouts take most of the time. Joints of separate kinematic trees move independently, so one rollout serves a state of
+each tree. The states at the last points are cached, as a descent uses them again.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from sim2real.identify.problem.residuals import STATE_DIFFERENCE, InitialState, 
 from sim2real.identify.problem.segments import Data
 
 _STEPS = 2
-"""Gauss-Newton steps of an initial state; they share the derivatives of the first point."""
+"""Gauss-Newton steps of an initial state; they share the derivatives at the first point."""
 _KEPT = 3
-"""Points whose states are kept: a descent evaluates its end, then begins its next round there."""
+"""Cached points: a descent evaluates its end, then begins its next round there."""
 _RESPONDS = 1e-9
-"""Share of the largest derivative below which a residual does not depend on a state: decoupled ones are exactly 0."""
+"""Share of the largest derivative below which a residual is independent of a state; decoupled derivatives are exactly
+0."""
 Errors = Callable[[Mapping[str, np.ndarray], np.ndarray, np.ndarray, Data], np.ndarray]
 """Residuals ``(N, K, F)`` of segments ``(N,)`` with parameters ``(N, ...)`` by name and shifts ``(N, n)``."""
 
@@ -46,24 +47,24 @@ class InitialStates:
 
         Args:
             z: Shape ``(P,)``: the parameters.
-            values: The same by name, ``(1, ...)``.
-            again: Whether the derivatives are taken once more, at the states that were found.
+            values: The parameters by name, ``(1, ...)``.
+            again: Whether the derivatives are computed at the fitted states.
         """
-        for point, own, there, states in self._last:
-            if point == z.tobytes() and own is data and there is again:
+        for point, cached_data, linearised_again, states in self._last:
+            if point == z.tobytes() and cached_data is data and linearised_again is again:
                 return states
         live = np.flatnonzero(np.asarray(data.weight) > 0.0)
         segments = np.asarray(data.fitted)[live]
         spread = {n: np.repeat(v, len(live), axis=0) for n, v in values.items()}
         if again:
             before = self.fitted(z, values, data)
-            found = InitialState(*(leaf[live] for leaf in before))
-            found = found._replace(slope=self._slopes(spread, segments, found.shift, data)[0])
+            fitted = InitialState(*(leaf[live] for leaf in before))
+            fitted = fitted._replace(slope=self._slopes(spread, segments, fitted.shift, data)[0])
         else:
-            found = self.best(spread, segments, np.full(len(live), float(data.length_s)), data, 1)
-        whole = [np.zeros((len(data.fitted), *leaf.shape[1:])) for leaf in found]
-        for leaf, own in zip(whole, found, strict=True):
-            leaf[live] = own
+            fitted = self.best(spread, segments, np.full(len(live), float(data.length_s)), data, 1)
+        whole = [np.zeros((len(data.fitted), *leaf.shape[1:])) for leaf in fitted]
+        for leaf, values_ in zip(whole, fitted, strict=True):
+            leaf[live] = values_
         states = InitialState(*whole)
         self._last = [(z.tobytes(), data, again, states), *self._last[: _KEPT - 1]]
         return states
@@ -78,19 +79,21 @@ class InitialStates:
     ) -> InitialState:
         """Fit the initial states of segments; return shifts, derivatives at no shift, and residuals.
 
-        The residuals are those at the best of the points that the steps lead to.
+        The residuals are those of the best point of the steps.
 
         Args:
-            values: Parameters of each by name, ``(R, ...)``.
-            eps: Shape ``(R,)``: the segments.
+            values: Parameters of each segment by name, ``(R, ...)``.
+            eps: Shape ``(R,)``: numbers of the segments.
             fit_s: Shape ``(R,)``: length of the first part of each, to which its state is fitted [s].
         """
+        # Linearise at the estimate from the log.
         still = np.zeros((len(eps), self._n))
         slope, errors = self._slopes(values, eps, still, data)
         ts = np.asarray(data.ts)[eps]
         counts = ((ts >= 0.0) & (ts <= fit_s[:, None]))[..., None]
         best = InitialState(still, slope, errors)
         least, candidate = _cost(best, counts), next_shift(best, counts)
+        # Step with these derivatives, and keep the best point.
         for _ in range(steps):
             here = InitialState(candidate, slope, self._errors(values, eps, candidate, data))
             cost = _cost(here, counts)
@@ -98,7 +101,7 @@ class InitialStates:
             shift = np.where(better[:, None], here.shift, best.shift)
             residuals = np.where(better[:, None, None], here.residuals, best.residuals)
             best, least = InitialState(shift, slope, residuals), np.where(better, cost, least)
-            # Near kinks, such as friction that sticks, a whole step may make it worse.
+            # Near kinks, such as sticking friction, a full step may increase the cost: go half way back.
             candidate = np.where(better[:, None], next_shift(best, counts), (candidate + shift) / 2.0)
         return best
 
@@ -106,6 +109,7 @@ class InitialStates:
         self, values: Mapping[str, np.ndarray], eps: np.ndarray, shift: np.ndarray, data: Data
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives ``(R, n, K, F)`` by initial states at shifts ``(R, n)``, and residuals ``(R, K, F)``."""
+        # Move all states of a group in one rollout, up and down.
         groups = self._groups or _each(self._n)
         member = np.array([[i in group for i in range(self._n)] for group in groups], float)
         moves = STATE_DIFFERENCE * np.concatenate([np.zeros((1, self._n)), member, -member])
@@ -115,20 +119,22 @@ class InitialStates:
         errors = errors.reshape(len(eps), len(moves), *errors.shape[1:])
         count = len(groups)
         change = (errors[:, 1 : count + 1] - errors[:, count + 1 :]) / (2.0 * STATE_DIFFERENCE)
+        # Assign the change to the state in the same tree as the residual.
         slope = np.empty((len(eps), self._n, *errors.shape[2:]))
         for i, group in enumerate(groups):
             for k in group:
                 slope[:, k] = np.where(self._responds[k], change[:, i], 0.0)
+        # Find the groups from the first derivatives.
         if self._groups is None:
             self._groups, self._responds = separated(np.max(np.abs(slope), axis=(0, 2)))
         return slope, errors[:, 0]
 
 
 def separated(slope: np.ndarray) -> tuple[list[tuple[int, ...]], np.ndarray]:
-    """Return which columns can be moved together since no residual depends on two of them, and what depends on each.
+    """Return which columns can be moved together, as no residual depends on two of them, and their residuals.
 
-    Curtis, Powell and Reid (J. Inst. Maths Applics 13, 1974). A column on which nothing depends here is moved alone,
-    as something may depend on it elsewhere.
+    Method of Curtis, Powell and Reid (J. Inst. Maths Applics 13, 1974). A column without effect at this point is moved
+    alone, as it may have an effect at another one.
 
     Args:
         slope: Shape ``(n, F)``: largest derivative of each residual by each column.
@@ -142,11 +148,11 @@ def separated(slope: np.ndarray) -> tuple[list[tuple[int, ...]], np.ndarray]:
     edges = np.block([[np.zeros((len(slope),) * 2), responds], [responds.T, np.zeros((slope.shape[1],) * 2)]])
     label = connected_components(csr_array(edges), directed=False)[1]
     columns, rows = label[: len(slope)], label[len(slope) :]
-    own = columns[:, None] == rows[None]
-    own[alone] = True
+    belongs = columns[:, None] == rows[None]
+    belongs[alone] = True
     trees = [[i for i in np.flatnonzero(columns == k) if i not in alone] for k in np.unique(columns)]
     groups = [tuple(int(i) for i in group if i is not None) for group in zip_longest(*trees)]
-    return [g for g in groups if g] + [(i,) for i in alone], own
+    return [g for g in groups if g] + [(i,) for i in alone], belongs
 
 
 def next_shift(at: InitialState, counts: np.ndarray) -> np.ndarray:
@@ -154,7 +160,7 @@ def next_shift(at: InitialState, counts: np.ndarray) -> np.ndarray:
 
     Args:
         at: The states, leaves ``(R, ...)``.
-        counts: Shape ``(R, K, 1)``, bool: which measurements they are fitted to.
+        counts: Shape ``(R, K, 1)``, bool: which measurements count.
     """
     J = np.where(counts[:, None], at.slope, 0.0).reshape(*at.slope.shape[:2], -1)
     r = np.where(counts, at.residuals, 0.0).reshape(len(J), -1)
@@ -172,7 +178,7 @@ def _each(n: int) -> list[tuple[int, ...]]:
 
 
 def _trees_are_apart(model: Any) -> bool:
-    """Return whether nothing but the bodies between them couples two joints: no contact, equality or tendon."""
+    """Return whether only bodies couple joints: there is no contact, equality or tendon."""
     contacts = model.opt.disableflags & mj.mjtDisableBit.mjDSBL_CONTACT == 0
     touching = contacts and (model.npair > 0 or bool(np.any(model.geom_contype) and np.any(model.geom_conaffinity)))
     return model.ntree > 1 and not touching and model.neq == 0 and model.ntendon == 0

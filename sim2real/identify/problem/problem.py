@@ -1,7 +1,7 @@
 """Recordings cut into segments, with the programs that compute their residuals.
 
-Each segment is simulated with the recorded commands and timing, from an initial state of its own. Every evaluation
-solves for these states: a search is over dynamics and delays alone.
+Each segment is simulated with the recorded commands and timing, from its own initial state. Every evaluation solves for
+the initial states, so a search is over dynamics and delays alone.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ class Evaluation:
     """The residuals of the fitted segments at a point, in numpy.
 
     Attributes:
-        residuals: Shape ``(S, K, F)``, in deviations of the measurement, with the robust loss; 0 where nothing counts.
+        residuals: Shape ``(S, K, F)``, in deviations of the measurement, with the robust loss; 0 without a comparison.
         jacobian: Shape ``(S, K, F, P)``: d residual / d z.
         raw: Shape ``(S, K, F)``: the residuals without the robust loss.
         prior: Shape ``(Q,)``: the residuals of the priors.
         prior_jacobian: Shape ``(Q, P)``: their derivatives.
-        loss: Half the mean square of the residuals, and the priors.
+        loss: Half the mean square of the residuals, plus the priors.
     """
 
     residuals: np.ndarray
@@ -51,24 +51,22 @@ class Evaluation:
 
 
 class Problem:
-    """Segments of recordings, ready to be simulated for any parameters.
+    """Segments of recordings, which can be simulated with any parameters.
 
     Args:
-        length_s: Their length [s].
-        table: The parameters; default: the model's.
-        moved: Changes the recorded timing of the segments before it is simulated.
-        like: Another problem of the same model, table and configuration, whose programs this one shares.
+        length_s: Length of a segment [s].
+        table: Default: the model's parameters.
+        moved: Changes the recorded timing of the segments before they are simulated.
+        like: Another problem of the same model, table and configuration; both share programs.
 
     Attributes:
-        residuals: The residuals as functions of parameters and data.
-        evaluator: Evaluates them.
         data: The segments, as an argument of programs.
         spans: The segments, recording by recording.
-        segments: How many there are.
+        segments: Number of segments.
         train: Numbers of the fitted segments.
 
     Raises:
-        Sim2RealError: When a log lacks a node or a field, or holds values that are no numbers.
+        Sim2RealError: When a log lacks a node or a field, or holds NaN.
         UsageError: When a segment holds too few measurements.
     """
 
@@ -90,24 +88,28 @@ class Problem:
         # Commands sent before a segment still act in it, up to the largest delay.
         cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
         self.spans, self.segment_s, self.given = cuts.spans, length_s, cuts.given
+        # Complete the recorded timing: draw the steps of the simulated nodes.
         self.timeline = draw(nodes, length_s + model.ahead_s, recorded=moved(cuts.timeline))
         make_room(nodes, self.timeline)  # after a hiccup commands leave in a burst
+        # Number the segments.
         self.segments = len(cuts.spans)
         self.begins_s = np.array([s.begin_s for s in cuts.spans])
         self.recording = np.array([s.recording for s in cuts.spans])
         self.train = np.flatnonzero([s.fitted for s in cuts.spans])
-        # Before this a measurement shows the world from before the segment's start.
+        # Earlier measurements show the world before the start of the segment.
         from_s = max(config.max_delay_s + 1.0 / min(n.rate for n in nodes.values()), config.skip_s)
         if not np.any(cuts.ts >= from_s):
             raise UsageError(
-                f"segments of {length_s:g} s leave nothing to compare after their first {from_s:g} s",
+                f"segments of {length_s:g} s have no measurement after their first {from_s:g} s to compare with",
                 hint="make them longer, or max_delay_s or skip_s smaller",
             )
+        # Make the arguments of the programs.
         tables = self.residuals.graph.tables(self.timeline, cuts.given)
         steps = cuts.ts.shape[1]
         tables[model.sensor] = padded(tables[model.sensor], rounded(steps), axis=1)
         self.data: Data = data_of(cuts, tables, from_s, len(self.fields), len(self.table))
         self._measured, self._ts = cuts.measured, np.where(cuts.ts >= from_s, cuts.ts, -1.0)
+        # Choose derivatives and evaluator, or share those of the other problem.
         if like is None:
             self.residuals.choose_derivative(self.data)
         on_c = self.engine.name == "c"
@@ -121,112 +123,110 @@ class Problem:
 
     @property
     def engine(self) -> Any:
-        """What rolls segments out."""
+        """The engine of rollouts."""
         return self.residuals.engine
 
     @property
     def channels(self) -> Any:
-        """What is measured."""
+        """The measured channels."""
         return self.model.channels
 
     @property
     def fields(self) -> Any:
-        """The columns of the residuals: field, deviation, and how to take the channel's entry of it."""
+        """The columns of the residuals: field, deviation, and a function that takes the channel's entry."""
         return self.residuals.fields
 
     @property
     def ts(self) -> np.ndarray:
-        """When each measurement was made ``(E, K)`` [s from the segment's start]; -1 where nothing is compared."""
+        """Time of each measurement ``(E, K)`` [s from the segment's start]; -1 without a comparison."""
         return self._ts
 
     @property
     def measurements(self) -> int:
-        """Measured numbers in the fitted segments."""
+        """Number of measured numbers in the fitted segments."""
         return int(self.data.count)
 
     def measured(self, column: int) -> np.ndarray:
-        """Return the measurements that a column's residuals compare with, ``(E, K)``."""
+        """Return the measurements of a column of the residuals, ``(E, K)``."""
         field, _, entry = self.fields[column]
         return np.asarray(entry(self._measured[field]))
 
-    def part(self, left_out: Any = (), kept: Any = None) -> Data:
+    def part(self, without: Any = (), kept: Any = None) -> Data:
         """Return the data without some segments, and with some of the parameters.
 
         Args:
-            left_out: Numbers of the segments that do not count.
+            without: Numbers of the segments that get no weight.
             kept: Shape ``(P,)``, bool: which free parameters are part of the model; default: all.
         """
         weight = np.asarray(self.data.weight).copy()
-        weight[: len(self.train)][np.isin(self.train, np.asarray(left_out, int))] = 0.0
+        weight[: len(self.train)][np.isin(self.train, np.asarray(without, int))] = 0.0
         kept = self.data.kept if kept is None else jnp.asarray(np.asarray(kept, bool))
         return self.data._replace(weight=jnp.asarray(weight), kept=kept)
 
     def at(self, z: Any, data: Data | None = None, on_compile: OnCompile | None = None) -> Evaluation:
-        """Return the residuals of the fitted segments at a point, and their derivatives.
+        """Return the residuals of the fitted segments at ``z (P,)``, and their derivatives.
 
         Args:
-            z: Shape ``(P,)``: the parameters.
-            data: What is fitted; default: all fitted segments.
+            data: Default: all fitted segments.
         """
-        found = self.evaluator.linearised(np.asarray(z), self.data if data is None else data, on_compile)
+        evaluated = self.evaluator.linearised(np.asarray(z), self.data if data is None else data, on_compile)
         count = len(self.train)
         steps = self._ts.shape[1]
-        r, J, raw = (np.asarray(a, np.float64)[:count, :steps] for a in found[:3])
-        prior, slope = (np.asarray(a, np.float64) for a in (found.prior, found.prior_jacobian))
-        return Evaluation(r, J, raw, prior, slope, float(found.loss))
+        r, J, raw = (np.asarray(a, np.float64)[:count, :steps] for a in evaluated[:3])
+        prior, slope = (np.asarray(a, np.float64) for a in (evaluated.prior, evaluated.prior_jacobian))
+        return Evaluation(r, J, raw, prior, slope, float(evaluated.loss))
 
     def loss(self, z: Any, data: Data | None = None, on_compile: OnCompile | None = None) -> float:
-        """Return the loss at a point.
+        """Return the loss at ``z (P,)``.
 
         Args:
-            z: Shape ``(P,)``: the parameters.
-            data: What is fitted; default: all fitted segments.
+            data: Default: all fitted segments.
         """
         return self.evaluator.loss(np.asarray(z), self.data if data is None else data, on_compile)
 
     def losses(self, candidates: Any, around: Any, data: Data | None = None) -> np.ndarray:
-        """Return the loss of each candidate ``(N,)``, their initial states linearised around one point.
+        """Return the loss of each candidate ``(N,)``, with initial states linearised at one point.
 
         Args:
             candidates: Shape ``(N, P)``.
             around: Shape ``(P,)``.
-            data: What is fitted; default: all fitted segments.
+            data: Default: all fitted segments.
         """
-        own = self.data if data is None else data
-        return self.evaluator.losses(np.asarray(candidates), np.asarray(around), own)
+        segments = self.data if data is None else data
+        return self.evaluator.losses(np.asarray(candidates), np.asarray(around), segments)
 
     def predict(self, values: Any, segments: np.ndarray, fit_s: np.ndarray) -> np.ndarray:
         """Return the residuals of segments whose initial states are fitted to their first parts, ``(R, K, F)``.
 
         Args:
             values: Parameters by name, ``(R, ...)``: each segment with its own.
-            segments: Shape ``(R,)``: their numbers.
+            segments: Shape ``(R,)``: numbers of the segments.
             fit_s: Shape ``(R,)``: lengths of the first parts [s].
         """
-        # Always as many at a time: one program serves all, and to compile one takes longer than to run it.
+        # Predict a fixed number at a time: one program serves all, and compiling takes longer than running.
         size = len(self.data.recording)
-        found = []
+        residuals = []
         for first in range(0, len(segments), size):
             rows = np.minimum(np.arange(first, first + size), len(segments) - 1)
-            own = {n: np.asarray(v)[rows] for n, v in values.items()}
-            found.append(self.evaluator.predict(own, segments[rows], fit_s[rows], self.data))
-        return np.concatenate(found)[: len(segments), : self._ts.shape[1]].astype(np.float64)
+            arrays = {n: np.asarray(v)[rows] for n, v in values.items()}
+            residuals.append(self.evaluator.predict(arrays, segments[rows], fit_s[rows], self.data))
+        return np.concatenate(residuals)[: len(segments), : self._ts.shape[1]].astype(np.float64)
 
     def with_values(self, z: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the robust residuals of the fitted segments with some values given, ``(G, S, K, F)``.
+        """Return the robust residuals of the fitted segments with some parameters set, ``(G, S, K, F)``.
 
         Args:
             z: Shape ``(P,)``: the parameters; initial states are linearised there.
-            rows: Shape ``(G, P)``: values that replace those at ``z``, where they are no NaN.
+            rows: Shape ``(G, P)``: values of the parameters that are set; NaN keeps the value at ``z``.
         """
-        found = self.evaluator.with_values(np.asarray(z), rows, self.data)
-        return found[:, : len(self.train), : self._ts.shape[1]]
+        residuals = self.evaluator.with_values(np.asarray(z), rows, self.data)
+        return residuals[:, : len(self.train), : self._ts.shape[1]]
 
     def recut(self, spans: Sequence[Span], length_s: float, moved: Retimed = lambda recorded: recorded) -> Problem:
-        """Return the same recordings cut into other segments; it shares the programs.
+        """Return the same recordings cut into other segments; both problems share programs.
 
         Args:
-            length_s: Their length [s].
+            length_s: Length of a segment [s].
         """
         return Problem(self.model, self._recordings, spans, length_s, self.config, moved=moved, like=self)
 

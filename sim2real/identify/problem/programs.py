@@ -1,4 +1,4 @@
-"""Compiled programs of identification: one for each form of their arguments, shared by all problems of a model."""
+"""Compiled programs of identification: one for each form of the arguments, shared by all problems of a model."""
 
 from __future__ import annotations
 
@@ -15,12 +15,7 @@ OnCompile = Callable[[bool], None]
 class Program:
     """A function that is compiled for each form of its arguments: their tree, shapes and dtypes.
 
-    On a CPU it is compiled without XLA's fusion emitters, as long as XLA can do without (jaxlib 0.10): for programs
-    that run for seconds, the older way to fuse loops is twice as fast. An identification of the disk takes 24 s instead
-    of 33, one of the pendulum 39 instead of 47. Training takes longer that way, 45 instead of 30.
-
-    Args:
-        function: The function; traceable.
+    On a CPU, XLA's fusion emitters are off (jaxlib 0.10), as programs that run for seconds then need half the time.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

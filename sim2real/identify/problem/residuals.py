@@ -1,6 +1,6 @@
-"""The residuals of a segment: what the model predicts minus what was measured, as a function of parameters and data.
+"""The residuals of a segment, prediction minus measurement, as a function of parameters and data.
 
-Everything that differs from log to log is in ``Data``, an argument: the compiled programs depend on shapes alone.
+``Data`` is an argument and holds all that differs between logs, so compiled programs depend on shapes alone.
 """
 
 from __future__ import annotations
@@ -25,8 +25,7 @@ from sim2real.identify.problem.segments import Data
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph
 
 _STATE_STEPS = 2
-"""Points at which a segment's initial state is linearised. With one, the loss of a pendulum's log jumped by 3 % where
-the delays changed by 0.3 ms, and descents from five starts ended 2 % apart; with two by 0.2 %, and 0.1 % apart."""
+"""Points at which a segment's initial state is linearised; see docs/reference/choices.md."""
 STATE_DIFFERENCE = 0.03
 """Step of finite differences by an initial state, in its prior deviation."""
 
@@ -35,8 +34,7 @@ class InitialState(NamedTuple):
     """A point at which the residuals of a segment are linearised by its initial state.
 
     Attributes:
-        shift: Shape ``(2 * channels,)``: distance from the state that was estimated from the log, in deviations of the
-            prior.
+        shift: Shape ``(2 * channels,)``: distance from the estimate from the log, in deviations of the prior.
         slope: Shape ``(2 * channels, K, F)``: d residual / d shift.
         residuals: Shape ``(K, F)``: the residuals at the point.
     """
@@ -47,16 +45,7 @@ class InitialState(NamedTuple):
 
 
 class LinearisedSegments(NamedTuple):
-    """The residuals of all fitted segments and their derivatives.
-
-    Attributes:
-        residuals: Shape ``(S, K, F)``, in deviations of the measurement, with the robust loss.
-        jacobian: Shape ``(S, K, F, P)``: d residual / d z.
-        raw: Shape ``(S, K, F)``: the residuals without the robust loss.
-        prior: Shape ``(Q,)``: the residuals of the priors.
-        prior_jacobian: Shape ``(Q, P)``: their derivatives.
-        loss: Half the mean square of the residuals, and the priors.
-    """
+    """The residuals of all fitted segments and their derivatives; leaves as in ``Evaluation``."""
 
     residuals: Any
     jacobian: Any
@@ -70,11 +59,11 @@ class SegmentResiduals:
     """The residuals of a model, for any data of one robot.
 
     Attributes:
-        prior: Shape ``(2 * channels,)``: how far an initial state may be from its estimate. Wide: a narrow prior would
-            seem to tell the delays apart, by nothing but the bias of that estimate.
+        prior: Shape ``(2 * channels,)``: deviation of an initial state from its estimate. It is wide: with a narrow
+            prior the bias of that estimate would seem to separate the delays.
         forward: Whether derivatives are taken in forward mode; else by finite differences.
         programs: The compiled programs by name.
-        searches: Those of ``search``.
+        searches: The compiled programs of ``search``.
     """
 
     def __init__(
@@ -95,23 +84,23 @@ class SegmentResiduals:
         self.programs: dict[str, Program] = {}
         self.searches: dict[Any, Any] = {}
         self._late = [p.name for p in table if p.side == "measurement"]
-        # Traced once for all programs that it is a part of: to trace a rollout of MuJoCo takes 6 s.
+        # Trace the rollout once for all programs that contain it: tracing MuJoCo takes 6 s.
         self._rollout = jax.jit(self._simulate)
 
     @property
     def outside(self) -> CRollouts:
-        """C MuJoCo, where it is the engine."""
+        """C MuJoCo, if it is the engine."""
         if self._outside is None:
             raise UsageError(f"the engine is not C MuJoCo: {self.engine}")
         return self._outside
 
     @property
     def fields(self) -> list[tuple[str, float, Callable[[Any], Any]]]:
-        """The columns of the residuals: field, deviation, and how to take the channel's entry of it."""
+        """The columns of the residuals: field, deviation, and a function that takes the channel's entry."""
         return [(field, sigma, c.of) for c in self.channels for field, sigma in c.fields]
 
     def program(self, name: str, function: Callable[..., Any]) -> Program:
-        """Return a compiled program that other problems of the same model share, made of a function at first."""
+        """Return the compiled program of a name; all problems of a model share it."""
         if name not in self.programs:
             self.programs[name] = Program(function)
         return self.programs[name]
@@ -122,9 +111,9 @@ class SegmentResiduals:
         Args:
             shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
         """
-        own, start = self._started(values, eps, shift, data)
+        values_, start = self._started(values, eps, shift, data)
         tables, given = jax.tree_util.tree_map(lambda rows: rows[eps], (data.tables, data.given))
-        return self._rollout(own, start, tables, given, eps)
+        return self._rollout(values_, start, tables, given, eps)
 
     def _simulate(self, own: Mapping[str, Any], start: Any, tables: Any, given: Any, eps: Any) -> Any:
         """Simulate a segment for one recording's parameters, from an initial state."""
@@ -136,11 +125,11 @@ class SegmentResiduals:
 
     def _started(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> tuple[dict[str, Any], Any]:
         """Return the parameters of a segment's recording, and its initial state."""
-        own = self.table.of_recording(values, data.recording[eps])
-        return own, self.start(eps, sum(own[n] for n in self._late), data) + shift
+        values_ = self.table.of_recording(values, data.recording[eps])
+        return values_, self.start(eps, sum(values_[n] for n in self._late), data) + shift
 
     def _first(self, params: Mapping[str, Any], given: Any, eps: Any) -> GraphState:
-        # The first recorded command is taken to have held before, too: nothing else is known.
+        # Assume that the first recorded command held before, too.
         first = jax.tree_util.tree_map(lambda rows: rows[0], given)
         return self.graph.begin(params, first, jnp.asarray(eps, jnp.int32))
 
@@ -151,11 +140,7 @@ class SegmentResiduals:
         return params, self._first(params, given, eps), tables, given
 
     def inputs(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> Outside:
-        """Return the inputs with which C simulates a segment.
-
-        Args:
-            shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
-        """
+        """Return the inputs with which C simulates a segment; ``shift`` as in ``simulate``."""
         params, gs, tables, given = self._begun(values, eps, shift, data)
         return self.outside.inputs(gs, params, tables, given)
 
@@ -163,19 +148,16 @@ class SegmentResiduals:
         """Return ``residuals`` of a segment that C simulated.
 
         Args:
-            shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
-            moved: What ``CRollouts.step`` returned for it.
+            shift: As in ``simulate``.
+            moved: Result of ``CRollouts.step`` for the segment.
         """
         _, gs, tables, given = self._begun(values, eps, shift, data)
         return self._compared(self.outside.outputs(gs, moved, tables, given, self.model.sensor), eps, data)
 
     def residuals(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> Any:
-        """Return how far the predictions of a segment are off, ``(K, F)``, in deviations of the measurement.
+        """Return prediction minus measurement of a segment, ``(K, F)``, in deviations of the measurement.
 
-        It is 0 where nothing is compared: where ``data.ts`` is -1.
-
-        Args:
-            shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
+        It is 0 where ``data.ts`` is -1; ``shift`` as in ``simulate``.
         """
         return self._compared(self.simulate(values, eps, shift, data), eps, data)
 
@@ -189,13 +171,10 @@ class SegmentResiduals:
     def initial_state(
         self, values: Mapping[str, Any], eps: Any, data: Data, fit_s: Any = None, points: int = _STATE_STEPS
     ) -> InitialState:
-        """Fit a segment's initial state by Gauss-Newton steps.
+        """Fit a segment's initial state by Gauss-Newton steps; return the best point.
 
         Args:
             fit_s: Length of the segment's first part, to which the state is fitted [s]; default: the whole segment.
-
-        Returns:
-            The best of these points.
         """
         zero = jnp.zeros(len(self.prior))
         like = jax.eval_shape(lambda: self.residuals(values, eps, zero, data))
@@ -209,7 +188,7 @@ class SegmentResiduals:
             error, push = jax.linearize(of_shift, zero)
             here = InitialState(candidate, jax.vmap(push)(jnp.eye(len(zero))), error)
             cost = jnp.sum(jnp.where(counts, error, 0.0) ** 2) + jnp.sum(candidate**2)
-            # Near kinks, such as friction that sticks, the linear step may make it worse.
+            # Near kinks, such as sticking friction, the linear step may increase the cost: go half way back.
             better = (i == 0) | (cost < least)
             best = jax.tree_util.tree_map(lambda new, old: jnp.where(better, new, old), here, best)
             after = jnp.where(better, candidate + self._solve(here, counts), (candidate + best.shift) / 2.0)
@@ -222,7 +201,7 @@ class SegmentResiduals:
         """Return a segment's residuals ``(K, F)`` at the best initial state near its estimate.
 
         Args:
-            state: What ``initial_state`` returned at these parameters, or at some close by; None: it is not fitted.
+            state: Result of ``initial_state`` at these parameters, or at near ones; None if states are not fitted.
         """
         if state is None:
             return self.residuals(values, eps, jnp.zeros(len(self.prior)), data)
@@ -241,7 +220,7 @@ class SegmentResiduals:
         return self.initial_state(values, eps, data, fit_s, _STATE_STEPS + 1).residuals
 
     def initial_states(self, z: Any, data: Data, pick: Any) -> InitialState | None:
-        """Return ``initial_state`` of several segments, leaves ``(B, ...)``; None where states are not fitted.
+        """Return ``initial_state`` of several segments, leaves ``(B, ...)``; None if states are not fitted.
 
         Args:
             z: Shape ``(P,)``: the parameters.
@@ -253,10 +232,10 @@ class SegmentResiduals:
         return jax.vmap(lambda e: self.initial_state(values, e, data))(pick)
 
     def losses(self, candidates: Any, around: Any, data: Data, pick: Any = None) -> Any:
-        """Return the loss of each candidate, ``(N,)``: half the mean square of its robust residuals, and the priors.
+        """Return the loss of each candidate, ``(N,)``: half the mean square of its robust residuals, plus the priors.
 
-        The initial states of all candidates are linearised at ``around``; the closer they are to it, the more exact
-        that is.
+        The initial states of all candidates are linearised at ``around``; the result is exact for a candidate at that
+        point.
 
         Args:
             candidates: Shape ``(N, P)``.
@@ -275,13 +254,15 @@ class SegmentResiduals:
     def linearised(self, z: Any, data: Data) -> LinearisedSegments:
         """Return the residuals of all fitted segments and their derivatives at ``z (P,)``.
 
-        Initial states are linearised at ``z``; how their slopes change with ``z`` is left out of the derivative
-        (Kaufman, BIT 15, 1975).
+        Initial states are linearised at ``z``; the derivative neglects the change of their slopes (Kaufman, BIT 15,
+        1975).
         """
         pick = jnp.arange(len(data.fitted))
+        # Solve for the initial states, then differentiate the residuals with these states' slopes held.
         states = self.initial_states(z, data, data.fitted)
         f = self.differentiable(lambda y: self._weighed(y, states, data, pick))
         raw, J = jax.vmap(lambda d: jax.jvp(f, (z,), (d,)), out_axes=(None, -1))(jnp.eye(z.size, dtype=z.dtype))
+        # Apply the robust loss to residuals and derivatives.
         r, slope = jax.jvp(self._tamed, (raw,), (jnp.ones_like(raw),))
         of_prior = self.table.prior_residuals
         prior = of_prior(z), jax.jacfwd(of_prior)(z)
@@ -291,7 +272,7 @@ class SegmentResiduals:
         """Return the initial state ``(2 * channels,)`` as measured around the start.
 
         Args:
-            delay_s: How late samples come [s].
+            delay_s: Delay of the samples [s].
         """
         c = data.starts[eps]  # (channels, 4): a cubic in time
         if self.config.initial_state == "rest":
@@ -306,7 +287,7 @@ class SegmentResiduals:
         return f if self.forward else finite_differences(f, step or self.config.difference)
 
     def choose_derivative(self, data: Data) -> None:
-        """Take forward mode where every node can be differentiated, if the configuration leaves that open."""
+        """Take forward mode if every node can be differentiated and the configuration is ``auto``."""
         if self.config.jacobian != "auto" or self._outside is not None:
             return
         point, still = jnp.zeros(len(self.table)), jnp.zeros(len(self.prior))
@@ -318,7 +299,7 @@ class SegmentResiduals:
         self.forward = True
 
     def _weighed(self, z: Any, states: InitialState | None, data: Data, pick: Any) -> Any:
-        """Return the residuals of some fitted segments without the robust loss, 0 where a segment has no weight."""
+        """Return the residuals of some fitted segments without the robust loss; 0 in segments without weight."""
         values = self.table.decode(z, data.kept)
         raw = jax.vmap(lambda e, s: self.projected(values, e, s, data))(data.fitted[pick], states)
         return jnp.where(data.weight[pick, None, None] > 0.0, raw, 0.0)

@@ -22,7 +22,7 @@ def tamed(residual: Any, loss: Loss, reach: float, xp: Any = jnp) -> Any:
     """
     if loss == "squared":
         return residual
-    if loss == "huber":  # by hypot: the square may overflow, and the worst residual would become the best
+    if loss == "huber":  # by hypot: a square may overflow to infinity, which would make the residual 0
         return residual * xp.sqrt(2.0 / (xp.hypot(1.0, residual / reach) + 1.0))
     square = (residual / reach) ** 2
     small = square < 1e-6

@@ -1,4 +1,4 @@
-"""Recordings cut into segments: the timing, the commands and the measurements of each, padded to one width."""
+"""Recordings cut into segments: timing, commands and measurements of each, padded to one width."""
 
 from __future__ import annotations
 
@@ -19,18 +19,12 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.sizes import padded, rounded
 
 Retimed = Callable[[Timeline], Timeline]
-"""From segments' recorded timing to another."""
+"""Recorded timing of segments -> changed timing."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A part of a recording.
-
-    Attributes:
-        recording: Which recording.
-        begin_s: Where it starts [s].
-        fitted: Whether it is part of the loss; else it is held out.
-    """
+    """A part of a recording: its number, its begin [s], and whether it is part of the loss; else it is held out."""
 
     recording: int
     begin_s: float
@@ -39,15 +33,13 @@ class Span:
 
 @dataclass(frozen=True)
 class Segments:
-    """Spans of one length, side by side.
+    """E spans of one length, side by side.
 
     Attributes:
-        spans: E of them.
-        length_s: Their length [s].
         timeline: The recorded timing of sensor and given nodes, E episodes; the sensor's is ``ahead_s`` later.
         given: Node -> its recorded messages, leaves ``(E, N, ...)``.
         measured: Field -> ``(E, N, ...)``.
-        ts: Shape ``(E, N)``: when each measurement was made [s from the segment's start]; 0 behind the last.
+        ts: Shape ``(E, N)``: time of each measurement [s from the segment's start]; 0 after the last.
         starts: Shape ``(E, channels, 4)``: a cubic in time through each channel's measurements around the start.
     """
 
@@ -61,23 +53,23 @@ class Segments:
 
 
 class Data(NamedTuple):
-    """Segments as an argument of compiled programs: one program serves all recordings whose counts round up alike.
+    """Segments as an argument of compiled programs: recordings whose counts round up alike share programs.
 
-    E is the number of segments, S that of the fitted ones, K that of the sensor's steps; all are rounded up, and what
-    was added repeats the last entry and has no weight.
+    E is the number of segments, S that of the fitted ones, K that of the sensor's steps. All are rounded up; the
+    padding repeats the last entry and has no weight.
 
     Attributes:
-        tables: Timing of the simulated steps, as ``OpenLoopGraph.tables`` returns it.
+        tables: Timing of the simulated steps, from ``OpenLoopGraph.tables``.
         given: Node -> its recorded messages, leaves ``(E, N, ...)``.
         measured: Field -> ``(E, K, ...)``: the measurement that each of the sensor's steps predicts.
-        ts: Shape ``(E, K)``: when it was made [s from the segment's start]; -1 where nothing is compared.
+        ts: Shape ``(E, K)``: its time [s from the segment's start]; -1 without a comparison.
         starts: Shape ``(E, channels, 4)``, as in ``Segments``.
         recording: Shape ``(E,)``: number of the segment's recording.
         length_s: Length of a segment [s].
         fitted: Shape ``(S,)``: numbers of the fitted segments.
-        weight: Shape ``(S,)``: 1 for a fitted segment that counts, 0 for one that is left out.
+        weight: Shape ``(S,)``: 1 for a fitted segment that counts, 0 for another.
         kept: Shape ``(P,)``, bool: which free parameters are part of the model.
-        count: How many numbers the fitted segments hold.
+        count: Number of measured numbers in the fitted segments.
     """
 
     tables: Any
@@ -97,10 +89,11 @@ def data_of(cuts: Segments, tables: Any, from_s: float, fields: int, parameters:
     """Return segments as an argument of compiled programs.
 
     Args:
-        from_s: Measurements before this time are not compared [s from the segment's start].
+        from_s: Start of the comparison [s from the segment's start].
     """
     segments = len(cuts.spans)
     fitted = np.flatnonzero([s.fitted for s in cuts.spans])
+    # Round the sizes up and pad, so that logs of similar length share programs.
     ts = np.where(cuts.ts >= from_s, cuts.ts, -1.0)
     steps, size = rounded(ts.shape[1]), rounded(segments)
     ts = np.pad(ts, ((0, 0), (0, steps - ts.shape[1])), constant_values=-1.0)
@@ -136,29 +129,30 @@ def cut(
     """Cut recordings into segments.
 
     Args:
-        model: Says which nodes and fields matter.
-        spans: Which parts, recording by recording.
-        length_s: Length of each [s].
-        lead_s: Commands of this long before a segment are kept, because they still act in it [s].
+        spans: The segments, recording by recording.
+        length_s: Length of a segment [s].
+        lead_s: Time before a segment from which commands are kept, as they still act in it [s].
 
     Raises:
-        Sim2RealError: When a log lacks a node or a field, or holds values that are no numbers.
+        Sim2RealError: When a log lacks a node or a field, or holds NaN.
         UsageError: When there are too few measurements around the start of a segment.
     """
     if not spans:
         raise UsageError("there is no segment to identify from")
+    # Cut the recorded timing, recording by recording.
     timelines, firsts, ordered = [], [], []
     for r, episode in enumerate(recordings):
-        own = [s for s in spans if s.recording == r]
-        if not own:
+        parts_of = [s for s in spans if s.recording == r]
+        if not parts_of:
             continue
         check_log(episode, model)
         recorded = Timeline.from_episode(episode, {n: nodes[n] for n in (model.sensor, *model.given)})
         lead = {n: to_ticks(lead_s) for n in model.given}
-        parts, first = recorded.cut([to_ticks(s.begin_s) for s in own], to_ticks(length_s), lead)
+        parts, first = recorded.cut([to_ticks(s.begin_s) for s in parts_of], to_ticks(length_s), lead)
         timelines.append(parts)
-        firsts += [(r, {n: int(f[i]) for n, f in first.items()}) for i in range(len(own))]
-        ordered += own
+        firsts += [(r, {n: int(f[i]) for n, f in first.items()}) for i in range(len(parts_of))]
+        ordered += parts_of
+    # Stack the recordings, and take the messages of each segment from its first step on.
     timeline = Timeline.stack(timelines)
     start = timeline.vertices[model.sensor].start / TICKS_PER_S
 
@@ -186,10 +180,10 @@ def _later(timeline: Timeline, node: str, ticks: int) -> Timeline:
 
 
 def require_moved(episode: Episode, name: str = "the log") -> None:
-    """Raise if a log is of a dry run: its commands never reached the motors.
+    """Raise an error if a log is of a dry run, whose commands did not reach the motors.
 
     Raises:
-        Sim2RealError: It is.
+        Sim2RealError: The log is of a dry run.
     """
     if episode.metadata.get("dry_run") is True:
         raise Sim2RealError(
@@ -199,7 +193,7 @@ def require_moved(episode: Episode, name: str = "the log") -> None:
 
 
 def check_log(episode: Episode, model: IdentifiableModel) -> None:
-    """Raise unless the log holds the sensor's channels and the commands, as numbers, and those were sent."""
+    """Raise an error unless the log holds the sensor's channels and the commands, as numbers and not of a dry run."""
     require_moved(episode)
     hint = "identify from a log of this pipeline's record stage, or one imported with its mapping"
     for name in (model.sensor, *model.given):
@@ -226,18 +220,20 @@ def check_log(episode: Episode, model: IdentifiableModel) -> None:
 
 
 def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:
-    """Return ``width`` recorded rows from ``first`` on; what is missing repeats the last."""
+    """Return ``width`` recorded rows from ``first`` on; rows after the last repeat it."""
     return recorded[np.minimum(first + np.arange(width), len(recorded) - 1)]
 
 
 def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np.ndarray:
     """Fit a cubic in time to each channel's samples around a start; shape ``(channels, 4)``."""
+    # Take the eight samples nearest to a point one period after the start.
     t = episode.steps[model.sensor].begun_s
     period = float(np.median(np.diff(t)))
     near = np.sort(np.argsort(np.abs(t - begin_s - period), kind="stable")[:8])
     near = near[np.abs(t[near] - begin_s) < 12 * period]
     if near.size < 4:
         raise UsageError(f"the log has {near.size} measurements around {begin_s:.3f} s, too few to start a segment")
+    # Fit positions, and velocities if they are measured, weighted by their deviations.
     x = (t[near] - begin_s)[:, None]
     powers = x ** np.arange(4)
     slopes = np.concatenate([np.zeros_like(x), np.ones_like(x), 2 * x, 3 * x**2], axis=1)
@@ -252,18 +248,18 @@ def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np
 def beyond(
     model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float, share: float = 0.1
 ) -> list[str]:
-    """Return sentences about signals whose held-out part leaves the range that was fitted: there, a model extrapolates.
+    """Return sentences about signals whose held-out part leaves the range of the fitted part: the model extrapolates.
 
     Args:
-        model: Says which nodes and fields matter.
-        length_s: Their length [s].
-        share: Only what goes beyond by more than this share of the fitted range is reported.
+        length_s: Length of a segment [s].
+        share: Smallest excess that is reported, as a share of the fitted range.
     """
     fields = [(n, f) for n, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
     fields += [(model.sensor, f) for f in dict.fromkeys(c.position for c in model.channels)]
-    said = []
+    messages = []
     for node, field in fields:
         ends: dict[bool, list[np.ndarray]] = {True: [], False: []}
+        # Collect the range of each segment.
         for span in spans:
             t = recordings[span.recording].steps[node].begun_s
             inside = (t >= span.begin_s) & (t <= span.begin_s + length_s)
@@ -272,14 +268,15 @@ def beyond(
                 ends[span.fitted].append(np.stack([rows.min(axis=0), rows.max(axis=0)]).reshape(2, -1))
         if not (ends[True] and ends[False]):
             continue
-        (low, high), (least, most) = (
+        (low, high), (lowest, highest) = (
             (np.min([e[0] for e in ends[k]], axis=0), np.max([e[1] for e in ends[k]], axis=0)) for k in (True, False)
         )
+        # Compare the fitted range with the held-out one.
         room = share * (high - low) + 1e-9 * np.abs(high)
-        for i in np.flatnonzero((least < low - room) | (most > high + room))[:3]:
+        for i in np.flatnonzero((lowest < low - room) | (highest > high + room))[:3]:
             name = field if low.size == 1 else f"{field}[{i}]"
-            said.append(
-                f"held-out data extrapolates: {name!r} of {node!r} reaches [{least[i]:.3g}, {most[i]:.3g}], fitted was "
-                f"[{low[i]:.3g}, {high[i]:.3g}]"
+            messages.append(
+                f"held-out data extrapolates: {name!r} of {node!r} reaches [{lowest[i]:.3g}, {highest[i]:.3g}], "
+                f"fitted was [{low[i]:.3g}, {high[i]:.3g}]"
             )
-    return said
+    return messages

@@ -1,4 +1,4 @@
-"""Sizes of compiled programs: counts are rounded up, so that logs of about one length share their programs."""
+"""Sizes of compiled programs: counts are rounded up, so that logs of similar length share programs."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import jax
 import numpy as np
 
 _EXACT = 4
-"""Counts up to this one are kept."""
+"""Largest count that is not rounded."""
 
 
 def rounded(count: int, steps: int = 4) -> int:
     """Return a count rounded up to one of ``steps`` sizes between a power of two and the next.
 
-    With four steps at most a quarter is added, an eighth on average; with eight steps half as much.
+    Four steps add a quarter at most and an eighth on average; eight steps add half of that.
 
     Args:
         count: At least 1.
@@ -26,10 +26,10 @@ def rounded(count: int, steps: int = 4) -> int:
 
 
 def padded(tree: Any, size: int, axis: int = 0) -> Any:
-    """Return arrays that repeat their last entry along an axis until they have a size.
+    """Return arrays that repeat their last entry along an axis up to a size.
 
     Args:
-        size: That length or more.
+        size: At least the length along the axis.
     """
 
     def one(leaf: np.ndarray) -> np.ndarray:

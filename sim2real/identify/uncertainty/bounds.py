@@ -1,4 +1,4 @@
-"""What to do about an estimate that lies at a bound: flags with which to identify again."""
+"""Flags with which to identify again after an estimate at a bound."""
 
 from __future__ import annotations
 
@@ -6,17 +6,13 @@ from sim2real.identify.parameters import Parameter
 from sim2real.identify.uncertainty.round_trip import RoundTrip
 
 _WIDER = 4.0
-"""Factor by which a bound on a logarithmic scale is moved."""
+"""Factor between the old and the new bound on a logarithmic scale."""
 _LONGEST_S = 1.0
-"""The longest delay that can be asked for [s]."""
+"""Longest delay that the flags allow [s]."""
 
 
 def is_physical(p: Parameter, upper: bool) -> bool:
-    """Return whether nothing lies beyond a bound: there is no delay and no friction below 0.
-
-    Args:
-        p: The parameter, with its bounds.
-    """
+    """Return whether no value beyond a bound is possible: delays and frictions are not below 0."""
     return not upper and p.low == 0.0 and not p.narrowed and (p.kind == "delay" or p.transform == "linear")
 
 
@@ -24,8 +20,7 @@ def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
     """Return flags that widen the bound at which a parameter lies.
 
     Args:
-        p: The parameter, with its bounds.
-        max_delay_s: For which delays the model is made [s].
+        max_delay_s: Longest delay of the model [s].
     """
     if p.kind == "delay":
         return _longer(p, max_delay_s) if upper else f"--bounds {p.name} 0 {p.high:g}"
@@ -44,14 +39,14 @@ def way_out_of(trip: RoundTrip, parameters: dict[str, Parameter], max_delay_s: f
 
     Args:
         parameters: Name -> parameter, with its bounds.
-        max_delay_s: For which delays the model is made [s].
+        max_delay_s: Longest delay of the model [s].
     """
     flags = [way_out(parameters[n], trip.at_bound == "upper", max_delay_s) for n in trip.parts]
     return " ".join(dict.fromkeys(flag for flag in flags if flag))
 
 
 def _longer(p: Parameter, max_delay_s: float) -> str:
-    """Return flags that allow a longer delay; empty where none can be allowed."""
+    """Return flags that allow a longer delay; "" if the delay is the longest possible."""
     if p.high < 0.999 * max_delay_s:  # it was narrowed
         return f"--bounds {p.name} {p.low:g} {min(2.0 * p.high, max_delay_s):g}"
     return f"--max-delay-s {min(2.0 * max_delay_s, _LONGEST_S):g}" if max_delay_s < _LONGEST_S else ""

@@ -22,97 +22,103 @@ from sim2real.identify.uncertainty.uncertainty import (
 from sim2real.identify.validation.optional_terms import Selection, statistics
 
 _WORSE = 0.1
-"""A model whose loss is larger by this share explains the recordings less well, whatever an approximation said."""
+"""Relative excess of the loss above which a model explains the recordings less well."""
 
 
-def posterior(found: Fit, at: Linearised, spread: Uncertainty, every: Fit, choice: Selection | None) -> Posterior:
+def posterior(
+    estimate: Fit, at: Linearised, spread: Uncertainty, widest: Fit, selection: Selection | None
+) -> Posterior:
     """Return the estimate with its uncertainty, and the models that explain the recordings as well.
 
     Args:
-        every: The estimate with all optional terms, from which the estimate's were chosen.
-        choice: What was chosen; None: nothing was to be chosen.
+        widest: The estimate with all optional terms.
+        selection: How terms were selected; None without a selection.
     """
-    table = found.problem.table
-    own = _possible(table.posterior(found.z, spread.scale_covariance), table, spread)
-    optima = _optima(found, at, spread)
-    models = [] if choice is None else _models(every, found, spread, choice)
+    table = estimate.problem.table
+    distribution = _possible(table.posterior(estimate.z, spread.scale_covariance), table, spread)
+    optima = _optima(estimate, at, spread)
+    models = [] if selection is None else _models(widest, estimate, spread, selection)
     if not optima and not models:
-        return own
+        return distribution
     left = 1.0 - sum(m.weight for m in models)
     others = (*(replace(o, weight=o.weight * left) for o in optima), *models)
-    names = dict.fromkeys(n for p in (own, *(o.posterior for o in others)) for n in p.names)
-    without = {c.label: c.parameter.without for c in every.problem.table.columns}
+    names = dict.fromkeys(n for p in (distribution, *(o.posterior for o in others)) for n in p.names)
+    without = {c.label: c.parameter.without for c in widest.problem.table.columns}
 
     def filled(p: Posterior) -> Posterior:
         return replace(p, without={n: without[n] for n in names if n not in p.names})
 
-    return replace(filled(own), others=tuple(replace(o, posterior=filled(o.posterior)) for o in others))
+    return replace(filled(distribution), others=tuple(replace(o, posterior=filled(o.posterior)) for o in others))
 
 
-def _optima(found: Fit, at: Linearised, spread: Uncertainty) -> list[Alternative]:
-    """Return where other starts of the refinement ended, as far as the recordings leave open which is right.
+def _optima(estimate: Fit, at: Linearised, spread: Uncertainty) -> list[Alternative]:
+    """Return the ends of the refinement from other starts between which the recordings do not decide.
 
-    That is: elsewhere than the uncertainty of the estimate admits, and worse by no more than one standard error of the
-    difference between segments. Then nothing tells them apart, and all have the same share.
+    Such an end lies outside the uncertainty of the estimate, and its loss is larger by one standard error of the
+    difference between segments at most. All optima have the same share.
     """
-    problem, table = found.problem, found.problem.table
-    near, score, kept = [at.x], _by_segment(at.residuals), []
-    # Of what may as well be absent, any value on its side of the bound is the same.
-    told = np.flatnonzero([v not in ABSENT for v in spread.verdict])
-    precision = np.linalg.pinv(spread.scale_covariance[np.ix_(told, told)])
+    problem, table = estimate.problem, estimate.problem.table
+    near, score, posteriors = [at.x], _by_segment(at.residuals), []
+    # Compare without absent parameters: all values on one side of their bound explain the recordings alike.
+    informed = np.flatnonzero([v not in ABSENT for v in spread.verdict])
+    precision = np.linalg.pinv(spread.scale_covariance[np.ix_(informed, informed)])
 
     def apart(x: np.ndarray) -> bool:
-        return all(float(d @ precision @ d) > len(d) for d in ((x - other)[told] for other in near))
+        return all(float(d @ precision @ d) > len(d) for d in ((x - other)[informed] for other in near))
 
     def as_good(residuals: np.ndarray) -> bool:
         off = _by_segment(residuals) - score
         return len(off) > 1 and bool(off.mean() <= off.std(ddof=1) / np.sqrt(len(off)))
 
-    for z, loss in found.refined[-1].ends if found.refined else ():
-        if not loss <= (1.0 + _WORSE) * found.loss or not apart(table.scale(centred(table, z))[0]):
+    # Test each end by a linear step first, as a refinement takes longer.
+    for z, loss in estimate.refined[-1].ends if estimate.refined else ():
+        if not loss <= (1.0 + _WORSE) * estimate.loss or not apart(table.scale(centred(table, z))[0]):
             continue
         x, residuals = _descended(linearise(problem, centred(table, z)))
         if not (apart(x) and as_good(residuals)):
             continue
-        # The estimate went on after the first round; so must what is compared with it.
+        # Refine the end further, as the estimate was refined after the first round.
         z = refine(problem, z[None], settle=False).z
-        there = linearise(problem, z)
-        if apart(there.x) and as_good(there.residuals):
-            near.append(there.x)
-            kept.append(table.posterior(z, from_linearised(problem, there).scale_covariance))
-    return [Alternative("another optimum", 1.0 / len(near), p) for p in kept]
+        end = linearise(problem, z)
+        if apart(end.x) and as_good(end.residuals):
+            near.append(end.x)
+            posteriors.append(table.posterior(z, from_linearised(problem, end).scale_covariance))
+    return [Alternative("another optimum", 1.0 / len(near), p) for p in posteriors]
 
 
 def _descended(at: Linearised) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the next step of a descent leads, on the parameters' scales ``(P,)``, and the residuals there."""
+    """Return the end of the next Gauss-Newton step, on the parameters' scales ``(P,)``, and the residuals there."""
     J = at.jacobian.reshape(-1, len(at.x))
     step = -np.linalg.solve(J.T @ J + at.prior, J.T @ at.residuals.reshape(-1))
     return at.x + step, at.residuals + at.jacobian @ step
 
 
-def _models(every: Fit, found: Fit, spread: Uncertainty, choice: Selection) -> list[Alternative]:
-    """Return the models with other terms that recordings like these might have chosen."""
-    problem, table = every.problem, every.problem.table
-    at = linearise(problem, every.z)
+def _models(widest: Fit, estimate: Fit, spread: Uncertainty, selection: Selection) -> list[Alternative]:
+    """Return the models with other terms that recordings like these might select."""
+    problem, table = widest.problem, widest.problem.table
+    # Approximate the loss of the widest model by a quadratic function.
+    at = linearise(problem, widest.z)
     whole = statistics(problem, at, np.ones((1, len(problem.train)), bool))
     precision = whole.information[0] / loss_variance(problem, at) + at.prior
     models = []
-    for kept, weight in zip(choice.near[1:], choice.weight[1:], strict=True):
-        own = table.of_terms(kept)
+    for kept, weight in zip(selection.near[1:], selection.weight[1:], strict=True):
+        columns = table.of_terms(kept)
         start = table.at_scale(at.x + whole.step(table, kept))
-        ended = refine(problem, start[None], problem.part(kept=own), settle=False)
-        if ended.loss > (1.0 + _WORSE) * found.loss:
+        # Refine each other model from the minimum of that function, and keep those with a similar loss.
+        ended = refine(problem, start[None], problem.part(kept=columns), settle=False)
+        if ended.loss > (1.0 + _WORSE) * estimate.loss:
             continue
-        z, rest = ended.z, np.flatnonzero(own)
+        # Compute its covariance from the quadratic function, widened like the estimate's.
+        z, rest = ended.z, np.flatnonzero(columns)
         fewer = ParameterTable([p for p in table if p.free], table.recordings).with_terms(_named(table, kept))
-        covariance = _widened(np.linalg.inv(precision[np.ix_(rest, rest)]), fewer, found.problem.table, spread)
-        drawn = _possible(fewer.posterior(z[rest], covariance), found.problem.table, spread)
+        covariance = _widened(np.linalg.inv(precision[np.ix_(rest, rest)]), fewer, estimate.problem.table, spread)
+        drawn = _possible(fewer.posterior(z[rest], covariance), estimate.problem.table, spread)
         models.append(Alternative(_about(table, kept), float(weight), drawn))
     return models
 
 
 def _possible(posterior: Posterior, table: ParameterTable, spread: Uncertainty) -> Posterior:
-    """Return a posterior without those values of limits that the recordings rule out."""
+    """Return a posterior without the values of limits that the recordings exclude."""
     low = posterior.low.copy()
     for name, column, verdict, bound in zip(table.names, table.columns, spread.verdict, spread.low, strict=True):
         if verdict == NOT_REACHED and name in posterior.names:
@@ -122,7 +128,7 @@ def _possible(posterior: Posterior, table: ParameterTable, spread: Uncertainty) 
 
 
 def _widened(covariance: np.ndarray, table: ParameterTable, known: ParameterTable, spread: Uncertainty) -> np.ndarray:
-    """Return a covariance that is as much wider than its linearisation as that of the estimate.
+    """Return a covariance that is wider than its linearisation by the factor of the estimate's covariance.
 
     Args:
         covariance: Shape ``(Q, Q)``, linearised.

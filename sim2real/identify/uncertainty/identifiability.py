@@ -1,4 +1,4 @@
-"""What recordings can determine, judged before a search: conditioning, and combinations that nothing determines."""
+"""The parameters that recordings determine: conditioning, and combinations of parameters that they leave open."""
 
 from __future__ import annotations
 
@@ -13,38 +13,37 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty.uncertainty import VAGUE, Linearised, linearise, time_shift
 
 _PART = 0.1
-"""A parameter takes part in a direction when its entry is at least this share of the largest."""
+"""Smallest entry with which a parameter takes part in a direction, as a share of the largest entry."""
 
 
 def check(problem: Problem, z: np.ndarray) -> Determined:
-    """Judge what the problem's segments determine, at ``z (P,)``.
-
-    The noise is what the channels say; errors of the model at ``z`` do not count here.
-    """
+    """Return which parameters the problem's segments determine at ``z (P,)``, with the noise of the channels alone."""
     return from_linearised(problem, linearise(problem, z))
 
 
 def from_linearised(problem: Problem, at: Linearised, without: Collection[str] = ()) -> Determined:
-    """Judge a linearised point.
+    """Return which parameters the data determines at a linearised point.
 
     Args:
-        without: Names of parameters that may be absent: whether the data determines them does not count.
+        without: Names of parameters that may be absent, which the result does not count.
     """
     table = problem.table
     J = at.jacobian.reshape(-1, len(at.x)) * table.span  # per width of the bounds
     held = np.isin(table.names, list(without))
     J[:, held] = 0.0
     shift = time_shift(table) / table.span
-    if shift.any():  # what the residuals say about it is no information: see ``uncertainty``
+    if shift.any():  # the residuals' change along the shift is no information: see ``uncertainty``
         unit = shift / np.linalg.norm(shift)
         J = J - np.outer(J @ unit, unit)
+    # Compute the condition number from the eigenvalues, and the directions that the data leaves open.
     information = J.T @ J
     weights, axes = np.linalg.eigh(information)
     largest = float(weights[-1])
-    gone = int(shift.any()) + int(held.sum())  # the shift, and what may be absent, are 0 by construction
+    gone = int(shift.any()) + int(held.sum())  # the shift and absent parameters are 0 by construction
     least = float(weights[gone]) if gone < len(weights) else largest
     condition = float(np.sqrt(largest / max(least, largest * 1e-14, 1e-300)))
     loose = weights < 1.0 / VAGUE**2
+    # Compute the standard errors to expect from one minute of such data.
     prior = at.prior * np.outer(table.span, table.span)
     duration_s = problem.segment_s * len(problem.train)
     slope = np.abs(table.slope(at.x)) * table.span
@@ -79,12 +78,12 @@ def _groups(directions: np.ndarray) -> list[list[int]]:
     if not directions.shape[1]:
         return []
     spread = directions @ directions.T  # (P, P): the projection onto them, the same in any basis
-    own = np.sqrt(np.diag(spread))
-    taking = own > _PART * own.max()
+    part = np.sqrt(np.diag(spread))
+    taking = part > _PART * part.max()
     groups: list[list[int]] = []
     for i in np.flatnonzero(taking):
         for group in groups:
-            if any(abs(spread[i, j]) > _PART**2 * own[i] * own[j] for j in group):
+            if any(abs(spread[i, j]) > _PART**2 * part[i] * part[j] for j in group):
                 group.append(int(i))
                 break
         else:
@@ -93,14 +92,14 @@ def _groups(directions: np.ndarray) -> list[list[int]]:
 
 
 def _determined(table: ParameterTable, directions: np.ndarray, group: list[int]) -> str:
-    """Return which combination of a group is determined: a product of powers, or a sum; empty if none."""
+    """Return the determined combination of a group: a product of powers, or a sum; "" if there is none."""
     part = directions[group]
     u, size, _ = np.linalg.svd(part, full_matrices=True)
     rank = int((size > 0.05 * size[0]).sum())
-    kept = u[:, rank:].T  # orthogonal to the directions: determined
-    if not len(kept):
+    determined = u[:, rank:].T  # orthogonal to the directions: determined
+    if not len(determined):
         return ""
-    reduced = _row_reduce(kept)
+    reduced = _row_reduce(determined)
     columns = [table.columns[i] for i in group]
     scales = {c.parameter.transform for c in columns}
     names = [c.label for c in columns]
@@ -109,13 +108,13 @@ def _determined(table: ParameterTable, directions: np.ndarray, group: list[int])
 
 
 def _row_reduce(rows: np.ndarray) -> np.ndarray:
-    """Return the rows in reduced echelon form, with entries rounded to small fractions where they nearly are."""
+    """Return the rows in reduced echelon form; entries near small fractions are rounded to them."""
     rows = rows.copy()
     pivots: list[int] = []
     for r in range(len(rows)):
         free = [c for c in range(rows.shape[1]) if c not in pivots]
         largest = max(abs(rows[r, c]) for c in free)
-        # Of equals the first, whatever the last digit says.
+        # Take the first of nearly equal entries, so that rounding does not decide.
         pivot = next(c for c in free if abs(rows[r, c]) >= 0.9 * largest)
         pivots.append(pivot)
         rows[r] /= rows[r, pivot]

@@ -1,4 +1,4 @@
-"""What the model leaves unexplained: noise of the sensor, and how far parameters must vary to cover the rest."""
+"""Noise of the sensor, and the spread of parameters that covers the remaining errors of the model."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.uncertainty.uncertainty import Linearised, Uncertainty, time_shift
 
 _ORDER = 3
-"""Differences of this order take out what changes slowly, such as the error of a model."""
+"""Differences of this order remove slow changes, such as the errors of a model."""
 _GAIN = 20.0
 """Variance of third differences of white noise of variance 1: 1 + 9 + 9 + 1."""
 _MULTIPLES = 0.98
-"""Share of the differences between readings that are whole multiples of a quantum."""
+"""Share of the differences between readings that must be multiples of a quantum."""
 
 
 def noises(samples: Mapping[str, np.ndarray], units: Mapping[str, str]) -> tuple[Noise, ...]:
     """Return how each measured quantity scatters around the identified model.
 
-    White noise is told from errors of the model by the third differences of the residuals: what changes slowly from one
-    sample to the next has none.
+    Third differences of the residuals separate white noise from slow errors of the model.
 
     Args:
         samples: Columns of the segments; see ``Identification.samples``.
         units: Column, or field of a message -> unit.
     """
-    found = []
+    rows = []
     for name in (n.removesuffix("_measured") for n in samples if n.endswith("_measured")):
         measured = samples[f"{name}_measured"]
+        # Split the residuals by segment, without values that diverged.
         parts = [
             (measured - samples[f"{name}_identified"])[rows]
             for rows in (samples["segment"] == s for s in np.unique(samples["segment"]))
@@ -41,25 +41,27 @@ def noises(samples: Mapping[str, np.ndarray], units: Mapping[str, str]) -> tuple
             continue
         quantum = _quantum(measured[np.isfinite(measured)])
         white = np.concatenate([np.diff(p, _ORDER) for p in parts])
-        # What rounding adds is no noise of its own: readings are rounded again in simulation.
+        # Subtract the variance of rounding, as the simulation rounds readings, too.
         variance = max(0.0, float(np.mean(white**2)) / _GAIN - quantum**2 / 12.0)
+        # Estimate the bias: the variance of the segments' means beyond that of noise.
         means = np.array([p.mean() for p in parts])
-        chance = float(np.mean([p.var() / p.size for p in parts]))
-        bias = max(0.0, float(np.mean(means**2)) - chance)
+        expected = float(np.mean([p.var() / p.size for p in parts]))
+        bias = max(0.0, float(np.mean(means**2)) - expected)
         unit = units.get(name) or units.get(name.partition("[")[0], "")
-        found.append(Noise(name, unit, variance**0.5, quantum, bias**0.5))
-    return tuple(found)
+        rows.append(Noise(name, unit, variance**0.5, quantum, bias**0.5))
+    return tuple(rows)
 
 
 def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> float:
     """Return the factor on the deviations of the posterior with which its predictions cover the model's errors.
 
-    The posterior says how well recordings determine the best parameters. It gets narrow with long recordings, also
-    where no parameters explain them: a robot that is not of the model's form acts, from moment to moment, like one with
-    other parameters. Predictions of draws that are as much wider spread as far as slow residuals lie off, on average.
-    White noise of the measurement is left out, and so is the share of either delay in their sum, which no log tells.
-    Where there is nothing else, the factor is 1.
+    The posterior is the uncertainty of the best parameters. It becomes narrow with long recordings, even if no
+    parameters explain them: a robot that the model does not describe acts, from moment to moment, like one with other
+    parameters. With this factor, the predictions of draws spread on average as widely as slow residuals. White noise of
+    the measurement does not count, nor the shares of the delays in their sum, which no log determines. Without slow
+    residuals the factor is 1.
     """
+    # Measure the slow part of the residuals.
     raw = at.raw.transpose(0, 2, 1)  # (S, F, C): one row a field of a segment
     inside = raw != 0.0
     total = slow = 0.0
@@ -70,6 +72,7 @@ def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> floa
         white = np.mean(np.concatenate([np.diff(r, _ORDER) for r in rows]) ** 2) / _GAIN
         squares = np.concatenate(rows) ** 2
         total, slow = total + squares.size, slow + float(max(0.0, squares.mean() - white)) * squares.size
+    # Compare it with the spread of the predictions, without the shift of time.
     J = at.jacobian.transpose(0, 2, 1, 3)[inside]
     shift = time_shift(table)
     J = J - np.outer(J @ shift, shift) / max(float(shift @ shift), 1.0)
@@ -78,7 +81,7 @@ def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> floa
 
 
 def _quantum(readings: Sequence[float] | np.ndarray) -> float:
-    """Return the step of which nearly all differences between readings are whole multiples; 0: there is none."""
+    """Return the step of which nearly all differences between readings are multiples; 0 if there is none."""
     levels = np.unique(np.asarray(readings, np.float64))
     steps = np.diff(levels)
     steps = steps[steps > 1e-6 * max(1e-12, float(np.ptp(levels)))] if levels.size > 1 else np.zeros(0)

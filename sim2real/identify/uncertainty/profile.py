@@ -1,4 +1,4 @@
-"""How much worse a model is for values of one parameter, all others fitted anew to the linearised residuals."""
+"""Profiles: the increase of the loss along one parameter, with the others fitted to the linearised residuals."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty.uncertainty import Linearised, Uncertainty, loss_variance
 
 ONE_SIDED = 1.645
-"""Standard deviations below which 95 % of a normal distribution lie; squared, what the loss may grow by at a bound."""
+"""One-sided 95 % quantile of a normal distribution; its square is the increase of the loss at a bound."""
 _VALUES = 12
 
 
 @dataclass(frozen=True)
 class Profile:
-    """How much worse the model is for values of one parameter, all others fitted anew.
+    """Increase of the loss along one parameter, with the others fitted.
 
     Attributes:
-        values: Shape ``(V,)``, from that without effect on: ascending, for a limit descending.
+        values: Shape ``(V,)``, from the value without effect on: ascending, of a limit descending.
         worse: Shape ``(V,)``: sum of squares over its variance, above the smallest; 1 is one standard deviation.
-        moves: Shape ``(V, P)``: how the others move, on their scales.
-        residuals: Shape ``(V, N)``: without that move.
+        moves: Shape ``(V, P)``: steps of the others, on their scales.
+        residuals: Shape ``(V, N)``: without these steps.
     """
 
     values: np.ndarray
@@ -31,30 +31,30 @@ class Profile:
     residuals: np.ndarray
 
     def last(self) -> int | None:
-        """Return the number of the last value in a one-sided interval of 95 %; None where nothing bounds it."""
+        """Return the number of the last value in a one-sided interval of 95 %; None without a bound."""
         good = np.flatnonzero(self.worse <= ONE_SIDED**2)
         return int(good[-1]) if len(good) and good[-1] + 1 < len(self.values) else None
 
     def bound(self) -> float | None:
-        """Return the end of a one-sided interval of 95 %; None where the data does not bound the parameter."""
+        """Return the end of a one-sided interval of 95 %; None if the data does not bound the parameter."""
         if (a := self.last()) is None:
             return None
         # The square root grows like the value itself, as in a linear model.
         return float(np.interp(ONE_SIDED, np.sqrt(self.worse[[a, a + 1]]), self.values[[a, a + 1]]))
 
     def moved(self, value: float) -> np.ndarray:
-        """Return how the others move at a value, ``(P,)``."""
+        """Return the steps of the others at a value, ``(P,)``."""
         sign = np.sign(self.values[-1] - self.values[0])
-        return np.array([np.interp(sign * value, sign * self.values, own) for own in self.moves.T])
+        return np.array([np.interp(sign * value, sign * self.values, column) for column in self.moves.T])
 
     def effect(self, value: float) -> np.ndarray:
-        """Return what the next of the values does to the residuals, ``(N,)``."""
+        """Return the change of the residuals at the next of the values, ``(N,)``."""
         sign = np.sign(self.values[-1] - self.values[0])
         return self.residuals[np.searchsorted(sign * self.values, sign * value)] - self.residuals[0]
 
 
 def profile(problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty, column: int) -> Profile:
-    """Return how much worse the model is for values of a parameter, from where it has no effect on.
+    """Return the profile of a parameter, from the value without effect on.
 
     Args:
         z: Shape ``(P,)``: the estimate.
@@ -69,29 +69,30 @@ def profile(problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty
 
     if not p.limits:
         return over(np.concatenate([[0.0], np.geomspace(p.low, p.high, _VALUES - 1)]))
-    found = over(np.geomspace(p.high, p.low, _VALUES))
-    # The model is as good down to what was reached, and soon much worse: where, the wide steps do not say.
-    if (a := found.last()) is None:
-        return found
-    return over(np.concatenate([[p.high], np.geomspace(found.values[a], found.values[a + 1], _VALUES - 1)]))
+    wide = over(np.geomspace(p.high, p.low, _VALUES))
+    # Take finer steps where the loss begins to grow, as it grows fast below the reached values.
+    if (a := wide.last()) is None:
+        return wide
+    return over(np.concatenate([[p.high], np.geomspace(wide.values[a], wide.values[a + 1], _VALUES - 1)]))
 
 
 def worse_with(
     problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty, rows: np.ndarray, held: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how much worse the model is with some values given, ``(G,)``; how all others move, ``(G, P)``; residuals.
+    """Return the increase of the loss with values set ``(G,)``, the steps of the others ``(G, P)``, and the residuals.
 
     Args:
         z: Shape ``(P,)``: the estimate.
-        rows: Shape ``(G, P)``: values; NaN: the estimate, from which the parameter is fitted anew.
-        held: Numbers of those that are not fitted anew in any row.
+        rows: Shape ``(G, P)``: values; NaN starts from the estimate and is fitted.
+        held: Numbers of parameters that are not fitted in any row.
     """
     size = len(at.x)
-    # Rows of one number: one program serves all.
+    # Pad to a fixed number of rows, so that one program serves all.
     padded = np.full((-(-len(rows) // _VALUES) * _VALUES, size), np.nan)
     padded[: len(rows)] = rows
-    found = [problem.with_values(z, part) for part in padded.reshape(-1, _VALUES, size)]
-    r = np.concatenate(found)[: len(rows)].reshape(len(rows), -1)
+    parts = [problem.with_values(z, part) for part in padded.reshape(-1, _VALUES, size)]
+    r = np.concatenate(parts)[: len(rows)].reshape(len(rows), -1)
+    # Fit the others, and compare with the same fit at the estimate.
     variance = loss_variance(problem, at) * float(np.median(spread.widening)) ** 2
     worse, moves = np.empty(len(rows)), np.zeros((len(rows), size))
     for k, row in enumerate(rows):

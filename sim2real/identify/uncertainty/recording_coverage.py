@@ -1,4 +1,4 @@
-"""How much a recording shows of a robot: what ranges it covers, how long it moves, and which frequencies drive it."""
+"""Coverage of a recording: the ranges of its signals, the time in motion, and the frequencies that drive it."""
 
 from __future__ import annotations
 
@@ -9,27 +9,26 @@ import numpy as np
 
 BINS = 10
 _GAP = 2.5
-"""A pause longer than this many periods is a gap."""
+"""Pauses longer than this many periods are gaps."""
 _THIN = 0.1
-"""A bin counts as empty below this share of the samples that it would have if they were spread evenly."""
+"""A bin is empty below this share of the samples that an even spread would give it."""
 _STILL = 0.05
 """A joint stands still below this share of its highest speed, or below three deviations of a measured speed."""
 
 _NOISE_ORDER = 6
-"""Differences of this order leave 0.2 % of a motion of a tenth of the sampling rate, and all of white noise."""
+"""Differences of this order keep 0.2 % of a motion at a tenth of the sampling rate, and all white noise."""
 _WINDOW_S = 0.03
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """When something was sampled.
+    """Regularity of samples.
 
     Attributes:
-        samples: How many samples there are.
-        duration_s: From the first to the last [s].
-        rate_hz: Their usual rate [Hz].
-        gaps: How many pauses are longer than two and a half periods.
-        longest_gap_s: The longest of them; 0 without any [s].
+        duration_s: From the first to the last sample [s].
+        rate_hz: Median rate [Hz].
+        gaps: Number of pauses longer than two and a half periods.
+        longest_gap_s: 0 without gaps [s].
     """
 
     samples: int
@@ -41,11 +40,9 @@ class Sampling:
 
 @dataclass(frozen=True)
 class Histogram:
-    """Which values a signal takes.
+    """Distribution of a signal's values.
 
     Attributes:
-        low: Its smallest value.
-        high: Its largest value.
         shares: Shape ``(10,)``: share of the samples in each tenth of the range.
     """
 
@@ -60,18 +57,18 @@ class Histogram:
 
     @property
     def moves(self) -> bool:
-        """Whether there is more than one value."""
+        """Whether there are different values."""
         return self.high > self.low
 
 
 @dataclass(frozen=True)
 class Motion:
-    """How a joint moves.
+    """Motion of a joint.
 
     Attributes:
-        moving: Share of the time in which it moves.
-        forward: Share of that time in which its position increases.
-        reversals: How often it turns around.
+        moving: Share of the time in motion.
+        forward: Share of that time in which the position increases.
+        reversals: Number of changes of direction.
     """
 
     moving: float
@@ -81,14 +78,14 @@ class Motion:
 
 @dataclass(frozen=True)
 class Band:
-    """Where a signal's power lies: 95 % between ``low_hz`` and ``high_hz``, 2.5 % on either side."""
+    """Band of a signal's power: 95 % lie between ``low_hz`` and ``high_hz``, 2.5 % on either side."""
 
     low_hz: float
     high_hz: float
 
 
 def sampling(t_s: np.ndarray) -> Sampling:
-    """Return how regularly times ``(N,)`` [s] follow each other."""
+    """Return the regularity of times ``(N,)`` [s]."""
     steps = np.diff(np.asarray(t_s, np.float64))
     if not steps.size:
         return Sampling(len(t_s), 0.0, 0.0, 0, 0.0)
@@ -99,7 +96,7 @@ def sampling(t_s: np.ndarray) -> Sampling:
 
 
 def spread(values: np.ndarray) -> Histogram:
-    """Return how values ``(N,)`` spread over their own range."""
+    """Return the distribution of values ``(N,)`` over their range."""
     values = np.asarray(values, np.float64)
     low, high = float(values.min()), float(values.max())
     if not high > low:
@@ -109,7 +106,7 @@ def spread(values: np.ndarray) -> Histogram:
 
 
 def speed(t_s: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the rate of a sampled position ``(N,)``, by differences; zero where there are too few samples."""
+    """Return the rate of a sampled position ``(N,)``, by differences; 0 with fewer than three samples."""
     if len(position) < 3:
         return np.zeros(len(position))
     times = np.asarray(t_s, np.float64)
@@ -118,13 +115,9 @@ def speed(t_s: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def motion(velocity: np.ndarray, sigma: float = 0.0) -> Motion:
-    """Return how a joint moves.
-
-    Args:
-        velocity: Shape ``(N,)``.
-    """
+    """Return the motion of a joint with velocities ``(N,)`` and their deviation."""
     velocity = np.asarray(velocity, np.float64)
-    # A rare spike must not make everything else count as standing still.
+    # Compare with the 99 % quantile: a rare spike must not make the other speeds count as standing still.
     still = max(_STILL * float(np.quantile(np.abs(velocity), 0.99)), 3.0 * sigma)
     fast = np.abs(velocity) > still
     if not fast.any():
@@ -134,13 +127,9 @@ def motion(velocity: np.ndarray, sigma: float = 0.0) -> Motion:
 
 
 def motion_of(t_s: np.ndarray, position: np.ndarray) -> Motion:
-    """Return how a joint moves, by its positions; what their noise and their steps explain is no motion.
+    """Return the motion of a joint with positions ``(N,)`` at times ``(N,)`` [s]; noise and quantisation do not count.
 
-    Speeds are those of positions averaged over 30 ms, so that noise of fast samples does not hide slow motion.
-
-    Args:
-        t_s: Shape ``(N,)`` [s].
-        position: Shape ``(N,)``.
+    Speeds are those of positions averaged over 30 ms, so that the noise of fast samples does not hide slow motion.
     """
     t_s, position = np.asarray(t_s, np.float64), np.asarray(position, np.float64)
     good = np.isfinite(position) & np.isfinite(t_s)
@@ -148,10 +137,12 @@ def motion_of(t_s: np.ndarray, position: np.ndarray) -> Motion:
     if len(position) < 3 * _NOISE_ORDER:
         return motion(speed(t_s, position))
     period_s = max(float(np.median(np.diff(t_s))), 1e-9)
+    # Average over 30 ms.
     width = min(max(1, round(_WINDOW_S / period_s)), len(position) // 3)
     mean = np.full(width, 1.0 / width)
     deviation = _noise(position)
     times, smooth = (np.convolve(values, mean, "valid") for values in (t_s - t_s[0], position))
+    # Compare the range of the averages with the noise and the steps of the readings.
     least = max(1.5 * float(np.diff(np.unique(position)).min(initial=np.inf)), 8.0 * deviation / np.sqrt(width))
     if not np.ptp(np.quantile(smooth, [0.005, 0.995])) > least:
         return Motion(0.0, 0.0, 0)
@@ -159,21 +150,18 @@ def motion_of(t_s: np.ndarray, position: np.ndarray) -> Motion:
 
 
 def _noise(values: np.ndarray) -> float:
-    """Return the deviation of white noise in values ``(N,)``: high differences take out motion; leaps are left out."""
+    """Return the deviation of white noise in values ``(N,)``, by high differences without the largest 2 %: leaps."""
     squares = np.sort(np.diff(values, _NOISE_ORDER) ** 2)
     return float(np.sqrt(squares[: math.ceil(0.98 * squares.size)].mean() / math.comb(2 * _NOISE_ORDER, _NOISE_ORDER)))
 
 
 def band(t_s: np.ndarray, values: np.ndarray, share: float = 0.95) -> Band | None:
-    """Return the band that holds a share of a signal's power, its mean left out; between samples its value holds.
+    """Return the band of a signal's power without its mean; None for a constant signal.
 
     Args:
-        t_s: Shape ``(N,)``: when each value begins to hold [s].
+        t_s: Shape ``(N,)``: start of each value, which holds until the next [s].
         values: Shape ``(N,)``.
-        share: Share of the power inside; the rest lies in equal parts below and above.
-
-    Returns:
-        The band; None for a signal that does not change.
+        share: Share of the power inside; equal parts of the rest lie below and above.
     """
     t_s, values = np.asarray(t_s, np.float64), np.asarray(values, np.float64)
     if len(values) < 8 or np.ptp(values) == 0.0 or t_s[-1] <= t_s[0]:
@@ -181,6 +169,7 @@ def band(t_s: np.ndarray, values: np.ndarray, share: float = 0.95) -> Band | Non
     period = float(np.median(np.diff(t_s)))
     if period <= 0.0:
         return None
+    # Sample the held values evenly, and take their spectrum.
     even = np.arange(t_s[0], t_s[-1] + 0.5 * period, period)
     held = values[np.clip(np.searchsorted(t_s, even + 1e-9, side="right") - 1, 0, None)]
     held = (held - held.mean()) * np.hanning(len(held))

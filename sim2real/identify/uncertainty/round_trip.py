@@ -1,4 +1,4 @@
-"""The sum of all delays, which a log determines even where it cannot tell them apart."""
+"""The sum of all delays, which a log determines even if it does not separate the delays."""
 
 from __future__ import annotations
 
@@ -15,18 +15,15 @@ SURE_S = 0.005
 
 @dataclass(frozen=True)
 class RoundTrip:
-    """How long it takes from a command to the first measurement that shows its effect; times in [s].
+    """Time from a command to the first measurement of its effect; times in [s].
 
     Attributes:
-        parts: Delays that were identified.
-        held: Delays that were fixed.
-        apart: Whether the log tells the parts apart; else only their sum is known.
+        parts: Identified delays.
+        held: Fixed delays.
+        apart: Whether the log separates the parts.
         estimate: The sum.
-        standard_error: Of the sum.
         low: Lower end of the 95 % interval.
-        high: Upper end.
-        lower: Sum of the parts' lower bounds, and of what is held.
-        upper: Sum of their upper bounds.
+        lower: Sum of the lower bounds and of the fixed delays.
     """
 
     parts: tuple[str, ...]
@@ -41,7 +38,7 @@ class RoundTrip:
 
     @property
     def at_bound(self) -> str:
-        """``lower`` or ``upper`` where the sum lies at a bound, else empty."""
+        """``lower`` or ``upper`` if the sum lies at a bound, else ""."""
         near = AT_BOUND * (self.upper - self.lower)
         return "lower" if self.estimate - self.lower < near else "upper" if self.upper - self.estimate < near else ""
 
@@ -58,7 +55,7 @@ class RoundTrip:
 
 
 def round_trip(table: ParameterTable, x: np.ndarray, spread: Uncertainty) -> RoundTrip | None:
-    """Return the sum of all delays; None where none is identified.
+    """Return the sum of all delays; None if no delay is identified.
 
     Args:
         x: Shape ``(P,)``: the estimate, on the parameters' scales.

@@ -1,38 +1,40 @@
-"""How well a model predicts, over horizons and in free runs, beside baselines that need no model."""
+"""Errors of a model's predictions, over horizons and in free runs, beside baselines without a model."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sim2real.artifacts.identification import FreeRun, Prediction
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.identify.model import Channel
 from sim2real.identify.problem.problem import Problem
 
-Values = Mapping[str, Any]
+GOAL = "told"
+"""Name of the baseline that takes the newest goal for the position."""
 
 
 def samples(
-    problem: Problem, models: Mapping[str, Values], settle_s: float, held_out: np.ndarray | None = None
+    problem: Problem, models: Mapping[str, Mapping[str, ArrayLike]], settle_s: float, held_out: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Simulate all segments with each model; initial states of held-out segments are fitted to their first part alone.
+    """Simulate all segments with each model; initial states of held-out segments are fitted to their first part.
 
     Args:
         settle_s: Length of that first part [s].
-        held_out: Shape ``(S,)``, bool: which segments count as held out; default: those that are not fitted.
+        held_out: Shape ``(S,)``, bool: the held-out segments; default: those that are not fitted.
 
     Returns:
-        Columns ``(N,)``: ``t`` and ``into`` [s], ``segment``, ``recording``, ``held_out``; for each channel's field
-        what was ``measured`` and what each model says, as ``FIELD_measured``, ``FIELD_MODEL``. ``FIELD_told`` is where
-        a joint was told to be at that time, where commands are positions.
+        Columns ``(N,)``: ``t`` and ``into`` [s], ``segment``, ``recording``, ``held_out``; for each field of a channel
+        the measurement ``FIELD_measured`` and each prediction ``FIELD_MODEL``. If commands are positions, the goal of
+        the joint is in the column of the baseline ``told``.
     """
     held_out = ~np.isin(np.arange(problem.segments), problem.train) if held_out is None else held_out
     every, fit_s = np.arange(problem.segments), np.where(held_out, settle_s, problem.segment_s)
     columns: dict[str, np.ndarray] = {}
+    # Simulate the segments with each model; the first one fixes the columns of all.
     for name, values in models.items():
         rows = {n: np.broadcast_to(v, (problem.segments, *np.shape(v))) for n, v in values.items()}
         residuals, ts = problem.predict(rows, every, fit_s), problem.ts
@@ -48,18 +50,19 @@ def samples(
             }
             for i, label in enumerate(labels(problem)):
                 columns[f"{label}_measured"] = problem.measured(i)[at]
-            columns |= _told(problem, segment, into)
+            columns |= _goals(problem, segment, into)
         for i, (label, (_, sigma, _)) in enumerate(zip(labels(problem), problem.fields, strict=True)):
             columns[f"{label}_{name}"] = columns[f"{label}_measured"] + residuals[..., i][at] * sigma
     return columns
 
 
-def _told(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the newest goal sent before each sample, ``LABEL_told`` for each channel that is told where to be."""
+def _goals(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the newest goal sent before each sample, a column for each channel with goals."""
     columns = {}
     for c in problem.channels:
         if c.goal is None:
             continue
+        # Find the node that sends the goals of this channel.
         node, place = next(
             (n, fields.index(c.goal))
             for n, tree in problem.model.given.items()
@@ -67,12 +70,13 @@ def _told(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str, 
         )
         rows = np.asarray(jax.tree_util.tree_leaves(problem.given[node])[place])
         sent_s = problem.timeline.vertices[node].end / TICKS_PER_S
-        told = np.empty(len(into))
+        # Take the newest goal before each sample.
+        goals = np.empty(len(into))
         for s in np.unique(segment):
-            own = segment == s
-            newest = np.searchsorted(sent_s[s], into[own], side="right") - 1
-            told[own] = c.of(rows[s])[np.maximum(newest, 0)]
-        columns[f"{position_of(c)}_told"] = told
+            mask = segment == s
+            newest = np.searchsorted(sent_s[s], into[mask], side="right") - 1
+            goals[mask] = c.of(rows[s])[np.maximum(newest, 0)]
+        columns[f"{position_of(c)}_goals"] = goals
     return columns
 
 
@@ -82,7 +86,7 @@ def position_of(channel: Channel) -> str:
 
 
 def labels(problem: Problem) -> list[str]:
-    """Return a name for each column of the residuals: the field, with the channel's index where it is a vector."""
+    """Return a name for each column of the residuals: the field, with the channel's index if it is a vector."""
     return [f if c.index is None else f"{f}[{c.index}]" for c in problem.channels for f, _ in c.fields]
 
 
@@ -95,13 +99,12 @@ def errors(
 ) -> list[Prediction]:
     """Return each model's error over each horizon, on fitted and on held-out segments.
 
-    Two baselines stand beside the models: ``hold`` (nothing changes) and, where commands are positions, ``told`` (every
-    joint is where it was told to be).
+    The baseline ``hold`` keeps the last measurement. If commands are positions, the second baseline is the goal itself.
 
     Args:
-        columns: What ``samples`` returned.
-        settle_s: First part of held-out segments, to which initial states were fitted: horizons begin at its end [s].
-        horizons: How far ahead [s].
+        columns: Result of ``samples``.
+        settle_s: First part of held-out segments, to which initial states were fitted; horizons begin at its end [s].
+        horizons: Horizons [s].
     """
     ahead = columns["into"] - settle_s
     names = labels(problem)
@@ -119,17 +122,17 @@ def errors(
 
 
 def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
-    """Return the baselines: ``hold``, and ``told`` where commands are positions."""
-    return ["hold", *(["told"] if any(n.endswith("_told") for n in columns) else [])]
+    """Return the names of the baselines: ``hold``, and that of the goal if commands are positions."""
+    return ["hold", *(["told"] if any(n.endswith("_goals") for n in columns) else [])]
 
 
 def free_runs(
     columns: Mapping[str, np.ndarray], names: Sequence[str], models: Sequence[str], settle_s: float
 ) -> list[FreeRun]:
-    """Return the errors of whole segments, each by itself.
+    """Return the errors of whole segments.
 
     Args:
-        columns: What ``samples`` returned, of long segments.
+        columns: Result of ``samples`` for long segments.
         models: Names of the models; the baselines are added.
         settle_s: First part of a segment, which does not count [s].
     """
@@ -140,12 +143,7 @@ def free_runs(
         if not pick.any():
             continue
         t = columns["t"][pick]
-        about: dict[str, Any] = {
-            "recording": int(columns["recording"][pick][0]),
-            "begin_s": float(t[0]),
-            "seconds": float(t[-1] - t[0]),
-            "held_out": bool(columns["held_out"][pick][0]),
-        }
+        recording, held_out = int(columns["recording"][pick][0]), bool(columns["held_out"][pick][0])
         for model in (*models, *_baselines(columns)):
             for name in names:
                 predicted = _predicted(columns, name, model, ahead)
@@ -153,14 +151,14 @@ def free_runs(
                     continue
                 off = (predicted - columns[f"{name}_measured"])[pick]
                 rmse, mae = float(np.sqrt(np.mean(off**2))), float(np.mean(np.abs(off)))
-                rows.append(FreeRun(model=model, field=name, rmse=rmse, mae=mae, **about))
+                rows.append(FreeRun(model, recording, float(t[0]), float(t[-1] - t[0]), held_out, name, rmse, mae))
     return rows
 
 
 def _predicted(columns: Mapping[str, np.ndarray], field: str, model: str, ahead: np.ndarray) -> np.ndarray | None:
-    """Return a model's prediction ``(N,)``, None where it has none of this field.
+    """Return a model's prediction ``(N,)``; None without a prediction of the field.
 
-    ``hold`` says that nothing changes after the last measurement before the horizon.
+    ``hold`` keeps the last measurement before the horizon.
     """
     if model != "hold":
         return columns.get(f"{field}_{model}")

@@ -1,4 +1,4 @@
-"""Whether an identification can be used: judged on held-out data, position by position."""
+"""The verdict on an identification: judged on held-out data, position by position."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from sim2real.log.schema import unit_of
 
 Status = Literal["accepted", "not converged", "no improvement on held-out data", "not identifiable", "hit a bound"]
 _BETTER = 0.95
-"""The error on held-out data must be below this share of every baseline's."""
+"""Largest ratio of the held-out error to that of a baseline with which the estimate is better."""
 _ALIKE = 1.05
-"""Up to this factor two errors count as the same."""
+"""Largest ratio of two errors that count as equal."""
 _NOISE = 2.0
-"""Errors below this many deviations of the measurement cannot be told from its noise."""
+"""Errors below this many deviations of the measurement count as noise."""
 _MOST = 3
-"""How many positions the reasons name one by one, the worst first."""
+"""Largest number of positions that the reasons name, the worst first."""
 NO_DELAY = "no delay"
-"""The same model fitted without delays. Where it is as good, the data needs no delays; that is no failure."""
+"""The same model fitted without delays. If it is as good, the data needs no delays; that is no failure."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,7 @@ class Position:
 
     Attributes:
         column: Its name in tables of errors, ``position[1]``.
-        name: What people call it.
-        unit: Its unit.
+        name: Its name for people.
         sigma: Deviation of a measurement.
     """
 
@@ -58,10 +57,10 @@ def positions(model: IdentifiableModel, units: Mapping[str, str]) -> list[Positi
 
 
 def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[HeldOut]:
-    """Return how far each position is off on held-out data at the longest horizon, the worst first.
+    """Return the errors of each position on held-out data at the longest horizon, the worst first.
 
     Args:
-        prediction: What ``prediction.errors`` returned.
+        prediction: Result of ``prediction.errors``.
     """
     columns = [p.column for p in positions]
     held_out = [row for row in prediction if row.held_out and any(row.rmse.get(c) is not None for c in columns)]
@@ -101,7 +100,7 @@ def errors_of(row: HeldOut) -> dict[str, float]:
 
 
 def judge(
-    found: Sequence[HeldOut],
+    held_out: Sequence[HeldOut],
     table: ParameterTable,
     x: np.ndarray,
     spread: Uncertainty,
@@ -112,48 +111,50 @@ def judge(
     beyond: Sequence[str] = (),
     left: float | None = None,
 ) -> Judgement:
-    """Judge an identification.
+    """Judge an identification; ``next`` of the result are flags with which to identify again.
 
     Args:
-        found: How far each position is off, the worst first.
+        held_out: Errors of the positions, the worst first.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
-        max_delay_s: For which delays the model is made [s].
-        beyond: Where held-out data goes beyond what was fitted: sentences.
-        left: Length of the next step of a fit that did not converge [standard errors]; None: it converged.
+        max_delay_s: Longest delay of the model [s].
+        beyond: Sentences about held-out data outside the range of the fitted data.
+        left: Length of the next step of a fit that did not converge [standard errors]; None if it converged.
     """
-    improves, reasons = _on_held_out(found)
+    improves, reasons = _on_held_out(held_out)
     reasons += beyond
     if left is not None:
         return Judgement("not converged", (_not_converged(left), *reasons))
-    known = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
-    bounded, least, flags = _at_bounds(table, x, spread, known, trip, max_delay_s)
+    # Collect the reasons: estimates at bounds, absent parameters, undetermined groups.
+    determined = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
+    bounded, at_zero, flags = _at_bounds(table, x, spread, determined, trip, max_delay_s)
     reasons += bounded
     reasons += _absent(table, spread)
-    reasons += [f"{name} comes out at 0, less than which there is not: held there, the same fit" for name in least]
+    reasons += [f"{name} is estimated at its lowest possible value, 0; the fit is the same with 0" for name in at_zero]
     together = trip.parts if trip and not trip.apart else ()
     groups = zip(check.undetermined, check.messages, strict=True)
-    loose = [message for group, message in groups if not set(group) <= set(together)]
+    undetermined = [message for group, message in groups if not set(group) <= set(together)]
     if trip and together:
-        loose += [f"not even their sum is known: {trip}"] * (trip.verdict == "not identifiable")
-        reasons.append(f"{' and '.join(together)} cannot be told apart from a log; what is known is their sum, {trip}")
-    reasons += loose
+        undetermined += [f"not even their sum is known: {trip}"] * (trip.verdict == "not identifiable")
+        reasons.append(f"{' and '.join(together)} cannot be separated by a log, which determines their sum, {trip}")
+    reasons += undetermined
     if spread.misfit > 3.0:
         reasons.append(
             f"residuals are {spread.misfit:.2g} times the measurement's deviation: the model explains the data only in "
             "part, and intervals follow how much estimates vary from block to block"
         )
+    # The first of these defects is the status.
     status: Status = "accepted"
     if not improves:
         status = "no improvement on held-out data"
     elif bounded:
         status = "hit a bound"
-    elif loose:
+    elif undetermined:
         status = "not identifiable"
     return Judgement(status, tuple(reasons), flags)
 
 
 def _not_converged(left: float) -> str:
-    """Return why a fit has no intervals."""
+    """Return the reason why a fit has no intervals."""
     return (
         f"the fit ended before its loss had a minimum: the next step would move an estimate by {left:.2g} standard "
         "errors, so there are no intervals"
@@ -161,33 +162,33 @@ def _not_converged(left: float) -> str:
 
 
 def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
-    """Return a sentence about each parameter that may as well be absent."""
-    said = []
+    """Return a sentence about each parameter that may be absent."""
+    messages = []
     for i, name in enumerate(table.names):
         unit = table.columns[i].parameter.unit
         if spread.verdict[i] == "negligible":
             bound = f"at most {spread.high[i]:.2g} {unit} (95 %)"
-            said.append(f"{name} is negligible: {bound}, and without it the model predicts the same")
+            messages.append(f"{name} is negligible: {bound}, and without it the model predicts the same")
         elif spread.verdict[i] == "not reached":
             bound = f"it is at least {spread.low[i]:.2g} {unit} (95 %)"
-            above = "no value above that changes what the model says of these recordings"
-            said.append(f"{name} is not reached: {bound}, and {above}")
-    return said
+            above = "no larger value changes the predictions for these recordings"
+            messages.append(f"{name} is not reached: {bound}, and {above}")
+    return messages
 
 
-def _on_held_out(found: Sequence[HeldOut]) -> tuple[bool, list[str]]:
-    """Return whether every position beats every baseline on held-out data, and what to say of it."""
-    if not found:
-        return True, ["nothing was held out: how well it predicts is not known"]
-    ahead = f"{found[0].horizon_s:g} s ahead on held-out data"
-    worse = [s for s in found if s.beaten_by]
+def _on_held_out(held_out: Sequence[HeldOut]) -> tuple[bool, list[str]]:
+    """Return whether every position beats every baseline on held-out data, and sentences about it."""
+    if not held_out:
+        return True, ["no data was held out: the error of its predictions is unknown"]
+    ahead = f"{held_out[0].horizon_s:g} s ahead on held-out data"
+    worse = [s for s in held_out if s.beaten_by]
     if worse:
         reasons = [f"{ahead} {s.name} is no better than: {_errors(s)}" for s in worse[:_MOST]]
         return False, reasons + [f"nor are {len(worse) - _MOST} more positions"] * (len(worse) > _MOST)
-    reasons = [f"{ahead} {_off(s)}" for s in found[:_MOST]]
-    if len(found) > _MOST:
-        reasons.append(f"{len(found) - _MOST} more positions improve at least as much")
-    if not any(_needs_delay(s) for s in found):
+    reasons = [f"{ahead} {_off(s)}" for s in held_out[:_MOST]]
+    if len(held_out) > _MOST:
+        reasons.append(f"{len(held_out) - _MOST} more positions improve at least as much")
+    if not any(_needs_delay(s) for s in held_out):
         reasons.append("without any delay it predicts as well: this data does not need one")
     return True, reasons
 
@@ -221,35 +222,35 @@ def _at_bounds(
     table: ParameterTable,
     x: np.ndarray,
     spread: Uncertainty,
-    known: Sequence[int],
+    determined: Sequence[int],
     trip: RoundTrip | None,
     max_delay_s: float,
 ) -> tuple[list[str], list[str], str]:
-    """Return a sentence about each estimate at a bound, names of those at 0 that cannot be less, and flags to widen.
+    """Return sentences about estimates at a bound, names of those at their lowest possible value, and flags to widen.
 
-    Only parameters in ``known`` count: for one that the data does not determine, other bounds do not help.
+    Only parameters in ``determined`` count: wider bounds do not help a parameter that the data does not determine.
     """
-    said, least, flags = [], [], []
-    for i in known:
+    messages, at_zero, flags = [], [], []
+    for i in determined:
         if spread.verdict[i] != "at a bound":
             continue
         label, p = table.columns[i].label, table.columns[i].parameter
         upper = bool(table.high[i] - x[i] < x[i] - table.low[i])
         if is_physical(p, upper):
-            least.append(label)
+            at_zero.append(label)
         else:
             flags.append(way_out(p, upper, max_delay_s))
-            said.append(_bound(label, upper, f"{p.high if upper else p.low:.4g} {p.unit}", flags[-1]))
+            messages.append(_bound(label, upper, f"{p.high if upper else p.low:.4g} {p.unit}", flags[-1]))
     if trip and not trip.apart and trip.verdict == "at a bound":
         parts = {c.label: c.parameter for c in table.columns if c.label in trip.parts}
         upper = trip.at_bound == "upper"
         if all(is_physical(p, upper) for p in parts.values()):
-            least.append("the sum of the delays")
+            at_zero.append("the sum of the delays")
         else:
             flags.append(way_out_of(trip, parts, max_delay_s))
             bound = trip.upper if upper else trip.lower
-            said.append(_bound("the sum of the delays", upper, f"{1e3 * bound:.4g} ms", flags[-1]))
-    return said, least, " ".join(dict.fromkeys(f for f in flags if f))
+            messages.append(_bound("the sum of the delays", upper, f"{1e3 * bound:.4g} ms", flags[-1]))
+    return messages, at_zero, " ".join(dict.fromkeys(f for f in flags if f))
 
 
 def _bound(name: str, upper: bool, bound: str, flags: str) -> str:

@@ -1,4 +1,4 @@
-"""What identify found, as its artifact holds it and as the console shows it."""
+"""The artifact of an identification: estimates with intervals, and the verdict."""
 
 from __future__ import annotations
 
@@ -28,15 +28,13 @@ from sim2real.stages.estimation.free_run import Lack
 
 @dataclass(frozen=True)
 class Findings:
-    """A fit, and how uncertain it is.
+    """A fit with its uncertainty.
 
     Attributes:
-        fit: The fit.
-        at: Its residuals.
-        spread: Its uncertainty.
-        check: What the data determines.
-        trip: The sum of the delays; None where there are none.
-        widening: Factor on its deviations with which draws cover the errors of the model.
+        at: The residuals at the estimate.
+        check: The combinations of parameters that the data determines.
+        trip: The sum of the delays; None without delays.
+        widening: Factor on deviations with which draws cover the errors of the model.
     """
 
     fit: Fit
@@ -53,24 +51,25 @@ class Findings:
 
     @staticmethod
     def of(fit: Fit, without: Sequence[HeldOutPart] = ()) -> Findings:
-        """Compute how uncertain a fit is.
+        """Compute the uncertainty of a fit.
 
         Args:
-            without: What was identified without one part of the recordings or another.
+            without: The estimates without one part of the recordings each.
         """
         at = uncertainty.linearise(fit.problem, fit.z)
         spread = held_out_parts.widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
         check = identifiability.from_linearised(fit.problem, at)
+        # Give parameters that the model does not need a single bound.
         spread, check = negligible(fit.problem, fit.z, at, spread, check)
-        fit, at = _where_nothing_is_said(fit, at, spread)
+        fit, at = _with_nominal_limits(fit, at, spread)
         trip = round_trip(fit.problem.table, at.x, spread)
         return Findings(fit, at, spread, check, trip, noise.widening(fit.problem.table, at, spread))
 
 
-def _where_nothing_is_said(
+def _with_nominal_limits(
     fit: Fit, at: uncertainty.Linearised, spread: uncertainty.Uncertainty
 ) -> tuple[Fit, uncertainty.Linearised]:
-    """Return a fit with limits that no motion reaches where the data sheet has them: the search left them anywhere."""
+    """Return a fit with limits that no motion reaches at their nominal values: the loss does not depend on them."""
     table, x = fit.problem.table, at.x.copy()
     for i in np.flatnonzero([v == NOT_REACHED for v in spread.verdict]):
         p = table.columns[i].parameter
@@ -80,19 +79,19 @@ def _where_nothing_is_said(
 
 
 def document(
-    pipeline: str, found: Findings, posterior: Posterior, truth: Mapping[str, float], seconds: float
+    pipeline: str, findings: Findings, posterior: Posterior, truth: Mapping[str, float], seconds: float
 ) -> Identification:
-    """Return the estimates and their uncertainty; predictions and verdict are added later.
+    """Return the estimates with their uncertainty; predictions and verdict are added later.
 
     Args:
-        truth: The embedded robot's own values, those that are known.
-        seconds: What the search took [s].
+        truth: Known parameters of the embedded robot.
+        seconds: Duration of the search [s].
     """
-    fit, spread, check = found.fit, found.spread, found.check
+    fit, spread, check = findings.fit, findings.spread, findings.check
     names = tuple(fit.problem.table.names)
     search = replace(fit.record, seconds=seconds)
     if not fit.converged:  # away from a minimum no interval, covariance or condition means anything
-        rows = tuple(_without_interval(row) for row in _rows(found, truth))
+        rows = tuple(_without_interval(row) for row in _rows(findings, truth))
         return Identification(
             pipeline=pipeline, logs=(), verdict=Judgement("", ()), parameters=rows, search=search, misfit=spread.misfit
         )
@@ -100,7 +99,7 @@ def document(
         pipeline=pipeline,
         logs=(),
         verdict=Judgement("", ()),
-        parameters=tuple(_rows(found, truth)),
+        parameters=tuple(_rows(findings, truth)),
         search=search,
         covariance=Matrix(names, spread.covariance),
         correlation=Matrix(names, spread.correlation),
@@ -108,54 +107,56 @@ def document(
         misfit=spread.misfit,
         check=check,
         posterior=posterior,
-        widening=found.widening,
+        widening=findings.widening,
     )
 
 
 def judged(
     document: Identification,
-    found: Findings,
+    findings: Findings,
     units: Mapping[str, str],
     max_delay_s: float,
     outside: Sequence[str],
     lack: Lack,
 ) -> Identification:
-    """Return the document with its verdict, whose ``next`` are the flags with which to identify again.
+    """Return the document with its verdict, whose ``next`` are flags with which to identify again.
 
     Args:
         units: Field -> unit.
-        max_delay_s: For which delays the model is made [s].
-        outside: Where held-out data goes beyond what was fitted: sentences.
+        max_delay_s: Longest delay of the model [s].
+        outside: Sentences about held-out data outside the range of the fitted data.
     """
-    judged_on = positions(found.fit.problem.model, units)
-    rows = scores(document.prediction, judged_on)
-    table = found.fit.problem.table
-    fit = found.fit
+    measured = positions(findings.fit.problem.model, units)
+    # Judge the errors on held-out data, the intervals and the bounds.
+    rows = scores(document.prediction, measured)
+    table = findings.fit.problem.table
+    fit = findings.fit
     verdict = judge(
         rows,
         table,
-        found.x,
-        found.spread,
-        found.check,
-        trip=found.trip,
+        findings.x,
+        findings.spread,
+        findings.check,
+        trip=findings.trip,
         max_delay_s=max_delay_s,
         beyond=outside,
         left=None if fit.converged else fit.left,
     )
     horizon_s = max((r.horizon_s for r in document.prediction), default=0.0)
-    worth = held_out_parts.sentences(document.left_out, judged_on, horizon_s)
+    promises = held_out_parts.sentences(document.left_out, measured, horizon_s)
+    # Add the sentences about held-out parts and free runs.
     status = "lacks a term" if lack.flags and verdict.status == "accepted" else verdict.status
     flags = " ".join(f for f in (verdict.next, lack.flags) if f)
-    told = Judgement(status, (*worth, *verdict.reasons, *lack.reasons), flags)
-    return replace(document, verdict=told, held_out=tuple(rows))
+    combined = Judgement(status, (*promises, *verdict.reasons, *lack.reasons), flags)
+    return replace(document, verdict=combined, held_out=tuple(rows))
 
 
-def _rows(found: Findings, truth: Mapping[str, float]) -> list[Estimate]:
-    parameters, spread = found.fit.problem.table, found.spread
+def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
+    parameters, spread = findings.fit.problem.table, findings.spread
     rows = []
     for i, column in enumerate(parameters.columns):
         p = column.parameter
-        value = np.ravel(found.fit.values[p.name])[column.recording or 0]
+        value = np.ravel(findings.fit.values[p.name])[column.recording or 0]
         rows.append(
             Estimate(
                 name=column.label,
@@ -174,21 +175,21 @@ def _rows(found: Findings, truth: Mapping[str, float]) -> list[Estimate]:
             )
         )
     for p in (p for p in parameters if not p.free):
-        ends = {"standard_error": 0.0, "low95": p.nominal, "high95": p.nominal, "lower": p.low, "upper": p.high}
-        named = (p.name, p.unit, p.kind, p.about, p.nominal, p.nominal)
-        rows.append(Estimate(*named, verdict="fixed", truth=truth.get(p.name), **ends))
-    return rows + ([_round_trip(found.trip, truth)] if found.trip else [])
+        numbers = {"standard_error": 0.0, "low95": p.nominal, "high95": p.nominal, "lower": p.low, "upper": p.high}
+        columns_ = (p.name, p.unit, p.kind, p.about, p.nominal, p.nominal)
+        rows.append(Estimate(*columns_, verdict="fixed", truth=truth.get(p.name), **numbers))
+    return rows + ([_round_trip(findings.trip, truth)] if findings.trip else [])
 
 
 def _without_interval(row: Estimate) -> Estimate:
-    """Return the row of a parameter whose fit did not converge."""
+    """Return the row of a parameter of a fit that did not converge."""
     if row.verdict == "fixed":
         return row
     return replace(row, standard_error=None, low95=None, high95=None, verdict="not converged")
 
 
 def _round_trip(trip: RoundTrip, truth: Mapping[str, float]) -> Estimate:
-    """Return the row of the sum of all delays, which a log determines even where it cannot tell them apart."""
+    """Return the row of the sum of all delays, which a log determines even if it does not separate the delays."""
     return Estimate(
         name=ROUND_TRIP,
         unit="s",

@@ -1,4 +1,4 @@
-"""Logs that were fitted are no test of a fit: they are found by their files' hashes and by what was measured."""
+"""Refuse logs that were fitted, as a test of a fit: by the hashes of their files and by their measurements."""
 
 from __future__ import annotations
 
@@ -16,89 +16,90 @@ from sim2real.identify.validation.prediction import position_of
 from sim2real.stages.terminal.console import note
 
 _PIECE = 50
-"""Samples of motion that are in two logs only if both hold the same stretch."""
+"""Samples in a piece of motion; two logs that hold the same piece hold the same recording."""
 _SAME = 1e-5
-"""Share of the range of a piece that its numbers may be off, by rounding alone."""
+"""Largest difference by rounding, as a share of the range of a piece."""
 
 
-def require_new(found: Identification, logs: Sequence[Recording], model: IdentifiableModel, force: bool) -> list[str]:
-    """Check that logs are none that parameters were identified from.
+def require_new(
+    identification: Identification, logs: Sequence[Recording], model: IdentifiableModel, force: bool
+) -> list[str]:
+    """Return the names of logs that the parameters were identified from; by default such a log is an error.
 
-    A copy, an import of the same file, and a part that was cut out of a fitted log are found by their measurements.
+    A copy, an import of the same file and a part of a fitted log have the same measurements.
 
     Args:
-        model: The robot's, for what it measures.
-        force: Whether such logs are named and used all the same.
-
-    Returns:
-        The names of those that were fitted.
+        force: Whether to warn, and use such logs.
 
     Raises:
-        UsageError: One of them was fitted.
+        UsageError: A log was fitted, and ``force`` is False.
     """
-    rows = found.samples
-    fitted = set(rows["recording"][~rows["held_out"]].tolist()) if rows else set(range(len(found.logs)))
-    known = {source.sha256: source.path for i, source in enumerate(found.logs) if i in fitted}
-    pieces = list(_fitted_pieces(found, model))
-    again = []
+    # Collect the hashes and the measurements of the fitted logs.
+    rows = identification.samples
+    fitted = set(rows["recording"][~rows["held_out"]].tolist()) if rows else set(range(len(identification.logs)))
+    paths = {source.sha256: source.path for i, source in enumerate(identification.logs) if i in fitted}
+    pieces = list(_fitted_pieces(identification, model))
+    # Compare each log with them.
+    messages = []
     for log in logs:
-        read = _measured(log, model)
-        if (path := known.get(_hash(log) or "")) is not None:
-            again.append(f"{log.path} is {path}, which these parameters were identified from")
-        elif any(_contains(read, piece) for piece in pieces):
-            again.append(f"{log.path} holds measurements that these parameters were identified from")
-    return _refuse(again, "take a log of later motion, or --force: errors there are no test of a fit", force)
+        positions = _measured(log, model)
+        if (path := paths.get(_hash(log) or "")) is not None:
+            messages.append(f"{log.path} is {path}, which these parameters were identified from")
+        elif any(_contains(positions, piece) for piece in pieces):
+            messages.append(f"{log.path} holds measurements that these parameters were identified from")
+    return _refuse(messages, "take a log of later motion, or --force: errors there are no test of a fit", force)
 
 
 def require_apart(
     fitted: Sequence[Recording], held_out: Sequence[Recording], model: IdentifiableModel, force: bool
 ) -> None:
-    """Check that no log is given twice: to be fitted and held out, or to be fitted two times.
+    """Raise an error if a log is given twice: fitted and held out, or fitted two times.
 
     Args:
-        model: The robot's, for what it measures.
-        force: Whether such logs are named and used all the same.
+        force: Whether to warn, and use such logs.
 
     Raises:
-        UsageError: One is.
+        UsageError: A log is given twice, and ``force`` is False.
     """
     hashes = [_hash(log) for log in fitted]
-    twice = [
+    messages = [
         f"{a.path} and {b.path} are the same log: fitted twice, it would count twice"
         for (a, ha), (b, hb) in combinations(zip(fitted, hashes, strict=True), 2)
         if ha is not None and ha == hb
     ]
     for log in held_out:
-        own, read = _hash(log), _measured(log, model)
-        for other, known in zip(fitted, hashes, strict=True):
-            if (own is not None and own == known) or any(_contains(_measured(other, model), p) for p in _cut(read)):
-                twice.append(f"{log.path} is to be held out, and {other.path}, with the same measurements, fitted")
-    _refuse(twice, "name each log once, or --force: held-out errors of a fitted log are no test of the fit", force)
+        digest, positions = _hash(log), _measured(log, model)
+        for other, other_digest in zip(fitted, hashes, strict=True):
+            if (digest is not None and digest == other_digest) or any(
+                _contains(_measured(other, model), p) for p in _cut(positions)
+            ):
+                messages.append(f"{log.path} is to be held out, and {other.path}, with the same measurements, fitted")
+    _refuse(messages, "name each log once, or --force: held-out errors of a fitted log are no test of the fit", force)
 
 
-def _refuse(said: list[str], hint: str, force: bool) -> list[str]:
-    if said and not force:
-        raise UsageError("; ".join(said), hint=hint)
-    for sentence in said:
+def _refuse(messages: list[str], hint: str, force: bool) -> list[str]:
+    if messages and not force:
+        raise UsageError("; ".join(messages), hint=hint)
+    for sentence in messages:
         note(f"warning: {sentence}")
-    return said
+    return messages
 
 
 def _hash(log: Recording) -> str | None:
-    """Return the SHA-256 of a log's file; None where there is no such file."""
+    """Return the SHA-256 of a log's file; None if there is no such file."""
     return sha256(log.path) if log.path.is_file() else None
 
 
 def _measured(log: Recording, model: IdentifiableModel) -> np.ndarray:
-    """Return all positions that a log measured, ``(N, C)``."""
+    """Return all measured positions of a log, ``(N, C)``."""
     read = log.episode.outputs.get(model.sensor, {})
     columns = [np.asarray(c.of(read[c.position]), np.float64) for c in model.channels if c.position in read]
     return np.stack(columns, axis=1) if columns else np.zeros((0, 0))
 
 
-def _fitted_pieces(found: Identification, model: IdentifiableModel) -> Iterator[np.ndarray]:
-    """Return what was measured in segments that were fitted, pieces ``(n, C)``."""
-    rows, names = found.samples, [f"{position_of(c)}_measured" for c in model.channels]
+def _fitted_pieces(identification: Identification, model: IdentifiableModel) -> Iterator[np.ndarray]:
+    """Yield the measurements of fitted segments, in pieces ``(n, C)``."""
+    rows, names = identification.samples, [f"{position_of(c)}_measured" for c in model.channels]
     if not rows or any(name not in rows for name in names):
         return
     read, fitted = np.stack([rows[name] for name in names], axis=1).astype(np.float64), ~rows["held_out"].astype(bool)
@@ -107,7 +108,7 @@ def _fitted_pieces(found: Identification, model: IdentifiableModel) -> Iterator[
 
 
 def _cut(read: np.ndarray) -> Iterator[np.ndarray]:
-    """Return pieces of measurements in which something moves; shorter measurements are one piece."""
+    """Yield pieces of measurements with motion; measurements shorter than a piece are one piece."""
     for first in range(0, max(len(read) - _PIECE, 0) + 1, _PIECE):
         piece = read[first : first + _PIECE]
         if len(piece) > 1 and max(len(np.unique(column)) for column in piece.T) > len(piece) // 4:
@@ -115,12 +116,12 @@ def _cut(read: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _contains(read: np.ndarray, piece: np.ndarray) -> bool:
-    """Return whether rows ``(N, C)`` hold a piece ``(n, C)``, one row after the other."""
+    """Return whether measurements ``(N, C)`` contain a piece ``(n, C)``."""
     size = len(piece)
     if len(read) < size or read.shape[1:] != piece.shape[1:]:
         return False
     slack = _SAME * np.ptp(piece, axis=0).max()
-    # The ends first: few places have them.
+    # Compare the ends and the middle first: few places match there.
     ends = [
         np.abs(read[i : len(read) - size + 1 + i] - piece[i]).max(axis=1) <= slack for i in (0, size // 2, size - 1)
     ]

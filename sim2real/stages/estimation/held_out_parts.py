@@ -1,4 +1,4 @@
-"""Optional terms of a model, and what an identification is worth on parts of the recordings that were left out."""
+"""Optional terms of a model, and the errors of an identification on held-out parts of the recordings."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.terminal.console import note
 
 _LEAST_PARTS = 2
-"""Errors of which a mean and a worst are worth saying."""
+"""Fewest parts whose mean and worst errors are reported."""
 _LEAST = 4
-"""Segments of which parts can be left out."""
+"""Fewest segments from which parts are held out."""
 _LEAST_TO_CHOOSE = 3
-"""Parts of which one is left out, and terms chosen by how the others predict each other."""
+"""Fewest parts for a selection of terms: one is held out, and the others predict each other."""
 _ANY_DELAY_S = 0.1
-"""Which parameters a model has does not depend on its longest delay [s]."""
+"""The parameters of a model do not depend on its longest delay, so any does [s]."""
 _VAGUE = 4.0
-"""How many times the worst error a promise may be before the words say that it is none."""
+"""Ratio of a promise to the worst error above which the text asks for more recordings."""
 _FEWEST = 4
-"""Parts from which on they say how much estimates differ."""
+"""Fewest parts from which the spread of estimates is computed."""
 
 
 def widest(table: ParameterTable, wanted: str) -> ParameterTable:
-    """Return the table with the optional terms that a flag names; for ``auto`` with all of them, to choose from.
+    """Return the table with the optional terms of a flag; with ``auto``, all of them.
 
     Args:
-        wanted: ``own``, ``auto``, ``all``, ``none``, or names with commas between.
+        wanted: ``own``, ``auto``, ``all``, ``none``, or names separated by commas.
     """
     if wanted == "own":
         return table
@@ -54,78 +54,80 @@ def widest(table: ParameterTable, wanted: str) -> ParameterTable:
 
 
 def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
-    """Return the robot with the optional terms that its kind offers, where a flag chooses among some.
+    """Return the robot with the optional terms that its kind offers, if a flag selects among them.
 
     Args:
-        wanted: As ``widest`` takes it.
+        wanted: As in ``widest``.
     """
     offer = getattr(robot, "with_optional_terms", None)
     return robot if offer is None or wanted in ("own", "none") else offer(wanted)
 
 
 def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:
-    """Return the robot with its optional terms where parameters are of one.
+    """Return the robot with the optional terms of some parameters.
 
     Args:
-        names: Names of parameters that were identified.
+        names: Names of identified parameters.
     """
-    own, every = (
+    present, offered = (
         {p.name: p.term for p in r.identifiable(_ANY_DELAY_S).parameters} for r in (robot, offering(robot, "all"))
     )
-    lacking = sorted({every[name] for name in names if name in every and name not in own})
+    lacking = sorted({offered[name] for name in names if name in offered and name not in present})
     return offering(robot, ",".join(lacking)) if lacking else robot
 
 
-def chosen(found: Fit, config: IdentifyConfig, names: Sequence[str]) -> optional_terms.Selection:
-    """Return which optional terms are needed: without them parts that are left out are predicted worse.
+def chosen(estimate: Fit, config: IdentifyConfig, names: Sequence[str]) -> optional_terms.Selection:
+    """Return the optional terms without which held-out parts are predicted worse.
 
     Args:
-        names: Of the recordings; each is left out by itself.
+        names: A name for each recording; recordings of different names are different parts.
     """
-    problem, table = found.problem, found.problem.table
+    problem, table = estimate.problem, estimate.problem.table
+    # Select terms by the quadratic approximation of the loss on each part.
     parts = folds_of(problem, config.folds, names, _LEAST_TO_CHOOSE)
-    choice = optional_terms.choose(
-        optional_terms.statistics(problem, linearise(problem, found.z), masks(problem, parts)), table
+    selection = optional_terms.choose(
+        optional_terms.statistics(problem, linearise(problem, estimate.z), masks(problem, parts)), table
     )
-    sets = optional_terms.below(choice, table)
+    sets = optional_terms.below(selection, table)
     if len(sets) == 1:
-        return choice
-    rows = compare_sets(found, parts, sets, config.settle_s, config.free_run_s)
+        return selection
+    # Refit the selected set and the smaller ones, and compare their errors on held-out parts.
+    rows = compare_sets(estimate, parts, sets, config.settle_s, config.free_run_s)
     sigma = dict(zip(labels(problem), (s for _, s, _ in problem.fields), strict=True))
-    scores = np.array([[_mean_square(row.ahead, sigma) for row in own] for own in rows])
-    free = np.array([[_mean_square(row.free, sigma) for row in own] for own in rows])
+    scores = np.array([[_mean_square(row.ahead, sigma) for row in errors] for errors in rows])
+    free = np.array([[_mean_square(row.free, sigma) for row in errors] for errors in rows])
     errors = np.sqrt(np.stack([scores.mean(axis=1), free.mean(axis=1)], axis=1))
-    return optional_terms.narrowed(choice, table, scores, errors)
+    return optional_terms.narrowed(selection, table, scores, errors)
 
 
 def _mean_square(errors: Mapping[str, float | None], sigma: Mapping[str, float]) -> float:
-    """Return the mean square of errors over the deviations of a measurement; 0 where nothing moved."""
-    found = [(e / sigma[name]) ** 2 for name, e in errors.items() if e is not None]
-    return float(np.mean(found)) if found else 0.0
+    """Return the mean square of errors in deviations of the measurement; 0 if no joint moved."""
+    squares = [(e / sigma[name]) ** 2 for name, e in errors.items() if e is not None]
+    return float(np.mean(squares)) if squares else 0.0
 
 
 def examined(
-    found: Fit, config: IdentifyConfig, names: Sequence[str], choice: optional_terms.Selection | None = None
+    estimate: Fit, config: IdentifyConfig, names: Sequence[str], selection: optional_terms.Selection | None = None
 ) -> tuple[HeldOutPart, ...]:
-    """Return what is identified without each part of the recordings, and how far it is off there.
+    """Return the estimates without each part of the recordings, and their errors on that part.
 
     Args:
-        found: The fit; with ``--terms auto`` the one with all optional terms, as each part's absence chooses anew.
-        names: Of the recordings; each is left out by itself.
-        choice: The terms of the model, of which each part's absence chooses some; None: nothing is chosen.
+        estimate: The fit; with ``--terms auto`` the fit with all optional terms, as each refit selects its own.
+        names: A name for each recording; recordings of different names are different parts.
+        selection: The selection of terms; None if there was none.
     """
-    segments = len(found.problem.train)
+    segments = len(estimate.problem.train)
     if segments < _LEAST:
-        note(f"{segments} segments are too few to leave parts out of the fit")
+        note(f"{segments} segments are too few to hold parts out of the fit")
         return ()
-    least = 2 if choice is None else _LEAST_TO_CHOOSE
-    parts = folds_of(found.problem, min(config.folds, segments // 2), names, least)
-    among = None if choice is None else choice.kept
-    return tuple(leave_out(found, parts, config.settle_s, choice is not None, config.free_run_s, among))
+    least = 2 if selection is None else _LEAST_TO_CHOOSE
+    parts = folds_of(estimate.problem, min(config.folds, segments // 2), names, least)
+    terms = None if selection is None else selection.kept
+    return tuple(leave_out(estimate, parts, config.settle_s, selection is not None, config.free_run_s, terms))
 
 
 def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[HeldOutPart]) -> Uncertainty:
-    """Return an uncertainty that holds how much estimates differ without one part or another.
+    """Return an uncertainty that includes the spread of the estimates without one part.
 
     Args:
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
@@ -133,41 +135,43 @@ def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Seq
     if len(rows) < _FEWEST:
         return spread
     values = [[np.ravel(row.values[c.parameter.name])[c.recording or 0] for c in table.columns] for row in rows]
-    moved = np.array([[c.parameter.to_scale(v) for c, v in zip(table.columns, own, strict=True)] for own in values])
+    moved = np.array(
+        [[c.parameter.to_scale(v) for c, v in zip(table.columns, estimates, strict=True)] for estimates in values]
+    )
     share = np.array([[row.share.get(name, 0.0) for name in table.names] for row in rows])
     return between_parts(spread, table, x, moved, share)
 
 
 def sentences(rows: Sequence[HeldOutPart], positions: Sequence[Position], horizon_s: float) -> list[str]:
-    """Return how far each position is off on parts that were left out: mean, worst, and what one more would be.
+    """Return a sentence for each position: mean and worst error on held-out parts, and the promise for a further part.
 
     Args:
-        horizon_s: Up to which horizon [s].
+        horizon_s: Largest horizon of the errors [s].
     """
     if not rows:
         return []
-    said = []
+    texts = []
     for p in positions:
-        for what, errors in (
+        for reach, errors in (
             (f"up to {horizon_s:g} s ahead", _of(rows, p, "ahead")),
-            ("in one go", _of(rows, p, "free")),
+            ("in a free run", _of(rows, p, "free")),
         ):
             if errors.size >= _LEAST_PARTS:
-                unit, most = f" {p.unit}".rstrip(), further(errors)
-                promise = f"95 % of further parts like these stay below {most:.2g}{unit}"
-                if most > _VAGUE * errors.max():
-                    promise = f"so few parts that differ so much promise no more than {most:.2g}{unit}: record more"
-                said.append(
-                    f"{p.name}, {what}, on parts that were left out of the fit: off by {errors.mean():.2g}{unit} on "
+                unit, bound = f" {p.unit}".rstrip(), further(errors)
+                promise = f"95 % of further parts like these stay below {bound:.2g}{unit}"
+                if bound > _VAGUE * errors.max():
+                    promise = f"few parts that differ widely promise no more than {bound:.2g}{unit}: record more"
+                texts.append(
+                    f"{p.name}, {reach}, on held-out parts: off by {errors.mean():.2g}{unit} on "
                     f"average, {errors.max():.2g}{unit} at worst of {errors.size}; {promise}"
                 )
-    return said
+    return texts
 
 
 def further(errors: np.ndarray) -> float:
-    """Return the error below which one more part stays with 95 % probability, from those of K parts ``(K,)``.
+    """Return the error below which a further part stays with 95 % probability, from the errors of K parts ``(K,)``.
 
-    Errors are taken to be log-normal: the upper end of a one-sided prediction interval by Student's distribution.
+    Errors are taken as log-normal. The result is the upper end of a one-sided prediction interval (Student).
     """
     logs = np.log(np.maximum(errors, 1e-300))
     k = len(logs)
@@ -175,12 +179,12 @@ def further(errors: np.ndarray) -> float:
 
 
 def promises(rows: Sequence[HeldOutPart]) -> dict[str, float]:
-    """Return below which error 95 % of further parts stay, up to the horizon: field -> error, where there are parts.
+    """Return the promise of each field, up to the horizon: field -> error.
 
-    The error on the one part that was held out is no such promise: half of all further parts are further off.
+    The error on a single held-out part is no promise: half of all further parts have a larger error.
     """
-    found = {field: _finite([row.ahead.get(field) for row in rows]) for row in rows for field in row.ahead}
-    return {field: further(errors) for field, errors in found.items() if errors.size >= _LEAST_PARTS}
+    errors_of = {field: _finite([row.ahead.get(field) for row in rows]) for row in rows for field in row.ahead}
+    return {field: further(errors) for field, errors in errors_of.items() if errors.size >= _LEAST_PARTS}
 
 
 def _of(rows: Sequence[HeldOutPart], position: Position, kind: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Advice on a recording, in sentences, from the results of a check."""
+"""Advice on a recording, in sentences, from the results of a check; and commands to identify again."""
 
 from __future__ import annotations
 
@@ -13,48 +13,44 @@ from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 _GOAL = 0.01
-"""Standard error to aim at, as a fraction of the nominal value."""
+"""Standard error to reach, as a fraction of the nominal value."""
 _SHORT_S = 12.0
 _MOVING, _COVERED, _ONE_SIDED = 0.3, 0.5, 0.2
 
 
-def recommend(found: Mapping[str, Any], identify: str, record: str) -> list[str]:
-    """Return sentences: first the problems of the data, then what to do next.
+def recommend(result: Mapping[str, Any], identify: str, record: str) -> list[str]:
+    """Return sentences: first the problems of the data, then the next step.
 
     Args:
-        found: The result of ``check.judge``.
+        result: The result of ``check.judge``.
         identify: The command that identifies from this data.
-        record: The command that records what was planned.
+        record: The command that records the planned excitation.
     """
-    planned = found["source"] != "log"
-    have_s = sum(r["sampling"]["duration_s"] for r in found["recordings"])
-    said = [f"only {have_s:.1f} s: too little to fit one part and check on another"] if have_s < _SHORT_S else []
-    said += [sentence for r in found["recordings"] for sentence in _about(r, len(found["recordings"]) > 1)]
-    enough = _enough(found)
-    if not found["determined"]:
-        names = ", ".join(dict.fromkeys(n for group in found["undetermined"] for n in group))
-        said.append(f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one")
-        said += _better(found)
-    if found["only_sum_of_delays"]:
-        said.append("of the delays before and after the world only the sum is determined: no log can tell them apart")
+    planned = result["source"] != "log"
+    have_s = sum(r["sampling"]["duration_s"] for r in result["recordings"])
+    texts = [f"only {have_s:.1f} s: too little to fit one part and check on another"] if have_s < _SHORT_S else []
+    texts += [sentence for r in result["recordings"] for sentence in _about(r, len(result["recordings"]) > 1)]
+    enough = _enough(result)
+    if not result["determined"]:
+        names = ", ".join(dict.fromkeys(n for group in result["undetermined"] for n in group))
+        texts.append(f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one")
+        texts += _better(result)
+    if result["only_sum_of_delays"]:
+        texts.append("of the delays before and after the world only the sum is determined: no log separates them")
     if enough:
-        said.append(enough)
-    if found["determined"]:
-        said.append(f"next: {record if planned else identify}")
-    return said
+        texts.append(enough)
+    if result["determined"]:
+        texts.append(f"next: {record if planned else identify}")
+    return texts
 
 
 def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) -> str:
-    """Return the command line of an identification with the same settings and further flags; "" without any."""
+    """Return the command of an identification with the same settings and further flags; "" without flags."""
     return command(pipeline, config, root, flags) if flags else ""
 
 
 def onward(pipeline: Pipeline, config: IdentifyConfig, root: Path, file: Path) -> str:
-    """Return the command line that goes on with an identification that was interrupted or did not converge.
-
-    Args:
-        config: The settings of that identification.
-    """
+    """Return the command that continues an identification that was interrupted or did not converge."""
     usual = pipeline.identify
     effort = {
         "generations": max(config.generations, usual.generations),
@@ -66,36 +62,37 @@ def onward(pipeline: Pipeline, config: IdentifyConfig, root: Path, file: Path) -
 
 
 def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str = "") -> str:
-    """Return the command line of an identification with some settings and further flags.
+    """Return the command of an identification.
 
     Args:
         pipeline: The robot; settings that equal its defaults need no flag.
-        flags: The further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
+        flags: Further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
     """
-    new = shlex.split(flags)
+    further = shlex.split(flags)
     if not pipeline.has_commands:
         call = "sim2real.identify(robot, recording, ...)"
         return f"{call} with the settings {flags}" if flags else call
-    named = {name for flag, name in pairwise(new) if flag in ("--bounds", "--fix")}
+    named = {name for flag, name in pairwise(further) if flag in ("--bounds", "--fix")}
     words = ["sim2real", "identify", *pipeline.words]
+    # Add a flag for each setting that differs from the pipeline's default.
     for f in fields(config):
         flag, value = "--" + f.name.replace("_", "-"), getattr(config, f.name)
         if isinstance(value, Mapping):
             for name, numbers in value.items():
-                own = numbers if isinstance(numbers, tuple) else (numbers,)
-                words += [] if name in named else [flag, name, *(f"{v:g}" for v in own)]
+                values = numbers if isinstance(numbers, tuple) else (numbers,)
+                words += [] if name in named else [flag, name, *(f"{v:g}" for v in values)]
         elif isinstance(value, tuple):
             words += [word for file in value for word in (flag, str(file))]
-        elif value != getattr(pipeline.identify, f.name) and flag not in new:
+        elif value != getattr(pipeline.identify, f.name) and flag not in further:
             words += (
                 [flag if value else flag.replace("--", "--no-", 1)] if isinstance(value, bool) else [flag, str(value)]
             )
     words += ["--runs", str(root)] if Path(root) != Path("runs") else []
-    return shlex.join([*words, *new])
+    return shlex.join([*words, *further])
 
 
 def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
-    """Yield the problems of one recording."""
+    """Yield a sentence for each problem of one recording."""
     which = f"{recording['name']}: " if several else ""
     s = recording["sampling"]
     if s["gaps"]:
@@ -115,21 +112,21 @@ def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
         yield f"{which}no command changes: gains and delays of the actuator are not determined"
 
 
-def _better(found: Mapping[str, Any]) -> list[str]:
-    """Return what to record instead, for parameters that are not determined and say so."""
-    open_names = {n for group in found["undetermined"] for n in group}
-    motions = [p["excite"] for p in found["parameters"] if p["name"] in open_names and p.get("excite")]
+def _better(result: Mapping[str, Any]) -> list[str]:
+    """Return the motions that the undetermined parameters name."""
+    open_names = {n for group in result["undetermined"] for n in group}
+    motions = [p["excite"] for p in result["parameters"] if p["name"] in open_names and p.get("excite")]
     return [f"record instead: {'; '.join(dict.fromkeys(motions))}"] if motions else []
 
 
-def _enough(found: Mapping[str, Any]) -> str:
-    """Return how long to record, judged by the parameter with the largest standard error."""
-    known = [p for p in found["parameters"] if p["percent_of_nominal"] is not None and p["determined"] == "alone"]
-    if not known:
+def _enough(result: Mapping[str, Any]) -> str:
+    """Return how long to record, by the parameter with the largest standard error."""
+    alone = [p for p in result["parameters"] if p["percent_of_nominal"] is not None and p["determined"] == "alone"]
+    if not alone:
         return ""
-    worst = max(known, key=lambda p: p["percent_of_nominal"])
+    worst = max(alone, key=lambda p: p["percent_of_nominal"])
     seconds = 60.0 * (worst["percent_of_nominal"] / (100 * _GOAL)) ** 2
-    have = sum(r["sampling"]["duration_s"] for r in found["recordings"])
+    have = sum(r["sampling"]["duration_s"] for r in result["recordings"])
     about = f"{worst['name']} is least certain: {worst['percent_of_nominal']:.2g} % of nominal from a minute"
     if seconds <= have:
         return f"{about}; {have:.0f} s are enough for {_GOAL:.0%}, if the model is right"

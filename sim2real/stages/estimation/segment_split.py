@@ -1,4 +1,4 @@
-"""How logs are cut into segments: those that are fitted, and those that are held out."""
+"""How logs are cut into fitted and held-out segments."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sim2real.stages.identify.config import IdentifyConfig
 
 _WINDOW_SPACING_S = 0.5
 _EDGES_S = (0.3, 0.2)
-"""What is left out at the beginning and at the end of a log where initial states are estimated [s]."""
+"""Unused time at the beginning and at the end of a log whose initial states are estimated [s]."""
 
 
 def spans(
@@ -23,40 +23,39 @@ def spans(
     length_s: float,
     spacing_s: float = _WINDOW_SPACING_S,
 ) -> list[Span]:
-    """Return segments of one length, those to fit and those that are held out.
+    """Return segments of one length, fitted and held out.
 
     Args:
         episodes: The logs; those that are held out whole come last.
-        config: Which share of each is held out, and how far apart segments start.
-        length_s: Of a segment [s].
-        spacing_s: Between the starts of segments that are held out [s].
+        length_s: Length of a segment [s].
+        spacing_s: Distance between the starts of held-out segments [s].
 
     Raises:
         UsageError: When the logs are too short.
     """
-    found: list[Span] = []
+    segments: list[Span] = []
     for r, episode in enumerate(episodes):
         begin, end = reach(episode, config)
         split = split_of(episode, r < fitted, config)
         last = end - length_s + 1e-6
         step_s = config.spacing_s or length_s
-        found += [Span(r, float(b)) for b in np.arange(begin, min(split - length_s, last) + 1e-6, step_s)]
-        found += [Span(r, float(b), False) for b in np.arange(split, last, spacing_s)]
-    used = sum(s.fitted for s in found)
-    if not used or used == len(found) or (config.initial_state == "free" and used < 3):
+        segments += [Span(r, float(b)) for b in np.arange(begin, min(split - length_s, last) + 1e-6, step_s)]
+        segments += [Span(r, float(b), False) for b in np.arange(split, last, spacing_s)]
+    fit_count = sum(s.fitted for s in segments)
+    if not fit_count or fit_count == len(segments) or (config.initial_state == "free" and fit_count < 3):
         lengths = ", ".join(f"{e.duration_s:.1f} s" for e in episodes)
         raise UsageError(
-            f"the logs last {lengths}: that makes {used} segments of {length_s:g} s to fit and "
-            f"{len(found) - used} to hold out",
+            f"the logs last {lengths}: that makes {fit_count} segments of {length_s:g} s to fit and "
+            f"{len(segments) - fit_count} to hold out",
             hint="record for at least 12 s, or shorten --settle-s and --horizon-s",
         )
-    return found
+    return segments
 
 
 def reach(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
-    """Return from when to when a log can be cut into segments [s].
+    """Return the begin and the end of the part of a log that can be cut into segments [s].
 
-    Where initial states are estimated, samples before and after a segment's start must be there.
+    An estimate of an initial state needs samples before and after the start of the segment.
     """
     if config.initial_state != "free":
         return 0.0, episode.duration_s
@@ -64,10 +63,10 @@ def reach(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
 
 
 def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
-    """Return when the held-out part of a log begins [s].
+    """Return the begin of the held-out part of a log [s].
 
     Args:
-        fitted: Whether it is fitted at all; else all of it is held out.
+        fitted: Whether the log is fitted; else it is held out whole.
     """
     begin, end = reach(episode, config)
     return begin + (1.0 - config.held_out) * (end - begin) if fitted else begin

@@ -1,4 +1,4 @@
-"""What a search that is ended by a signal leaves: the best values that it had found."""
+"""The best values of a search that a signal ended, as a file."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Search
 from sim2real.artifacts.run.run_folder import OpenStage, Source
-from sim2real.identify.fit import as_numbers
+from sim2real.identify.fit import Value, as_numbers
 from sim2real.identify.parameters import ParameterTable
 from sim2real.stages.terminal.console import note, shown
 
@@ -21,14 +20,13 @@ PARTIAL = "partial.json"
 
 @dataclass
 class Best:
-    """The best so far.
+    """The best values of a search so far.
 
     Attributes:
-        table: The parameters that are searched for.
-        z: Shape ``(P,)``: where it is; None before anything was evaluated.
-        loss: Its loss.
-        done: Shares of search and refinement that are done.
-        on_fit: Called when the fit is finished, before it is judged.
+        table: The parameters of the search.
+        z: Shape ``(P,)``; None before the first evaluation.
+        done: Phase -> completed share.
+        on_fit: Called after the fit, before it is judged.
     """
 
     table: ParameterTable | None = None
@@ -38,23 +36,23 @@ class Best:
     on_fit: Callable[[], object] | None = None
 
     def restart(self, table: ParameterTable) -> None:
-        """Begin another search, of other parameters."""
+        """Begin a search of other parameters."""
         self.table, self.z, self.loss, self.done = table, None, float("inf"), {"search": 0.0, "refine": 0.0}
 
     def advance(self, stage: str, share: float, loss: float, z: np.ndarray) -> None:
-        """Take note of progress; the first result of a refinement replaces that of the search, even with a larger loss.
+        """Record progress; the first result of a refinement replaces that of the search, even with a larger loss.
 
         Args:
             stage: ``search`` or ``refine``.
-            share: Share of it that was done since the last call.
-            z: Shape ``(P,)``: where it is.
+            share: Share of the phase that was completed since the last call.
+            z: Shape ``(P,)``.
         """
         if loss < self.loss or (stage == "refine" and not self.done["refine"]):
             self.z, self.loss = np.array(z), loss
         self.done[stage] = min(1.0, self.done[stage] + share)
 
     def fitted(self, z: np.ndarray, loss: float) -> None:
-        """Take note of the finished fit; it is written before it is judged, which takes longer than the fit.
+        """Record the finished fit, which is written before the longer judgement begins.
 
         Args:
             z: Shape ``(P,)``: the estimate.
@@ -66,13 +64,12 @@ class Best:
 
 @contextmanager
 def left_behind(stage: OpenStage, pipeline: str, logs: Sequence[Path], again: Callable[[Path], str]) -> Iterator[Best]:
-    """Yield a place for the best so far.
+    """Yield the record of the best values, which is written to ``partial.json`` after the fit and on a signal.
 
-    It is written to ``partial.json`` when the fit is finished, and when a signal ends the block; a block that ends by
-    itself removes the file.
+    The file is removed when the block ends without a signal.
 
     Args:
-        again: Returns the command that goes on from that file.
+        again: Path of the file -> the command that continues from it.
     """
     best, path = Best(), stage.folder / PARTIAL
 
@@ -86,18 +83,18 @@ def left_behind(stage: OpenStage, pipeline: str, logs: Sequence[Path], again: Ca
         if best.z is not None and np.isfinite(best.loss):
             stage.output("partial", PARTIAL)
             write()
-            note(f"interrupted: the best so far is in {shown(path)}, neither judged nor with intervals")
+            note(f"interrupted: the best values so far are in {shown(path)}, without intervals and verdict")
             note(f"next: {again(path)}")
         raise
     path.unlink(missing_ok=True)
 
 
 def _unfinished(pipeline: str, logs: Sequence[Path], run_dir: Path, best: Best, again: str) -> Identification:
-    """Return the best so far as an identification with the verdict ``interrupted``."""
+    """Return the best values as an identification with the verdict ``interrupted``."""
     table = best.table or ParameterTable([])
     values = as_numbers(table, np.asarray(best.z))
     done = ", ".join(f"{share:.0%} of {what}" for what, share in best.done.items())
-    reason = f"it ended after {done}: these values were neither judged on held-out data nor do they have intervals"
+    reason = f"it ended after {done}: these values have no intervals and were not judged on held-out data"
     rows = [
         Estimate(
             name=name,
@@ -122,6 +119,6 @@ def _unfinished(pipeline: str, logs: Sequence[Path], run_dir: Path, best: Best, 
     )
 
 
-def _each(name: str, value: Any) -> list[tuple[str, float]]:
-    """Return a parameter's names and values: several where each recording has its own."""
+def _each(name: str, value: Value) -> list[tuple[str, float]]:
+    """Return a parameter's names and values: one for each recording if the value is a list."""
     return [(f"{name}@{i}", v) for i, v in enumerate(value)] if isinstance(value, list) else [(name, value)]

@@ -1,4 +1,4 @@
-"""What really happened on the embedded robot: asked for after the work is done, to compare with."""
+"""True parameters and delays of the embedded robot, read after the fit for comparison."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from sim2real.robots.roles import Roles
 from sim2real.stages.terminal.console import note
 
 _NEAR_NS = 3_000_000
+"""Largest distance between a sample of the robot and a step of the sensor that read it [ns]."""
 
 
 def true_values(recording: Recording, roles: Roles) -> dict[str, float]:
-    """Return the true parameters, and the true mean delays in the log's own terms.
+    """Return true parameters and true mean delays in the log's terms; an empty dict if the robot is not embedded.
 
     ``sensor_delay`` is from the motion to the measurement's time stamp, ``actuator_delay`` from the end of the
-    actuator's step to the motor [s]. Nothing is returned for a robot that is not embedded.
+    actuator's step to the motor [s].
     """
     try:
         truth = recording.truth
         if truth is None:
             return {}
         values = {name: float(v) for name, v in truth.parameters.items()}
-    except (ValueError, KeyError) as error:  # nothing depends on it but a column of a table
-        note(f"warning: {recording.truth_path} is damaged, so nothing is compared with the truth: {error}")
+    except (ValueError, KeyError) as error:  # the true values fill one column of a table
+        note(f"warning: {recording.truth_path} is damaged, so estimates are not compared with it: {error}")
         return {}
     episode, origin_ns = recording.episode, recording.end.get("monotonic_ns")
-    if origin_ns is None:  # a session that crashed never wrote when it started
+    if origin_ns is None:  # the session crashed before it wrote its start
         return values
     sensing = sensing_delay_s(truth, episode.steps[roles.sensor], origin_ns)
     actuation = actuation_delay_s(truth, episode.steps[roles.actuator], origin_ns)
@@ -39,7 +40,7 @@ def true_values(recording: Recording, roles: Roles) -> dict[str, float]:
 
 
 def sensing_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
-    """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without any.
+    """Return the mean time from a sample to the stamp of the sensor's step that read it [s]; NaN without samples.
 
     Args:
         origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
@@ -54,7 +55,7 @@ def sensing_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
 
 
 def actuation_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
-    """Return the mean time from the end of the actuator's step to the command's effect [s]; NaN without any.
+    """Return the mean time from the end of the actuator's step to the command's effect [s]; NaN without commands.
 
     Args:
         origin_ns: Time 0 of the log on the computer's monotonic clock [ns].
