@@ -108,7 +108,7 @@ def test_a_table_knows_its_terms():
     values = TABLE.decode(np.ones(6), kept)
     assert [round(float(values[n]), 3) for n in "def"] == [0.0, 0.0, 0.5]
     assert float(values["c"]) == pytest.approx(float(TABLE.decode(np.ones(6))["c"])) != 0.0
-    with pytest.raises(UsageError, match="where its term"):
+    with pytest.raises(UsageError, match="its value without a term"):
         row("g", off=1.0)
 
 

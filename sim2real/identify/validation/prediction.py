@@ -76,7 +76,7 @@ def _goals(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str,
             mask = segment == s
             newest = np.searchsorted(sent_s[s], into[mask], side="right") - 1
             goals[mask] = c.of(rows[s])[np.maximum(newest, 0)]
-        columns[f"{position_of(c)}_goals"] = goals
+        columns[f"{position_of(c)}_{GOAL}"] = goals
     return columns
 
 
@@ -123,7 +123,7 @@ def errors(
 
 def _baselines(columns: Mapping[str, np.ndarray]) -> list[str]:
     """Return the names of the baselines: ``hold``, and that of the goal if commands are positions."""
-    return ["hold", *(["told"] if any(n.endswith("_goals") for n in columns) else [])]
+    return ["hold", *([GOAL] if any(n.endswith(f"_{GOAL}") for n in columns) else [])]
 
 
 def free_runs(
