@@ -37,8 +37,8 @@ def waits_for_schedule(node: BaseNode) -> bool:
         return True
     if not any(c.blocking for c in node.inputs.values()):
         raise UsageError(
-            f"node {node.name!r}: advance=True needs a blocking input: nothing else would hold the node back",
-            hint="connect an input with blocking=True, or leave advance False",
+            f"node {node.name!r}: advance=True needs a blocking input, which holds the node back",
+            hint="connect an input with blocking=True, or use advance=False",
         )
     return not all(c.blocking for c in node.inputs.values())
 
@@ -58,11 +58,11 @@ def start(scheduled, drift, previous_end, blocked_until, waits: bool):  # noqa: 
 
 
 def next_drift(scheduling: Scheduling, scheduled, drift, previous_end):  # noqa: ANN001, ANN201
-    """Return how far the schedule has moved once a step's start is known [ticks] (rule 3).
+    """Return the shift of the schedule after a step's start [ticks] (rule 3).
 
     Args:
         scheduled: The step's slot [ticks].
-        drift: How far the schedule had moved before [ticks].
+        drift: The shift before [ticks].
         previous_end: End of the node's previous step [ticks].
     """
     if scheduling is Scheduling.PHASE:
@@ -111,11 +111,7 @@ def quota(connection: Connection, k: np.ndarray | int) -> np.ndarray:
 
 
 def at_delay(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex, delay: int) -> Edge:
-    """Return an edge whose delay is trainable as it is at another delay; what is lost stays lost.
-
-    Args:
-        delay: The delay [ticks].
-    """
+    """Return an edge with a trainable delay at another delay [ticks]; lost messages stay lost."""
     sent = sender.end[:, : edge.received.shape[1]]
     received = np.where(edge.received >= NEVER, NEVER, np.maximum.accumulate(sent + delay, axis=1))
     return Edge(received, consumer(connection, received, reader, sender), edge.sender)

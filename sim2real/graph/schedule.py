@@ -29,14 +29,13 @@ def draw(
     Args:
         nodes: The nodes, by name or as a list.
         duration_s: Steps that start before this time belong to the timeline [s].
-        episodes: How many timelines; ignored with ``recorded``.
+        episodes: Number of timelines; without effect if ``recorded`` is given.
         rng: Generator or seed of the delays.
-        recorded: Vertices and edges that are kept as they are; only those that are missing, e.g. of a simulated world,
-            are drawn.
+        recorded: Vertices and edges that stay unchanged; only missing ones, e.g. of a simulated world, are drawn.
 
     Raises:
-        UsageError: On an algebraic loop, a duration in which a node makes no step, ``advance`` without a blocking
-            input, a sender that is not in the graph, or a distribution whose samples are not valid delays.
+        UsageError: The graph has an algebraic loop, a node makes no step in the duration or has ``advance`` without a
+            blocking input, a sender is not in the graph, or the samples of a distribution are not valid delays.
     """
     nodes = by_name(nodes)
     check_senders(nodes)
@@ -44,22 +43,24 @@ def draw(
         raise UsageError(
             f"{episodes} timelines of {duration_s} s cannot be drawn", hint="draw one or more, of a few seconds"
         )
+
+    # Draw the computation delays of all nodes, then the communication delays of all connections.
     rng = np.random.default_rng(rng)
-    kept = recorded or Timeline({}, {})
-    episodes = kept.episodes if recorded else episodes
+    fixed = recorded or Timeline({}, {})
+    episodes = fixed.episodes if recorded else episodes
     delays = {
         name: computation_delays(node, duration_s, episodes, rng)
         for name, node in nodes.items()
-        if name not in kept.vertices
+        if name not in fixed.vertices
     }
     transfers = {}
     for node in nodes.values():
         for c in node.inputs.values():
-            if (node.name, c.name) not in kept.edges:
-                sender = kept.vertices.get(c.output_node.name)
+            if (node.name, c.name) not in fixed.edges:
+                sender = fixed.vertices.get(c.output_node.name)
                 count = sender.start.shape[1] if sender else delays[c.output_node.name].shape[1]
                 transfers[node.name, c.name] = transport_delays(c, (episodes, count), rng)
-    return derive(nodes, delays, transfers, to_ticks(duration_s), kept)
+    return derive(nodes, delays, transfers, to_ticks(duration_s), fixed)
 
 
 def derive(
@@ -67,7 +68,7 @@ def derive(
     delays: Mapping[str, np.ndarray],
     transfers: Mapping[tuple[str, str], np.ndarray],
     duration: int,
-    kept: Timeline | None = None,
+    fixed: Timeline | None = None,
 ) -> Timeline:
     """Apply the rules to given delays.
 
@@ -75,16 +76,19 @@ def derive(
         delays: Node -> computation delays, shape ``(E, N)`` [ticks].
         transfers: (node, input) -> communication delays, shape ``(E, M)`` [ticks].
         duration: Steps that start before this belong to the timeline [ticks].
-        kept: Vertices and edges that are taken as they are, not derived.
+        fixed: Vertices and edges that stay unchanged.
     """
-    kept = kept or Timeline({}, {})
-    vertices = dict(kept.vertices)
+    # Starts, ends and arrivals of the messages that blocking inputs wait for.
+    fixed = fixed or Timeline({}, {})
+    vertices = dict(fixed.vertices)
     received: dict[tuple[str, str], np.ndarray] = {}
     _run_in_order(nodes, delays, transfers, vertices, received)
     for name in delays:
         v = vertices[name]
         vertices[name] = Vertex(v.start, v.end, (v.start < duration).sum(axis=1))
-    edges = dict(kept.edges)
+
+    # Arrivals of all messages, and the steps that consume them.
+    edges = dict(fixed.edges)
     for key in transfers:
         connection = nodes[key[0]].inputs[key[1]]
         sender = connection.output_node.name
@@ -123,13 +127,12 @@ def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
 
 
 def computation_delays(
-    node: BaseNode, duration_s: float, episodes: int, rng: np.random.Generator, known: np.ndarray | None = None
+    node: BaseNode, duration_s: float, episodes: int, rng: np.random.Generator, earlier: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw a node's computation delays [ticks], shape ``(E, N)``: one for each slot within the duration.
 
     Args:
-        duration_s: The duration [s].
-        known: Delays that were drawn for a shorter duration, and are kept.
+        earlier: Delays that were drawn for a shorter duration; they stay at the front.
     """
     last = to_ticks(duration_s) - 1 - phase_ticks(node)
     count = int(np.floor(last * (node.rate / TICKS_PER_S))) + 2 if last >= 0 else 0
@@ -139,29 +142,29 @@ def computation_delays(
             f"node {node.name!r} makes no step within {duration_s} s: its first is due after {node.phase} s",
             hint="draw longer timelines",
         )
-    return _more(node.delay_dist, rng, (episodes, count), f"node {node.name!r}", known)
+    return _extend(node.delay_dist, rng, (episodes, count), f"node {node.name!r}", earlier)
 
 
 def transport_delays(
-    connection: Connection, shape: tuple[int, int], rng: np.random.Generator, known: np.ndarray | None = None
+    connection: Connection, shape: tuple[int, int], rng: np.random.Generator, earlier: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw a connection's communication delays [ticks].
 
     Args:
         shape: Number of episodes, and of messages.
-        known: Delays that were drawn for fewer messages, and are kept.
+        earlier: Delays that were drawn for fewer messages; they stay at the front.
     """
-    return _more(connection.delay_dist, rng, shape, repr(connection), known)
+    return _extend(connection.delay_dist, rng, shape, repr(connection), earlier)
 
 
-def _more(
-    dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, int], where: str, known: np.ndarray | None
+def _extend(
+    dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, int], where: str, earlier: np.ndarray | None
 ) -> np.ndarray:
-    if known is None:
+    if earlier is None:
         return _sampled(dist, rng, shape, where)
-    if shape[1] <= known.shape[1]:
-        return known
-    return np.concatenate([known, _sampled(dist, rng, (shape[0], shape[1] - known.shape[1]), where)], axis=1)
+    if shape[1] <= earlier.shape[1]:
+        return earlier
+    return np.concatenate([earlier, _sampled(dist, rng, (shape[0], shape[1] - earlier.shape[1]), where)], axis=1)
 
 
 def _sampled(dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, ...], where: str) -> np.ndarray:
@@ -169,8 +172,8 @@ def _sampled(dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int
     seconds = np.asarray(dist.sample(rng, shape))
     if seconds.shape != shape or not np.isfinite(seconds).all() or (seconds < 0).any():
         raise UsageError(
-            f"{where}: {dist!r} draws what are no delays: {seconds.ravel()[:3]} of shape {seconds.shape}",
-            hint=f"sample() returns finite seconds of at least 0, of the shape that is asked for, here {shape}",
+            f"{where}: {dist!r} draws invalid delays: {seconds.ravel()[:3]} of shape {seconds.shape}",
+            hint=f"sample() returns finite seconds of at least 0, of the shape of its argument, here {shape}",
         )
     return np.floor(seconds * TICKS_PER_S + 0.5).astype(np.int64)
 
@@ -242,7 +245,7 @@ class _BlockingRun:
         self.drift = self.previous = np.zeros(busy.shape[0], np.int64)
 
     def step(self, k: int) -> None:
-        """Compute start and end of step ``k``, once all steps of earlier slots are known."""
+        """Compute start and end of step ``k``, after all steps of earlier slots."""
         blocked = np.zeros_like(self.previous)
         for connection, upto in self.inputs:
             blocked = np.maximum(blocked, self._last_arrival(connection, int(upto[k])))

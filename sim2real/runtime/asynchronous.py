@@ -130,7 +130,7 @@ class AsyncGraph:
         """
         if self.running:
             raise UsageError("the graph is running", hint="call stop() first")
-        self._start(graph_state, own=True, timeout_s=timeout_s)
+        self._start(graph_state, autonomous=True, timeout_s=timeout_s)
 
     def stop(self, timeout_s: float = 10.0) -> None:
         """Stop the graph, at any time and from any thread; without effect on a stopped graph.
@@ -167,7 +167,7 @@ class AsyncGraph:
     def reset(self, graph_state: GraphState, timeout_s: float = 60.0) -> tuple[GraphState, StepState]:
         """Start an episode, after stopping a running one; return the supervisor's first step state."""
         self.stop()
-        run = self._start(graph_state, own=False, timeout_s=timeout_s)
+        run = self._start(graph_state, autonomous=False, timeout_s=timeout_s)
         step_state = run.observe(self._timeout_s)
         return run.snapshot(), step_state
 
@@ -267,7 +267,7 @@ class AsyncGraph:
             stepper.prepare(data[name], self._jit[name])
         return data
 
-    def _start(self, graph_state: GraphState, own: bool, timeout_s: float) -> WallClockRun | SimulatedRun:
+    def _start(self, graph_state: GraphState, autonomous: bool, timeout_s: float) -> WallClockRun | SimulatedRun:
         if self._run is not None:
             self._run.check()
             if self._run.alive:
@@ -279,7 +279,7 @@ class AsyncGraph:
         # Compile the steps, and make the run.
         stops = self._stops
         data = self._prepare(graph_state)
-        common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, own)
+        common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, autonomous)
         if self.clock is Clock.SIMULATED:
             endless = self._duration_s is None and self._timeline is None
             growing = Growing(self.nodes, self._seed(graph_state), check_bursts) if endless else None
@@ -335,7 +335,7 @@ class AsyncGraph:
 
     def _restart(self, graph_state: GraphState) -> WallClockRun | SimulatedRun:
         self.stop()
-        return self._start(graph_state, own=False, timeout_s=self._timeout_s)
+        return self._start(graph_state, autonomous=False, timeout_s=self._timeout_s)
 
     def _reply(self, step_state: StepState | None, output: PyTree) -> Reply:
         if output is None:

@@ -126,7 +126,7 @@ class SimulatedRun:
     Args:
         graph_state: The state at the episode's start.
         recorder: Receives all steps and messages, or None.
-        own: Whether the supervisor makes its own steps.
+        autonomous: Whether the supervisor makes its own steps.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit.
         growing: Draws longer timelines that begin with ``timeline``; None: the episode ends with ``timeline``.
     """
@@ -139,7 +139,7 @@ class SimulatedRun:
         data: dict[str, NodeData],
         graph_state: GraphState,
         recorder: Recorder | None,
-        own: bool,
+        autonomous: bool,
         timeline: Timeline,
         episode: int,
         real_time_factor: float,
@@ -147,7 +147,12 @@ class SimulatedRun:
     ) -> None:
         self._growing = growing
         self._nodes, self._supervisor, self._data = nodes, supervisor, data
-        self._graph_state, self._recorder, self._own, self._factor = graph_state, recorder, own, real_time_factor
+        self._graph_state, self._recorder, self._autonomous, self._factor = (
+            graph_state,
+            recorder,
+            autonomous,
+            real_time_factor,
+        )
         # Senders before readers: of two steps that start at the same time, the sender's comes first.
         self._players = {n: _Player(steppers[n], data[n], timeline, episode) for n in topological(nodes)}
         for player in self._players.values():
@@ -181,7 +186,7 @@ class SimulatedRun:
 
     def observe(self, timeout_s: float) -> StepState:
         """Run the graph to the supervisor's next step and return its step state."""
-        if self._own:
+        if self._autonomous:
             raise UsageError(
                 f"the supervisor {self._supervisor!r} makes its own steps",
                 hint="call reset() instead of start() to make them yourself",
@@ -252,7 +257,7 @@ class SimulatedRun:
 
     def _run_until(self, limit: int, deadline: float | None) -> bool:
         """Run all steps that start before ``limit`` [ticks]; return False if ``deadline`` [s] came first."""
-        own, self._own = self._own, True
+        autonomous, self._autonomous = self._autonomous, True
         try:
             if self._pending is not None:
                 self.reply(Reply())
@@ -261,7 +266,7 @@ class SimulatedRun:
                     return False
                 self._event()
         finally:
-            self._own = own
+            self._autonomous = autonomous
         self._now = max(self._now, limit) if limit < _NEVER - 1 else self._now
         return True
 
@@ -302,7 +307,7 @@ class SimulatedRun:
             if not player.data.node.inputs[name].trainable:
                 player.log.read(name, begin, messages[-1].sent if messages else None)
         step_state = player.data.step_state(player.k, begin)
-        if player.data.node.name == self._supervisor and not self._own:
+        if player.data.node.name == self._supervisor and not self._autonomous:
             self._pending = step_state
         else:
             self._make(player, step_state, Reply())

@@ -43,7 +43,7 @@ def test_a_sender_is_the_node_itself():
     other = BaseNode("sensor", 50)
     with pytest.raises(UsageError, match=r"'agent' listens to another object called 'sensor' \(.*rate=10\)") as error:
         draw([other, agent], 1.0)
-    assert "connect 'agent' to what replaces it" in (error.value.hint or "")
+    assert "connect 'agent' to the new node" in (error.value.hint or "")
     with pytest.raises(UsageError, match="'agent' listens to 'sensor', which is not in the graph"):
         check_senders({"agent": agent})
     check_senders({"agent": agent}, among={})
@@ -69,11 +69,11 @@ class Odd(DelayDistribution):
     ids=["nan", "<0", "shape"],
 )
 def test_a_distribution_that_draws_no_delays_is_named(drawn):
-    with pytest.raises(UsageError, match=r"node 'n': .*Odd.* draws what are no delays"):
+    with pytest.raises(UsageError, match=r"node 'n': .*Odd.* draws invalid delays"):
         draw([BaseNode("n", 10, delay_dist=Odd(drawn))], 1.0)
     sensor, agent = BaseNode("sensor", 10), BaseNode("agent", 10)
     agent.connect(sensor, delay_dist=Odd(drawn))
-    with pytest.raises(UsageError, match=r"'sensor' -> 'agent'.* draws what are no delays"):
+    with pytest.raises(UsageError, match=r"'sensor' -> 'agent'.* draws invalid delays"):
         draw([sensor, agent], 1.0)
 
 

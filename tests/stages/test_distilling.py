@@ -10,7 +10,7 @@ from sim2real.errors import UsageError
 from sim2real.policy import NetworkSpec, PolicyContract
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train.config import TrainConfig
-from sim2real.stages.train.teacher_bundle import as_taught, find_teacher, teacher_of
+from sim2real.stages.train.teacher_bundle import find_teacher, policy_contract, teacher_policy
 from sim2real.train.networks.architectures import MLP
 from sim2real.train.networks.policy import Policy
 
@@ -42,7 +42,7 @@ def root(contract, robot, tmp_path_factory):
         zeros, ones = np.zeros(size, np.float32), np.ones(size, np.float32)
         params = network.init(np.random.default_rng(0), size, 1.0)
         policy = Policy(params, 0 * low, zeros, ones, low, high, network, NetworkSpec(privileged=known))
-        bundle = Bundle(as_taught(contract, policy), policy.to_weights(), spec=policy.spec)
+        bundle = Bundle(policy_contract(contract, policy), policy.to_weights(), spec=policy.spec)
         with open_stage(root, "pendulum", "train", TrainConfig(), {}, run) as stage:
             for name, file in bundle.save(stage.folder).items():
                 stage.output(name, file)
@@ -69,10 +69,10 @@ def test_a_run_without_a_teacher_is_refused(tmp_path):
 
 def test_the_teacher_of_another_robot_is_refused(root, contract):
     bundle, _ = find_teacher("pendulum", str(next((root / "pendulum").glob("*/train"))), root)
-    assert teacher_of(bundle, contract).spec.privileged == KNOWN
+    assert teacher_policy(bundle, contract).spec.privileged == KNOWN
     other = PolicyContract(contract.observation[:1], contract.action, 10.0)
     with pytest.raises(UsageError, match=r"the teacher in .* at 50 Hz, the student .* at 10 Hz"):
-        teacher_of(bundle, other)
+        teacher_policy(bundle, other)
 
 
 def test_a_teacher_is_never_deployed(root, capsys):

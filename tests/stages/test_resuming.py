@@ -81,7 +81,7 @@ def settings(own, target, **changes):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"seed": "2"}, r"other settings: seed = 1 there and 2 here[\s\S]*hint: .*it was: sim2real"),
+        ({"seed": "2"}, r"other settings: seed = 1 there and 2 here[\s\S]*hint: .*its command: sim2real"),
         ({"ppo.gamma": "0.5"}, r"ppo.gamma = 0.99 there and 0.5 here"),
     ],
 )
@@ -110,7 +110,7 @@ def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
 
 
 def test_a_sweep_names_what_it_tried_and_no_checkpoint_is_written_where_that_is_said(tmp_path, capsys, monkeypatch):
-    report, left = stage._report, []
+    report, left = stage.show_progress, []
     monkeypatch.setattr(
         stage, "show_progress", lambda *given: (report(*given), left.extend(tmp_path.rglob(CHECKPOINT)))
     )

@@ -71,35 +71,35 @@ class Reference:
     def received(self, c: Connection, i: int) -> int:
         """Return when message ``i`` is received [ticks] (rule 5)."""
         key = c.input_node.name, c.name
-        known = self._received[key]
-        while len(known) <= i:
-            m = len(known)
+        arrivals = self._received[key]
+        while len(arrivals) <= i:
+            m = len(arrivals)
             direct = self.ends[c.output_node.name][m] + self.travel[key][m]
-            known.append(max([direct, *known[-1:]]))
-        return known[i]
+            arrivals.append(max([direct, *arrivals[-1:]]))
+        return arrivals[i]
 
     def window(self, node: str, name: str, k: int, width: int) -> list[int]:
         """Return the messages that a step sees on an input, oldest first; -1 in empty slots (rule 7)."""
-        seen = [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k]
+        messages = [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k]
         connection = self.nodes[node].inputs[name]
         if isinstance(connection.delay_dist, TrainableDist):
-            return self._held(connection, connection.delay_dist, [-1] * width + seen, self.starts[node][k], width)
-        return ([-1] * width + seen)[-width:]
+            return self._held(connection, connection.delay_dist, [-1] * width + messages, self.starts[node][k], width)
+        return ([-1] * width + messages)[-width:]
 
-    def _held(self, c: Connection, dist: TrainableDist, seen: list[int], start: int, width: int) -> list[int]:
+    def _held(self, c: Connection, dist: TrainableDist, messages: list[int], start: int, width: int) -> list[int]:
         """Return the messages that hold when a step starts, and at the earlier times of its window."""
         delay, ends = round(float(dist.delay) * 1e6), self.ends[c.output_node.name]
         before = 0 if dist.interp == "linear" else -(10**15)
-        arrival = {m: ends[m] + delay if m >= 0 else before for m in seen}
+        arrival = {m: ends[m] + delay if m >= 0 else before for m in messages}
 
         def last(t: int) -> int:
-            return max(i for i, m in enumerate(seen) if m < 0 or (arrival[m] < t if c.skip else arrival[m] <= t))
+            return max(i for i, m in enumerate(messages) if m < 0 or (arrival[m] < t if c.skip else arrival[m] <= t))
 
         newest = max(last(start), width - 1)
         entries = range(newest - width + 1, newest + 1)
         if dist.interp == "zoh":
-            return [seen[i] for i in entries]
-        return [seen[last(start - arrival[seen[newest]] + arrival[seen[i]])] for i in entries]
+            return [messages[i] for i in entries]
+        return [messages[last(start - arrival[messages[newest]] + arrival[messages[i]])] for i in entries]
 
     def message(self, node: str, state: int) -> int:
         """Return the number that a hash node sends in a state."""
@@ -107,7 +107,7 @@ class Reference:
 
     def hashes(self, states: Mapping[str, int], outputs: Mapping[str, int]) -> dict[str, list[int]]:
         """Return the state of each hash node after each of its steps."""
-        made: dict[str, list[int]] = {n: [] for n in self.nodes}
+        hashes: dict[str, list[int]] = {n: [] for n in self.nodes}
         order = sorted((self.starts[n][k], k, n) for n in self.nodes for k in range(self.count[n]))
         while order:  # steps that start at the same time may need each other's outputs: repeat until all are done
             waiting = []
@@ -115,19 +115,19 @@ class Reference:
                 windows = []
                 for i, c in sorted(self.nodes[n].inputs.items()):
                     seqs, sender = self.window(n, i, k, c.window), c.output_node.name
-                    if seqs[-1] >= len(made[sender]) or len(made[n]) < k:
+                    if seqs[-1] >= len(hashes[sender]) or len(hashes[n]) < k:
                         break
-                    sent = (made[sender][m] if m >= 0 else None for m in seqs)
+                    sent = (hashes[sender][m] if m >= 0 else None for m in seqs)
                     values = [outputs[sender] if s is None else self.message(sender, s) for s in sent]
                     windows.append((seqs, values))
                 else:
-                    made[n].append(hash_step(made[n][-1] if k else states[n], k, windows)[0])
+                    hashes[n].append(hash_step(hashes[n][-1] if k else states[n], k, windows)[0])
                     continue
                 waiting.append((t, k, n))
             if len(waiting) == len(order):
                 raise ValueError(f"steps wait for each other: {waiting[:4]}")
             order = waiting
-        return made
+        return hashes
 
     @cached_property
     def _phases(self) -> dict[str, int]:

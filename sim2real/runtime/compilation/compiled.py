@@ -216,7 +216,7 @@ class CompiledGraph:
             The graph's state, and each node's steps of the row.
         """
         self._check_row_start(gs, "run_row")
-        return self._run_row(gs, _known(gs))
+        return self._run_row(gs, _is_checked(gs))
 
     def rollout(
         self, gs: GraphState, record: Sequence[str] = (), rows: int | None = None
@@ -282,7 +282,7 @@ class CompiledGraph:
         """
         self._check_row_start(gs, "observe")
         turn = self.walk.only_turn()
-        inside = inside or _known(gs)
+        inside = inside or _is_checked(gs)
         gs = self.program.run_slots(gs, 0, turn, {}, inside)
         step_state = self.program.step_state(gs, turn, inside)
         return gs.replace(seq={self.supervisor: step_state.seq}), step_state, step_state.seq >= 0
@@ -298,7 +298,7 @@ class CompiledGraph:
             The state at the start of the next row.
         """
         turn, k = self.walk.only_turn(), self._awaited(gs, "advance")
-        inside = inside or _known(gs)
+        inside = inside or _is_checked(gs)
         ran = None if inside and self.program.always(turn) else k >= 0
         gs = self.program.commit(gs.replace(seq={}), self.supervisor, step_state, output, ran)
         gs = self.program.run_slots(gs, turn + 1, len(self.wiring.slots), {}, inside)
@@ -348,7 +348,7 @@ class CompiledGraph:
             )
 
 
-def _known(gs: GraphState) -> bool:
+def _is_checked(gs: GraphState) -> bool:
     """Return whether episode and row are numbers, which were checked against the timelines, and not traced."""
     return not (_traced(gs.step) or _traced(gs.eps))
 

@@ -108,13 +108,13 @@ class Repetition:
                 connection = self.nodes[reader].inputs[name]
                 sender = connection.output_node.name
                 if sender == self.world:
-                    made = np.minimum(
+                    outputs_before = np.minimum(
                         ticks, np.where(np.arange(wiring.rows) < wiring.rows - 1, wiring.ticks, wiring.last)
                     )
                 else:
-                    made = sum(ran[j].astype(int) for j in range(before) if wiring.slots[j] == sender)
+                    outputs_before = sum(ran[j].astype(int) for j in range(before) if wiring.slots[j] == sender)
                 used = (table.seq >= 0).any(axis=-1)
-                needed = np.where(used, table.age + connection.total_window - made, 0)
+                needed = np.where(used, table.age + connection.total_window - outputs_before, 0)
                 yield sender, int(needed.max(initial=0))
 
 

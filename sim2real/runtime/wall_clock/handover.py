@@ -23,7 +23,7 @@ class Reply(NamedTuple):
     leaves: list[np.ndarray] | None = None
 
     @property
-    def own(self) -> bool:
+    def autonomous(self) -> bool:
         """Whether the node's ``step`` is called with ``step_state``."""
         return self.leaves is None
 
@@ -32,27 +32,27 @@ class Handover:
     """The supervisor offers its step state and waits; the caller observes it and replies.
 
     Args:
-        own: Whether the node makes its own steps at first, without waiting for a caller.
+        autonomous: Whether the node makes its own steps at first, without waiting for a caller.
     """
 
-    def __init__(self, own: bool) -> None:
+    def __init__(self, autonomous: bool) -> None:
         self._condition = threading.Condition()
-        self._own = own
+        self._autonomous = autonomous
         self._closed = False
         self._offered: StepState | None = None
         self._reply: Reply | None = None
         self._finished = 0
 
     @property
-    def own(self) -> bool:
+    def autonomous(self) -> bool:
         """Whether the node makes its own steps."""
-        return self._own
+        return self._autonomous
 
-    def set_own(self, own: bool) -> None:
+    def set_autonomous(self, autonomous: bool) -> None:
         """Let the node, or else the caller, make the steps from now on, the one on offer included."""
         with self._condition:
-            self._own = own
-            if own:
+            self._autonomous = autonomous
+            if autonomous:
                 self._offered = None
             self._condition.notify_all()
 
@@ -70,17 +70,17 @@ class Handover:
             GraphTimeout: There was no reply in time.
         """
         with self._condition:
-            if not self._own:
+            if not self._autonomous:
                 self._offered = step_state
                 self._condition.notify_all()
-                self._condition.wait_for(lambda: self._reply or self._own or self._closed, timeout_s)
+                self._condition.wait_for(lambda: self._reply or self._autonomous or self._closed, timeout_s)
                 self._offered = None
             reply, self._reply = self._reply, None
             if reply is not None:
                 return reply
             if self._closed:
                 raise Stopped
-            if not self._own:
+            if not self._autonomous:
                 raise GraphTimeout(
                     f"the supervisor waited {timeout_s:g} s for its output, so the graph stopped",
                     hint="call step() in time, or give AsyncGraph a longer timeout_s",

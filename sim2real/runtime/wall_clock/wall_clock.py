@@ -32,7 +32,7 @@ class WallClockRun:
     Args:
         graph_state: The state at the episode's start.
         recorder: Receives all steps and messages, or None.
-        own: Whether the supervisor makes its own steps.
+        autonomous: Whether the supervisor makes its own steps.
         spin_s: Time before each step in which a thread polls the clock instead of sleeping [s].
         timeout_s: Longest wait of the supervisor for its caller [s].
         step_timeout_s: Longest time of a step, see ``step_limits``.
@@ -46,15 +46,15 @@ class WallClockRun:
         data: dict[str, NodeData],
         graph_state: GraphState,
         recorder: Recorder | None,
-        own: bool,
+        autonomous: bool,
         spin_s: float,
         timeout_s: float,
         step_timeout_s: float | None,
     ) -> None:
         self._nodes, self._supervisor, self._data = nodes, supervisor, data
-        self._graph_state, self._recorder, self._gym = graph_state, recorder, not own
+        self._graph_state, self._recorder, self._gym = graph_state, recorder, not autonomous
         self._clock = MonotonicClock()
-        self._handover = Handover(own)
+        self._handover = Handover(autonomous)
         self._shared = Shared(self._clock, recorder, graph_state, self._wake, round(spin_s * TICKS_PER_S), timeout_s)
         self._channels = {(n, c.name): MessageChannel(c, self._clock) for n in nodes for c in nodes[n].inputs.values()}
         self._threads: dict[str, NodeThread] = {}
@@ -124,7 +124,7 @@ class WallClockRun:
 
     def observe(self, timeout_s: float) -> StepState:
         """Wait for the supervisor's next step."""
-        if self._handover.own:
+        if self._handover.autonomous:
             raise UsageError(
                 f"the supervisor {self._supervisor!r} makes its own steps",
                 hint="call reset() instead of start() to make them yourself",
@@ -148,11 +148,11 @@ class WallClockRun:
 
     def run_for(self, duration_s: float) -> None:
         """Let the graph run for ``duration_s``, the supervisor making its own steps; return early if it is stopped."""
-        self._handover.set_own(True)
+        self._handover.set_autonomous(True)
         self._shared.stopping.wait(duration_s)
         self.check()
         if self._gym:
-            self._handover.set_own(False)
+            self._handover.set_autonomous(False)
 
     def wait(self, timeout_s: float | None) -> bool:
         """Wait until the graph stops; return False after a timeout."""

@@ -63,7 +63,7 @@ class Rows(NamedTuple):
     advice: jax.Array | None = None
 
 
-class Evaluation(NamedTuple):
+class PolicyEvaluation(NamedTuple):
     """One episode of each of N copies, as far as it is played.
 
     Attributes:
@@ -187,14 +187,14 @@ def _play_row(
     return select(step.terminated | truncated, fresh, following), out
 
 
-def new_evaluation(env: TrainingEnvironment, config: PPOConfig) -> Evaluation:
+def new_evaluation(env: TrainingEnvironment, config: PPOConfig) -> PolicyEvaluation:
     """Return an evaluation without rows."""
     names = metric_names(env)
     zeros, no = jnp.zeros(config.num_envs), jnp.zeros(config.num_envs, bool)
-    return Evaluation(~no, no, dict.fromkeys(["return", *names], zeros))
+    return PolicyEvaluation(~no, no, dict.fromkeys(["return", *names], zeros))
 
 
-def add_rows(evaluation: Evaluation, rows: Rows, config: PPOConfig) -> Evaluation:
+def add_rows(evaluation: PolicyEvaluation, rows: Rows, config: PPOConfig) -> PolicyEvaluation:
     """Return the evaluation after more rows; rows behind a copy's first episode do not count."""
     end = rows.terminated | rows.truncated
     runs = evaluation.running & (jnp.cumsum(end, axis=0) - end == 0)  # (T, N): before each row
@@ -204,14 +204,14 @@ def add_rows(evaluation: Evaluation, rows: Rows, config: PPOConfig) -> Evaluatio
     figures = {"return": rows.reward / config.reward_scale} | rows.metrics
     summed = {"return"} - set(rows.metrics)
     added = {n: jnp.where(runs if n in summed else last, v, 0.0).sum(0) for n, v in figures.items()}
-    return Evaluation(
+    return PolicyEvaluation(
         running=evaluation.running & ~last.any(0),
         terminated=evaluation.terminated | (last & rows.terminated).any(0),
         figures={name: evaluation.figures[name] + value for name, value in added.items()},
     )
 
 
-def averages(evaluation: Evaluation) -> dict[str, jax.Array]:
+def averages(evaluation: PolicyEvaluation) -> dict[str, jax.Array]:
     """Return the means over the episodes that ended, each of shape ``()``.
 
     ``finished`` is the share of the episodes that ended, ``terminated`` the share of those that a termination ended.
@@ -239,8 +239,8 @@ def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: j
     blank = blank._replace(carry=repeat(policy.initial_carry(), config.num_envs))
 
     def rollout(
-        carry: tuple[Copies, Evaluation], x: tuple[jax.Array, jax.Array]
-    ) -> tuple[tuple[Copies, Evaluation], None]:
+        carry: tuple[Copies, PolicyEvaluation], x: tuple[jax.Array, jax.Array]
+    ) -> tuple[tuple[Copies, PolicyEvaluation], None]:
         (copies, evaluation), (number, key) = carry, x
         copies, rows = collect(env, config, policy, copies, number, key, evaluating=True)
         return (copies, add_rows(evaluation, rows, config)), None

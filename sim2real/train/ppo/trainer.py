@@ -27,7 +27,7 @@ from sim2real.train.ppo.initial_state import make_initial_state, make_networks, 
 from sim2real.train.ppo.result import Progress as Progress
 from sim2real.train.ppo.result import TrainResult as TrainResult
 from sim2real.train.ppo.result import find_best, history_of
-from sim2real.train.ppo.rollout import Copies, Evaluation, add_rows, averages, choose, collect, new_evaluation
+from sim2real.train.ppo.rollout import Copies, PolicyEvaluation, add_rows, averages, choose, collect, new_evaluation
 from sim2real.train.ppo.teacher import TeacherEnvironment
 from sim2real.train.ppo.update import TrainState, keys, make_policy, update
 from sim2real.train.scale.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
@@ -166,8 +166,8 @@ def _train_until_evaluation(
     count = config.updates_per_evaluation
 
     def iteration(
-        now: tuple[TrainState, Copies, Evaluation], i: jax.Array
-    ) -> tuple[tuple[TrainState, Copies, Evaluation], _Figures]:
+        now: tuple[TrainState, Copies, PolicyEvaluation], i: jax.Array
+    ) -> tuple[tuple[TrainState, Copies, PolicyEvaluation], _Figures]:
         state, evaluated_copies, evaluation = now
         evaluating = i >= count
 
@@ -180,11 +180,11 @@ def _train_until_evaluation(
         copies, rows = collect(env, config, policy, copies, number, key, networks.teacher, evaluating)
 
         # Update the networks, or add the rows to the evaluation.
-        def learn() -> tuple[TrainState, Evaluation, _Figures]:
+        def learn() -> tuple[TrainState, PolicyEvaluation, _Figures]:
             state_after, figures = update(env, config, networks, state, copies, rows)
             return state_after, evaluation, figures
 
-        def evaluate() -> tuple[TrainState, Evaluation, _Figures]:
+        def evaluate() -> tuple[TrainState, PolicyEvaluation, _Figures]:
             blank = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
             return state, add_rows(evaluation, rows, config), blank
 
