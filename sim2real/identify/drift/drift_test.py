@@ -1,4 +1,4 @@
-"""Whether a later log is still of the robot that was identified: a test of each parameter, and of their causes."""
+"""Test whether a later log is still of the identified robot: of each parameter, and of causes that move several."""
 
 from __future__ import annotations
 
@@ -17,27 +17,25 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty.uncertainty import Linearised, linearise, loss_variance
 
 LEVEL = 0.05
-"""Share of robots that did not change for which there is an alarm."""
+"""False-alarm rate of the drift test, per log."""
 _SIZES = (-0.4, -0.25, -0.12, -0.05, 0.05, 0.12, 0.25, 0.4)
 """How large changes are that are tried first, in shares of the bounds' width: of a factor of four up and down, the
 largest is 3."""
 _TURNS = 3
-"""How often so many changes are tried, each time between the neighbours of the best."""
+"""Rounds of trials; each lies between the neighbours of the best size of the round before."""
 _FELT = 1e-3
-"""A change over all of the bounds moves residuals by at least so many of their variances where a log feels it."""
+"""Smallest change of residuals, over all of the bounds, with which a log tests a change [variances]."""
 _SMALL = 0.05
-"""A factor that is nearer to 1 than this is no change. Where a model predicts well its own small errors are
-significant: of 16 hidden SO-101 that had not changed, three seemed to have 8 to 14 % more friction."""
+"""Factors nearer to 1 are no change; see docs/reference/choices.md."""
 _LEAST = 0.1
-"""Share of the error that a change explains at least to raise an alarm: in 112 changed robots the right change
-explained 0.2 or more, and in nine that had not changed a torque limit that seemed sure 0.05 at most."""
+"""Smallest share of the error that a change explains in an alarm; see docs/reference/choices.md."""
 Causes = Mapping[str, Mapping[str, float]]
-"""Name of a cause -> parameter -> by how much it moves on its scale when what is named grows by a factor of e."""
+"""Name of a cause -> parameter -> its move on its scale when the cause grows by a factor of e."""
 
 
 @dataclass(frozen=True)
 class Way:
-    """A change that may have come alone: a direction ``(P,)`` on the parameters' scales, and what it is called."""
+    """A change that may come alone: its name, and a direction ``(P,)`` on the parameters' scales."""
 
     name: str
     along: np.ndarray
@@ -45,15 +43,14 @@ class Way:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a log says about one change, if it came alone.
+    """The fit of one change to a log, without other changes.
 
     Attributes:
-        way: The change.
-        size: How far along it.
+        size: Distance along the change.
         own: Variance of ``size`` by the log's residuals.
-        before: Its variance by what the identification leaves open.
-        segments: How many segments of the log say something about it, those that say little counted less.
-        loss: Of the log, with this change, and all else as far off as the identification leaves open.
+        before: Variance of ``size`` by the posterior.
+        segments: Effective number of segments that inform the size.
+        loss: Loss of the log with this change, the other parameters within the posterior.
     """
 
     way: Way
@@ -74,10 +71,10 @@ class Fitted:
 
 
 def ways(table: ParameterTable, causes: Causes) -> list[Way]:
-    """Return the changes that may have come alone: of each parameter, and those of several that have a cause.
+    """Return the changes that may come alone: of each parameter, and of causes.
 
-    A log tells of the delays on either side of the world their sum alone: both move by half. Causes that move what was
-    not identified are left out.
+    A log determines only the sum of the delays on either side of the world: both move by half. A cause that moves
+    unidentified parameters is not tested.
     """
     delays = [i for i, c in enumerate(table.columns) if c.parameter.kind == "delay"]
     found = [Way(n, np.eye(len(table))[i]) for i, n in enumerate(table.names) if len(delays) < 2 or i not in delays]
@@ -120,7 +117,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     tried = [_alone(problem, posterior.mean, root, way) for way in ways(table, causes)]
     found = [one for one in tried if one is not None]
     if not found:
-        raise Sim2RealError("this log says nothing about any parameter", hint="deploy something that moves")
+        raise Sim2RealError("this log determines no parameter", hint="deploy a policy that moves the robot")
     at = _finite(linearise(problem, table.at_scale(posterior.mean)))
     now = _with_the_rest(at, root, loss_variance(problem, at))
     found.sort(key=lambda one: one.loss)
@@ -133,7 +130,10 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
 def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
     """Return the posterior of all parameters of a table: those that were not identified are sure to be nominal."""
     if lacking := [name for name in posterior.names if name not in table.names]:
-        raise UsageError(f"the log is tested for {', '.join(table.names)}, identified were {', '.join(lacking)}, too")
+        raise UsageError(
+            f"the log is tested for {', '.join(table.names)}, but {', '.join(lacking)} were identified, too"
+        )
+
     at = [table.names.index(name) for name in posterior.names]
     mean = np.array([c.parameter.to_scale(c.parameter.nominal) for c in table.columns])
     covariance = np.zeros((len(mean), len(mean)))

@@ -33,13 +33,13 @@ _ROUGH = 1e-2
 _ROUNDS, _BACK = 4, 4
 """Most rounds of a descent, and how often a round goes half the way back to its start."""
 _NEAR = 1e-5
-"""Relative change of the point at which a descent ends, where the evaluator resolves it."""
+"""Relative change of the point at which a descent ends, if the evaluator resolves it."""
 _PIN = 10.0
 """How stiffly the delays' common shift is held in the middle at first: what all of it costs, in norms of the residuals.
 A log does not determine the shift, and the loss has a minimum for each tick of the world: descents from all starts end
 in the one next to the middle."""
 _LEFT = 0.1
-"""A descent has converged where less is left of the next Gauss-Newton step, in standard errors."""
+"""A descent has converged if the next Gauss-Newton step is shorter [standard errors]."""
 _POLLED, _REACH, _BETTER = 12, 0.5, 1e-3
 """Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
 their loss must be lower. Where friction sticks, the derivative at a point says little about the points around it."""
@@ -50,16 +50,15 @@ OnStep = Callable[[float, np.ndarray], None]
 
 @dataclass(frozen=True)
 class Refined:
-    """Where refinement ended.
+    """Result of a refinement.
 
     Attributes:
         z: Shape ``(P,)``: the best point.
-        loss: Its loss.
         before: Loss of the best start.
         steps: Evaluations, of all starts.
-        left: Length of the next Gauss-Newton step at the end [standard errors], of the parameter that it moves most.
-        converged: Whether the loss has a minimum there: little is left, or no point around is better.
-        ends: Where the descent from each start ended, ``(P,)``, and the loss there.
+        left: Length of the next Gauss-Newton step [standard errors], of the parameter that it moves most.
+        converged: Whether the loss has a minimum there: the next step is short, or no point around is better.
+        ends: End of the descent from each start, ``(P,)``, and the loss there.
     """
 
     z: np.ndarray
@@ -84,9 +83,9 @@ def refine(
 
     Args:
         starts: Shape ``(K, P)``.
-        data: What is fitted; default: all fitted segments.
-        coarse: Whether the first descents do: to compare with a model by percents.
-        settle: Whether the end is tested, and points around it tried where it is no minimum.
+        data: Default: all fitted segments.
+        coarse: Whether the first descents suffice, to compare with a model by percents.
+        settle: Whether the end is tested, and points around it are tried if it is no minimum.
 
     Raises:
         Sim2RealError: When no start has a finite loss.
@@ -98,15 +97,18 @@ def refine(
             "no start of the refinement can be simulated: every loss is infinite or no number",
             hint="search first, with generations above 0, or check the nominal values",
         )
+    # Descend roughly from each start, with the shift of the delays held.
     fine = problem.evaluator.precision
     first_gain = _ROUGH if coarse else _COARSE if settle else fine
     ends = [descent.down(z, first_gain, _PIN) for z, loss in zip(starts, first, strict=True) if np.isfinite(loss)]
     z, loss = min(ends, key=lambda end: end[1])
     if coarse or not settle:
         return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
+    # Descend from the best end to the minimum.
     if descent.shift.any():
         z, loss = descent.down(z, fine, _PIN)
     z, loss = descent.down(z, fine)
+    # Test the end; if it is no minimum, continue from a better point nearby.
     left, converged = remaining(problem, z, data), False
     for _ in range(_TRIES):
         if converged := left < _LEFT:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,20 +21,20 @@ from sim2real.identify.search.pytrees import strong
 Losses = Callable[[Any, Any, Any, Any], Any]
 """``candidates (N, P), around (P,), data, pick (B,) or None -> losses (N,)``, traceable; ``data`` is any pytree."""
 HostLosses = Callable[[np.ndarray, np.ndarray, np.ndarray | None, bool], np.ndarray]
-"""The same in numpy, of data that it has: ``candidates, around, pick, fresh -> losses``. ``fresh`` is true in the first
-generation of a block: what it computes at ``around`` may serve the others."""
+"""The same in numpy, with its own data: ``candidates, around, pick, fresh -> losses``. ``fresh`` is true in the first
+generation of a block; the other generations may use its results at ``around``."""
 _BLOCK = 10
-"""Generations that one call of the program makes; after each block the search decides whether to go on."""
+"""Generations in one call of the program; after each block the search decides whether to continue."""
 _NARROW = 0.02
-"""A generation whose candidates deviate by less has found its place; 1 is about a quarter of the bounds' width."""
+"""Deviation of a generation's candidates at which the search ends; 1 is about a quarter of the bounds' width."""
 _STANDSTILL = 0.01
-"""A search whose generations' median improves by a smaller share from block to block stands still."""
+"""Relative improvement of the generations' median between blocks below which a search stands still."""
 _INFINITE = 1e9
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
         z: Shape ``(P,)``: the best candidate.
@@ -50,7 +50,7 @@ class SearchResult:
 
 
 def strategies() -> list[str]:
-    """Return the names of the algorithms there are."""
+    """Return the names of the algorithms of evosax."""
     import evosax.algorithms  # 2 s
 
     return sorted(n for n, a in vars(evosax.algorithms).items() if inspect.isclass(a) and hasattr(a, "ask"))
@@ -68,55 +68,47 @@ def search(
     alone: Callable[[np.ndarray], float] | None = None,
     host: bool = False,
 ) -> SearchResult:
-    """Minimise; every candidate of a generation sees the same data (common random numbers).
+    """Minimise losses; all candidates of a generation get the same data (common random numbers).
 
-    A run ends early once its candidates are close together, or the median of the last ten generations is not below that
-    of the ten before. The best candidate does not count: a lucky one of the first generation may stay so for long.
-    Restarts follow BIPOP: in turn with twice the largest population so far, and with the first population from a random
-    place, with smaller steps.
+    A run ends early when its candidates are close together, or the median of the last ten generations is not below that
+    of the ten before. The best candidate does not count, as one of the first generation may be best by chance. Restarts
+    follow
+    BIPOP: in turn with twice the largest population so far, and with the first population from a random place, with
+        smaller steps.
 
     Args:
-        losses: See ``Losses``.
         start: Shape ``(P,)``: middle of the first generation.
-        data: What ``losses`` gets.
+        data: Argument of ``losses``.
         weight: Shape ``(S,)``: batches are drawn from the segments with a weight above 0; None without batches.
-        on_generations: Called with the number of generations done since the last call, and the best loss and candidate
-            of this run so far.
-        programs: Compiled programs of earlier calls with the same losses; those of this one are added.
-        alone: Loss of one candidate on all segments, where there is a program for it; default: that of ``losses``.
+        on_generations: Called with the number of generations since the last call, and the best loss and candidate of
+            this run so far.
+        programs: Compiled programs of earlier calls with the same losses; those of this call are added.
+        alone: Loss of one candidate on all segments; default: that of ``losses``.
         host: Whether ``losses`` are ``HostLosses``; these need ``alone``.
 
     Raises:
         UsageError: When there is no such strategy, or it cannot work with this population.
         Sim2RealError: When no candidate has a finite loss.
     """
-    key = jax.random.key(config.seed)
-    count = min(_BLOCK, config.generations)
     programs = {} if programs is None else programs
-    runs, histories, evaluations, large = [], [], 0, config.population
-    for index in range(config.restarts + 1):
-        k_run, k_step, k_middle = jax.random.split(jax.random.fold_in(key, index), 3)
-        middle, std, population = start, config.std, config.population
-        if index % 2:
-            large = population = 2 * large
-        elif index:
-            # Hansen draws the population of small runs as well; each size takes 5 s to compile, so ours keep the first.
-            u = float(jax.random.uniform(k_step))
-            middle = np.asarray(jax.random.normal(k_middle, start.shape)) * 1.5
-            std = config.std * 10.0 ** (-2.0 * u)
-        segments = 0 if weight is None else int(np.sum(np.asarray(weight) > 0.0))
-        batched = 0 < config.batch < segments
+    segments = 0 if weight is None else int(np.sum(np.asarray(weight) > 0.0))
+    batched = 0 < config.batch < segments
+    arguments = (data, jnp.asarray(weight) if batched else None)
+    count, runs, histories, evaluations = min(_BLOCK, config.generations), [], [], 0
+    for key, middle, std, population in _restarts(start, config):
+        # Compile a program for each kind of run; a program has the data as an argument, losses on the host hold it.
         kind = (config.strategy, population, batched and config.batch, config.generations, config.std)
         if kind not in programs:
             programs[kind] = (_HostRun if host else _Run)(losses, config, population, len(start), count, batched)
-        if host:  # a program has the data as an argument, losses on the host have their own
+        if host:
             programs[kind].losses = losses
-        given = (data, jnp.asarray(weight) if batched else None)
-        z, history, made = programs[kind](k_run, middle, std, config.generations, given, on_generations, on_compile)
+        z, history, simulated = programs[kind](
+            key, middle, std, config.generations, arguments, on_generations, on_compile
+        )
         runs.append(z)
         histories.append(history)
-        evaluations += made
-    # Each is linearised at itself: finalists of several runs may lie far apart.
+        evaluations += simulated
+    # Compare the finalists, each with initial states linearised at itself, as they may lie far apart.
     if alone is None:
         traced: Any = losses
         single = programs.setdefault("alone", Program(lambda z, data: traced(z[None], z, data, None)[0]))
@@ -125,6 +117,23 @@ def search(
     history = np.minimum.accumulate(np.concatenate(histories))
     record = Search(strategy=config.strategy, history=history, evaluations=evaluations)
     return SearchResult(finalists[0], best, finalists, record)
+
+
+def _restarts(start: np.ndarray, config: FitConfig) -> Iterator[tuple[jax.Array, np.ndarray, float, int]]:
+    """Yield key, middle ``(P,)``, spread and population of each run."""
+    key, large = jax.random.key(config.seed), config.population
+    for index in range(config.restarts + 1):
+        k_run, k_step, k_middle = jax.random.split(jax.random.fold_in(key, index), 3)
+        if index % 2:
+            large = 2 * large
+            yield k_run, start, config.std, large
+        elif index:
+            # Hansen draws the population of small runs, too. Each size takes 5 s to compile, so ours keep the first.
+            u = float(jax.random.uniform(k_step))
+            middle = np.asarray(jax.random.normal(k_middle, start.shape)) * 1.5
+            yield k_run, middle, config.std * 10.0 ** (-2.0 * u), config.population
+        else:
+            yield k_run, start, config.std, config.population
 
 
 def _ranked(finalists: np.ndarray, alone: Callable[[Any], Any]) -> tuple[np.ndarray, float]:
@@ -157,22 +166,22 @@ class _Run:
         middle: np.ndarray,
         std: float,
         generations: int,
-        given: Any,
-        told: Callable[[int, float, np.ndarray], None] | None,
+        data: Any,
+        report: Callable[[int, float, np.ndarray], None] | None,
         on_compile: OnCompile | None,
     ) -> tuple[np.ndarray, np.ndarray, int]:
-        """Run; return the best candidate ``(P,)``, the best loss up to each generation, and how many were simulated."""
+        """Return the best candidate ``(P,)``, the best loss up to each generation, and the number of evaluations."""
         params = self.strategy.default_params
         if hasattr(params, "std_init"):
             params = params.replace(std_init=std)
         params = strong(params)
         k_first, *keys = jax.random.split(key, 1 + -(-generations // self.count))
-        first = self._first(k_first, jnp.asarray(middle, jnp.float32), std, params, given)
+        first = self._first(k_first, jnp.asarray(middle, jnp.float32), std, params, data)
         state = strong(first)  # else it compiles twice
         history: list[np.ndarray] = []
         median = np.inf
         for k_generations in keys:
-            state, (best, medians, width) = self.advance(state, params, k_generations, given, on_compile=on_compile)
+            state, (best, medians, width) = self.advance(state, params, k_generations, data, on_compile=on_compile)
             history.append(np.asarray(best))
             if not self.by_population and not np.isfinite(np.asarray(self._middle(state))).all():
                 raise UsageError(
@@ -180,8 +189,8 @@ class _Run:
                     f"{middle.size} parameters its candidates are no numbers",
                     hint="try another population, or CMA_ES",
                 )
-            if told:
-                told(self.count, float(np.min(history[-1])), np.asarray(self._best(state)))
+            if report:
+                report(self.count, float(np.min(history[-1])), np.asarray(self._best(state)))
             before, median = median, float(np.median(medians))
             # With batches the losses of two generations are on different segments: they show no standstill.
             still = not self.batched and median > (1.0 - _STANDSTILL) * before
@@ -190,13 +199,13 @@ class _Run:
         losses = np.minimum.accumulate(np.concatenate(history))
         return np.asarray(self._best(state)), losses, self.population * losses.size
 
-    def _first(self, key: Any, middle: Any, std: float, params: Any, given: Any) -> Any:
+    def _first(self, key: Any, middle: Any, std: float, params: Any, data: Any) -> Any:
         if not self.by_population:
             return self.strategy.init(key, middle, params)
         k_spread, k_pick, k_init = jax.random.split(key, 3)
         spread = std * jax.random.normal(k_spread, (self.population, middle.size))
         candidates = middle + spread.at[0].set(0.0)
-        return self.strategy.init(k_init, candidates, self._fitness(candidates, middle, k_pick, given), params)
+        return self.strategy.init(k_init, candidates, self._fitness(candidates, middle, k_pick, data), params)
 
     def _best(self, state: Any) -> Any:
         return self._middle(state) if self.batched else state.best_solution
@@ -204,8 +213,8 @@ class _Run:
     def _middle(self, state: Any) -> Any:
         return state.best_solution if self.by_population else self.strategy.get_mean(state)
 
-    def _fitness(self, candidates: Any, around: Any, key: Any, given: Any) -> Any:
-        fitness = self.losses(candidates, around, given[0], self._pick(key, given[1]))
+    def _fitness(self, candidates: Any, around: Any, key: Any, data: Any) -> Any:
+        fitness = self.losses(candidates, around, data[0], self._pick(key, data[1]))
         return jnp.where(jnp.isfinite(fitness), fitness, _INFINITE)
 
     def _pick(self, key: Any, weight: Any) -> Any:
@@ -215,11 +224,11 @@ class _Run:
         return jax.lax.top_k(jnp.where(weight > 0.0, jax.random.uniform(key, weight.shape), -1.0), self.batch)[1]
 
     def _divided(self, candidates: Any) -> Any:
-        """Return candidates of which each device simulates a part."""
+        """Return candidates that are divided among the devices."""
         return self._spread(candidates, PartitionSpec("candidates"))
 
     def _on_all(self, values: Any) -> Any:
-        """Return values that all devices have: each makes the same next generation."""
+        """Return values that all devices hold, so that each makes the same next generation."""
         return self._spread(values, PartitionSpec())
 
     def _spread(self, values: Any, how: PartitionSpec) -> Any:
@@ -228,14 +237,14 @@ class _Run:
         where = NamedSharding(Mesh(np.array(self.devices), ("candidates",), (AxisType.Auto,)), how)
         return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, where), values)
 
-    def _advance(self, state: Any, params: Any, key: Any, given: Any) -> tuple[Any, Any]:
-        """Make a block of generations; return the state, and of each its best and median loss and its width."""
+    def _advance(self, state: Any, params: Any, key: Any, data: Any) -> tuple[Any, Any]:
+        """Make a block of generations; return the state, and best loss, median loss and width of each generation."""
 
         def generation(state: Any, key: Any) -> tuple[Any, Any]:
-            ask, tell, pick = jax.random.split(key, 3)
-            candidates, state = self.strategy.ask(ask, state, params)
-            fitness = self._on_all(self._fitness(self._divided(candidates), self._middle(state), pick, given))
-            state, _ = self.strategy.tell(tell, candidates, fitness, state, params)
+            k_ask, k_tell, pick = jax.random.split(key, 3)
+            candidates, state = self.strategy.ask(k_ask, state, params)
+            fitness = self._on_all(self._fitness(self._divided(candidates), self._middle(state), pick, data))
+            state, _ = self.strategy.tell(k_tell, candidates, fitness, state, params)
             return state, (jnp.min(fitness), jnp.median(fitness), jnp.max(jnp.std(candidates, axis=0)))
 
         return self._on_all(jax.lax.scan(generation, state, jax.random.split(key, self.count)))
@@ -250,20 +259,20 @@ class _HostRun(_Run):
         self.advance = self._generations
         self._fresh = True
 
-    def _generations(self, state: Any, params: Any, key: Any, given: Any, on_compile: OnCompile | None) -> Any:
+    def _generations(self, state: Any, params: Any, key: Any, data: Any, on_compile: OnCompile | None) -> Any:
         """Make a block of generations; as ``_advance``."""
         rows = []
         self._fresh = True
         for own in jax.random.split(key, self.count):
-            ask, tell, pick = jax.random.split(own, 3)
-            candidates, state = self._ask(ask, state, params, on_compile=on_compile)
-            fitness = self._fitness(candidates, self._middle(state), pick, given)
-            state = strong(self._tell(tell, candidates, fitness, state, params, on_compile=on_compile)[0])
+            k_ask, k_tell, pick = jax.random.split(own, 3)
+            candidates, state = self._ask(k_ask, state, params, on_compile=on_compile)
+            fitness = self._fitness(candidates, self._middle(state), pick, data)
+            state = strong(self._tell(k_tell, candidates, fitness, state, params, on_compile=on_compile)[0])
             rows.append((np.min(fitness), np.median(fitness), np.max(np.std(candidates, axis=0))))
         return state, tuple(np.array(column) for column in zip(*rows, strict=True))
 
-    def _fitness(self, candidates: Any, around: Any, key: Any, given: Any) -> Any:
-        pick = self._pick(key, given[1])
+    def _fitness(self, candidates: Any, around: Any, key: Any, data: Any) -> Any:
+        pick = self._pick(key, data[1])
         points = np.asarray(candidates, np.float64), np.asarray(around, np.float64)
         fitness = self.losses(*points, None if pick is None else np.asarray(pick), self._fresh)
         self._fresh = False
