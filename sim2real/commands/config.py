@@ -21,9 +21,9 @@ class NewConfig:
     model: Annotated[Positional[Path | None], arg(metavar="ROBOT.xml")] = None
     """Model of the robot: MJCF or URDF."""
     log: Annotated[str | None, arg(metavar="FILE")] = None
-    """A log of it, which says what was commanded and measured, and how fast."""
+    """Log of the robot; its commands, measurements and rate are taken over."""
     drive: Literal["position", "velocity", "torque", "duty", "mit"] = "position"
-    """What drives are told, where no log says so."""
+    """Command of the drives, if there is no log."""
     robot: Annotated[RobotFlags, arg(name="")] = field(default_factory=RobotFlags)
     folder: Path = Path("pipelines")
     """Folder of pipelines."""
@@ -31,7 +31,7 @@ class NewConfig:
 
 @dataclass(frozen=True)
 class RecoverConfig:
-    """Write what is readable of a damaged MCAP file into a new one."""
+    """Copy the readable part of a damaged MCAP file into a new file."""
 
     log: Annotated[Positional[Path | None], arg(metavar="FILE")] = None
     """The damaged file; it is left as it is."""
@@ -43,7 +43,7 @@ class RecoverConfig:
         """The damaged file.
 
         Raises:
-            UsageError: When none was named.
+            UsageError: No file is given.
         """
         if self.log is None:
             raise UsageError("log recover needs a file", hint="sim2real log recover FILE")
@@ -52,12 +52,12 @@ class RecoverConfig:
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Write what was identified in the terms of another simulator."""
+    """Write the estimates as a model of another simulator."""
 
     source: Annotated[Positional[str | None], arg(metavar="RUN|PIPELINE|FILE")] = None
     """A run folder, a pipeline, whose newest identification is taken, or a parameters.json."""
     to: Literal["mjcf", "mjlab", "isaaclab", "json"] = "mjcf"
-    """What to write: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, or everything as JSON."""
+    """Format: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, or everything as JSON."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """The file to write; default: one in the working directory that is called after the pipeline."""
     runs: Path = Path("runs")

@@ -1,4 +1,4 @@
-"""``sim2real export identified``: what was identified, in the terms of another simulator."""
+"""``sim2real export identified``: the estimates as a model of another simulator."""
 
 from __future__ import annotations
 
@@ -33,21 +33,15 @@ _PLAIN = {"gain", "stiffness", "damping", "viscous", "coulomb", "armature", "gra
 
 
 def run(config: ExportConfig) -> Path:
-    """Write the file and say what is not in it.
-
-    Args:
-        config: What to export, and as what.
-
-    Returns:
-        The file.
+    """Write the file, print the parameters that it lacks, and return its path.
 
     Raises:
-        UsageError: When there is no identification, it was interrupted, or the target cannot hold the robot's model.
+        UsageError: There is no identification, it was interrupted, or the target cannot hold the robot's model.
     """
     file = find_parameters(config)
-    found = Identification.load(file)
-    out = config.out or Path(f"{found.pipeline}_{_FILES[config.to]}")
-    _export(found, pipeline_beside(file, found), config.to, out, str(file))
+    identification = Identification.load(file)
+    out = config.out or Path(f"{identification.pipeline}_{_FILES[config.to]}")
+    _export(identification, pipeline_beside(file, identification), config.to, out, str(file))
     wrote(out)
     return out
 
@@ -58,52 +52,54 @@ def export(
     out: AnyPath,
     to: Literal["mjcf", "mjlab", "isaaclab", "json"] = "mjcf",
 ) -> Path:
-    """Write what was identified in the terms of another simulator.
+    """Write the estimates as a model of another simulator.
 
     Args:
         robot: The robot, its pipeline, or the pipeline's name.
-        identification: What was identified, or its folder.
+        identification: The identification, or its folder.
         to: ``mjcf``, ``mjlab``, ``isaaclab`` or ``json``.
 
     Returns:
         The file.
 
     Raises:
-        UsageError: When it was interrupted, is of another robot, or the target cannot hold the robot's model.
+        UsageError: The identification was interrupted or is of another robot, or the target cannot hold the model.
     """
-    pipeline, found, out = python_arguments.pipeline_of(robot), identification_of(identification), Path(out)
+    pipeline, document, out = python_arguments.pipeline_of(robot), identification_of(identification), Path(out)
     if to not in _FILES:
         raise UsageError(f"cannot export to {to!r}. Available: {', '.join(_FILES)}")
-    if found.pipeline != pipeline.name:
-        raise UsageError(f"these are parameters of pipeline {found.pipeline!r}, not of {pipeline.name!r}")
-    _export(found, pipeline, to, out, "memory" if isinstance(identification, Identification) else str(identification))
+    if document.pipeline != pipeline.name:
+        raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {pipeline.name!r}")
+    _export(
+        document, pipeline, to, out, "memory" if isinstance(identification, Identification) else str(identification)
+    )
     return out
 
 
-def _export(found: Identification, pipeline: Pipeline, to: str, out: Path, where: str) -> None:
-    if found.posterior is None:
-        ended = UNFINISHED.get(found.verdict.status, "has no intervals")
+def _export(identification: Identification, pipeline: Pipeline, to: str, out: Path, where: str) -> None:
+    if identification.posterior is None:
+        ended = UNFINISHED.get(identification.verdict.status, "has no intervals")
         raise UsageError(
             f"the identification in {where} {ended}: its estimates may be far off",
-            hint=found.verdict.next or f"sim2real identify {found.pipeline}",
+            hint=identification.verdict.next or f"sim2real identify {identification.pipeline}",
         )
-    robot = having(pipeline.load(), [p.name for p in found.parameters])
+    robot = having(pipeline.load(), [p.name for p in identification.parameters])
     table = robot.identifiable(pipeline.identify.max_delay_s).parameters
     about = [
-        ("pipeline", found.pipeline),
-        ("verdict", found.verdict.status),
-        *(("log", f"{log.path} {log.sha256}") for log in found.logs[:1]),
+        ("pipeline", identification.pipeline),
+        ("verdict", identification.verdict.status),
+        *(("log", f"{log.path} {log.sha256}") for log in identification.logs[:1]),
         ("sim2real", metadata.version("sim2real")),
     ]
-    if found.verdict.status != "accepted":
-        note(f"verdict: {found.verdict.status}; the file says so too")
-    write(to, out, found, robot, table, about)
+    if identification.verdict.status != "accepted":
+        note(f"verdict: {identification.verdict.status}; the file contains the verdict, too")
+    write(to, out, identification, robot, table, about)
 
 
 def write(
     to: str,
     out: Path,
-    found: Identification,
+    identification: Identification,
     robot: RecordedRobot,
     table: ParameterTable,
     about: list[tuple[str, str]],
@@ -114,14 +110,15 @@ def write(
         to: ``mjcf``, ``mjlab``, ``isaaclab`` or ``json``.
     """
     sides = {p.name: p.side for p in table}
-    off = {p.name: p.nominal for p in table}  # of optional terms that nobody asked for
-    text = robot.identified_mjcf({**off, **values_of(found)})
-    terms = None if text is None else find_terms(found, lambda values: _text(robot, {**off, **values}), sides)
+    # Optional terms that were not identified have their nominal values, which switch them off.
+    off = {p.name: p.nominal for p in table}
+    text = robot.identified_mjcf({**off, **values_of(identification)})
+    terms = None if text is None else find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
     if to == "json":
-        write_json(out, json_document(found, terms, find_delays(found, sides), about))
+        write_json(out, json_document(identification, terms, find_delays(identification, sides), about))
         return
     if text is None or terms is None:
-        raise _no_model(found, table, to)
+        raise _no_model(identification, table, to)
     if terms.unexpressed:
         note(f"not expressed in {to}: {', '.join(terms.unexpressed)}")
         about = [*about, ("not expressed", ", ".join(terms.unexpressed))]
@@ -130,16 +127,16 @@ def write(
     else:
         source = mjlab_source if to == "mjlab" else isaaclab_source
         content = source(
-            terms, f"Actuators and randomisation of {found.pipeline!r}, as sim2real identified them.", about
+            terms, f"Actuators and randomisation of {identification.pipeline!r}, as sim2real identified them.", about
         )
     out.write_text(content, encoding="utf-8")
 
 
 def find_parameters(config: ExportConfig) -> Path:
-    """Return the file with the identification that is meant.
+    """Return the file of the identification that the configuration names.
 
     Raises:
-        UsageError: When none was named, or there is none.
+        UsageError: It names none, or there is no such file.
     """
     source = config.source
     if source is None:
@@ -165,12 +162,12 @@ def _text(robot: RecordedRobot, values: Mapping[str, float]) -> str:
     return text
 
 
-def _no_model(found: Identification, table: ParameterTable, to: str) -> UsageError:
+def _no_model(identification: Identification, table: ParameterTable, to: str) -> UsageError:
     """Return the error for a robot whose world is not MuJoCo's: it names what an MJCF would lack."""
     leaves = {p.name: str(p.leaf).rpartition(".")[2].partition("[")[0] for p in table if p.leaf}
-    lost = [p.name for p in found.parameters if leaves.get(p.name.partition("@")[0], "delay") not in _PLAIN]
+    lost = [p.name for p in identification.parameters if leaves.get(p.name.partition("@")[0], "delay") not in _PLAIN]
     return UsageError(
-        f"the world of pipeline {found.pipeline!r} is not MuJoCo's, so there is no model to export to {to}. Joints and "
-        f"drives of MuJoCo's have nothing for: {', '.join(lost) or 'its equations of motion'}",
+        f"the world of pipeline {identification.pipeline!r} is not MuJoCo's, so there is no model to export to "
+        f"{to}. Joints and drives of MuJoCo's have nothing for: {', '.join(lost) or 'its equations of motion'}",
         hint="--to json has all parameters, their intervals and the posterior",
     )

@@ -20,20 +20,14 @@ EXAMPLE = "run_policy.py"
 
 
 def run(config: ShipConfig) -> Path:
-    """Copy a bundle and write the example beside it.
-
-    Args:
-        config: Which, and where to.
-
-    Returns:
-        The folder.
+    """Copy a bundle, write the example beside it, and return the folder.
 
     Raises:
-        UsageError: No policy was named, or the folder holds something.
+        UsageError: The configuration names no policy, or the folder is not empty.
         Sim2RealError: The bundle is missing or damaged.
     """
     bundle = find_bundle(config)
-    contract = load_bundle(bundle).contract  # what is damaged is not passed on
+    contract = load_bundle(bundle).contract  # refuses a damaged bundle
     plain = read_contract(bundle)[1] == NetworkSpec()
     out = config.to or Path(f"{bundle.resolve().parent.name}_policy")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -52,10 +46,10 @@ def run(config: ShipConfig) -> Path:
 
 
 def find_bundle(config: ShipConfig) -> Path:
-    """Return the folder of the bundle that is meant.
+    """Return the folder of the bundle that the configuration names.
 
     Raises:
-        UsageError: None was named, or there is none.
+        UsageError: It names none, or there is no such bundle.
     """
     if (source := config.source) is None:
         raise UsageError(

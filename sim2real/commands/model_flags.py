@@ -19,14 +19,14 @@ from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY, RobotFlags
 
 @dataclass(frozen=True)
 class CheckLogFlags:
-    """Judge what a log can tell about the parameters, before anything is searched."""
+    """Predict which parameters a log can determine, before a search."""
 
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
     """Log to judge, one flag a log."""
     bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
     """Bounds of a parameter instead of the usual ones: NAME LOW HIGH, one flag a parameter."""
     fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
-    """Value of a parameter that is not to be identified: NAME VALUE, one flag a parameter."""
+    """Value at which a parameter is fixed: NAME VALUE, one flag a parameter."""
     json: bool = False
     """Print JSON instead of tables."""
 

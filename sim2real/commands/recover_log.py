@@ -1,4 +1,4 @@
-"""``sim2real log recover``: copies what is readable of a damaged log."""
+"""``sim2real log recover``: copies the readable part of a damaged log."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from sim2real.stages.terminal.console import note, table, wrote
 
 
 def run(config: RecoverConfig) -> None:
-    """Write the new file, and print what it has and what was lost.
+    """Write the new file; print the numbers of its messages and the unreadable parts.
 
     Raises:
         Sim2RealError: When the file is missing or not an MCAP file, or the new file exists or cannot be written.
     """
     source = config.source
     target = config.out or source.with_name(f"{source.stem}.recovered.mcap")
-    found = recover(source, target)
-    for lost in found.skipped:
+    recovery = recover(source, target)
+    for lost in recovery.skipped:
         note(f"unreadable: {lost}")
-    if found.cut:
+    if recovery.cut:
         note("the file ends before its data does")
-    print(table(sorted(found.messages.items()), ["topic", "messages"]))
+    print(table(sorted(recovery.messages.items()), ["topic", "messages"]))
     wrote(target)

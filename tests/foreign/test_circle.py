@@ -9,7 +9,7 @@ from sim2real.log import ImportMapping, import_file, load_mapping
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.importer import import_opened
 from sim2real.log.importing.mapping import to_toml
-from sim2real.stages.import_logs.stage import asked_of_model, proposed
+from sim2real.stages.import_logs.stage import description_of_model, proposed
 
 T = np.arange(0, 16, 0.01)
 GOAL = 0.8 * T + 0.4 * np.sin(2 * T) + 0.3 * np.sin(5.3 * T)
@@ -99,7 +99,7 @@ def of_rail(tmp_path, values, joints, limits=""):
     (tmp_path / "rail.xml").write_text(RAIL.format(limits))
     np.savez(tmp_path / "run.npz", **values)
     file = open_foreign(tmp_path / "run.npz")
-    mapping, text = proposed(file, asked_of_model(tmp_path / "rail.xml", "rail", joints))
+    mapping, text = proposed(file, description_of_model(tmp_path / "rail.xml", "rail", joints))
     return import_opened(file, mapping), text
 
 

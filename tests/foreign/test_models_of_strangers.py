@@ -285,7 +285,7 @@ def test_logs_of_slides_are_in_metres_and_newtons(tmp_path, capsys, file, text, 
         tmp_path / "run.npz", **{"t_s": t, file: q, "force_cmd_n": 1000 * np.gradient(np.gradient(q, axis=0), axis=0)}
     )
     (tmp_path / "robot.xml").write_text(text)
-    asked = import_logs_stage.asked_of_model(tmp_path / "robot.xml", "axis", joints)
+    asked = import_logs_stage.description_of_model(tmp_path / "robot.xml", "axis", joints)
     mapping, written = import_logs_stage.proposed(open_foreign(tmp_path / "run.npz"), asked)
     assert (mapping.units["sensor"]["position"], mapping.units["actuator"]["torque"]) == units
     assert (units[0] == "m") == ("is in radians" not in written)
@@ -297,6 +297,6 @@ def test_millimetres_of_a_slide_are_not_taken_for_degrees(tmp_path):
     q = 120.0 * np.sin(2 * np.pi * 0.7 * t + np.sin(1.3 * t))[:, None]
     np.savez(tmp_path / "run.npz", t_s=t, q=q, force_cmd=np.gradient(np.gradient(q, axis=0), axis=0))
     (tmp_path / "robot.xml").write_text(AXIS.format(""))
-    asked = import_logs_stage.asked_of_model(tmp_path / "robot.xml", "axis")
+    asked = import_logs_stage.description_of_model(tmp_path / "robot.xml", "axis")
     with pytest.raises(UsageError, match=r"(?s)x slides, but .*not in metres.*0.001 for mm"):
         import_logs_stage.proposed(open_foreign(tmp_path / "run.npz"), asked)

@@ -123,7 +123,7 @@ def test_an_identification_without_intervals_is_refused(arm, here, capsys, statu
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "needs to be told what to do"),
+        ([], "export needs an action"),
         (["weights"], "there is no `export weights`"),
         (["identified"], "needs a run folder, a pipeline or a parameters.json"),
         (["identified", "no_such"], "there is no file, pipeline or run 'no_such'"),

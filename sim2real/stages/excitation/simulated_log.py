@@ -1,4 +1,4 @@
-"""The log that commands would give if the robot were its model."""
+"""The log of simulated commands, for a robot that equals its model."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ def simulate(
     config: FitConfig,
     seed: int = 0,
 ) -> Episode:
-    """Return the log that commands would give if the robot were the model.
+    """Return the log of commands, simulated with the model.
 
-    It starts at rest; joints that are told where to go start where they are told to be.
+    It starts at rest; a joint with a goal starts at its first goal.
 
     Args:
-        robot: Says which command is excited, and at which rate.
+        robot: Its command is excited, at its rate.
         signal: Shape ``(N, actions)``: one command a step, as ``Robot.around`` returns them.
-        config: For which delays the model is made, and what simulates it.
+        config: Largest delay of the model, and the engine.
     """
     nodes = model.nodes(config.max_delay_s)
     engine = choose(config.engine, nodes, model.given, config.jacobian)
     timeline = draw(nodes, len(signal) / robot.rate_hz, rng=seed)
-    given, outputs = {}, {}
+    commands, outputs = {}, {}
     for name in model.given:
         message = nodes[name].init_output(jax.random.key(0), None)
         count = timeline.vertices[name].start.shape[1]
@@ -49,27 +49,27 @@ def simulate(
             played = signal[np.minimum(np.arange(count), len(signal) - 1)]
             rows[robot.command] = played.reshape(rows[robot.command].shape)
         leaves, kind = jax.tree_util.tree_flatten(message)
-        given[name] = kind.unflatten(
+        commands[name] = kind.unflatten(
             [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]
         )
         outputs[name] = rows
     graph = OpenLoopGraph(nodes, model.sensor, model.given)
-    tables = jax.tree_util.tree_map(lambda rows: jnp.asarray(rows[0]), graph.tables(timeline, given))
-    messages = jax.tree_util.tree_map(lambda rows: rows[0], given)
+    tables = jax.tree_util.tree_map(lambda rows: jnp.asarray(rows[0]), graph.tables(timeline, commands))
+    messages = jax.tree_util.tree_map(lambda rows: rows[0], commands)
     rest = named_leaves(nodes[model.sensor].init_output(jax.random.key(0), None))
-    told = [i for i, c in enumerate(model.channels) if c.goal is not None]
+    driven = [i for i, c in enumerate(model.channels) if c.goal is not None]
     start = np.array([float(c.of(np.asarray(rest[c.position]))) for c in model.channels])
-    start[told] = [signal[0, model.channels[i].index or 0] for i in told]
+    start[driven] = [signal[0, model.channels[i].index or 0] for i in driven]
     params = model.params(values, jnp.asarray(np.concatenate([start, np.zeros_like(start)]), jnp.float32))
     # The first command is taken to have held before, as where a log is cut into segments.
     gs = graph.begin(params, jax.tree_util.tree_map(lambda rows: rows[0], messages), 0)
     if engine.name == "c":
         outside = CRollouts(graph, engine.model)
-        found = jax.jit(lambda state: outside.rollout(state, params, tables, messages, model.sensor))(gs)
+        records = jax.jit(lambda state: outside.rollout(state, params, tables, messages, model.sensor))(gs)
     else:
-        found = jax.jit(lambda state: graph.run(state, tables, messages, model.sensor))(gs)
+        records = jax.jit(lambda state: graph.run(state, tables, messages, model.sensor))(gs)
     count = int(timeline.vertices[model.sensor].count[0])
-    outputs[model.sensor] = {n: np.asarray(v)[:count] for n, v in named_leaves(found).items()}
+    outputs[model.sensor] = {n: np.asarray(v)[:count] for n, v in named_leaves(records).items()}
     early = {model.sensor: to_ticks(model.ahead_s)}  # where it is put back when the log is cut into segments
     steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values()))), early.get(n, 0)) for n in outputs}
     return Episode(steps=steps, messages={}, outputs=outputs, metadata={})

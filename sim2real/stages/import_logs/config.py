@@ -19,7 +19,7 @@ class ImportConfig:
     files: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE...")] = ()
     """Files of other recorders: npz, JSON, CSV, MCAP or the folder of a ROS 2 bag, or a LeRobot data set."""
     mapping: Path | None = None
-    """TOML file that says which signal is which field; default: the pipeline's import.toml, or one is proposed."""
+    """TOML file that maps signals to fields; default: the pipeline's import.toml, or one is proposed."""
     mjcf: Path | None = None
     """Model of the robot (MJCF or URDF), for the names and ranges of its joints."""
     joints: tuple[str, ...] = ()
@@ -29,7 +29,7 @@ class ImportConfig:
     together: bool = False
     """All files are of one recording: a log of all of them instead of one for each."""
     as_told: bool = False
-    """Keep names, order and signs of the file or the mapping where the data contradicts them, or cannot tell."""
+    """Keep names, order and signs of the file or the mapping, even if the data contradicts them or is ambiguous."""
     pipeline: str | None = None
     """Pipeline that the logs are for; default: the one that the mapping names, or the model's name."""
     format: Literal["npz", "json", "csv", "lerobot", "mcap"] | None = None

@@ -27,7 +27,7 @@ from sim2real.stages.terminal import console
 
 
 def run(config: ImportConfig) -> None:
-    """Write a log for each file, into a run folder of its own or where the configuration says.
+    """Write a log for each file, into a run folder of its own, or to the configured file.
 
     Raises:
         UsageError: When a file or the mapping cannot be read, they do not fit each other, or a mapping is to be
@@ -35,11 +35,11 @@ def run(config: ImportConfig) -> None:
     """
     files = [open_foreign(path, config.format, config.episode) for path in config.sources]
     files = [joined(files)] if config.together and len(files) > 1 else files
-    mapping = told_mapping(config)
+    mapping = configured_mapping(config)
     text = "" if mapping else None
     for file in files:
         if mapping is None:
-            mapping, text = proposed(file, asked(config))
+            mapping, text = proposed(file, description_of(config))
         else:
             for line in file.notes:
                 console.note(line)
@@ -67,8 +67,8 @@ def run(config: ImportConfig) -> None:
             text = ""
 
 
-def told_mapping(config: ImportConfig) -> ImportMapping | None:
-    """Return the mapping that is named, or that the pipeline has; None: one is to be proposed."""
+def configured_mapping(config: ImportConfig) -> ImportMapping | None:
+    """Return the mapping of the flag or of the pipeline; None: one is proposed."""
     if config.mapping is None and config.pipeline is None:
         return None
     home = pipeline.load_pipeline(config.pipeline) if config.pipeline and not config.mapping else None
@@ -82,20 +82,24 @@ def described(home: pipeline.Pipeline) -> bool:
     return isinstance(home.load(), MjcfRobot)
 
 
-def asked(config: ImportConfig) -> ImportHints:
-    """Return what the user says of files without a mapping."""
+def description_of(config: ImportConfig) -> ImportHints:
+    """Return the user's description of files without a mapping."""
     if config.mjcf is not None:
         name = config.pipeline or pipeline_name(config.mjcf)
-        return replace(asked_of_model(config.mjcf, name, config.joints, config.rate_hz), as_told=config.as_told)
+        return replace(description_of_model(config.mjcf, name, config.joints, config.rate_hz), as_told=config.as_told)
     home = pipeline.load_pipeline(config.pipeline) if config.pipeline else None
     if home is not None:
-        own: RobotConfig = home.load().config  # pyright: ignore[reportAttributeAccessIssue] - `described` said so
-        return replace(asked_of_model(own.model, home.name, own.joints, config.rate_hz), as_told=config.as_told)
+        robot: RobotConfig = home.load().config  # pyright: ignore[reportAttributeAccessIssue] - checked by `described`
+        return replace(
+            description_of_model(robot.model, home.name, robot.joints, config.rate_hz), as_told=config.as_told
+        )
     return ImportHints("robot", config.rate_hz, config.joints, as_told=config.as_told)
 
 
-def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz: float | None = None) -> ImportHints:
-    """Return what a model says of files without a mapping.
+def description_of_model(
+    mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz: float | None = None
+) -> ImportHints:
+    """Return a model's description of files without a mapping.
 
     Args:
         joints: The joints that were recorded; empty: all of the model's.
@@ -105,44 +109,44 @@ def asked_of_model(mjcf: Path, name: str, joints: tuple[str, ...] = (), rate_hz:
         UsageError: When the model has no such joint.
     """
     model = read_model(mjcf)
-    own = joints_of(model)
-    if unknown := [j for j in joints if j not in own]:
-        raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
-    ranges = np.array([model.joint(j).range for j in joints or own])
-    return ImportHints(name, rate_hz, joints or own, ranges, slides=slides_of(model, joints or own))
+    model_joints = joints_of(model)
+    if unknown := [j for j in joints if j not in model_joints]:
+        raise UsageError(f"{mjcf} has no joint {unknown[0]!r}. Available: {', '.join(model_joints)}")
+    ranges = np.array([model.joint(j).range for j in joints or model_joints])
+    return ImportHints(name, rate_hz, joints or model_joints, ranges, slides=slides_of(model, joints or model_joints))
 
 
-def proposed(file: ForeignFile, told: ImportHints) -> tuple[ImportMapping, str]:
-    """Return the mapping that a file's names and data speak for, and its text; the evidence is printed.
+def proposed(file: ForeignFile, description: ImportHints) -> tuple[ImportMapping, str]:
+    """Propose a mapping from a file's names and data; return it and its text; print the evidence.
 
     Raises:
         UsageError: When something is ambiguous.
     """
     try:
-        found = propose(file, told)
+        proposal = propose(file, description)
     except UsageError:
-        # What was left out may be the reason.
+        # A signal that the file's reader omitted may be the cause.
         for line in file.notes:
             console.note(line)
         raise
     console.note(f"proposed mapping for {file.path.name}:")
-    lines, mapping = list(found.evidence), found.mapping
-    if told.slides:
-        mapping, line = in_lengths(mapping, told, file.path)
+    lines, mapping = list(proposal.evidence), proposal.mapping
+    if description.slides:
+        mapping, line = in_lengths(mapping, description, file.path)
         lines.append(line)
     for line in lines:
         console.note(f"  {line}")
-    names = f"Joints: {', '.join(found.joints)}"
+    names = f"Joints: {', '.join(proposal.joints)}"
     return mapping, to_toml(mapping, [f"Proposed by `sim2real import {file.path.name}`:", *lines, names])
 
 
-def in_lengths(mapping: ImportMapping, told: ImportHints, path: Path) -> tuple[ImportMapping, str]:
+def in_lengths(mapping: ImportMapping, description: ImportHints, path: Path) -> tuple[ImportMapping, str]:
     """Return a proposed mapping with the units of slides; it was proposed as if their positions were angles.
 
     Raises:
         UsageError: The positions were taken for degrees.
     """
-    mixed, names = len(told.slides) < len(told.joints), ", ".join(told.slides)
+    mixed, names = len(description.slides) < len(description.joints), ", ".join(description.slides)
 
     def field(how: FieldMapping) -> FieldMapping:
         if unit_for(how.unit, True) == how.unit:
@@ -166,39 +170,39 @@ def refuse_contradictions(path: Path, episode: Episode, as_told: bool) -> None:
     Raises:
         UsageError: When joints follow other commands than their own, or move against them.
     """
-    said = contradictions(episode)
-    if said and not as_told:
+    sentences = contradictions(episode)
+    if sentences and not as_told:
         raise UsageError(
-            f"the mapping and the data of {path} contradict each other: {'; '.join(said)}",
+            f"the mapping and the data of {path} contradict each other: {'; '.join(sentences)}",
             hint="correct order, signs or units in the mapping; --as-told imports it all the same",
         )
-    for line in said:
+    for line in sentences:
         console.note(f"warning: {line}")
 
 
 def contradictions(episode: Episode) -> list[str]:
-    """Return what a log's data says against the goals and positions in it: sentences."""
+    """Return sentences about contradictions between the goals and the positions of a log."""
     sensor, actuator = ROLES.sensor, ROLES.actuator
     if not {sensor, actuator} <= set(episode.outputs):
         return []
     commands, units = episode.outputs[actuator], {**episode.units.get(actuator, {}), **episode.units.get(sensor, {})}
-    said: list[str] = []
+    sentences: list[str] = []
     for field, values in episode.outputs[sensor].items():
         if meaning(field).quantity != "position" or not units.get(field):
             continue
-        for goal, told in commands.items():
+        for goal, goals in commands.items():
             if (
                 units.get(goal) == units[field]
-                and told.shape[1:] == values.shape[1:]
+                and goals.shape[1:] == values.shape[1:]
                 and meaning(goal).side == "command"
             ):
                 t = episode.steps[actuator].begun_s, episode.steps[sensor].begun_s
-                flat = told.reshape(len(told), -1), values.reshape(len(values), -1)
-                said += evidence.contradictions(t, *flat, acting=_acting(list(commands.items())))
-    return said
+                flat = goals.reshape(len(goals), -1), values.reshape(len(values), -1)
+                sentences += evidence.contradictions(t, *flat, acting=_acting(list(commands.items())))
+    return sentences
 
 
 def _acting(commands: Sequence[tuple[str, np.ndarray]]) -> np.ndarray | None:
-    """Return whether torque was on at each command; None where it is not known."""
-    found = [values for name, values in commands if meaning(name).quantity == "enabled"]
-    return (found[0].reshape(len(found[0]), -1) > 0).min(axis=1) if len(found) == 1 else None
+    """Return whether torque was on at each command; None without exactly one such signal."""
+    enabled = [values for name, values in commands if meaning(name).quantity == "enabled"]
+    return (enabled[0].reshape(len(enabled[0]), -1) > 0).min(axis=1) if len(enabled) == 1 else None

@@ -25,7 +25,7 @@ def picture(
 
     Args:
         chain: The nodes, as in `Latency.of`.
-        links: What the motion tells of how the device's delays are distributed.
+        links: Distributions of the device's delays, estimated from the motion.
     """
     parts = list(measured(recording, chain))
     with styled():

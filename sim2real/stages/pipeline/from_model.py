@@ -42,14 +42,14 @@ class DescribedPipeline(Pipeline):
     """A pipeline without a folder.
 
     Attributes:
-        description: What there is to know about the robot.
-        mapping: Of files of other recorders; None: not known.
-        told: The flags that described it.
+        description: The robot's model, joints, commands and parameters.
+        mapping: Mapping of files of other recorders; None: there is none.
+        flag_words: The flags that describe it.
     """
 
     description: RobotConfig = field(default_factory=lambda: RobotConfig(Path(), (), ()))
     mapping: ImportMapping | None = None
-    told: tuple[str, ...] = ()
+    flag_words: tuple[str, ...] = ()
 
     def load(self, module: str | None = None) -> Any:
         """Return the robot; it has no other modules."""
@@ -60,22 +60,24 @@ class DescribedPipeline(Pipeline):
     @property
     def words(self) -> tuple[str, ...]:
         """How a command names it."""
-        return self.told or (self.name,)
+        return self.flag_words or (self.name,)
 
     def mapping_of(self, path: Path) -> ImportMapping | None:
         """Return the mapping of a file of another recorder; None of a log of ours."""
         return None if path.suffix == ".mcap" and bags.is_ours(path) else self.mapping
 
     def reading(self, logs: Sequence[str], mapping: ImportMapping | None = None) -> DescribedPipeline:
-        """Return the pipeline with what it needs to read logs: a mapping where they are of another recorder.
+        """Return the pipeline with the mapping that it needs to read logs of another recorder.
 
         Args:
             mapping: Their mapping; None: one is proposed.
         """
         first = Path(logs[0])
         if mapping is None and not (first.suffix == ".mcap" and bags.is_ours(first)):
-            asked = import_logs_stage.asked_of_model(self.description.model, self.name, self.description.joints)
-            mapping, _ = import_logs_stage.proposed(open_foreign(first), asked)
+            description = import_logs_stage.description_of_model(
+                self.description.model, self.name, self.description.joints
+            )
+            mapping, _ = import_logs_stage.proposed(open_foreign(first), description)
         return replace(self, mapping=mapping)
 
     def texts(self) -> Mapping[str, str]:
@@ -83,61 +85,61 @@ class DescribedPipeline(Pipeline):
         return files_of(self.description)
 
 
-def from_flags(told: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
-    """Return the pipeline of a model and of what a log says of it.
+def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
+    """Return the pipeline of a model and a log.
 
     Args:
-        logs: The logs; the first one says which commands there are and how fast they came.
+        logs: The logs; the first one has the commands and their rate.
 
     Raises:
         UsageError: When there is no model or log, or they do not fit each other.
     """
-    if told.mjcf is None or not logs:
+    if flags.mjcf is None or not logs:
         raise UsageError(
             "a robot without a pipeline is described by its model and by a log",
             hint="sim2real identify --mjcf robot.xml --log run.csv",
         )
-    model, first = read_model(told.mjcf), Path(logs[0])
-    name = pipeline_name(told.mjcf)
+    model, first = read_model(flags.mjcf), Path(logs[0])
+    name = pipeline_name(flags.mjcf)
     if first.suffix == ".mcap" and bags.is_ours(first):
         mapping, episode = None, read_log(first)
         name = str(episode.metadata.get("pipeline") or name)
     else:
-        mapping = load_mapping(told.mapping, name) if told.mapping else None
+        mapping = load_mapping(flags.mapping, name) if flags.mapping else None
         if mapping is None:
-            asked = import_logs_stage.asked_of_model(told.mjcf, name, told.joints, told.rate_hz)
-            mapping, _ = import_logs_stage.proposed(open_foreign(first), replace(asked, as_told=told.as_told))
+            description = import_logs_stage.description_of_model(flags.mjcf, name, flags.joints, flags.rate_hz)
+            mapping, _ = import_logs_stage.proposed(open_foreign(first), replace(description, as_told=flags.as_told))
         episode = importer.import_file(first, mapping)
-        import_logs_stage.refuse_contradictions(first, episode, told.as_told)
-    description = _description(told, model, episode)
+        import_logs_stage.refuse_contradictions(first, episode, flags.as_told)
+    description = _description(flags, model, episode)
     note_held(description)
-    summary = f"{len(description.joints)} joints of {told.mjcf.name}"
+    summary = f"{len(description.joints)} joints of {flags.mjcf.name}"
     return DescribedPipeline(
-        name, summary, "", identify=MODEL_IDENTIFY, description=description, mapping=mapping, told=_words(told)
+        name, summary, "", identify=MODEL_IDENTIFY, description=description, mapping=mapping, flag_words=_words(flags)
     )
 
 
 def note_held(description: RobotConfig) -> None:
-    """Print which files were left out, where joints that were not recorded are held, and what moves the others."""
+    """Print the omitted files, and the held and free joints that were not recorded."""
     holding, model = description.held(), read_model(description.model)
-    if left_out := model_file.read(description.model, description.contacts)[1]:
-        console.note(f"left out, as nothing but contacts and pictures needs them: {', '.join(left_out)}")
+    if omitted := model_file.read(description.model, description.contacts)[1]:
+        console.note(f"omitted, because only contacts and pictures need them: {', '.join(omitted)}")
     for held in holding.held:
         console.note(f"not recorded, held: {held}")
     for number, name in holding.moved.items():
         console.note(f"not recorded, free: {model.joint(number).name or 'a joint without a name'}, which {name} moves")
 
 
-def _words(told: RobotFlags) -> tuple[str, ...]:
+def _words(flags: RobotFlags) -> tuple[str, ...]:
     """Return the flags that describe the robot, as a command line has them."""
-    found: list[str] = []
-    for f in fields(told):
-        flag, value = f"--{f.name.replace('_', '-')}", getattr(told, f.name)
+    words: list[str] = []
+    for f in fields(flags):
+        flag, value = f"--{f.name.replace('_', '-')}", getattr(flags, f.name)
         if f.name in ("parameter", "hold"):
-            found += [word for one in value for word in (flag, one)]
+            words += [word for one in value for word in (flag, one)]
         elif value != f.default:
-            found += [flag, *([] if value is True else value if isinstance(value, tuple) else [str(value)])]
-    return tuple(map(str, found))
+            words += [flag, *([] if value is True else value if isinstance(value, tuple) else [str(value)])]
+    return tuple(map(str, words))
 
 
 def from_file(path: Path, name: str) -> DescribedPipeline:
@@ -147,14 +149,14 @@ def from_file(path: Path, name: str) -> DescribedPipeline:
     )
 
 
-def pipeline_beside(parameters: Path, found: Identification) -> Pipeline:
+def pipeline_beside(parameters: Path, identification: Identification) -> Pipeline:
     """Return the robot that parameters are of: described beside them, or a pipeline.
 
     Args:
         parameters: Their file, or its folder.
     """
     beside = (parameters if parameters.is_dir() else parameters.parent) / ROBOT_FILE
-    return from_file(beside, found.pipeline) if beside.is_file() else load_pipeline(found.pipeline)
+    return from_file(beside, identification.pipeline) if beside.is_file() else load_pipeline(identification.pipeline)
 
 
 def files_of(description: RobotConfig) -> dict[str, str]:
@@ -168,14 +170,14 @@ def files_of(description: RobotConfig) -> dict[str, str]:
     return {ROBOT_FILE: description.to_toml(MODEL_FILE), MODEL_FILE: text}
 
 
-def _description(told: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
-    """Return what there is to know about a robot, from its model and a log."""
-    joints = told.joints or joints_of(model)
+def _description(flags: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
+    """Return the description of a robot, from its model and a log."""
+    joints = flags.joints or joints_of(model)
     commands, sensed = episode.outputs.get("actuator", {}), episode.outputs.get("sensor", {})
     driving = tuple(n for n in COMMANDS if n in commands)
     # A factor of 0 leaves its parameter open: a recorder that does not know a gain writes 0.
     if "goal" in driving and (idle := [n for n in driving if n in _FACTORS and not commands[n].any()]):
-        note(f"{', '.join(idle)} is 0 in all of the log: left out")
+        note(f"{', '.join(idle)} is 0 in all of the log: omitted")
         driving = tuple(n for n in driving if n not in idle)
         commands = {n: values for n, values in commands.items() if n not in idle}
     if "position" not in sensed or not driving:
@@ -186,32 +188,32 @@ def _description(told: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
         )
     n, one = (len(joints),), {name: (1,) for name in driving}
     shapes = {name: values.shape[1:] for name, values in [("position", sensed["position"]), *commands.items()]}
-    if odd := [f"{name} {shapes[name]}" for name in ("position", *driving) if shapes[name] not in (n, one.get(name))]:
+    if wrong := [f"{name} {shapes[name]}" for name in ("position", *driving) if shapes[name] not in (n, one.get(name))]:
         raise UsageError(
-            f"a sample of each field has the shape {n}, for {', '.join(joints)}, but in the log: {', '.join(odd)}",
+            f"a sample of each field has the shape {n}, for {', '.join(joints)}, but in the log: {', '.join(wrong)}",
             hint="name the joints that were recorded with --joints, in the order of the columns; in a mapping, "
             "shape = [1] makes a vector of a number",
         )
     fastest = min(float(np.quantile(np.diff(episode.steps[n].begun_s), _FASTEST)) for n in ("actuator", "sensor"))
     own_s = float(model.opt.timestep)
-    found = RobotConfig(
-        model=Path(str(told.mjcf)),
+    description = RobotConfig(
+        model=Path(str(flags.mjcf)),
         joints=tuple(joints),
         commands=driving,
         shared=tuple(name for name in driving if shapes[name] != n),
-        velocity=told.velocity and "velocity" in sensed,
+        velocity=flags.velocity and "velocity" in sensed,
         rate_hz=round(1.0 / fastest, 3),
-        step_s=told.step_s or min(max(own_s, _STEPS_S[0]), _STEPS_S[1]),
-        fix_base=told.fix_base,
-        contacts=told.contacts,
-        hold=told.hold,
+        step_s=flags.step_s or min(max(own_s, _STEPS_S[0]), _STEPS_S[1]),
+        fix_base=flags.fix_base,
+        contacts=flags.contacts,
+        hold=flags.hold,
     )
-    if told.velocity and not found.velocity:
-        raise UsageError("the log has no velocity", hint="leave --velocity out: it is not needed")
+    if flags.velocity and not description.velocity:
+        raise UsageError("the log has no velocity", hint="run without --velocity: it is not needed")
     units = {n: float(np.median(commands[n][commands[n] > 0])) for n in ("kp", "kd") if n in commands}
     if set(units) == {"kp"}:  # a firmware's own unit; both gains together are those of a motor's own torque loop
-        found = replace(found, kp_unit=units["kp"])
-    terms = tuple(ParameterPattern.parse(p) for p in told.parameter) or usual_terms(
+        description = replace(description, kp_unit=units["kp"])
+    terms = tuple(ParameterPattern.parse(p) for p in flags.parameter) or usual_terms(
         driving, physical=set(units) == {"kp", "kd"}
     )
-    return replace(found, terms=terms)
+    return replace(description, terms=terms)

@@ -20,7 +20,7 @@ class RobotFlags:
     joints: tuple[str, ...] = ()
     """Joints that were recorded, in the order of the columns; default: all of the model's, in its order."""
     parameter: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """What is identified: WHAT[:each][@PATTERN][=VALUE], one flag a quantity, such as frictionloss:each or
+    """Identified quantity: WHAT[:each][@PATTERN][=VALUE], one flag a quantity, such as frictionloss:each or
     kp@.*_calf_joint; with =VALUE it is held. An unknown WHAT is refused, with a list."""
     mapping: Annotated[Path | None, arg(metavar="FILE")] = None
     """Mapping of the log, if it is of another recorder; default: one is proposed."""
@@ -37,7 +37,7 @@ class RobotFlags:
     hold: Annotated[tuple[str, ...], UseAppendAction] = ()
     """Where joints that were not recorded are held: JOINT=VALUE [rad or m], or a keyframe; default: keyframe home."""
     as_told: bool = False
-    """Keep names, order and signs of the file or the mapping where the data contradicts them, or cannot tell."""
+    """Keep names, order and signs of the file or the mapping, even if the data contradicts them or is ambiguous."""
 
 
 MODEL_IDENTIFY = IdentifyConfig(
@@ -49,4 +49,4 @@ MODEL_IDENTIFY = IdentifyConfig(
     jacobian="finite",
     max_delay_s=0.05,
 )
-"""How a robot of a model is identified: rough values are known, so there is no search; starts are read off the log."""
+"""Defaults of identify for a model, which has rough values: no search, initial states from the measurements."""

@@ -33,7 +33,7 @@ class SignalHandling:
 
     Only the first signal raises an exception: a second Ctrl-C must not interrupt the clean-up that takes the torque
     off. What may take its time after the first, such as a soft stop, is done in ``interruptible``, where the next one
-    raises once more. If the exception is raised where Python ignores exceptions (in a finaliser or a callback of the
+    raises again. If the exception is raised where Python ignores exceptions (in a finaliser or a callback of the
     garbage collector), the signal is sent again.
 
     Attributes:

@@ -10,7 +10,6 @@ import numpy as np
 from sim2real.artifacts.identification import HeldOut, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
-from sim2real.graph.episode import Episode
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span, check_log
@@ -58,12 +57,12 @@ def score(
     horizon_s = config.horizon_s or next((row.horizon_s for row in identification.held_out), fitting.horizon_s)
     shortest_s = min(end - begin for begin, end in (reach(e, fitting) for e in episodes))
     with progress(None, "validate: simulate"):
-        windows = _problem(model, episodes, fitting, min(horizon_s, shortest_s - fitting.settle_s))
+        windows = _problem(model, logs, fitting, min(horizon_s, shortest_s - fitting.settle_s))
         columns = prediction.samples(windows, models, fitting.settle_s)
         errors = prediction.errors(windows, columns, list(models), fitting.settle_s, [horizon_s])
         held_out = scores(errors, positions(model, robot.units))
         moves = dict(zip(prediction.labels(windows), moving(windows, np.arange(windows.segments)), strict=True))
-        whole = _problem(model, episodes, fitting, min(config.free_run_s, shortest_s) - fitting.settle_s, once=True)
+        whole = _problem(model, logs, fitting, min(config.free_run_s, shortest_s) - fitting.settle_s, once=True)
         columns = prediction.samples(whole, models, fitting.settle_s)
         free_runs = prediction.free_runs(columns, prediction.labels(whole), list(models), fitting.settle_s)
 
@@ -110,13 +109,13 @@ def position_row(s: HeldOut, promised: float | None, free_run: float, moves: boo
 
 
 def _problem(
-    model: IdentifiableModel, episodes: Sequence[Episode], config: IdentifyConfig, horizon_s: float, once: bool = False
+    model: IdentifiableModel, logs: Sequence[Recording], config: IdentifyConfig, horizon_s: float, once: bool = False
 ) -> Problem:
     """Return logs in segments without a fitted one; ``once``: one segment a log."""
     length_s = config.settle_s + horizon_s
     spans = []
-    for r, episode in enumerate(episodes):
-        begin, end = reach(episode, config)
+    for r, log in enumerate(logs):
+        begin, end = reach(log.episode, config)
         begins = np.arange(begin, end - length_s + 1e-6, length_s)
         spans += [Span(r, float(b), False) for b in (begins[:1] if once else begins)]
-    return Problem(model, list(episodes), spans, length_s, config)
+    return Problem(model, [log.episode for log in logs], spans, length_s, config)
