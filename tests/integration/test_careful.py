@@ -147,7 +147,7 @@ def test_a_robot_that_leans_too_far_is_stopped(make_pipeline, tmp_path, capsys):
 def test_a_tilt_that_the_robot_does_not_see_is_refused(tmp_path, resting, capsys):
     flags = ["--bundle", str(resting), "--max-tilt-rad", "1", "--runs", str(tmp_path)]
     assert cli.main(["deploy", "pendulum", *flags]) == errors.USAGE
-    assert "does not see its tilt" in capsys.readouterr().err
+    assert "does not measure its tilt" in capsys.readouterr().err
     assert not (tmp_path / "pendulum").exists()
 
 

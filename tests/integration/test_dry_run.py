@@ -139,7 +139,7 @@ def test_no_later_stage_takes_it_for_a_recording(recorded):
         assert code == 1
         assert "is of a dry run: torque was off, and none of its commands was sent" in err
     code, _, err = call("run", "pendulum", "--record.dry-run", "--runs", recorded.runs)
-    assert (code, "a run cannot go on from a dry recording" in err) == (2, True)
+    assert (code, "a run cannot identify from it" in err) == (2, True)
     assert len(list(recorded.runs.glob("pendulum/*"))) == 1
 
 
@@ -157,8 +157,8 @@ def test_whoever_looks_at_the_run_is_told(recorded):
     assert "no command in it was sent" in call("info", recorded.folder / "session.mcap")[1]
     assert call("report", run_dir)[0] == 0
     page = (run_dir / "report.html").read_text(encoding="utf-8")
-    assert "Dry run: nothing was moved" in page
-    assert "What would have been sent to the motors" in page
+    assert "Dry run: the robot did not move" in page
+    assert "Commands to the motors, which were not sent" in page
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -188,8 +188,8 @@ def test_a_deployment_says_what_the_policy_would_have_sent(tapped, tmp_path):
     code, out, err = call(*on(tap.port, from_page("deploy.md"), *flags))
     assert code == 0, err
     nothing_moved(tap, robot)
-    assert "the robot stays where it is" in err
-    assert "there is no gap report, for nothing was moved" in err
+    assert "the robot is not moved to its start" in err
+    assert "the robot did not move, so there is no gap report" in err
     (folder,) = tmp_path.glob("pendulum/*/deploy")
     assert manifest_of(folder)["status"] == "dry run"
     result = json.loads((folder / "result.json").read_text())
@@ -201,8 +201,8 @@ def test_a_deployment_says_what_the_policy_would_have_sent(tapped, tmp_path):
     assert (row["name"], row["commands"], row["high"]) == ("hinge", len(sent), pytest.approx(float(sent.max())))
     assert "would have been sent to" in out
     page = (folder / "report.html").read_text(encoding="utf-8")
-    assert "Dry run: nothing was moved" in page
-    assert "There is no gap report" in page
+    assert "Dry run: the robot did not move" in page
+    assert "the deployment has no verdict" in page
 
 
 def steady(robot, folder):
