@@ -14,7 +14,7 @@ from types import ModuleType
 MOVED = {
     "composer.mjx": "composer.physics.mjx",
     "composer.engine": "composer.physics.engine",
-    "hardware.config": "hardware.safety.config",
+    "hardware.config": "robots.gate_limits",
     "hardware.gate": "hardware.safety.gate",
     "hardware.guardian": "hardware.safety.guardian",
     "hardware.models": "hardware.bus.models",

@@ -4,43 +4,43 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import SafetyStop
-from sim2real.hardware.device import Reading
-from sim2real.hardware.dynamixel.bus import BusConfig
-from sim2real.hardware.dynamixel.device import DynamixelServos
-from sim2real.hardware.dynamixel.drive import VoltageDrive
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.joint import Joint
-from sim2real.hardware.safety.config import GateLimits
-from sim2real.hardware.safety.gate import GateConfig
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
 from sim2real.robots.control_loop.hardware import Embedded, ServoSession
-from sim2real.robots.control_loop.loop import DelayParams
-from sim2real.robots.control_loop.loop_robot import LoopRobot
-from sim2real.robots.control_loop.training_task import Draw
+from sim2real.robots.control_loop.loop import Draw
+from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.probe import Probe
 from sim2real.robots.servo.agent import AgentParams
+from sim2real.types import Key
 
-from .model import HISTORY, Agent, Command, Measurement, PendulumWorld, causes, dynamics, from_groups
-from .plant import SUPPLY_V
+from .model import HISTORY, Agent, Command, Measurement, PendulumParams, PendulumWorld, causes, dynamics, from_groups
+
+if TYPE_CHECKING:
+    from sim2real.hardware.device import Reading
+    from sim2real.hardware.dynamixel.device import DynamixelServos
+    from sim2real.hardware.joint import Joint
+    from sim2real.hardware.safety.gate import GateConfig
+    from sim2real.robots.gate_limits import GateLimits
 
 SERVO_ID = 1
 LIMIT_V = 2.0
-"""Largest voltage that the policy may ask for [V]."""
+"""Largest voltage of the policy [V]."""
 WORLD_HZ = 100.0
-HINGE = Joint("hinge", zero_rad=0.0)
-"""Angle 0 is upright."""
+HINGE = "hinge"
+"""The joint; angle 0 is upright."""
 _UNITS, _LOW, _HIGH = ("1", "1", "rad/s"), (-1.0, -1.0, -6.0), (1.0, 1.0, 6.0)
-"""What is seen of a measurement: its units and bounds; the model limits the speed to 60 rad/s."""
+"""Units and bounds of the measurement in the observation; the model limits the speed to 60 rad/s."""
 _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
 
 
@@ -49,108 +49,76 @@ def upright(th: Any, thdot: Any) -> Any:
     return (jnp.cos(th) > 0.95) & (jnp.abs(thdot) < 0.5)
 
 
-class PendulumRobot(LoopRobot):
-    """An eccentric mass on a servo that is driven by voltage."""
+class HingeSensor(RobotSensor):
+    """The servo's encoder."""
+
+    channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
+    joints = {HINGE: {"position": "th", "velocity": "thdot"}}
+    units = {"th": "rad", "thdot": "rad/s"}
+    at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
+
+    def read(self, reading: Reading) -> Measurement:
+        """Return the sensor's message of a reading."""
+        return Measurement(reading.position_rad[0], reading.velocity_rad_s[0])
+
+
+class HingeDrive(RobotDrive):
+    """The servo in PWM mode, commanded in volts."""
 
     rate_hz = 50.0
-    units = {"th": "rad", "thdot": "rad/s", "action": "V", "voltage": "V", "command": "V"}
-    command = "action"
-    message = Command
-    joints = {HINGE.name: {"position": "th", "velocity": "thdot"}}
-    observation = (
-        ObservationTerm("cos(th), sin(th), thdot / 10", _UNITS, low=_LOW, high=_HIGH),
-        ObservationTerm("past cos(th), sin(th), thdot / 10", _UNITS, HISTORY, _LOW, _HIGH),
-        ObservationTerm("past voltage", ("V",), HISTORY, (-LIMIT_V,), (LIMIT_V,)),
-    )
-    action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
-    mounting = (HINGE,)
+    command, message = "action", Command
+    units = {"action": "V", "voltage": "V", "command": "V"}
     probe = Probe(step=1.5, lag_s=0.004)
-    tick_s = 1 / WORLD_HZ
-    causes = causes()
-    channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
-    at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
-    # Latencies that the stages never read; ``--reveal`` compares with them.
-    embedded = Embedded(
-        f"{Path(__file__).with_name('plant.py')}:PendulumPlant",
-        EmulatorConfig(
+
+    def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:
+        self._mounting = mounting
+
+    @cached_property
+    def embedded(self) -> Embedded:
+        """The emulated pendulum. The stages never read its latencies; ``--reveal`` compares with them."""
+        from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+
+        emulator = EmulatorConfig(
             sensing_latency_s=0.020,
             sensing_jitter_s=0.003,
             actuation_latency_s=0.025,
             actuation_jitter_s=0.004,
             reply_loss=0.002,
             model_number=1190,  # an XL330-M077, for 5 V: when its host dies it goes on turning
-        ),
-    )
+        )
+        return Embedded(f"{Path(__file__).with_name('plant.py')}:PendulumPlant", emulator)
 
-    def dynamics(self) -> list[Parameter]:
-        """Return what a log can tell of the model."""
-        return dynamics()
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
+        """Open the servo, with torque off; see ``RobotDrive.connect``."""
 
-    def make_world(self, resumed: bool = False) -> PendulumWorld:
-        """Return the world's node; all of its state is measured, so a resumed one is no other."""
-        del resumed
-        return PendulumWorld("world", WORLD_HZ)
+        def device(port: str) -> DynamixelServos:
+            return self.make_device(port, limits.servo_watchdog_s)
 
-    def make_agent(self, **options: Any) -> Agent:
-        """Return the policy's node."""
-        return Agent("agent", self.rate_hz, **options)
+        from sim2real.hardware.joint import Joint
 
-    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
-        """Draw an episode, see ``LoopRobot``: half of them start hanging, half anywhere."""
-        k_values, k_state, k_where = jax.random.split(key, 3)
-        drawn = draw(k_values)
-        anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
-        hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
-        return self.resumed_params(drawn, jnp.where(jax.random.bernoulli(k_where), hanging, anywhere))
-
-    def reward(self, state: Measurement, action: jax.Array) -> dict[str, jax.Array]:
-        """Return minus the seed's cost: angle, speed that matters only near the top, and voltage."""
-        th = state.th - 2 * jnp.pi * jnp.floor((state.th + jnp.pi) / (2 * jnp.pi))
-        return {
-            "angle": -(th**2),
-            "speed": -0.1 * (state.thdot / (1 + 10 * jnp.abs(th))) ** 2,
-            "voltage": -0.01 * action[0] ** 2,
-        }
-
-    def success(self, state: Measurement) -> jax.Array:
-        """Return whether the pendulum is upright."""
-        return upright(state.th, state.thdot)
-
-    def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
-        """Return node parameters for values and an initial state ``(th, thdot)``."""
-        return {
-            "world": from_groups(values, start),
-            "sensor": DelayParams(delay=values.get("sensor_delay")),
-            "actuator": DelayParams(delay=values.get("actuator_delay")),
-        }
-
-    def rest_params(self, values: Mapping[str, Any], policy: Any, trial: int) -> dict[str, Any]:
-        """Return node parameters for an episode that begins hanging at rest; every trial is the same."""
-        del trial
-        return {**self.resumed_params(values, [np.pi, 0.0]), "agent": AgentParams(policy=policy)}
-
-    def agent_params(self, session: ServoSession, policy: Any, trial: int) -> AgentParams:
-        """Return the agent's parameters; every trial is the same."""
-        del session, trial
-        return AgentParams(policy=policy)
+        mounting = self._mounting or (Joint(HINGE),)
+        embedded = self.embedded.mounted(mounting, zero_rad=0.0)
+        return ServoSession(port, device, self.gate(limits), embedded, truth_path, seed, mounting)
 
     def make_device(self, port: str, silence_s: float) -> DynamixelServos:
-        """Return the servo, driven by voltage."""
+        """Return the servo on a port, not opened yet; ``silence_s``: longest silence while torque is on [s]."""
+        from sim2real.hardware.dynamixel.bus import BusConfig
+        from sim2real.hardware.dynamixel.device import DynamixelServos
+        from sim2real.hardware.dynamixel.drive import VoltageDrive
+
+        from .plant import SUPPLY_V
+
         return DynamixelServos(BusConfig(port, silence_s=silence_s), [SERVO_ID], VoltageDrive(SUPPLY_V))
 
     def gate(self, limits: GateLimits) -> GateConfig:
         """Return a gate that falls back to 0 V."""
-        return limits.gate(limits.limit, joints=(HINGE.name,))
-
-    def read(self, reading: Reading) -> Measurement:
-        """Return the sensor's message of a reading."""
-        return Measurement(reading.position_rad[0], reading.velocity_rad_s[0])
+        return limits.gate(limits.limit, joints=(HINGE,))
 
     def prepare(self, session: ServoSession, settle_s: float) -> None:
         """Bring the pendulum to rest hanging down: friction can hold it upright, and then it is pushed over.
 
         Raises:
-            SafetyStop: It does not hang after five pushes, or what the gate stopped.
+            SafetyStop: It does not hang after five pushes, or the gate stopped it.
             HardwareLost: It does not come to rest within ``settle_s`` [s].
         """
         rig = session.rig
@@ -170,6 +138,76 @@ class PendulumRobot(LoopRobot):
             hint="free it, or check its encoder",
         )
 
+
+class HingeAgent(RobotAgent):
+    """A voltage from the angle, the speed, and a short history of both and of the voltage."""
+
+    observation = (
+        ObservationTerm("cos(th), sin(th), thdot / 10", _UNITS, low=_LOW, high=_HIGH),
+        ObservationTerm("past cos(th), sin(th), thdot / 10", _UNITS, HISTORY, _LOW, _HIGH),
+        ObservationTerm("past voltage", ("V",), HISTORY, (-LIMIT_V,), (LIMIT_V,)),
+    )
+    action = (ActionTerm("voltage", "V", -LIMIT_V, LIMIT_V),)
+
+    def make(self, rate_hz: float, **options: Any) -> Agent:
+        """Return the policy's node."""
+        return Agent("agent", rate_hz, **options)
+
+    def params(self, start: EpisodeStart, policy: Any) -> AgentParams:
+        """Return the node's parameters: the policy alone."""
+        del start
+        return AgentParams(policy=policy)
+
+
+class HingeModel(RobotModel):
+    """The pendulum as a differential equation, with four groups of parameters."""
+
+    tick_s, causes = 1 / WORLD_HZ, causes()
+
+    def dynamics(self) -> list[Parameter]:
+        """Return the groups of parameters that a log determines."""
+        return dynamics()
+
+    def make_world(self, resumed: bool = False) -> PendulumWorld:
+        """Return the world's node; all of its state is measured, so a resumed one is no other."""
+        del resumed
+        return PendulumWorld("world", WORLD_HZ)
+
+    def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PendulumParams:
+        """Return the world's parameters for values and a start."""
+        return from_groups(values, jnp.concatenate([jnp.asarray(x) for x in (start.position, start.velocity)]))
+
+
+class SwingUp(RobotTask):
+    """Swing up, and stay upright; every trial is the same."""
+
+    def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], EpisodeStart]:
+        """Return values and a start: half of the episodes start hanging, half anywhere."""
+        k_values, k_state, k_where = jax.random.split(key, 3)
+        values = draw(k_values)
+        anywhere = jax.random.uniform(k_state, (2,), minval=-1.0, maxval=1.0) * jnp.array([jnp.pi, 9.0])
+        hanging = jnp.array([jnp.pi, 0.0]) + 0.05 * anywhere
+        start = jnp.where(jax.random.bernoulli(k_where), hanging, anywhere)
+        return values, EpisodeStart(start[:1], start[1:], jnp.zeros(0))
+
+    def at_rest(self, trial: int) -> EpisodeStart:
+        """Return the start hanging at rest."""
+        del trial
+        return EpisodeStart(np.array([np.pi]), np.zeros(1), np.zeros(0))
+
+    def reward(self, state: Measurement, action: jax.Array) -> dict[str, jax.Array]:
+        """Return minus the seed's cost: angle, speed that matters only near the top, and voltage."""
+        th = state.th - 2 * jnp.pi * jnp.floor((state.th + jnp.pi) / (2 * jnp.pi))
+        return {
+            "angle": -(th**2),
+            "speed": -0.1 * (state.thdot / (1 + 10 * jnp.abs(th))) ** 2,
+            "voltage": -0.01 * action[0] ** 2,
+        }
+
+    def success(self, state: Measurement) -> jax.Array:
+        """Return whether the pendulum is upright."""
+        return upright(state.th, state.thdot)
+
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return how well the pendulum was swung up and held.
 
@@ -188,6 +226,17 @@ class PendulumRobot(LoopRobot):
             "speed_rms_rad_s": float(np.sqrt(np.mean(states["thdot"][last] ** 2))),
             "command_rms_v": float(np.sqrt(np.mean(states["command"][half:] ** 2))),
         }
+
+
+class PendulumRobot(Robot):
+    """An eccentric mass on a servo that is driven by voltage."""
+
+    def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:
+        self.sensor = HingeSensor()
+        self.drive = HingeDrive(mounting)
+        self.agent = HingeAgent()
+        self.model = HingeModel()
+        self.task = SwingUp()
 
 
 ROBOT = PendulumRobot()

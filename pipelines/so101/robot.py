@@ -1,4 +1,4 @@
-"""The SO-101 for the stages: its servos and their calibration, what is identified, its aim and its score."""
+"""The SO-101 for the stages: its servos and their calibration, its aim, its observation, its parts and its score."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import random
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,147 +15,157 @@ import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.errors import UsageError
-from sim2real.graph.base import Array
-from sim2real.hardware.device import Device
-from sim2real.hardware.feetech.calibration import CalibratedJoint, read_calibration
-from sim2real.hardware.feetech.emulation import StsEmulation
-from sim2real.hardware.registry import load_device
-from sim2real.hardware.safety.config import GateLimits
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.control_loop.hardware import Embedded, ServoSession
+from sim2real.robots.contract import Robot
+from sim2real.robots.control_loop.hardware import Embedded
 from sim2real.robots.control_loop.messages import JointReading
 from sim2real.robots.probe import Probe
 from sim2real.robots.servo import parameters
+from sim2real.robots.servo.drive import JointSensor, ServoDrive
+from sim2real.robots.servo.model import ComposedModel
+from sim2real.robots.servo.observation import ServoAgent
 from sim2real.robots.servo.payload import Hand
-from sim2real.robots.servo.servo_robot import ServoRobot, Servos
+from sim2real.robots.servo.servos import Servos
+from sim2real.robots.servo.task import Aim, AimTask
+from sim2real.types import Array, Key
 
 from .parts import JOINTS, SHEET, TIP_M, TRAVEL_RAD, Arm
 from .task import CLOSE_M, CLOSE_RAD, Reach, tip_of
 
-LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5)
-"""Joint angles between which targets are drawn [rad]: whatever is drawn can be reached."""
-CALIBRATION = "SO101_CALIBRATION"
-"""Environment variable that names the calibration of the arm on the port."""
+if TYPE_CHECKING:
+    from sim2real.hardware.feetech.calibration import CalibratedJoint
+    from sim2real.hardware.feetech.drive import StsDrive
+
+SERVOS = Servos(
+    joints=JOINTS,
+    ids=(1, 2, 3, 4, 5, 6),
+    low=Arm.low,
+    high=Arm.high,
+    sheet=SHEET,
+    speed=1.5,
+    rest=(0.0, -1.65, 1.6, -1.4, 0.0, -0.6),
+    middle=(0.0, -0.95, 0.9, -1.3, 0.0, 0.0),
+    device="feetech",
+)
 SATURATES = ("wrist_roll", "gripper")
 """Joints whose servos may push no harder from a smaller error on than the others: each has a limit of its own."""
 HAND = Hand("wrist_roll", (TIP_M, 0.0, 0.0), most_kg=0.5, least_kg=-0.07)
 """Between the jaws; the link has 87 g."""
+LOW, HIGH = (-0.8, -1.3, 0.5, -1.5, -1.0, -0.5), (0.8, -0.4, 1.4, -1.1, 1.0, 0.5)
+"""Joint angles between which targets are drawn [rad]: the arm can reach all of them."""
+FEATURES = (
+    ("position", ("rad",) * 6, 5.0),
+    ("velocity / 5", ("rad/s",) * 6, 5.0),
+    ("goal less position", ("rad",) * 6, 6.0),
+    ("10 x target less tip: outwards, sideways, up", ("m",) * 3, 10.0),
+    ("opening less the jaw's", ("rad",), 6.0),
+)
+CALIBRATION = "SO101_CALIBRATION"
+"""Environment variable that names the calibration of the arm on the port."""
 
 
-class SO101Robot(ServoRobot):
+class SO101Robot(Robot):
     """An SO-101 on a table.
 
     Its goals stay in a box of joint angles that keeps the arm 4 cm above the table. In a corner of the box it is folded
-    away: the upper arm lies back on its stop, the forearm above it, the hand points up. There it stays without torque;
-    wherever else it loses its torque, it sinks to the table.
+    away: the upper arm lies back on its stop, the forearm above it, the hand points up. It stays there without torque.
+    From any other pose it sinks to the table when it loses its torque.
     """
 
-    servos = Servos(
-        joints=JOINTS,
-        ids=(1, 2, 3, 4, 5, 6),
-        low=Arm.low,
-        high=Arm.high,
-        sheet=SHEET,
-        speed=1.5,
-        rest=(0.0, -1.65, 1.6, -1.4, 0.0, -0.6),
-        middle=(0.0, -0.95, 0.9, -1.3, 0.0, 0.0),
-        device="feetech",
+    def __init__(self, servos: Servos = SERVOS) -> None:
+        probe = Probe(step=0.12, lag_s=-0.004)
+        self.sensor = JointSensor(servos)
+        self.drive = ServoDrive(servos, probe=probe, embedded=embedded, settings=calibrated)
+        self.agent = ServoAgent(servos, TARGET, FEATURES, observe)
+        self.model = ComposedModel(servos, Reach, TARGET, HAND, dynamics, parameters.causes(JOINTS))
+        self.task = AimTask(servos, TARGET, success, score)
+
+
+def embedded() -> Embedded:
+    """Return the emulated arm, with latencies that no stage reads."""
+    from sim2real.hardware.feetech.emulation import StsEmulation
+
+    draw = random.Random("an SO-101 of its own")
+    emulator = StsEmulation(
+        sensing_latency_s=draw.uniform(0.004, 0.008),
+        sensing_jitter_s=draw.uniform(0.0005, 0.001),
+        actuation_latency_s=draw.uniform(0.008, 0.016),
+        actuation_jitter_s=draw.uniform(0.001, 0.002),
+        reply_loss=0.001,
+        homing_offset=85,
     )
-    probe = Probe(step=0.12, lag_s=-0.004)
-    causes = parameters.causes(JOINTS)
-    hand = HAND
-    aim = (("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad"))
-    features = (
-        ("position", ("rad",) * 6, 5.0),
-        ("velocity / 5", ("rad/s",) * 6, 5.0),
-        ("goal less position", ("rad",) * 6, 6.0),
-        ("10 x target less tip: outwards, sideways, up", ("m",) * 3, 10.0),
-        ("opening less the jaw's", ("rad",), 6.0),
-    )
+    return Embedded(f"{Path(__file__).with_name('plant.py')}:SO101Plant", emulator)
 
-    @property
-    def embedded(self) -> Embedded:
-        """The robot inside the computer, with latencies that no stage is told."""
-        draw = random.Random("an SO-101 of its own")
-        emulator = StsEmulation(
-            sensing_latency_s=draw.uniform(0.004, 0.008),
-            sensing_jitter_s=draw.uniform(0.0005, 0.001),
-            actuation_latency_s=draw.uniform(0.008, 0.016),
-            actuation_jitter_s=draw.uniform(0.001, 0.002),
-            reply_loss=0.001,
-            homing_offset=85,
-        )
-        return Embedded(f"{Path(__file__).with_name('plant.py')}:SO101Plant", emulator)
 
-    def dynamics(self) -> list[Parameter]:
-        """Return what may be identified: servos of one model, each with friction and brake of its own."""
-        found = parameters.parameters(SHEET, JOINTS, own=("damping", "friction")) + parameters.offsets(JOINTS)
-        full, about = SHEET.full_rad, "error from which on it pushes no harder"
-        limit = Parameter("saturation", "rad", full, full / 10, full * 2, about=about, limits=True)
-        # A search that begins at the data sheet's limit, which no motion reaches, often stays there.
-        limits = [limit, *(replace(limit, name=f"saturation_{j}", begin=full / 4) for j in SATURATES)]
-        return [*found, *limits, HAND.parameter()]
+def calibrated(port: str) -> StsDrive:
+    """Return the servos' settings with the calibration of the arm on a port."""
+    joints = read(Path(__file__).with_name("calibration.json") if port == "embedded" else find())
+    return replace(SHEET.drive, joints=joints)
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
-        """Open the arm with the calibration of the one on this port, with torque off; see ``Robot.connect``."""
-        joints = read(Path(__file__).with_name("calibration.json") if port == "embedded" else find())
 
-        def device(port: str) -> Device:
-            s = self.servos
-            drive = replace(SHEET.drive, joints=joints)
-            return load_device(s.device)(port, s.ids, drive, baud_rate=s.baud_rate, silence_s=limits.servo_watchdog_s)
+def dynamics() -> list[Parameter]:
+    """Return the parameters: servos of one model, each with its own friction and damping."""
+    of_servos = parameters.parameters(SHEET, JOINTS, own=("damping", "friction")) + parameters.offsets(JOINTS)
+    full, about = SHEET.full_rad, "error from which on it pushes no harder"
+    limit = Parameter("saturation", "rad", full, full / 10, full * 2, about=about, limits=True)
+    # A search that begins at the data sheet's limit, which no motion reaches, often stays there.
+    limits = [limit, *(replace(limit, name=f"saturation_{j}", begin=full / 4) for j in SATURATES)]
+    return [*of_servos, *limits, HAND.parameter()]
 
-        return ServoSession(port, device, self.gate(limits), self.embedded, truth_path, seed)
 
-    def make_task(self) -> Reach:
-        """Return the task; where the target is, the graph's parameters say."""
-        return Reach()
+def draw_target(key: Key) -> Array:
+    """Return a target [m] and an opening [rad], ``(4,)``."""
+    angles = jax.random.uniform(key, (6,), minval=jnp.array(LOW), maxval=jnp.array(HIGH))
+    return jnp.append(tip_of(jnp, angles), angles[5])
 
-    def aim_fields(self, task: Reach) -> Mapping[str, tuple[Any, str]]:
-        """Return where target and opening stand in the model."""
-        return {"target": (task.table.target, "pos"), "opening": (task.table.opening, "pos")}
 
-    def place_aim(self, aim: Any) -> dict[str, Any]:
-        """Return the target's position ``(3,)`` [m], and the opening [rad] as the first of ``(3,)``."""
-        aim = jnp.asarray(aim, jnp.float32)
-        return {"target": aim[:3], "opening": jnp.zeros(3).at[0].set(aim[3])}
+def place_target(aim: Array) -> dict[str, Array]:
+    """Return the target's position ``(3,)`` [m], and the opening [rad] as the first of ``(3,)``."""
+    aim = jnp.asarray(aim, jnp.float32)
+    return {"target": aim[:3], "opening": jnp.zeros(3).at[0].set(aim[3])}
 
-    def draw_aim(self, key: jax.Array) -> jax.Array:
-        """Return a target [m] and an opening [rad], ``(4,)``."""
-        angles = jax.random.uniform(key, (6,), minval=jnp.array(LOW), maxval=jnp.array(HIGH))
-        return jnp.append(tip_of(jnp, angles), angles[5])
 
-    def observe(self, reading: JointReading, goal: Any, aim: Any) -> Array:
-        """Return what the policy sees: joints, and the way to the target, seen from the arm."""
-        q, xp = reading.position, namespace(reading.position, goal)
-        gap = aim[:3] - tip_of(xp, q)
-        c, s = xp.cos(q[0]), -xp.sin(q[0])  # pan turns clockwise
-        way = xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
-        return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way, aim[3:] - q[5:]])
+TARGET = Aim(
+    entries=(("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad")),
+    draw=draw_target,
+    elements=lambda task: {"target": (task.table.target, "pos"), "opening": (task.table.opening, "pos")},
+    place=place_target,
+)
 
-    def success(self, state: Any) -> jax.Array:
-        """Return whether the tip is at the target, and the jaw as it is told."""
-        return (state.variables["distance"] < CLOSE_M) & (state.variables["ajar"] < CLOSE_RAD)
 
-    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return how near tip and jaw came.
+def observe(reading: JointReading, goal: Array, aim: Array) -> Array:
+    """Return ``FEATURES``: the joints, and the way to the target in the frame of the arm."""
+    q, xp = reading.position, namespace(reading.position, goal)
+    gap = aim[:3] - tip_of(xp, q)
+    c, s = xp.cos(q[0]), -xp.sin(q[0])  # pan turns clockwise
+    way = xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
+    return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way, aim[3:] - q[5:]])
 
-        ``success`` is the share of the second half in which both are there, ``reached`` 1 where they are at the end.
-        """
-        position = np.stack([states[f"position[{i}]"] for i in range(6)], axis=-1)
-        aim = np.array([states[f"aim[{i}]"][-1] for i in range(4)])
-        distance = np.linalg.norm(tip_of(np, position) - aim[:3], axis=-1)
-        ajar = np.abs(position[:, 5] - aim[3])
-        there = (distance < CLOSE_M) & (ajar < CLOSE_RAD)
-        second_half, end = t_s >= (t_s[0] + t_s[-1]) / 2, t_s >= t_s[-1] - 0.5
-        first = np.flatnonzero(there)
-        return {
-            "success": float(there[second_half].mean()),
-            "reached": float(distance[end].mean() < CLOSE_M and ajar[end].mean() < CLOSE_RAD),
-            "distance_m": float(distance[end].mean()),
-            "opening_off_rad": float(ajar[end].mean()),
-            "first_reached_s": float(t_s[first[0]] - t_s[0]) if first.size else float("nan"),
-        }
+
+def success(state: Any) -> jax.Array:
+    """Return whether the tip is at the target, and the jaw as it is told."""
+    return (state.variables["distance"] < CLOSE_M) & (state.variables["ajar"] < CLOSE_RAD)
+
+
+def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return how near tip and jaw came.
+
+    ``success`` is the share of the second half in which both are there, ``reached`` 1 where they are at the end.
+    """
+    position = np.stack([states[f"position[{i}]"] for i in range(6)], axis=-1)
+    aim = np.array([states[f"aim[{i}]"][-1] for i in range(4)])
+    distance = np.linalg.norm(tip_of(np, position) - aim[:3], axis=-1)
+    ajar = np.abs(position[:, 5] - aim[3])
+    there = (distance < CLOSE_M) & (ajar < CLOSE_RAD)
+    second_half, end = t_s >= (t_s[0] + t_s[-1]) / 2, t_s >= t_s[-1] - 0.5
+    first = np.flatnonzero(there)
+    return {
+        "success": float(there[second_half].mean()),
+        "reached": float(distance[end].mean() < CLOSE_M and ajar[end].mean() < CLOSE_RAD),
+        "distance_m": float(distance[end].mean()),
+        "opening_off_rad": float(ajar[end].mean()),
+        "first_reached_s": float(t_s[first[0]] - t_s[0]) if first.size else float("nan"),
+    }
 
 
 def read(path: Path) -> tuple[CalibratedJoint, ...]:
@@ -164,6 +174,8 @@ def read(path: Path) -> tuple[CalibratedJoint, ...]:
     Raises:
         UsageError: It is no calibration of an SO-101, or the range of a joint with stops is far from its travel.
     """
+    from sim2real.hardware.feetech.calibration import read_calibration
+
     joints = {joint.name: joint for joint in read_calibration(path, TRAVEL_RAD)}
     if lacking := [name for name in JOINTS if name not in joints]:
         raise UsageError(

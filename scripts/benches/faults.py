@@ -111,12 +111,12 @@ class Outcome:
 def swinging_bundle(folder: Path) -> Path:
     """Write a policy that pumps the pendulum: full voltage in the direction of the motion."""
     robot = load_pipeline("pendulum").load()
-    size, low, high = robot.observation_size, *np.array([(a.low, a.high) for a in robot.action]).T
+    size, low, high = robot.agent.observation_size, *np.array([(a.low, a.high) for a in robot.agent.action]).T
     kernel = np.zeros((size, 1))
     kernel[2] = 40.0  # thdot / 10
     bias = np.full(1, 0.6)  # from rest it needs a push
     weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(1)}
-    contract = PolicyContract(robot.observation, robot.action, robot.rate_hz)
+    contract = PolicyContract(robot.agent.observation, robot.agent.action, robot.rate_hz)
     return save_bundle(folder, {**weights, "layers.0.kernel": kernel, "layers.0.bias": bias}, contract)
 
 
@@ -170,12 +170,12 @@ def _deploy(flags: list[str], messages: Path) -> None:
     sys.stdout = sys.stderr = messages.open("w", buffering=1)
     os.dup2(sys.stdout.fileno(), 1)  # the guardian's process reports there
     os.dup2(sys.stdout.fileno(), 2)
-    _nan_on_signal(load_pipeline("pendulum").load())
+    _nan_on_signal(load_pipeline("pendulum").load().sensor)
     os._exit(cli.main(["deploy", "pendulum", *flags]))
 
 
-def _nan_on_signal(robot: Any) -> None:
-    kind, factor = type(robot), [1.0]
+def _nan_on_signal(sensor: Any) -> None:
+    kind, factor = type(sensor), [1.0]
     read: Callable[..., Any] = kind.read
 
     def ill(self: Any, reading: Any) -> Any:
@@ -194,9 +194,9 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
     """
     draw = random.Random(f"{fault.name}/{seed}")
     robot = load_pipeline("pendulum").load()
-    config = replace(robot.embedded.emulator, seed=seed, model_number=1020, on_signal=True, **fault.emulator)
+    config = replace(robot.drive.embedded.emulator, seed=seed, model_number=1020, on_signal=True, **fault.emulator)
     truth, messages = folder / "truth.bin", folder / "messages.txt"
-    with emulated(config, robot.embedded.plant, truth) as (port, emulator_pid):
+    with emulated(config, robot.drive.embedded.plant, truth) as (port, emulator_pid):
         child = deployed(port, bundle, folder / "runs", messages, watchdog_s)
         try:
             wait_until_moving(truth, messages, child, _ROUND_RAD_S)

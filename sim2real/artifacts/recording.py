@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +15,11 @@ from sim2real.artifacts.paths import shown
 from sim2real.artifacts.summary import ArtifactTable, Summed
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
-from sim2real.hardware.emulation.truth import Truth, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.types import Json
+
+if TYPE_CHECKING:
+    from sim2real.hardware.emulation.truth import Truth
 
 LOG, TRUTH = "session.mcap", "truth.bin"
 
@@ -105,6 +108,8 @@ class Recording(Summed):
         Raises:
             Sim2RealError: When its file is damaged.
         """
+        from sim2real.hardware.emulation.truth import read_truth  # training reads recordings without hardware
+
         return None if self.truth_path is None else read_truth(self.truth_path)
 
     def true_states(self) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:

@@ -1,302 +1,258 @@
-"""What a robot is for the stages: ``ROBOT = MyRobot()`` in ``pipelines/NAME/robot.py`` is one.
+"""A robot for the stages: ``ROBOT = MyRobot()`` in ``pipelines/NAME/robot.py``.
 
-A robot that misses something cannot be made: whatever it lacks is named at once.
+A robot has five parts: a sensor, a drive, an agent, a task and a model. ``Robot`` connects them to graphs. A robot that
+was only recorded has none of them: ``RecordedRobot`` lists what identification needs.
 """
 
 from __future__ import annotations
 
-import inspect
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
-from functools import cached_property
-from pathlib import Path
+from abc import abstractmethod
+from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from sim2real.errors import UsageError
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode
-from sim2real.hardware.safety.config import GateLimits
 from sim2real.identify.model import IdentifiableModel
-from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.probe import Probe
+from sim2real.policy.upright import Runner
+from sim2real.robots.completeness import complete
+from sim2real.robots.control_loop.hardware import Excitation, ServoActuator, ServoSensor
+from sim2real.robots.control_loop.identification_model import IdentifiableLoop
+from sim2real.robots.control_loop.loop import (
+    DELAYS,
+    DelayParams,
+    control_nodes,
+    delay_bounds,
+    drawn_in_a_loop,
+    in_a_loop,
+    simulated_loop,
+)
+from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.control_loop.policy_node import PolicyNode, in_numpy
+from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
+from sim2real.robots.control_loop.training_task import LoopTask
+from sim2real.robots.robot_parts import RobotAgent as RobotAgent
+from sim2real.robots.robot_parts import RobotDrive as RobotDrive
+from sim2real.robots.robot_parts import RobotModel as RobotModel
+from sim2real.robots.robot_parts import RobotSensor as RobotSensor
+from sim2real.robots.robot_parts import RobotTask as RobotTask
+from sim2real.robots.robot_parts import Session as Session
 from sim2real.robots.roles import ROLES, Roles
-from sim2real.train.environment.graph_environment import TrainingTask
-
-if TYPE_CHECKING:
-    from sim2real.hardware.emulation.embedded import EmbeddedRobot
-    from sim2real.hardware.safety.rig import Rig
-
-Datum = tuple[str, Callable[[Any], bool]]
-"""What a robot's datum must be, in words, and the test for it."""
+from sim2real.types import PyTree
 
 
-def tuple_of(kind: type) -> Callable[[Any], bool]:
-    """Return the test for a tuple of some objects of a kind."""
-    return lambda value: isinstance(value, tuple) and bool(value) and all(isinstance(t, kind) for t in value)
-
-
-def _texts(value: Any) -> bool:
-    return isinstance(value, Mapping) and all(isinstance(t, str) for pair in value.items() for t in pair)
-
-
-def positive(value: Any) -> bool:
-    """Return whether a value is a finite number above 0."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value > 0
-
-
-def _roles(value: Any) -> bool:
-    return isinstance(value, Roles) and len({value.sensor, value.supervisor, value.actuator, value.world}) == 4
-
-
-def _joints(value: Any) -> bool:
-    return isinstance(value, Mapping) and all(_texts(fields) for fields in value.values())
-
-
-class RecordedRobot(ABC):
-    """A robot that others have recorded: what identification needs of it.
-
-    Data are attributes of the class, or properties.
+@runtime_checkable
+class RecordedRobot(Protocol):
+    """A robot that was recorded: what identification needs.
 
     Attributes:
         units: Field of a message -> its unit.
-        roles: Which node does what.
+        roles: Names of the nodes.
         profile_rad_s: How fast the actuators' setpoints move to their goals [rad/s]; infinite: at once.
-        causes: What may change several parameters at once: name -> parameter -> by how much it moves on its scale when
-            what is named grows by a factor of e.
-        export_lead_s: What a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s], to do
-            what the identified graph does.
+        causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
+            when the cause grows by a factor of e.
+        export_lead_s: Time that a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s].
     """
 
-    units: Mapping[str, str]
-    roles: Roles = ROLES
-    profile_rad_s: float = math.inf
-    export_lead_s: float = 0.0
-    causes: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+    if TYPE_CHECKING:  # Each is an attribute or a property.
 
-    _DATA: ClassVar[Mapping[str, Datum]] = {
-        "units": ("field -> unit, e.g. {'th': 'rad'}", _texts),
-        "roles": ("sim2real.robots.roles.Roles with four different names", _roles),
-    }
+        @property
+        def units(self) -> Mapping[str, str]: ...  # noqa: D102
+        @property
+        def roles(self) -> Roles: ...  # noqa: D102
+        @property
+        def profile_rad_s(self) -> float: ...  # noqa: D102
+        @property
+        def export_lead_s(self) -> float: ...  # noqa: D102
+        @property
+        def causes(self) -> Mapping[str, Mapping[str, float]]: ...  # noqa: D102
+    else:
+        units: Mapping[str, str]
+        roles, profile_rad_s, export_lead_s, causes = ROLES, math.inf, 0.0, MappingProxyType({})
 
     def __new__(cls, *args: Any, **options: Any) -> Self:
-        """Make a robot.
-
-        Raises:
-            UsageError: Something is missing or of the wrong kind; all of it is named.
-        """
-        del args, options
-        _refuse(cls, cls)
-        return super().__new__(cls)
+        """Make the robot, if its class has all methods."""
+        return complete(cls, *args, **options)
 
     @abstractmethod
     def identifiable(self, max_delay_s: float) -> IdentifiableModel:
         """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
 
     def watched(self, max_delay_s: float) -> IdentifiableModel:
-        """Return the model with all that may change between deployments; default: what is identified.
+        """Return the model with all parameters that may change between deployments; default: as ``identifiable``.
 
-        Parameters beyond those, such as what a hand holds, count as known when the robot was identified: their nominal
-        values are what they were then.
+        Further parameters, such as a payload, have their nominal values at the time of the identification.
         """
         return self.identifiable(max_delay_s)
 
+    def with_optional_terms(self, wanted: str) -> RecordedRobot:
+        """Return the robot with further optional terms; default: the robot, which has all of them.
+
+        Args:
+            wanted: ``auto``, ``all``, or names separated by commas.
+        """
+        del wanted
+        return self
+
     def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
-        """Return the robot's model with identified values, as MJCF; None: it has none."""
+        """Return the model with identified values, as MJCF; None: there is none."""
         del values
         return None
 
 
-class Session(AbstractContextManager["Session"], Protocol):
-    """An open robot, as a context manager; leaving it takes the torque off.
+class Robot:
+    """A robot that can be recorded, trained for and deployed to. It has five parts, which its ``__init__`` sets.
 
     Attributes:
-        rig: The servos behind the safety gate.
-        embedded: The emulated robot, if the session has one.
+        delay_spread_s: Largest deviation of a delay that the simulated loop is given from the one that it was made for,
+            either way [s].
     """
 
-    rig: Rig
-    embedded: EmbeddedRobot | None
+    drive: RobotDrive
+    sensor: RobotSensor
+    agent: RobotAgent
+    task: RobotTask
+    model: RobotModel
+    roles: Roles = ROLES
+    delay_spread_s: float = 0.002
 
-
-class Robot(RecordedRobot):
-    """A robot that can be recorded, trained for and deployed to: what all stages need of it.
-
-    Attributes:
-        rate_hz: Rate of the supervisor [Hz].
-        command: Field of the actuator's message that is sent to the motors, with one entry per action.
-        joints: Joint -> quantity -> field of the sensor's message, for the log; see ``McapRecorder``.
-        observation: Terms of the policy's observation, in order.
-        action: The policy's actions, in order, with the bounds that the robot bears.
-        limits: Name -> limit that a policy is trained for, such as the ends of the joints' goals.
-        probe: The steps by which deploy measures the delay; None: it is not measured.
-    """
-
-    rate_hz: float
-    command: str
-    joints: Mapping[str, Mapping[str, str]]
-    observation: tuple[ObservationTerm, ...]
-    action: tuple[ActionTerm, ...]
-    limits: Mapping[str, float] = MappingProxyType({})
-    probe: Probe | None = None
-
-    _DATA: ClassVar[Mapping[str, Datum]] = {
-        **RecordedRobot._DATA,
-        "rate_hz": ("a number above 0 [Hz]", positive),
-        "command": ("the name of a field", lambda value: isinstance(value, str) and bool(value)),
-        "joints": ("joint -> quantity -> field, e.g. {'hinge': {'position': 'th'}}", _joints),
-        "observation": ("a tuple of sim2real.policy.ObservationTerm", tuple_of(ObservationTerm)),
-        "action": ("a tuple of sim2real.policy.ActionTerm", tuple_of(ActionTerm)),
-    }
+    # -- for identification, as of any RecordedRobot
 
     @property
-    def observation_size(self) -> int:
-        """Number of entries of the policy's observation."""
-        return sum(term.size * term.history for term in self.observation)
+    def rate_hz(self) -> float:
+        """Rate of sensor, agent and actuator [Hz]."""
+        return self.drive.rate_hz
 
-    @abstractmethod
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:
-        """Open the robot, with torque off.
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Field of a message -> its unit."""
+        return {**self.sensor.units, **self.drive.units, **self.agent.units}
 
-        Args:
-            port: Device file of the port, or ``embedded`` for the emulated robot.
-            truth_path: File for the emulated robot's true states and latencies.
-        """
+    @property
+    def profile_rad_s(self) -> float:
+        """How fast the actuators' setpoints move to their goals [rad/s]."""
+        return self.model.profile_rad_s
 
-    @abstractmethod
-    def prepare(self, session: Any, settle_s: float) -> None:
-        """Bring the robot to rest where the task starts; torque is off afterwards.
+    @property
+    def causes(self) -> Mapping[str, Mapping[str, float]]:
+        """Causes that change several parameters at once."""
+        return self.model.causes
 
-        Args:
-            settle_s: Longest time to wait for rest, per attempt [s].
-        """
+    @property
+    def export_lead_s(self) -> float:
+        """Time that C MuJoCo adds to the delay of commands [s]."""
+        return self.model.export_lead_s
 
-    @abstractmethod
+    def nominal(self) -> dict[str, float]:
+        """Return the nominal values of the model's parameters, without delays."""
+        return {p.name: p.nominal for p in self.model.dynamics()}
+
+    def identifiable(self, max_delay_s: float) -> IdentifiableLoop:
+        """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
+        return IdentifiableLoop(self, max_delay_s)
+
+    def watched(self, max_delay_s: float) -> IdentifiableLoop:
+        """Return the model with all parameters that may change between deployments."""
+        loop = self.identifiable(max_delay_s)
+        loop.parameters = loop.parameters.with_terms([*loop.parameters.terms, *self.model.watched_terms])
+        return loop
+
+    def with_optional_terms(self, wanted: str) -> Self:
+        """Return the robot: its model has all of its optional terms."""
+        del wanted
+        return self
+
+    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+        """Return the model with identified values, as MJCF; None: there is none."""
+        return self.model.identified_mjcf(values)
+
+    # -- graphs on hardware
+
     def recording_nodes(self, session: Any, signal: np.ndarray) -> dict[str, BaseNode]:
-        """Return the graph on hardware that sends an excitation signal.
+        """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step."""
+        rows = np.asarray(signal, np.float64).reshape(-1, len(self.agent.action))
+        rows, drive = self.drive.approach(session, rows), self.drive
+        options = {"delay": drive.expected_delay_s[1]}
+        player = Excitation(self.roles.supervisor, self.rate_hz, rows, drive.message, **options)
+        return self._on_hardware(session, player)
+
+    def deployment_nodes(
+        self, session: Any, policy: Runner, trial: int = 0
+    ) -> tuple[dict[str, BaseNode], dict[str, PyTree]]:
+        """Return the graph on hardware that runs a policy, and the agent's parameters.
 
         Args:
-            signal: Shape ``(N,)`` or ``(N, actions)``: one command per step.
+            policy: ``reset()`` begins an episode; a call with an observation ``(O,)`` returns the action ``(A,)``.
+            trial: Number of the trial; see ``RobotTask.at_rest``.
         """
+        start = self.drive.measured_start(session, self.task.at_rest(trial))
+        params = {self.roles.supervisor: in_numpy(self.agent.params(start, None))}
+        node = self.agent.make(self.rate_hz, delay=self.drive.expected_delay_s[1])
+        return self._on_hardware(session, PolicyNode(node, policy)), params
 
-    def around(self, signal: np.ndarray) -> np.ndarray:
-        """Return an excitation ``(N, actions)`` as this robot plays it; default: around 0, as it is."""
-        return signal
+    def _on_hardware(self, session: Any, agent: BaseNode) -> dict[str, BaseNode]:
+        rate, rig, (sensing_s, _, acting_s) = self.rate_hz, session.rig, self.drive.expected_delay_s
+        roles, drive = self.roles, self.drive
+        sensor = ServoSensor(roles.sensor, rate, rig, self.sensor.read, self.sensor.at_rest, delay=sensing_s)
+        actuator = ServoActuator(
+            roles.actuator, rate, rig, drive.command, drive.message, roles.supervisor, delay=acting_s
+        )
+        return control_nodes(sensor, agent, actuator)
 
-    def tilt_rad(self, observation: np.ndarray) -> float:
-        """Return how far the robot leans, for ``deploy --max-tilt-rad`` [rad]; NaN, the default: it does not see that.
+    # -- graphs in simulation
 
-        Args:
-            observation: Shape ``(O,)``: what the policy sees.
-        """
-        del observation
-        return math.nan
-
-    @abstractmethod
-    def deployment_nodes(self, session: Any, policy: Any, trial: int = 0) -> tuple[dict[str, BaseNode], dict[str, Any]]:
-        """Return the graph on hardware that runs a policy, and parameters of its nodes.
-
-        Args:
-            policy: What runs the policy: ``reset()`` begins an episode, a call with an observation ``(O,)`` returns the
-                action ``(A,)``, both numpy arrays; see ``PolicyNode``.
-            trial: Number of the trial. If the task differs between trials, e.g. in its target, the same number stands
-                for the same task, on hardware and in simulation.
-        """
-
-    @abstractmethod
     def training(
         self,
         values: Mapping[str, float],
         draws: Mapping[str, np.ndarray],
         computation: Mapping[str, DelayDistribution],
         delays: bool,
-    ) -> tuple[dict[str, BaseNode], TrainingTask]:
+    ) -> tuple[dict[str, BaseNode], LoopTask]:
         """Return the graph in simulation, and the training task.
 
         Args:
             draws: Samples of some parameters, each of shape ``(K,)``; an episode uses one of the K joint samples in
                 place of the values.
             computation: Node -> distribution of its computation delay.
+            delays: Whether the connections have delays.
         """
-
-    @abstractmethod
-    def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, Any]:
-        """Return the nodes' parameters for an episode in simulation that starts at rest.
-
-        Args:
-            trial: Number of the trial, as in ``deployment_nodes``.
-        """
-
-    @abstractmethod
-    def nominal(self) -> dict[str, float]:
-        """Return the data sheet's values of the parameters, without delays."""
-
-    @abstractmethod
-    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return figures of how well a deployment went, among them ``success``.
-
-        Args:
-            t_s: Times ``(N,)`` [s].
-            states: Name -> values ``(N,)``; entries of a vector are named ``name[i]``. Besides the measured fields, one
-                value per step of what the supervisor sent, and of ``command``, the command that was sent to the motors.
-        """
-
-
-def checked(found: Any, where: str) -> RecordedRobot:
-    """Return what a module calls its robot, once it is known to be one.
-
-    Args:
-        found: The module's ``ROBOT``; None where it has none.
-        where: The module, for the message.
-
-    Raises:
-        UsageError: It is none, or something about it is of the wrong kind; all of it is named.
-    """
-    if not isinstance(found, RecordedRobot):
-        what = f"is {found!r}" if found is not None else "is missing"
-        raise UsageError(
-            f"ROBOT of {where} {what}: a robot is an object of a class that inherits from "
-            "sim2real.robots.contract.Robot, or from RecordedRobot where there are recordings only",
-            hint="make functions and constants of the module methods and attributes of such a class, and end with "
-            "`ROBOT = MyRobot()`",
+        roles, rate, tick_s = self.roles, self.rate_hz, self.model.tick_s
+        # Move the delays to where a simulated loop can have them, and make room for all draws.
+        draws = drawn_in_a_loop(values, draws, tick_s, self.delay_spread_s)
+        values = in_a_loop(values, tick_s, self.delay_spread_s)
+        bounds = delay_bounds(values, tick_s, self.delay_spread_s, self.model.lead_s, draws) if delays else None
+        names = (roles.sensor, roles.supervisor, roles.actuator)
+        on_sensor, on_agent, on_actuator = (
+            {"delay": delay_s if delays else 0.0, "delay_dist": computation.get(name)}
+            for name, delay_s in zip(names, self.drive.expected_delay_s, strict=True)
         )
-    _refuse(type(found), found)
-    return found
+        # Make the nodes and connect them.
+        world, agent = self.model.make_world(), self.agent.make(rate, **on_agent)
+        sensor = SimSensor(roles.sensor, rate, world, **on_sensor)
+        nodes = simulated_loop(sensor, agent, self.sim_actuator(**on_actuator), world, bounds)
+        task = LoopTask(self, agent, values, draws)
+        self.model.check_task(task)
+        return nodes, task
 
+    def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, PyTree]:
+        """Return the nodes' parameters for an episode in simulation that starts at rest."""
+        values = in_a_loop(values, self.model.tick_s, self.delay_spread_s)
+        return self.node_parameters(values, self.task.at_rest(trial), policy)
 
-def _refuse(kind: type[RecordedRobot], owner: Any) -> None:
-    """Say all that is missing or of the wrong kind about a class, or about a robot, which has its properties too."""
-    said = [f"has no {name}()" for name in sorted(kind.__abstractmethods__)]
-    for name, (what, holds) in kind._DATA.items():
-        if owner is kind and isinstance(inspect.getattr_static(kind, name, None), property | cached_property):
-            continue  # known once there is a robot
-        if not hasattr(owner, name):
-            said.append(f"has no {name}: {what}")
-        elif not holds(value := getattr(owner, name)):
-            said.append(f"has {name} = {value!r}, which is not {what}")
-    said += [] if owner is kind else _misfits(owner)
-    if said:
-        base = Robot if issubclass(kind, Robot) else RecordedRobot
-        raise UsageError(
-            f"robot {kind.__module__}.{kind.__qualname__} is not complete: it " + "; it ".join(said),
-            hint=f"sim2real.robots.contract.{base.__name__} says what each of them is",
-        )
+    def node_parameters(self, values: Mapping[str, Any], start: EpisodeStart, policy: Any = None) -> dict[str, PyTree]:
+        """Return the parameters of all nodes in simulation, from values by name and a start."""
+        return {
+            self.roles.world: self.model.params(values, start),
+            self.roles.sensor: DelayParams(delay=values.get(DELAYS[0])),
+            self.roles.actuator: DelayParams(delay=values.get(DELAYS[1])),
+            self.roles.supervisor: self.agent.params(start, policy),
+        }
 
-
-def _misfits(robot: Any) -> list[str]:
-    """Return which methods are none, or do not take what the stages call them with."""
-    said = []
-    for base in (RecordedRobot, Robot):
-        for name, wanted in vars(base).items() if isinstance(robot, base) else ():
-            if name.startswith("_") or not inspect.isfunction(wanted):
-                continue
-            given, expected = getattr(robot, name), list(inspect.signature(wanted).parameters)[1:]
-            try:
-                inspect.signature(given).bind(*expected)
-            except TypeError:
-                said.append(f"has {name} = {given!r}, which does not take ({', '.join(expected)})")
-    return said
+    def sim_actuator(self, **options: Any) -> SimActuator:
+        """Return the bus in simulation, with options of ``BaseNode``."""
+        name, agent, drive = self.roles.actuator, self.roles.supervisor, self.drive
+        actions = len(self.agent.action)
+        return SimActuator(name, self.rate_hz, actions, drive.command, drive.message, agent, **options)

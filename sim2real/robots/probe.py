@@ -6,12 +6,15 @@ import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim2real.errors import SafetyStop, Sim2RealError
-from sim2real.hardware.device import Reading
-from sim2real.hardware.safety.rig import Rig
+
+if TYPE_CHECKING:
+    from sim2real.hardware.device import Reading
+    from sim2real.hardware.safety.rig import Rig
 
 _PERIOD_S, _WATCHED_S = 0.004, 0.16
 """Time between two samples; how long a step is watched."""

@@ -21,5 +21,5 @@ def as_columns(fields: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 def as_sent(robot: Robot, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Return the columns of what the supervisor sent besides its command, and of the command to the motors."""
-    field = robot.command
+    field = robot.drive.command
     return as_columns({**{n: v for n, v in decided.items() if n != field}, "command": commanded[field]})

@@ -22,10 +22,11 @@ from sim2real.graph.episode import named_leaves
 from sim2real.graph.schedule import draw
 from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.safety.config import GateLimits
 from sim2real.identify.model import IdentifiableModel
 from sim2real.robots import score_columns
-from sim2real.robots.contract import RecordedRobot, Robot, checked
+from sim2real.robots.contract import RecordedRobot, Robot
+from sim2real.robots.gate_limits import GateLimits
+from sim2real.robots.loading import checked
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.train.environment.graph_environment import TrainingTask
 from sim2real.train.environment.tasks import EndingTask, PrivilegedTask, terms_of
@@ -49,7 +50,7 @@ def check_robot(robot: RecordedRobot, folder: Path, limits: GateLimits | None = 
     check_identification(robot)
     if isinstance(robot, Robot):
         check_simulation(robot)
-        if getattr(robot, "embedded", None) is not None:
+        if robot.drive.embedded is not None:
             check_embedded(robot, folder, limits or GateLimits())
 
 
@@ -80,7 +81,7 @@ def check_identification(robot: RecordedRobot, max_delay_s: float = 0.06) -> Non
 
 def check_simulation(robot: Robot) -> None:
     """Check names, shapes and scores by an episode in simulation at the nominal values; it is compiled."""
-    roles, values = robot.roles, robot.nominal()
+    roles, values, size = robot.roles, robot.nominal(), robot.agent.observation_size
     known = {p.name: p for p in robot.identifiable(0.06).parameters}
     _include(known, set(values), "parameters that can be identified")
     for name, value in values.items():
@@ -89,7 +90,7 @@ def check_simulation(robot: Robot) -> None:
     _include(nodes, {roles.sensor, roles.supervisor, roles.actuator, roles.world}, "nodes of the loop")
     _hold(task.supervisor == roles.supervisor, f"the task's supervisor is {task.supervisor!r}")
     for sign, own in (("low", task.action_low), ("high", task.action_high)):
-        bears = np.array([getattr(term, sign) for term in robot.action], np.float32)
+        bears = np.array([getattr(term, sign) for term in robot.agent.action], np.float32)
         _hold(np.shape(own) == bears.shape, f"the task has {np.shape(own)} actions, the robot {bears.shape}")
         excess = (own - bears) * (1 if sign == "high" else -1)
         _hold(bool((excess <= 0).all()), f"the task's actions go beyond what the robot bears: {own} and {bears}")
@@ -102,25 +103,33 @@ def check_simulation(robot: Robot) -> None:
 
     seen, records, judged = jax.jit(episode)(jax.random.key(0))
     _check_judgement(judged)
-    _hold(seen.shape == (robot.observation_size,), f"the policy sees {seen.shape}, not ({robot.observation_size},)")
-    _hold(task.observation_size == robot.observation_size, f"the task shows {task.observation_size} entries")
+    _hold(
+        seen.shape == (robot.agent.observation_size,),
+        f"the policy sees {seen.shape}, not ({robot.agent.observation_size},)",
+    )
+    _hold(task.observation_size == size, f"the task shows {task.observation_size} entries")
     _hold(bool(jnp.isfinite(seen).all()), f"the policy sees {seen}")
     _include(nodes, set(jax.eval_shape(task.params, jax.random.key(0))), "nodes with parameters")
     found = {name: _ran(records[name]) for name in recorded}
-    fields = {field for row in robot.joints.values() for field in row.values()}
+    fields = {field for row in robot.sensor.joints.values() for field in row.values()}
     measured = score_columns.as_columns(found[roles.sensor])
     _include(measured, fields, "fields of joints")
-    _include(found[roles.actuator], {robot.command}, "fields of a command")
-    _include(robot.units, {*found[roles.sensor], robot.command}, "units")
-    width = found[roles.actuator][robot.command].reshape(len(found[roles.actuator][robot.command]), -1).shape[1]
-    _hold(width == len(robot.action), f"a command has {width} entries, and there are {len(robot.action)} actions")
+    _include(found[roles.actuator], {robot.drive.command}, "fields of a command")
+    _include(robot.units, {*found[roles.sensor], robot.drive.command}, "units")
+    width = (
+        found[roles.actuator][robot.drive.command].reshape(len(found[roles.actuator][robot.drive.command]), -1).shape[1]
+    )
+    _hold(
+        width == len(robot.agent.action),
+        f"a command has {width} entries, and there are {len(robot.agent.action)} actions",
+    )
     _check_score(robot, measured, score_columns.as_sent(robot, found[roles.supervisor], found[roles.actuator]))
 
 
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
     """Check that the embedded robot opens, takes torque, and ends without."""
     truth = folder / "truth.bin"
-    with robot.connect("embedded", limits, truth, 0) as session:
+    with robot.drive.connect("embedded", limits, truth, 0) as session:
         reading = session.rig.measure()
         _hold(bool(np.isfinite(reading.position_rad).all()), f"the embedded robot is at {reading.position_rad}")
         session.rig.start()
@@ -161,7 +170,7 @@ def _check_score(robot: Robot, measured: Mapping[str, np.ndarray], sent: Mapping
     for name, values in (*measured.items(), *sent.items()):
         _hold(bool(np.isfinite(values).all()), f"{name} is not finite in simulation: {values}")
     t_s = np.arange(len(next(iter(measured.values())))) / robot.rate_hz
-    score = robot.score(t_s, {**sent, **measured})
+    score = robot.task.score(t_s, {**sent, **measured})
     _include(score, {"success"}, "figures of the score")
     _hold(0.0 <= score["success"] <= 1.0, f"success is {score['success']}, not a share")
 

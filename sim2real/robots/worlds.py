@@ -14,19 +14,16 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
-from sim2real.graph.delays import DelayDistribution
-from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import BaseNode
-from sim2real.hardware.entries import WORLDS
-from sim2real.hardware.registry import load_entry
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.contract import RecordedRobot
-from sim2real.robots.control_loop.loop import DELAYS, DelayParams
-from sim2real.robots.control_loop.loop_robot import LoopRobot
-from sim2real.robots.control_loop.training_task import Draw
+from sim2real.robots.contract import RecordedRobot, Robot, RobotModel, RobotTask
+from sim2real.robots.control_loop.loop import Draw
+from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.from_model.recorded import LoggedRobot
+from sim2real.robots.roles import Roles
 from sim2real.train.environment.graph_environment import TrainingTask
-from sim2real.train.environment.tasks import EndingTask
+from sim2real.train.environment.tasks import EndingTask, Rewards
+from sim2real.types import Array, Key, PyTree
 from sim2real.worlds.recorded import RecordedActuator
 
 AnyRobot = TypeVar("AnyRobot", bound=RecordedRobot)
@@ -80,21 +77,26 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
     """
     if name is None:
         return robot
+    from sim2real.hardware.entries import WORLDS
+    from sim2real.hardware.registry import load_entry
+
     model = load_entry("world", name, WORLDS, "robots.worlds.WorldModel")(robot)
     if not isinstance(model, WorldModel):
         raise UsageError(
             f"world {name!r} makes a {type(model).__name__}", hint="it has to be a sim2real.robots.worlds.WorldModel"
         )
     _check(name, robot, model)
-    step = {"tick_s": 1.0 / model.node.rate, "lead_s": float(getattr(model.node, "lead_s", 0.0))}
-    for base, kind, data in ((LoopRobot, _LoopInWorld, step), (LoggedRobot, _LogInWorld, {})):
-        if isinstance(robot, base):
-            made: Any = copy.copy(robot)
-            made.__class__ = type(type(robot).__name__, (kind, type(robot)), {**data, "model": model, "world": name})
-            return made
+    if isinstance(robot, Robot):
+        moved: Any = copy.copy(robot)
+        moved.model, moved.task = _OtherWorld(model, name), _OtherWorldsTask(robot.task)
+        return moved
+    if isinstance(robot, LoggedRobot):
+        moved = copy.copy(robot)
+        moved.__class__ = type(type(robot).__name__, (_LogInWorld, type(robot)), {"model": model, "world": name})
+        return moved
     raise UsageError(
         f"{type(robot).__name__} makes its nodes itself: it cannot be put into world {name!r}",
-        hint="only robots that inherit from LoopRobot or LoggedRobot can",
+        hint="only robots that inherit from Robot or LoggedRobot can",
     )
 
 
@@ -110,52 +112,23 @@ def _check(name: str, robot: RecordedRobot, model: WorldModel) -> None:
         raise UsageError(f"the parameters of world {name!r} have no field 'start'", hint="positions, then velocities")
 
 
-class _LoopInWorld(LoopRobot):
-    """A robot of the control loop in another world; its policy, device, task and delays are its own."""
+class _OtherWorld(RobotModel):
+    """The model of a robot in another world."""
 
-    model: WorldModel
-    world: str
+    def __init__(self, model: WorldModel, name: str) -> None:
+        self._model, self._name = model, name
+        self.tick_s, self.lead_s = 1.0 / model.node.rate, float(getattr(model.node, "lead_s", 0.0))
 
     def dynamics(self) -> list[Parameter]:
-        return self.model.dynamics()
+        return self._model.dynamics()
 
     def make_world(self, resumed: bool = False) -> BaseNode:
-        return self.model.make_world(resumed)
+        return self._model.make_world(resumed)
 
-    def true_state(self, state: Any) -> Any:
-        return state  # of another kind than the robot's own
+    def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PyTree:
+        return self._model.params(values, jnp.concatenate([*map(jnp.asarray, (start.position, start.velocity))]))
 
-    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
-        del values  # of another model than the robot's own
-
-    def resumed_params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
-        delays = zip((self.roles.sensor, self.roles.actuator), DELAYS, strict=True)
-        own = {node: DelayParams(values.get(delay)) for node, delay in delays}
-        return {**own, self.roles.world: self.model.params(values, start)}
-
-    def rest_params(self, values: Mapping[str, Any], policy: Any, trial: int) -> dict[str, Any]:
-        own: Any = self.model.robot
-        return self._placed(own.rest_params(self._own(values), policy, trial), values)
-
-    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
-        own: Any = self.model.robot
-        of_task, of_world = jax.random.split(key)
-        drawn = draw(of_world)
-        return self._placed(own.random_params(of_task, lambda _: self._own(drawn)), drawn)
-
-    def training(
-        self,
-        values: Mapping[str, float],
-        draws: Mapping[str, np.ndarray],
-        computation: Mapping[str, DelayDistribution],
-        delays: bool,
-    ) -> tuple[dict[str, BaseNode], TrainingTask]:
-        nodes, task = super().training(values, draws, computation, delays)
-        self._require_judgement(task)
-        return nodes, task
-
-    def _require_judgement(self, task: TrainingTask) -> None:
-        """Refuse a world whose state lacks what the task reads of the robot's own."""
+    def check_task(self, task: TrainingTask) -> None:
         node = self.make_world()
 
         def judged() -> Any:
@@ -168,26 +141,43 @@ class _LoopInWorld(LoopRobot):
             jax.eval_shape(judged)
         except (AttributeError, KeyError) as error:
             raise UsageError(
-                f"no policy can be trained in world {self.world!r}: the task reads of the world's state what it "
-                f"does not have: {error}",
-                hint="give the world's state the fields that the robot's own has",
+                f"no policy can be trained in world {self._name!r}: its state lacks a field that the task reads: "
+                f"{error}",
+                hint="give the world's state the fields that the robot's own world has",
             ) from error
 
-    def _own(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the data sheet's values of the robot's own model, and the delays."""
-        own: Any = self.model.robot
-        return {**own.nominal(), **{name: values[name] for name in DELAYS if name in values}}
 
-    def _placed(self, params: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return nodes' parameters with those of this world, which begins where the robot's own would."""
-        own: Any = self.model.robot
-        node = own.make_world()
-        gs = GraphState(params=dict(params))
-        first = named_leaves(node.init_output(None, gs.replace(state={node.name: node.init_state(None, gs)})))
-        at = [c.of(first[c.position]) for c in self.channels]
-        moving = [jnp.zeros(()) if c.velocity is None else c.of(first[c.velocity]) for c in self.channels]
-        start = jnp.stack([jnp.asarray(x).reshape(()) for x in (*at, *moving)])
-        return {**params, node.name: self.model.params(values, start)}
+class _OtherWorldsTask(RobotTask):
+    """The task of a robot in another world: its own, with values of the other world's parameters."""
+
+    def __init__(self, task: RobotTask) -> None:
+        self._task, self.aim_size = task, task.aim_size
+
+    def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], EpisodeStart]:
+        of_task, of_world = jax.random.split(key)
+        values = draw(of_world)
+        return values, self._task.random(of_task, lambda _: values)[1]
+
+    def at_rest(self, trial: int) -> EpisodeStart:
+        return self._task.at_rest(trial)
+
+    def moved(self, start: EpisodeStart, position: Array, velocity: Array) -> EpisodeStart:
+        return self._task.moved(start, position, velocity)
+
+    def judged(self, graph_state: GraphState, roles: Roles) -> Any:
+        return self._task.judged(graph_state, roles)
+
+    def reward(self, state: Any, action: jax.Array) -> Rewards:
+        return self._task.reward(state, action)
+
+    def success(self, state: Any) -> jax.Array:
+        return self._task.success(state)
+
+    def terminated(self, state: Any) -> jax.Array:
+        return self._task.terminated(state)
+
+    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
+        return self._task.score(t_s, states)
 
 
 class _LogInWorld(LoggedRobot):

@@ -24,19 +24,27 @@ pendulum = load_pipeline("pendulum")
 robot = pendulum.load()
 
 def faulty_emulator(**faults):
-    return replace(robot.embedded, emulator=replace(robot.embedded.emulator, **faults))
+    return replace(robot.drive.embedded, emulator=replace(robot.drive.embedded.emulator, **faults))
 
 def nodes(session, signal, sensor=hardware.ServoSensor, agent=hardware.Excitation):
-    rows, command = np.reshape(signal, (-1, 1)), robot.message
+    rows, command = np.reshape(signal, (-1, 1)), robot.drive.message
     return control_nodes(
-        sensor("sensor", 50.0, session.rig, robot.read, robot.at_rest, delay=0.002),
+        sensor("sensor", 50.0, session.rig, robot.sensor.read, robot.sensor.at_rest, delay=0.002),
         agent("agent", 50.0, rows, command, delay=0.002),
         hardware.ServoActuator("actuator", 50.0, session.rig, "action", command, delay=0.002),
     )
 """
 FAULTS = """
-faults = {name: value for name, value in globals().items() if hasattr(type(robot), name) and not name.startswith("_")}
-ROBOT = type("Faulty", (type(robot),), {n: staticmethod(f) if callable(f) else f for n, f in faults.items()})()
+ROBOT = type(robot)()
+for part in (None, "drive", "sensor", "agent", "task", "model"):
+    kind = type(getattr(robot, part) if part else robot)
+    faults = {n: v for n, v in globals().items() if hasattr(kind, n) and not n.startswith("_")}
+    faults = {n: staticmethod(f) if callable(f) else f for n, f in faults.items()}
+    faulty = type("Faulty", (kind,), faults)
+    if part:
+        setattr(ROBOT, part, faulty())
+    else:
+        ROBOT = faulty()
 """
 
 
@@ -67,7 +75,7 @@ def make_pipeline(tmp_path, monkeypatch):
 @pytest.fixture
 def lone_robot(tmp_path):
     """Start an emulated pendulum that does not end with its host; returns its port, its truth file, how to stop it."""
-    embedded = load_pipeline("pendulum").load().embedded
+    embedded = load_pipeline("pendulum").load().drive.embedded
     path = tmp_path / "truth.bin"
     command = [sys.executable, "-m", "sim2real.hardware.emulation.emulator", "--plant", embedded.plant]
     command += ["--emulation", "sim2real.hardware.dynamixel.emulation:EmulatorConfig", "--truth", str(path)]

@@ -29,11 +29,11 @@ pytestmark = pytest.mark.realtime
 def resting(tmp_path_factory):
     """A bundle whose policy rests, trained with the delay that the pendulum has."""
     robot = load_pipeline("pendulum").load()
-    size, low, high = robot.observation_size, *np.array([(a.low, a.high) for a in robot.action]).T
+    size, low, high = robot.agent.observation_size, *np.array([(a.low, a.high) for a in robot.agent.action]).T
     weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(1)}
     weights |= {"layers.0.kernel": np.zeros((size, 1)), "layers.0.bias": np.zeros(1)}
     trained = {"round_trip_delay": (0.043, 0.047)}
-    contract = PolicyContract(robot.observation, robot.action, robot.rate_hz, trained_s=trained)
+    contract = PolicyContract(robot.agent.observation, robot.agent.action, robot.rate_hz, trained_s=trained)
     return save_bundle(tmp_path_factory.mktemp("bundle") / "resting", weights, contract)
 
 
@@ -74,7 +74,7 @@ def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, resti
 
 
 def test_15_ms_more_of_delay_are_refused(make_pipeline, tmp_path, resting, capsys):
-    latency = load_pipeline("pendulum").load().embedded.emulator.actuation_latency_s + 0.015
+    latency = load_pipeline("pendulum").load().drive.embedded.emulator.actuation_latency_s + 0.015
     name = make_pipeline("late_pendulum", f"\n    embedded = faulty_emulator(actuation_latency_s={latency})\n")
     code, folder = deploy(name, resting, tmp_path)
     assert code == errors.SAFETY_STOP
@@ -87,7 +87,7 @@ def test_15_ms_more_of_delay_are_refused(make_pipeline, tmp_path, resting, capsy
 
 
 def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
-    robot, truth, said = load_pipeline("pendulum").load().embedded, tmp_path / "truth.bin", tmp_path / "said.txt"
+    robot, truth, said = load_pipeline("pendulum").load().drive.embedded, tmp_path / "truth.bin", tmp_path / "said.txt"
     bundle = faults.swinging_bundle(tmp_path / "bundle")
     with faults.emulated(robot.emulator, robot.plant, truth) as (port, _):
         patient = ("--gate.stop-s=2", "--gate.max-sample-age-s=1")  # on a busy machine commands come late
@@ -109,10 +109,12 @@ def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
 @pytest.mark.slow
 def test_a_robot_that_would_fall_is_held_until_it_is_let_go(tmp_path, start_cli):
     robot = load_pipeline("arm").load()
-    size, low, high = robot.observation_size, *np.array([(a.low, a.high) for a in robot.action]).T
+    size, low, high = robot.agent.observation_size, *np.array([(a.low, a.high) for a in robot.agent.action]).T
     weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(3)}
     weights |= {"layers.0.kernel": np.zeros((size, 3)), "layers.0.bias": np.full(3, 0.2)}
-    bundle = save_bundle(tmp_path / "bundle", weights, PolicyContract(robot.observation, robot.action, robot.rate_hz))
+    bundle = save_bundle(
+        tmp_path / "bundle", weights, PolicyContract(robot.agent.observation, robot.agent.action, robot.rate_hz)
+    )
     flags = ["--bundle", bundle, "--episodes", 1, "--duration-s", 1, "--runs", tmp_path, *PATIENT]
     process = start_cli("deploy", "arm", "--hold", *flags)
     assert any("holding: support the robot" in line for line in process.stderr)

@@ -34,7 +34,7 @@ PATIENT = ["--gate.servo-watchdog-s", "0.6"]  # a busy machine is not what is te
 @pytest.fixture(scope="module")
 def tapped(tmp_path_factory):
     """Start an emulated pendulum behind a wiretap."""
-    embedded = load_pipeline("pendulum").load().embedded
+    embedded = load_pipeline("pendulum").load().drive.embedded
     with contextlib.ExitStack() as stack:
 
         def start():
@@ -207,9 +207,9 @@ def test_a_deployment_says_what_the_policy_would_have_sent(tapped, tmp_path):
 
 def steady(robot, folder):
     """Write a bundle whose policy always asks for the same."""
-    size = robot.observation_size
-    low, high = (np.array([getattr(a, side) for a in robot.action], np.float32) for side in ("low", "high"))
-    contract = PolicyContract(robot.observation, robot.action, robot.rate_hz)
+    size = robot.agent.observation_size
+    low, high = (np.array([getattr(a, side) for a in robot.agent.action], np.float32) for side in ("low", "high"))
+    contract = PolicyContract(robot.agent.observation, robot.agent.action, robot.rate_hz)
     zeros, n = np.zeros(size, np.float32), len(low)
     weights = {"mean": zeros, "std": zeros + 1, "low": low, "high": high, "log_std": np.zeros(n)}
     weights |= {"layers.0.kernel": np.zeros((size, n)), "layers.0.bias": np.full(n, 0.5)}

@@ -20,7 +20,7 @@ STEP_S = 0.0025
 @pytest.fixture(scope="module")
 def env():
     """The task on C, which draws no targets."""
-    env = composer.Environment(ROBOT.make_task())
+    env = composer.Environment(ROBOT.model.make_task())
     env.reset()
     return env
 
@@ -60,9 +60,9 @@ def test_model_and_embedded_robot_weigh_the_same(env):
 def test_parameters_stand_where_c_keeps_them(env):
     task, physics = env.task, env.physics
     aim = np.array([0.1, -0.05, 0.3])
-    before = {n: np.array(getattr(physics.bind(e), a)) for n, (e, a) in ROBOT.fields(task).items()}
-    placed = ROBOT.place(VALUES, aim)
-    for name, (elements, attribute) in ROBOT.fields(task).items():
+    before = {n: np.array(getattr(physics.bind(e), a)) for n, (e, a) in ROBOT.model.fields(task).items()}
+    placed = ROBOT.model.place(VALUES, aim)
+    for name, (elements, attribute) in ROBOT.model.fields(task).items():
         assert np.shape(placed[name]) == before[name].shape, name
         setattr(physics.bind(elements), attribute, np.asarray(placed[name]))
     model = physics.model.ptr
@@ -78,7 +78,7 @@ def test_parameters_stand_where_c_keeps_them(env):
     np.testing.assert_allclose(physics.bind(task.robot.actuators).force, torque, rtol=1e-5)
     gap = np.linalg.norm(TASK.tip_of(np, np.array([0.1, -0.2, 0.3])) - aim)
     assert task.distance(physics) == pytest.approx(gap, rel=1e-5)
-    for name, (elements, attribute) in ROBOT.fields(task).items():
+    for name, (elements, attribute) in ROBOT.model.fields(task).items():
         setattr(physics.bind(elements), attribute, before[name])
 
 
@@ -88,18 +88,18 @@ def test_nominal_values_are_the_data_sheets_and_no_delays():
     assert nominal["gain"] == pytest.approx(1.4 / (885 / (800 / 256) * 2 * np.pi / 4096), rel=1e-6)
     assert (nominal["damping"], nominal["armature"], nominal["friction_pan"]) == (0.23, 0.0045, 0.03)
     assert set(PLANT.ArmPlant().truth()) == set(nominal), "what is true goes by the same names"
-    for p in ROBOT.dynamics():
+    for p in ROBOT.model.dynamics():
         assert p.low < PLANT.ArmPlant().truth()[p.name] < p.high
 
 
 def test_aims_can_be_reached():
-    targets = np.array([ROBOT.draw_aim(jax.random.key(i)) for i in range(60)])
+    targets = np.array([ROBOT.task.aim.draw(jax.random.key(i)) for i in range(60)])
     from_shoulder = targets - np.array([0, 0, 0.37])
     out = np.linalg.norm(targets[:, :2], axis=1)
     reach = np.hypot(out - 0.04, from_shoulder[:, 2])
     assert np.all((reach < 0.24) | (out < 0.04))
     assert targets[:, 2].min() > 0.1
-    np.testing.assert_array_equal(ROBOT.draw_aim(jax.random.key(7)), ROBOT.draw_aim(jax.random.key(7)))
+    np.testing.assert_array_equal(ROBOT.task.aim.draw(jax.random.key(7)), ROBOT.task.aim.draw(jax.random.key(7)))
 
 
 def trajectory(angles, target):
@@ -112,7 +112,7 @@ def test_the_score_of_an_arm_that_arrives_and_stays():
     there = np.array([0.5, 0.4, 0.3])
     angles = np.tile(there, (401, 1))
     angles[:150] += [0.6, 0.0, 0.0]
-    score = ROBOT.score(*trajectory(angles, TASK.tip_of(np, there)))
+    score = ROBOT.task.score(*trajectory(angles, TASK.tip_of(np, there)))
     assert score == {
         "success": 1.0,
         "reached": 1.0,
@@ -125,7 +125,7 @@ def test_the_score_of_an_arm_that_passes_by():
     there = np.array([0.5, 0.4, 0.3])
     angles = np.tile(there + np.array([0.0, 0.5, 0.0]), (401, 1))
     angles[200:250] = there
-    score = ROBOT.score(*trajectory(angles, TASK.tip_of(np, there)))
+    score = ROBOT.task.score(*trajectory(angles, TASK.tip_of(np, there)))
     off = np.linalg.norm(TASK.tip_of(np, angles[0]) - TASK.tip_of(np, there))
     assert score["success"] == pytest.approx(50 / 201)
     assert score["reached"] == 0.0
@@ -134,7 +134,7 @@ def test_the_score_of_an_arm_that_passes_by():
 
 
 def test_the_score_of_an_arm_that_never_comes_near():
-    score = ROBOT.score(*trajectory(np.zeros((401, 3)), TASK.tip_of(np, np.array([1.0, 1.0, 1.0]))))
+    score = ROBOT.task.score(*trajectory(np.zeros((401, 3)), TASK.tip_of(np, np.array([1.0, 1.0, 1.0]))))
     assert (score["success"], score["reached"]) == (0.0, 0.0)
     assert np.isnan(score["first_reached_s"])
 
@@ -163,11 +163,11 @@ def test_the_command_line_tells_about_it(capsys, tmp_path):
 
 def test_what_was_found_is_written_as_mjcf():
     found = {"gain": 2.8, "damping": 0.25, "armature": 0.0056, "sensor_delay": 0.01}
-    found |= {f"friction_{joint}": 0.03 + 0.01 * i for i, joint in enumerate(ROBOT.servos.joints)}
+    found |= {f"friction_{joint}": 0.03 + 0.01 * i for i, joint in enumerate(ROBOT.drive.servos.joints)}
     model = mujoco.MjModel.from_xml_string(ROBOT.identified_mjcf(found))
     np.testing.assert_allclose(model.actuator_gainprm[:, 0], 2.8)
     np.testing.assert_allclose(model.actuator_biasprm[:, 1], -2.8)
-    np.testing.assert_allclose(model.actuator_forcerange[:, 1], 2.8 * ROBOT.servos.sheet.full_rad, rtol=1e-5)
+    np.testing.assert_allclose(model.actuator_forcerange[:, 1], 2.8 * ROBOT.drive.servos.sheet.full_rad, rtol=1e-5)
     np.testing.assert_allclose(model.dof_damping, 0.25)
     added = 0.5 * model.opt.timestep * 0.25  # MuJoCo's implicit step adds it
     np.testing.assert_allclose(model.dof_armature, 0.0056 - added, rtol=1e-5)

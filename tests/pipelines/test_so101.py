@@ -11,21 +11,21 @@ import pytest
 from sim2real import cli, composer
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers
-from sim2real.hardware.safety.config import GateLimits
+from sim2real.robots.gate_limits import GateLimits
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("so101")
 ROBOT, TASK, PLANT = PIPELINE.load(), PIPELINE.load("task"), PIPELINE.load("plant")
 MODULE = PIPELINE.load("robot")
-LOW, HIGH = np.array(ROBOT.servos.low), np.array(ROBOT.servos.high)
+LOW, HIGH = np.array(ROBOT.drive.servos.low), np.array(ROBOT.drive.servos.high)
 STEP_S = 0.01 / 3
 
 
 @pytest.fixture(scope="module")
 def env():
     """The task on C."""
-    env = composer.Environment(ROBOT.make_task())
+    env = composer.Environment(ROBOT.model.make_task())
     env.reset()
     return env
 
@@ -89,7 +89,7 @@ def lowest(plant, angles):
 
 def test_no_goal_leads_into_the_table(plant):
     """The gate lets no goal out of a box; everywhere in it the arm is above the table, by more than it droops."""
-    gate = ROBOT.gate(PIPELINE.deploy.gate)
+    gate = ROBOT.drive.gate(PIPELINE.deploy.gate)
     np.testing.assert_array_equal(gate.range, [LOW, HIGH])
     swing = [np.linspace(LOW[i], HIGH[i], 9) for i in (1, 2, 3)]
     heights = [lowest(plant, [0, *angles, 0, 0]) for angles in itertools.product(*swing)]
@@ -98,12 +98,12 @@ def test_no_goal_leads_into_the_table(plant):
 
 
 def test_excitations_aims_and_rest_are_within_the_limits(plant):
-    signal = ROBOT.around(excitation(PIPELINE.record, ROBOT.rate_hz, 6))
+    signal = ROBOT.drive.around(excitation(PIPELINE.record, ROBOT.rate_hz, 6))
     inside = (signal >= LOW - 1e-9) & (signal <= HIGH + 1e-9)
     assert inside.mean(axis=0).min() > 0.85, "the gate cuts little"
     assert np.ptp(np.clip(signal, LOW, HIGH), axis=0).min() > 0.5
-    assert np.all((ROBOT.servos.at_rest >= LOW) & (ROBOT.servos.at_rest <= HIGH))
-    targets = np.array([ROBOT.draw_aim(jax.random.key(i)) for i in range(60)])
+    assert np.all((ROBOT.drive.servos.at_rest >= LOW) & (ROBOT.drive.servos.at_rest <= HIGH))
+    targets = np.array([ROBOT.task.aim.draw(jax.random.key(i)) for i in range(60)])
     assert targets[:, 2].min() > 0.1
     assert np.ptp(targets, axis=0).min() > 0.2
     assert np.all(np.array(MODULE.LOW) > LOW)
@@ -114,9 +114,9 @@ def test_parameters_stand_where_c_keeps_them(env):
     physics = env.physics
     values = {**ROBOT.nominal(), "damping_elbow_flex": 0.3, "friction_gripper": 0.02, "saturation_gripper": 0.1}
     aim = np.array([0.1, -0.05, 0.3, 0.4])
-    placed = ROBOT.place(values, aim)
-    before = {n: np.array(getattr(physics.bind(e), a)) for n, (e, a) in ROBOT.fields(env.task).items()}
-    for name, (elements, attribute) in ROBOT.fields(env.task).items():
+    placed = ROBOT.model.place(values, aim)
+    before = {n: np.array(getattr(physics.bind(e), a)) for n, (e, a) in ROBOT.model.fields(env.task).items()}
+    for name, (elements, attribute) in ROBOT.model.fields(env.task).items():
         assert np.shape(placed[name]) == before[name].shape, name
         setattr(physics.bind(elements), attribute, np.asarray(placed[name]))
     model, gain = physics.model.ptr, values["gain"]
@@ -128,7 +128,7 @@ def test_parameters_stand_where_c_keeps_them(env):
     )
     np.testing.assert_allclose(physics.bind(env.task.table.target).pos, aim[:3], rtol=1e-6)
     assert physics.bind(env.task.table.opening).pos[0] == pytest.approx(0.4)
-    for name, (elements, attribute) in ROBOT.fields(env.task).items():
+    for name, (elements, attribute) in ROBOT.model.fields(env.task).items():
         setattr(physics.bind(elements), attribute, before[name])
 
 
@@ -142,7 +142,7 @@ def test_what_was_found_is_written_as_mjcf():
 
 def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
     """P gain of 16, 0.166 duty per radian and count of P: 30 kg cm at 0.377 rad."""
-    sheet = ROBOT.servos.sheet
+    sheet = ROBOT.drive.servos.sheet
     assert sheet.full_rad == pytest.approx(0.3765, abs=1e-4)
     assert sheet.gain == pytest.approx(7.81, abs=0.01)
     assert sheet.drive.p_gain == 16
@@ -152,8 +152,8 @@ def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
 def test_what_is_true_goes_by_the_same_names_and_lies_within_the_bounds():
     truth = PLANT.SO101Plant().truth()
     # Where friction wears off each of its joints has a speed of its own: the model's one is none of them.
-    assert set(truth) | {"stribeck"} == {p.name for p in ROBOT.dynamics()} == set(ROBOT.nominal())
-    for p in ROBOT.dynamics():
+    assert set(truth) | {"stribeck"} == {p.name for p in ROBOT.model.dynamics()} == set(ROBOT.nominal())
+    for p in ROBOT.model.dynamics():
         assert p.low < truth.get(p.name, 0.33) < p.high, p.name
 
 
@@ -168,7 +168,7 @@ def test_the_score_of_an_arm_that_arrives_and_stays():
     angles = np.tile(there, (401, 1))
     angles[:150, 0] += 0.6
     aim = [*TASK.tip_of(np, there), 0.25]
-    assert ROBOT.score(*trajectory(angles, aim)) == {
+    assert ROBOT.task.score(*trajectory(angles, aim)) == {
         "success": 1.0,
         "reached": 1.0,
         "distance_m": pytest.approx(0.0, abs=1e-12),
@@ -179,7 +179,7 @@ def test_the_score_of_an_arm_that_arrives_and_stays():
 
 def test_the_score_of_an_arm_whose_jaw_is_not_as_it_is_told():
     there = np.array([0.5, -0.8, 1.0, -1.2, 0.3, 0.2])
-    score = ROBOT.score(*trajectory(np.tile(there, (401, 1)), [*TASK.tip_of(np, there), -0.2]))
+    score = ROBOT.task.score(*trajectory(np.tile(there, (401, 1)), [*TASK.tip_of(np, there), -0.2]))
     assert (score["success"], score["reached"]) == (0.0, 0.0)
     assert score["distance_m"] < 0.001
     assert np.isnan(score["first_reached_s"])
@@ -222,7 +222,7 @@ def test_the_only_calibration_is_taken_and_of_several_the_one_that_is_named(lero
 
 def test_an_arm_without_calibration_is_not_opened(lerobot, tmp_path):
     with pytest.raises(UsageError, match="no calibration in") as told:
-        ROBOT.connect("/dev/ttyACM0", GateLimits(), tmp_path / "truth.bin", 0)
+        ROBOT.drive.connect("/dev/ttyACM0", GateLimits(), tmp_path / "truth.bin", 0)
     assert "SO101_CALIBRATION" in str(told.value.hint)
 
 
@@ -239,7 +239,7 @@ def test_the_calibration_is_the_embedded_arms():
     for joint, zero in zip(joints, PLANT.ZERO_COUNTS, strict=True):
         assert joint.zero_count + joint.homing_offset == pytest.approx(zero, abs=0.5)
         low, high = joint.range_rad
-        i = ROBOT.servos.joints.index(joint.name)
+        i = ROBOT.drive.servos.joints.index(joint.name)
         assert low < LOW[i] < HIGH[i] < high
 
 

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from small_robot import VALUES, PairRobot, play_in_a_graph
+from small_robot import VALUES, PairRobot, play_in_a_graph, world_params
 
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -20,8 +20,8 @@ def played(pair):
     """Half a second of moving goals, some of them too fast for the profile, played by the graph's world."""
     t = 0.01 * np.arange(50)
     goals = np.stack([np.sin(5 * t), np.where(t < 0.2, 0.9, -0.3)], axis=1).astype(np.float32)
-    params = pair.node_params(VALUES, [0.3, -0.2], [0.0, 0.5], [0.1])["world"]
-    world = pair.make_world()
+    params = world_params(pair, VALUES, [0.3, -0.2], [0.0, 0.5], [0.1])
+    world = pair.model.make_world()
     first, later, references, rewards = play_in_a_graph(world)(params, goals)
     return SimpleNamespace(
         world=world, params=params, goals=goals, first=first, later=later, references=references, rewards=rewards

@@ -9,10 +9,15 @@ import numpy as np
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.graph.base import GraphState, InputState, StepState
-from sim2real.robots.control_loop.messages import Goals
+from sim2real.robots.contract import Robot
+from sim2real.robots.control_loop.messages import EpisodeStart, Goals
 from sim2real.robots.servo.datasheet import DataSheet
+from sim2real.robots.servo.drive import JointSensor, ServoDrive
+from sim2real.robots.servo.model import ComposedModel
+from sim2real.robots.servo.observation import ServoAgent
 from sim2real.robots.servo.parts import GoalTask, Servo, ServoDriven
-from sim2real.robots.servo.servo_robot import ServoRobot, Servos
+from sim2real.robots.servo.servos import Servos
+from sim2real.robots.servo.task import Aim, AimTask
 
 SHEET = DataSheet(stall=1.4, damping=0.2, armature=0.01, friction=0.02, p_gain=1200, profile_rad_s=2.0)
 
@@ -51,33 +56,41 @@ class PairTask(GoalTask):
         return -physics.np.sum(physics.bind(self.joints).qpos ** 2)
 
 
-class PairRobot(ServoRobot):
-    """Shows its policy the default features; its aim is one angle, of which the model knows nothing."""
+SERVOS = Servos(("left", "right"), (1, 2), (-1.0, -0.5), (0.8, 1.2), SHEET, speed=2.0)
+ANGLE = Aim((("angle", "rad"),), lambda key: jax.random.uniform(key, (1,), minval=-0.4, maxval=0.8))
 
-    servos = Servos(("left", "right"), (1, 2), (-1.0, -0.5), (0.8, 1.2), SHEET, speed=2.0)
-    aim = (("angle", "rad"),)
-    history = 2
 
-    def make_task(self):
-        return PairTask()
+class PairRobot(Robot):
+    """Shows its policy the default features; its aim is one angle, which its model does not have."""
 
-    def draw_aim(self, key):
-        return jax.random.uniform(key, (1,), minval=-0.4, maxval=0.8)
+    def __init__(self, servos=SERVOS, make_task=PairTask, aim=ANGLE, features=None, observe=None, history=2):
+        self.sensor = JointSensor(servos)
+        self.drive = ServoDrive(servos)
+        self.agent = ServoAgent(servos, aim, features, observe, history)
+        self.model = ComposedModel(servos, make_task, aim)
+        self.task = AimTask(servos, aim, success, score)
 
-    def success(self, state):
-        return jnp.all(jnp.abs(state.data.qpos) < 0.1)
 
-    def score(self, t_s, states):
-        return {"success": float(abs(states["position[0]"][-1]) < 0.1)}
+def success(state):
+    return jnp.all(jnp.abs(state.data.qpos) < 0.1)
+
+
+def score(t_s, states):
+    return {"success": float(abs(states["position[0]"][-1]) < 0.1)}
+
+
+def world_params(robot, values, position, velocity, aim):
+    """Return the parameters of a robot's world."""
+    return robot.model.params(values, EpisodeStart(position, velocity, aim))
 
 
 def play_on_c(robot, params, goals):
     """Play goals ``(T, n)`` of every tick on C MuJoCo; return the environment, and positions, speeds and rewards."""
-    task = robot.make_task()
+    task = robot.model.make_task()
     env = composer.Environment(task)
     env.reset()
     physics, joints = env.physics, env.physics.bind(task.joints)
-    for name, (elements, attribute) in robot.fields(task).items():
+    for name, (elements, attribute) in robot.model.fields(task).items():
         setattr(physics.bind(elements), attribute, np.asarray(params.values[name]))
     joints.qpos, joints.qvel = np.asarray(params.qpos), np.asarray(params.qvel)
     physics.recompute_constants()
@@ -88,7 +101,7 @@ def play_on_c(robot, params, goals):
         reward = env.step(np.asarray(goal, np.float64)).reward
         # MuJoCo's speeds are those of half a step ago.
         rows.append([*joints.qpos, *(joints.qvel + 0.5 * task.physics_timestep * joints.qacc), reward])
-    rows, n = np.array(rows), len(robot.servos.joints)
+    rows, n = np.array(rows), len(robot.drive.servos.joints)
     return env, rows[:, :n], rows[:, n : 2 * n], rows[:, 2 * n]
 
 

@@ -21,8 +21,14 @@ def test_every_pipeline_here_has_a_robot(name, tmp_path):
     testing.check_robot(pipeline.load(), tmp_path, gate)
 
 
-def changed(**changes):
-    return type("Changed", (type(load_pipeline("pendulum").load()),), changes)()
+def pendulum(part=None, **changes):
+    """Return the pendulum with other attributes of itself or of one of its parts."""
+    robot = load_pipeline("pendulum").load()
+    if part is None:
+        return type("Changed", (type(robot),), changes)()
+    robot = type(robot)()
+    setattr(robot, part, type("Changed", (type(getattr(robot, part)),), changes)())
+    return robot
 
 
 def too_strong(robot, values, draws, computation, delays):
@@ -32,29 +38,37 @@ def too_strong(robot, values, draws, computation, delays):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("part", "changes", "message"),
     [
-        ({"units": {"action": "V"}}, "units: there are action, but not th, thdot"),
-        ({"roles": Roles(world="plant")}, "nodes of the model: there are .* but not plant"),
-        ({"nominal": lambda _: {"gain": 1e9}}, "gain = 1000000000.0 is outside its bounds"),
-        ({"nominal": lambda _: {"mass": 1.0}}, "parameters that can be identified: .* but not mass"),
-        ({"training": too_strong}, "go beyond what the robot bears"),
+        (None, {"units": {"action": "V"}}, "units: there are action, but not th, thdot"),
+        (None, {"roles": Roles(world="plant")}, "nodes of the model: there are .* but not plant"),
+        (None, {"nominal": lambda _: {"gain": 1e9}}, "gain = 1000000000.0 is outside its bounds"),
+        (None, {"nominal": lambda _: {"mass": 1.0}}, "parameters that can be identified: .* but not mass"),
+        (None, {"training": too_strong}, "go beyond what the robot bears"),
+        (
+            "sensor",
+            {"joints": {"hinge": {"position": "angle"}}},
+            "fields of joints: there are th, thdot, but not angle",
+        ),
+        ("task", {"score": lambda _, t_s, states: {"success": np.nan}}, "success is nan, not a share"),
+        (
+            "task",
+            {"reward": lambda _, state, action: {"voltage": action}},
+            r"reward 'voltage' of a state has shape \(1,\)",
+        ),
+        (
+            "agent",
+            {"observation": load_pipeline("pendulum").load().agent.observation[:2]},
+            r"the policy sees \(19,\), not \(15,\)",
+        ),
     ],
 )
-def test_who_does_not_fit_is_noticed(changes, said, tmp_path):
-    with pytest.raises(AssertionError, match=said):
-        testing.check_robot(changed(**changes, embedded=None), tmp_path)
+def test_a_robot_that_does_not_fit_is_refused(part, changes, message):
+    robot = pendulum(part, **changes)
 
+    def check():
+        testing.check_identification(robot)
+        testing.check_simulation(robot)
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"joints": {"hinge": {"position": "angle"}}}, "fields of joints: there are th, thdot, but not angle"),
-        ({"score": lambda _, t_s, states: {"success": np.nan}}, "success is nan, not a share"),
-        ({"reward": lambda _, state, action: {"voltage": action}}, r"reward 'voltage' of a state has shape \(1,\)"),
-        ({"observation": load_pipeline("pendulum").load().observation[:2]}, r"the policy sees \(19,\), not \(15,\)"),
-    ],
-)
-def test_what_only_an_episode_shows_is_noticed(changes, said):
-    with pytest.raises(AssertionError, match=said):
-        testing.check_simulation(changed(**changes))
+    with pytest.raises(AssertionError, match=message):
+        check()

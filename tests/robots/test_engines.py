@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_robot import SHEET, VALUES, PairRobot, PairTask
+from small_robot import SERVOS, SHEET, VALUES, PairRobot, PairTask
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
@@ -21,20 +21,21 @@ LIMITS = {"gain": (2.0, 8.0), "damping": (0.05, 0.4), "armature": (0.003, 0.03),
 LIMITS |= {"stribeck": (0.05, 2.0)}
 
 
-class ConvergedRobot(PairRobot):
-    """Its solver ends where the solution is, on either engine."""
-
-    def make_task(self):
-        task = PairTask()
-        option = task.root_entity.mjcf_model.option
-        option.iterations, option.ls_iterations, option.tolerance = 20, 50, 0
-        return task
+def converged_task():
+    """Return a task whose solver ends where the solution is, on either engine."""
+    task = PairTask()
+    option = task.root_entity.mjcf_model.option
+    option.iterations, option.ls_iterations, option.tolerance = 20, 50, 0
+    return task
 
 
-class WornRobot(ConvergedRobot):
+def converged_robot():
+    return PairRobot(make_task=converged_task)
+
+
+def worn_robot():
     """Its friction wears off with speed."""
-
-    servos = replace(PairRobot.servos, sheet=replace(SHEET, stribeck_rad_s=0.5))
+    return PairRobot(replace(SERVOS, sheet=replace(SHEET, stribeck_rad_s=0.5)), converged_task)
 
 
 def steps(start, stamp, end):
@@ -64,7 +65,7 @@ def episode():
 
 
 @pytest.fixture(
-    scope="module", params=[pytest.param(ConvergedRobot, marks=pytest.mark.full), WornRobot], ids=["constant", "worn"]
+    scope="module", params=[pytest.param(converged_robot, marks=pytest.mark.full), worn_robot], ids=["constant", "worn"]
 )
 def engines(request, episode):
     """Programs that return the residuals of two segments in radians, of both engines, in double precision.
@@ -87,7 +88,7 @@ def engines(request, episode):
                 return sigmas * errors[:, :steps]
 
             programs[engine] = jax.jit(run)
-        yield SimpleNamespace(**programs, worn=request.param is WornRobot)
+        yield SimpleNamespace(**programs, worn=request.param is worn_robot)
     finally:
         jax.config.update("jax_enable_x64", False)
 

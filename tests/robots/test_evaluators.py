@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_robot import VALUES
-from test_engines import MAX_DELAY_S, SEGMENT_S, ConvergedRobot, pair_log
+from test_engines import MAX_DELAY_S, SEGMENT_S, converged_robot, pair_log
 
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import run_search
@@ -37,7 +37,7 @@ def problems(request):
     made = {}
     for engine in ("c", "compiled"):
         config = FitConfig(max_delay_s=MAX_DELAY_S, initial_state=request.param, engine=engine)
-        model, spans = ConvergedRobot().identifiable(MAX_DELAY_S), [Span(0, b, b != 0.4) for b in BEGINS_S]
+        model, spans = converged_robot().identifiable(MAX_DELAY_S), [Span(0, b, b != 0.4) for b in BEGINS_S]
         made[engine] = Problem(model, [pair_log()], spans, SEGMENT_S, config)
     measured = shown_by(made["c"])
     for problem in made.values():

@@ -11,10 +11,10 @@ from sim2real.artifacts.timing import Timing
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.safety.config import GateLimits
 from sim2real.log.reader import read_log
 from sim2real.robots.control_loop.hardware import Excitation
 from sim2real.robots.control_loop.messages import Goals
+from sim2real.robots.gate_limits import GateLimits
 from sim2real.stages.on_robot.episode import run_episode
 
 pytestmark = pytest.mark.realtime
@@ -47,13 +47,12 @@ class Steady:
 def changed(pipeline, **servos):
     """Return the arm, set up otherwise."""
     robot = pipeline.load()
-    kind = type(robot)
-    return type("Changed", (kind,), {"servos": replace(robot.servos, **servos)})()
+    return type(robot)(replace(robot.drive.servos, **servos))
 
 
 def with_drive(pipeline, **settings):
     """Return the arm with servos that are set up otherwise on the bus."""
-    sheet = pipeline.load().servos.sheet
+    sheet = pipeline.load().drive.servos.sheet
     drive = replace(sheet.drive, **settings)
     kind = type("Sheet", (type(sheet),), {"drive": drive})
     return changed(pipeline, sheet=kind(**asdict(sheet)))
@@ -65,17 +64,17 @@ def episodes(arm, tmp_path_factory):
     folder, robot = tmp_path_factory.mktemp("arm"), arm.load()
     truth, logs = folder / "truth.bin", (folder / "recorded.mcap", folder / "deployed.mcap")
     policy = Steady([1.0, -0.5, 0.25])
-    with robot.connect("embedded", GATE, truth, 3) as session:
+    with robot.drive.connect("embedded", GATE, truth, 3) as session:
         range_ = session.rig.gate.config.range
         config = Config()
-        robot.prepare(session, 5.0)
+        robot.drive.prepare(session, 5.0)
         nodes = robot.recording_nodes(session, SIGNAL)
         recorded = run_episode(arm, robot, session, nodes, {}, logs[0], 1.0, config, "record")
-        robot.prepare(session, 10.0)
+        robot.drive.prepare(session, 10.0)
         nodes, params = robot.deployment_nodes(session, policy, trial=2)
         deployed = run_episode(arm, robot, session, nodes, params, logs[1], 0.6, config, "deploy")
         left = session.rig.wait_until_still(5.0).position_rad
-        robot.prepare(session, 10.0)
+        robot.drive.prepare(session, 10.0)
         brought = session.rig.measure().position_rad
     return SimpleNamespace(
         robot=robot,
@@ -158,7 +157,7 @@ def test_a_policy_moves_goals_from_where_the_robot_is(episodes):
 def test_the_log_says_what_the_episode_was_about_and_the_simulations_trial_is_the_same(episodes):
     robot = episodes.robot
     aims = episodes.deployed.outputs["agent"]["aim"]
-    expected = np.asarray(robot.draw_aim(jax.random.key(2)))
+    expected = np.asarray(robot.task.aim.draw(jax.random.key(2)))
     np.testing.assert_allclose(aims, np.tile(expected, (len(aims), 1)), atol=1e-6)
     simulated = robot.simulation_params(robot.nominal(), None, trial=2)
     np.testing.assert_array_equal(simulated["agent"].aim, expected)
@@ -185,12 +184,12 @@ def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
     else:
         robot = changed(arm, rest=(0.0, 0.9, 0.0))
     with (
-        robot.connect("embedded", replace(GATE, limit=1.3), tmp_path / "truth.bin", 0) as session,
+        robot.drive.connect("embedded", replace(GATE, limit=1.3), tmp_path / "truth.bin", 0) as session,
         pytest.raises(
             SafetyStop, match=r"joint 'shoulder' rests at .* rad, not within 0\.4 rad of 0(\.9)? rad"
         ) as caught,
     ):
-        robot.prepare(session, 10.0)
+        robot.drive.prepare(session, 10.0)
     assert "zero of its encoder" in caught.value.hint
     modes = read_truth(tmp_path / "truth.bin").of(Kind.EFFECT)["values"][:, 0]
     assert modes[-3:].tolist() == [OperatingMode.OFF] * 3
@@ -198,7 +197,7 @@ def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
 
 def test_a_robot_without_an_embedded_twin_has_no_such_port(pair, tmp_path):
     with pytest.raises(UsageError, match="has no embedded twin") as caught:
-        pair.connect("embedded", GATE, tmp_path / "truth.bin", 0)
+        pair.drive.connect("embedded", GATE, tmp_path / "truth.bin", 0)
     assert "--port" in caught.value.hint
     assert not (tmp_path / "truth.bin").exists()
 

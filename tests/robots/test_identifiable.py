@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_robot import VALUES, play_on_c
+from small_robot import VALUES, play_on_c, world_params
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
@@ -33,9 +33,9 @@ def episode(pair):
     count = 110
     t = PERIOD_S * np.arange(count)
     goals = np.stack([0.6 * np.sin(4 * t), np.where(t % 1.0 < 0.5, 0.2, -0.1)], axis=1)
-    params = pair.node_params(VALUES, [0.0, 0.0], [0.0, 0.0], jnp.zeros(1))["world"]
+    params = world_params(pair, VALUES, [0.0, 0.0], [0.0, 0.0], jnp.zeros(1))
     _, positions, speeds, _ = play_on_c(pair, params, np.repeat(goals, 2, axis=0))
-    ticks = pair.tick_s * np.arange(2 * count + 1)
+    ticks = pair.model.tick_s * np.arange(2 * count + 1)
     shown, fast = (
         np.stack([np.interp(t + SAMPLE_S, ticks, np.append(0.0, rows[:, j])) for j in range(2)], axis=1)
         for rows in (positions, speeds)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_robot import VALUES
-from test_engines import MAX_DELAY_S, SEGMENT_S, ConvergedRobot, pair_log
+from test_engines import MAX_DELAY_S, SEGMENT_S, converged_robot, pair_log
 
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.initial_states import separated
@@ -18,7 +18,7 @@ from sim2real.identify.problem.segments import Span
 def problem():
     config = FitConfig(max_delay_s=MAX_DELAY_S, initial_state="free", engine="c")
     spans = [Span(0, begin) for begin in (0.2, 0.3, 0.5, 0.55)]
-    return Problem(ConvergedRobot().identifiable(MAX_DELAY_S), [pair_log()], spans, SEGMENT_S, config)
+    return Problem(converged_robot().identifiable(MAX_DELAY_S), [pair_log()], spans, SEGMENT_S, config)
 
 
 def test_trees_share_rollouts_with_the_same_derivatives(problem):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from mujoco import MjModel
-from small_robot import PairRobot, PairTask
+from small_robot import SERVOS, PairRobot, PairTask
 
 from sim2real.errors import UsageError
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
@@ -14,10 +14,10 @@ from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.emulation.twin import TwinPlant
 from sim2real.hardware.joint import Joint
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.safety.config import GateLimits
 from sim2real.identify.fit import fit
 from sim2real.identify.problem.segments import Span
 from sim2real.log.reader import read_log
+from sim2real.robots.gate_limits import GateLimits
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.on_robot.episode import run_episode
@@ -27,37 +27,33 @@ PATIENT = GateLimits(command_timeout_s=0.2, servo_watchdog_s=0.6)
 GEARS = (2.0, 0.5)
 
 
-class Geared(PairRobot):
-    servos = replace(PairRobot.servos, joints=(Joint("left", 0.3, -1, GEARS[0]), Joint("right", gear=GEARS[1])))
-
-    def make_task(self):
-        return PairTask(self.servos.joints)
+GEARED = replace(SERVOS, joints=(Joint("left", 0.3, -1, GEARS[0]), Joint("right", gear=GEARS[1])))
 
 
-def turned(robot, **changed):
-    return type("Turned", (type(robot),), changed)()
+def geared():
+    return PairRobot(GEARED, lambda: PairTask(GEARED.joints))
 
 
 def test_a_robots_joints_are_called_as_before(pair):
-    robot = Geared()
-    assert (robot.servos.names, pair.servos.names) == (("left", "right"),) * 2
-    assert robot.joints == pair.joints
-    assert [p.name for p in robot.dynamics()] == [p.name for p in pair.dynamics()]
+    robot = geared()
+    assert (robot.drive.servos.names, pair.drive.servos.names) == (("left", "right"),) * 2
+    assert robot.sensor.joints == pair.sensor.joints
+    assert [p.name for p in robot.model.dynamics()] == [p.name for p in pair.model.dynamics()]
     assert robot.nominal() == pair.nominal()
-    assert robot.action == pair.action
-    assert robot.gate(PATIENT).joints == ("left", "right")
+    assert robot.agent.action == pair.agent.action
+    assert robot.drive.gate(PATIENT).joints == ("left", "right")
 
 
 def test_a_gear_is_in_the_model_and_not_in_the_servos_parameters(pair):
     """Torque and friction grow by the gear, gain, damping and inertia by its square."""
     gears = np.array(GEARS)
-    robot = Geared()
-    placed, plain = (r.place(r.nominal(), jnp.zeros(1)) for r in (robot, pair))
+    robot = geared()
+    placed, plain = (r.model.place(r.nominal(), jnp.zeros(1)) for r in (robot, pair))
     model = MjModel.from_xml_string(robot.identified_mjcf(robot.nominal()))
-    built = MjModel.from_xml_string(robot.task.root_entity.mjcf_model.root_model.to_xml_string())
+    built = MjModel.from_xml_string(robot.model.task.root_entity.mjcf_model.root_model.to_xml_string())
     rows = {"gain": "actuator_gainprm", "bias": "actuator_biasprm", "most": "actuator_forcerange"}
     rows |= {"damping": "dof_damping", "armature": "dof_armature", "friction": "dof_frictionloss"}
-    lost = 0.5 * robot.task.physics_timestep * np.asarray(placed["damping"])  # see `standard.place`
+    lost = 0.5 * robot.model.task.physics_timestep * np.asarray(placed["damping"])  # see `standard.place`
     for name, power in {"gain": 2, "bias": 2, "most": 1, "damping": 2, "armature": 2, "friction": 1}.items():
         own = np.asarray(placed[name])
         np.testing.assert_allclose(own.T, np.asarray(plain[name]).T * gears**power, rtol=1e-6, err_msg=name)
@@ -65,24 +61,19 @@ def test_a_gear_is_in_the_model_and_not_in_the_servos_parameters(pair):
             # What is written for other tools is as the graph has it; what is composed is the data sheet's.
             found = getattr(compiled, rows[name]) - (lost if name == "armature" and compiled is built else 0.0)
             np.testing.assert_allclose(own, found, rtol=2e-5, err_msg=name)
-    np.testing.assert_allclose([s.profile_rad_s for s in robot.task.robot.servos], 2.0 / gears)
-
-
-def test_what_is_no_joint_is_refused_when_the_robot_is_made():
-    with pytest.raises(UsageError, match=r"has mounting = \('hinge',\), which is not a tuple of .*Joint"):
-        turned(load_pipeline("pendulum").load(), mounting=("hinge",))
+    np.testing.assert_allclose([s.profile_rad_s for s in robot.model.task.robot.servos], 2.0 / gears)
 
 
 def test_a_model_without_the_joints_gears_is_refused():
-    robot = turned(PairRobot(), servos=Geared.servos)
+    robot = PairRobot(GEARED)
     with pytest.raises(UsageError, match=r"servos have the gears \[1\.0, 1\.0\], the joints \[2\.0, 0\.5\]") as caught:
-        robot.make_world()
+        robot.model.make_world()
     assert "Servo(joint" in caught.value.hint
 
 
 def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
     factors = {"gain": 0.9, "damping": 1.1, "armature": 1.2, "friction": 1.5}
-    one, other = (TwinPlant(**r.twin(EmulatorConfig(), **factors).plant_args) for r in (pair, Geared()))
+    one, other = (TwinPlant(**r.model.twin(EmulatorConfig(), **factors).plant_args) for r in (pair, geared()))
     assert other.truth() == pytest.approx(one.truth(), rel=1e-5)
     assert one.truth() == pytest.approx({n: v * factors[n.split("_")[0]] for n, v in pair.nominal().items()}, rel=1e-5)
 
@@ -92,10 +83,10 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
     """The servos turn up to twice as far, some of them the other way; the true joints go where they are told."""
     robot = arm.load()
     joints = (Joint("pan", 0.5, -1, 1.5), Joint("shoulder", -0.2, 1, 2.0), Joint("elbow", 0.1, -1, 0.8))
-    robot = turned(robot, servos=replace(robot.servos, joints=joints))
+    robot = type(robot)(replace(robot.drive.servos, joints=joints))
     goal = np.array([0.4, -0.3, 0.5])
-    with robot.connect("embedded", PATIENT, tmp_path / "truth.bin", 0) as session:
-        robot.prepare(session, 5.0)
+    with robot.drive.connect("embedded", PATIENT, tmp_path / "truth.bin", 0) as session:
+        robot.drive.prepare(session, 5.0)
         nodes = robot.recording_nodes(session, np.tile(goal, (90, 1)))
         run_episode(arm, robot, session, nodes, {}, tmp_path / "log.mcap", 1.6, RecordConfig(), "record")
     episode, truth = read_log(tmp_path / "log.mcap"), read_truth(tmp_path / "truth.bin")
@@ -115,10 +106,10 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
 def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path):
     """The log of a pendulum whose motor turns twice the other way gives the parameters of the pendulum's plant."""
     pipeline = load_pipeline("pendulum")
-    robot = turned(pipeline.load(), mounting=(Joint("hinge", 0.7, -1, 2.0),))
+    robot = type(pipeline.load())((Joint("hinge", 0.7, -1, 2.0),))
     config = RecordConfig(duration_s=8.0, amplitude=2.0, low_hz=0.7, high_hz=2.0, gate=PATIENT)
     log, truth = tmp_path / "log.mcap", tmp_path / "truth.bin"
-    with robot.connect("embedded", PATIENT, truth, 1) as session:
+    with robot.drive.connect("embedded", PATIENT, truth, 1) as session:
         nodes = robot.recording_nodes(session, excitation(config, 50.0, 1))
         run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
     episode, true = read_log(log), read_truth(truth)

@@ -63,14 +63,14 @@ class Watched(PairTask):
 )
 def test_hooks_that_need_the_state_are_refused(task, match):
     made = task()
-    world = ServoWorld("world", made, PairRobot().fields(made))
+    world = ServoWorld("world", made, PairRobot().model.fields(made))
     with pytest.raises(UsageError, match=match):
         world.open_loop()
 
 
 def test_hooks_that_only_look_are_not():
     task = Watched()
-    world = ServoWorld("world", task, PairRobot().fields(task), resumed=True)
+    world = ServoWorld("world", task, PairRobot().model.fields(task), resumed=True)
     assert world.open_loop().nq == 2
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from small_robot import SHEET, PairTask, play_in_a_graph, play_on_c
+from small_robot import SHEET, PairTask, play_in_a_graph, play_on_c, world_params
 
 from sim2real import composer
 from sim2real.errors import UsageError
@@ -95,8 +95,8 @@ def test_the_arm_moves_alike_on_c_and_on_mjx(arm):
     robot = arm.load()
     goals = 0.8 * np.sin(6 * 0.01 * np.arange(50)[:, None] + np.arange(3)).astype(np.float32)
     target = np.array([0.2, 0.1, 0.25])
-    params = robot.node_params(robot.nominal(), [0.1, 0.5, -0.3], [0.3, -1.0, 0.5], target)["world"]
-    _, later, _, rewards = play_in_a_graph(robot.make_world())(params, goals)
+    params = world_params(robot, robot.nominal(), [0.1, 0.5, -0.3], [0.3, -1.0, 0.5], target)
+    _, later, _, rewards = play_in_a_graph(robot.model.make_world())(params, goals)
     _, positions, speeds, expected = play_on_c(robot, params, goals)
     assert np.ptp(positions, axis=0).min() > 0.5
     np.testing.assert_allclose(later.position, positions, atol=1e-3)
@@ -107,7 +107,7 @@ def test_the_arm_moves_alike_on_c_and_on_mjx(arm):
 def test_other_learners_see_the_joints_and_get_bounds_for_the_goals():
     """A composed task of servos, without its graph, for brax and gymnasium: what it shows, and what it may be told."""
     pytest.importorskip("gymnasium", reason="pip install 'sim2real[interop]'")
-    task = load_pipeline("arm").load().make_task()
+    task = load_pipeline("arm").load().model.make_task()
     with pytest.raises(UsageError, match=r"Reach shows its policy nothing: no observable is enabled\. There are: '"):
         composer.MjxVectorEnv(composer.MjxEnvironment(task), 2)
     for observable in task.observables.values():

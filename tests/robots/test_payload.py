@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.hardware.plant import load_plant
+from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.stages.estimation.held_out_parts import widest
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -14,6 +15,12 @@ from sim2real.stages.pipeline.pipeline import load_pipeline
 @pytest.fixture(scope="module")
 def arm():
     return load_pipeline("arm").load()
+
+
+def at_zero(robot, values):
+    """Return the world's parameters of a robot at rest at 0."""
+    still = np.zeros(len(robot.drive.servos.joints))
+    return robot.model.params(values, EpisodeStart(still, still, np.zeros(robot.task.aim_size)))
 
 
 def free(table):
@@ -32,7 +39,9 @@ def test_a_payload_is_identified_where_it_is_asked_for_and_always_watched(arm):
 
 def test_a_hand_weighs_something_whatever_it_holds(arm):
     for robot in (arm, load_pipeline("so101").load()):
-        lightest = robot.place(robot.nominal() | {"payload": robot.hand.least_kg}, np.zeros(len(robot.aim)))
+        lightest = robot.model.place(
+            robot.nominal() | {"payload": robot.model.hand.least_kg}, np.zeros(robot.task.aim_size)
+        )
         assert lightest["mass of the hand"][0] > 0.005
 
 
@@ -40,11 +49,11 @@ def test_a_hand_weighs_something_whatever_it_holds(arm):
 def test_it_is_the_point_mass_that_the_plant_carries(name):
     """The plant is a model of its own: with the same mass at its tip, the whole hand weighs and balances alike."""
     robot, carried_kg = load_pipeline(name).load(), 0.1
-    model, start = robot.watched(0.06), jnp.zeros(2 * len(robot.servos.joints))
+    model, start = robot.watched(0.06), jnp.zeros(2 * len(robot.drive.servos.joints))
     values = {p.name: jnp.float32(p.nominal) for p in model.parameters} | {"payload": jnp.float32(carried_kg)}
     world = model.nodes(0.06)[robot.roles.world]
     found = world._model(model.params(values, start)[robot.roles.world])
-    plant = load_plant(robot.embedded.plant, {"carried_kg": carried_kg}).model
+    plant = load_plant(robot.drive.embedded.plant, {"carried_kg": carried_kg}).model
     carried = plant.body("carried").id
     hand = int(plant.body_parentid[carried])
     total = plant.body_mass[hand] + carried_kg
@@ -55,9 +64,9 @@ def test_it_is_the_point_mass_that_the_plant_carries(name):
 
 
 def test_without_a_payload_the_model_is_as_it_was_composed(arm):
-    params = arm.resumed_params(arm.nominal(), np.zeros(6))["world"]
-    model = arm.make_world()._model(params)
-    own = mj.MjModel.from_xml_string(arm.task.root_entity.mjcf_model.root_model.to_xml_string())
+    params = at_zero(arm, arm.nominal())
+    model = arm.model.make_world()._model(params)
+    own = mj.MjModel.from_xml_string(arm.model.task.root_entity.mjcf_model.root_model.to_xml_string())
     np.testing.assert_allclose(model.body_mass, own.body_mass, rtol=1e-6)
     np.testing.assert_allclose(model.body_ipos, own.body_ipos, atol=1e-7)
 
@@ -66,7 +75,7 @@ def test_without_a_payload_the_model_is_as_it_was_composed(arm):
 def test_the_exported_model_carries_it(name):
     robot = load_pipeline(name).load()
     values = robot.nominal() | {"payload": 0.1}
-    model = robot.make_world()._model(robot.resumed_params(values, np.zeros(2 * len(robot.servos.joints)))["world"])
+    model = robot.model.make_world()._model(at_zero(robot, values))
     laden, empty = (mj.MjModel.from_xml_string(robot.identified_mjcf(v)) for v in (values, values | {"payload": 0.0}))
     np.testing.assert_allclose(laden.body_mass, model.body_mass, rtol=1e-5)
     np.testing.assert_allclose(laden.body_ipos, model.body_ipos, atol=1e-6)
@@ -76,7 +85,7 @@ def test_the_exported_model_carries_it(name):
 
 def test_a_robot_that_is_first_asked_while_jax_traces_keeps_no_tracer():
     robot = type(load_pipeline("arm").load())()
-    mass = jax.jit(lambda kg: robot.place(robot.nominal() | {"payload": kg}, jnp.zeros(3))["mass of the hand"])
+    mass = jax.jit(lambda kg: robot.model.place(robot.nominal() | {"payload": kg}, jnp.zeros(3))["mass of the hand"])
     heavier = mass(0.1) - mass(0.0)
-    again = robot.place(robot.nominal() | {"payload": 0.1}, np.zeros(3))["mass of the hand"]
+    again = robot.model.place(robot.nominal() | {"payload": 0.1}, np.zeros(3))["mass of the hand"]
     np.testing.assert_allclose([heavier[0], again[0] - mass(0.0)[0]], 0.1, rtol=1e-5)

@@ -7,72 +7,69 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_robot import SHEET, VALUES, PairRobot
+from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.graph.base import InputState, StepState
 from sim2real.graph.episode import named_leaves
-from sim2real.robots.control_loop.messages import Decision, JointReading
+from sim2real.robots.control_loop.messages import Decision, EpisodeStart, JointReading
 from sim2real.robots.servo import parameters
 from sim2real.robots.servo.agent import AgentParams
 from sim2real.robots.servo.datasheet import DataSheet
+from sim2real.robots.servo.task import NO_AIM
 
 
-class Slouching(PairRobot):
-    """Shows features of its own, no past, and hangs askew."""
+def slouching():
+    """Return a pair that hangs askew, whose policy observes errors and no past."""
+    return PairRobot(
+        replace(SERVOS, rest=(0.1, -0.2)),
+        features=(("error", ("rad", "rad")),),
+        observe=lambda reading, goal, aim: goal - reading.position,
+        history=0,
+    )
 
-    servos = replace(PairRobot.servos, rest=(0.1, -0.2))
-    features = (("error", ("rad", "rad")),)
-    history = 0
 
-    def observe(self, reading, goal, aim):
-        return goal - reading.position
-
-
-class Aimless(PairRobot):
-    aim = ()
-
-    def draw_aim(self, key):
-        return jnp.zeros(0)
+def aimless():
+    return PairRobot(aim=NO_AIM)
 
 
 def observation_of(robot):
     """Return what the policy sees in the first step of the loop in simulation."""
     nodes, task = robot.training(robot.nominal(), {}, {}, False)
-    agent, n, one = nodes["agent"], len(robot.servos.joints), jnp.zeros(1)
+    agent, n, one = nodes["agent"], len(robot.drive.servos.joints), jnp.zeros(1)
     reading = JointReading(jnp.zeros((1, n)), jnp.zeros((1, n)))
-    params = AgentParams(aim=jnp.zeros(len(robot.aim)), start=jnp.zeros(n))
+    params = AgentParams(aim=jnp.zeros(robot.task.aim_size), start=jnp.zeros(n))
     step_state = StepState(
         state=agent.init_state(), params=params, inputs={"sensor": InputState(one.astype(int), one, one, reading)}
     )
     return task, task.observe(step_state)
 
 
-@pytest.mark.parametrize("kind", [PairRobot, Slouching, Aimless, "arm"])
+@pytest.mark.parametrize("kind", [PairRobot, slouching, aimless, "arm"])
 def test_an_observation_has_as_many_entries_as_the_robot_announces(kind, arm):
     robot = arm.load() if kind == "arm" else kind()
     task, seen = observation_of(robot)
-    assert seen.shape == (robot.observation_size,) == (task.observation_size,)
+    assert seen.shape == (robot.agent.observation_size,) == (task.observation_size,)
 
 
 def test_it_names_its_units_joints_and_actions(pair):
     assert pair.units == {"position": "rad", "velocity": "rad/s", "goal": "rad", "aim[0]": "rad"}
-    assert pair.joints == {
+    assert pair.sensor.joints == {
         "left": {"position": "position[0]", "velocity": "velocity[0]"},
         "right": {"position": "position[1]", "velocity": "velocity[1]"},
     }
-    assert [(a.name, a.unit) for a in pair.action] == [
+    assert [(a.name, a.unit) for a in pair.agent.action] == [
         ("speed of left's goal", "rad/s"),
         ("speed of right's goal", "rad/s"),
     ]
-    assert [(t.name, t.size, t.history) for t in pair.observation] == [
+    assert [(t.name, t.size, t.history) for t in pair.agent.observation] == [
         ("position", 2, 1),
         ("velocity", 2, 1),
         ("goal", 2, 1),
         ("aim", 1, 1),
         ("past position, velocity, goal", 6, 2),
     ]
-    assert pair.command in named_leaves(Decision(goal=np.zeros(2), aim=np.zeros(1)))
-    assert pair.tick_s == 0.01
+    assert pair.drive.command in named_leaves(Decision(goal=np.zeros(2), aim=np.zeros(1)))
+    assert pair.model.tick_s == 0.01
 
 
 def test_a_data_sheets_gain_is_the_torque_of_a_step_of_error():
@@ -91,13 +88,13 @@ def test_nominal_values_are_the_data_sheets_without_delays(pair):
         "friction_left": 0.02,
         "friction_right": 0.02,
     }
-    for p in pair.dynamics():
+    for p in pair.model.dynamics():
         assert p.low < p.nominal < p.high
 
 
 def test_parameters_land_in_the_nodes_that_need_them(pair):
     values = {**VALUES, "sensor_delay": 0.012, "actuator_delay": 0.02}
-    params = pair.node_params(values, [0.1, 0.2], [1.0, 2.0], jnp.array([0.4]), policy="policy")
+    params = pair.node_parameters(values, EpisodeStart([0.1, 0.2], [1.0, 2.0], jnp.array([0.4])), policy="policy")
     world = params["world"]
     np.testing.assert_array_equal(world.qpos, np.float32([0.1, 0.2]))
     np.testing.assert_array_equal(world.qvel, [1.0, 2.0])
@@ -106,31 +103,31 @@ def test_parameters_land_in_the_nodes_that_need_them(pair):
     np.testing.assert_array_equal(agent.start, world.qpos)
     assert (agent.policy, float(agent.aim[0])) == ("policy", pytest.approx(0.4))
     for name in ("sensor", "actuator"):
-        assert pair.node_params(VALUES, [0, 0], [0, 0], jnp.zeros(1))[name].delay is None
-    compiled = pair.make_world().init_params()
+        assert pair.node_parameters(VALUES, EpisodeStart([0, 0], [0, 0], jnp.zeros(1)))[name].delay is None
+    compiled = pair.model.make_world().init_params()
     shapes = {k: (v.shape, v.dtype) for k, v in compiled.values.items()}
     assert {k: (v.shape, v.dtype) for k, v in world.values.items()} == shapes
 
 
 def test_numbers_of_the_data_sheet_are_those_of_the_compiled_model(pair):
     """But for the inertia, which MuJoCo's implicit step adds to by half a step of damping."""
-    compiled = pair.make_world().init_params().values
-    placed = pair.place(pair.nominal(), jnp.zeros(1))
+    compiled = pair.model.make_world().init_params().values
+    placed = pair.model.place(pair.nominal(), jnp.zeros(1))
     for name in set(compiled) - {"armature"}:
         np.testing.assert_allclose(placed[name], compiled[name], rtol=1e-6, err_msg=name)
     np.testing.assert_allclose(placed["armature"], compiled["armature"] - 0.5 * 0.005 * 0.2, rtol=1e-5)
-    light = pair.place({**pair.nominal(), "armature": 1e-4}, jnp.zeros(1))["armature"]
+    light = pair.model.place({**pair.nominal(), "armature": 1e-4}, jnp.zeros(1))["armature"]
     np.testing.assert_array_equal(light, [0.0, 0.0])
 
 
 def test_a_simulation_starts_from_rest_and_each_trial_has_its_own_aim():
-    robot = Slouching()
+    robot = slouching()
     params = [robot.simulation_params(robot.nominal(), None, trial) for trial in (0, 1, 1)]
     np.testing.assert_array_equal(params[0]["world"].qpos, np.float32([0.1, -0.2]))
     np.testing.assert_array_equal(params[0]["world"].qvel, [0.0, 0.0])
     aims = [float(p["agent"].aim[0]) for p in params]
     assert aims[0] != aims[1] == aims[2]
-    assert aims[1] == float(robot.draw_aim(jax.random.key(1))[0])
+    assert aims[1] == float(robot.task.aim.draw(jax.random.key(1))[0])
 
 
 def test_a_recording_begins_where_the_joints_are(pair):
@@ -147,7 +144,7 @@ def test_a_recording_begins_where_the_joints_are(pair):
 
 
 def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
-    robot = type("Askew", (PairRobot,), {"servos": replace(PairRobot.servos, middle=(0.3, -0.2))})()
+    robot = PairRobot(replace(SERVOS, middle=(0.3, -0.2)))
     reading = SimpleNamespace(position_rad=np.array([0.3, -0.2]))
     session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: reading))
     signal = 0.1 * np.sin(np.arange(40))[:, None] * np.ones(2)
@@ -155,7 +152,7 @@ def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
     played = np.array([agent.step(SimpleNamespace(seq=k))[1].goal for k in range(60)])
     np.testing.assert_allclose(played[:40], signal + np.array([0.3, -0.2]))
     np.testing.assert_allclose(played[40:], np.tile(played[39], (20, 1)))
-    np.testing.assert_allclose(robot.around(signal), signal + np.array([0.3, -0.2]))
+    np.testing.assert_allclose(robot.drive.around(signal), signal + np.array([0.3, -0.2]))
 
 
 def test_joints_may_have_any_of_the_servos_parameters_for_themselves():

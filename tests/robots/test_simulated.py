@@ -42,7 +42,7 @@ def test_in_the_middle_of_a_recording_references_begin_at_the_goals(pair):
     """What nobody measures is where profiles were up to; later ticks leave references alone."""
     goal, before = jnp.array([0.7, -0.4]), jnp.array([0.1, 0.2])
     for resumed, tick, expected in ((True, 0, goal), (True, 1, before), (False, 0, before)):
-        world = pair.make_world(resumed)
+        world = pair.model.make_world(resumed)
         state = State(*[None] * len(dataclasses.fields(State))).replace(
             steps=jnp.int32(tick), variables={"goal": before, "reference": before, "other": before}
         )
@@ -86,7 +86,7 @@ def test_the_actuator_passes_goals_on_and_holds_the_start_before():
 @pytest.fixture
 def noisy(pair):
     """A sensor whose first position and second velocity scatter, and its readings of a joint that stands still."""
-    sensor = SimSensor("sensor", 50.0, pair.make_world())
+    sensor = SimSensor("sensor", 50.0, pair.model.make_world())
     sensor.noise = (Noise("position[0]", "rad", 0.02, 0.05, 0.3), Noise("velocity[1]", "rad/s", 0.4, 0.0, 0.0))
     still = heard("world", JointReading(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])))
 
@@ -140,6 +140,6 @@ def test_noise_needs_random_numbers_and_without_it_readings_are_exact(noisy, pai
     still = heard("world", JointReading(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])))
     with pytest.raises(UsageError, match="no random numbers"):
         sensor.step(StepState(None, sensor.init_state(None), DelayParams(), still, 0, 0, 0.0))
-    exact = SimSensor("sensor", 50.0, pair.make_world())
+    exact = SimSensor("sensor", 50.0, pair.model.make_world())
     _, message = exact.step(StepState(None, exact.init_state(None), DelayParams(), still, 0, 0, 0.0))
     np.testing.assert_array_equal(message.position, [1.0, 2.0])

@@ -9,6 +9,7 @@ import pytest
 from small_robot import VALUES
 
 from sim2real.graph.schedule import draw
+from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.train.environment.graph_environment import GraphEnvironment
 
@@ -63,9 +64,10 @@ def test_a_push_gives_the_joints_other_velocities(trained):
 
 def test_a_start_is_moved_with_its_goals_and_within_the_joints_limits(pair, drawn):
     one = jax.tree.map(lambda leaf: leaf[0], drawn)
-    moved = pair.displaced(one, jnp.array([0.1, 100.0]), SPEEDS)
-    expected = [one["world"].qpos[0] + 0.1, pair.servos.high[1]]
-    np.testing.assert_allclose(moved["world"].qpos, np.minimum(expected, pair.servos.high), rtol=1e-6)
+    start = EpisodeStart(one["world"].qpos, one["world"].qvel, one["agent"].aim)
+    moved = pair.node_parameters(VALUES, pair.task.moved(start, jnp.array([0.1, 100.0]), SPEEDS))
+    expected = [one["world"].qpos[0] + 0.1, pair.drive.servos.high[1]]
+    np.testing.assert_allclose(moved["world"].qpos, np.minimum(expected, pair.drive.servos.high), rtol=1e-6)
     np.testing.assert_array_equal(moved["agent"].start, moved["world"].qpos)
     np.testing.assert_allclose(moved["world"].qvel, one["world"].qvel + SPEEDS)
 
@@ -74,7 +76,7 @@ def test_half_of_the_episodes_start_from_rest_and_half_from_anywhere(pair, drawn
     starts = drawn["world"].qpos
     resting = np.all(starts == 0.0, axis=1)
     assert 0.4 < resting.mean() < 0.6
-    low, high = np.array(pair.servos.low), np.array(pair.servos.high)
+    low, high = np.array(pair.drive.servos.low), np.array(pair.drive.servos.high)
     assert np.all((starts >= low) & (starts <= high))
     assert np.all(np.ptp(starts[~resting], axis=0) > 0.9 * (high - low))
     np.testing.assert_array_equal(drawn["agent"].start, starts)
@@ -98,7 +100,7 @@ def test_the_actions_are_speeds_of_the_goals(pair, trained):
     np.testing.assert_array_equal(trained.task.action_high, [2.0, 2.0])
     start, goals = np.asarray(trained.params["agent"].start), trained.rows["goal"]
     count = np.arange(1, len(goals) + 1)[:, None]
-    expected = np.clip(start + count / 50.0 * np.asarray(SPEEDS), pair.servos.low, pair.servos.high)
+    expected = np.clip(start + count / 50.0 * np.asarray(SPEEDS), pair.drive.servos.low, pair.drive.servos.high)
     np.testing.assert_allclose(goals, expected, atol=1e-5)
 
 
@@ -131,12 +133,12 @@ def test_a_value_function_may_see_where_the_joints_are_and_what_they_are_like(tr
 
 
 def test_the_reward_is_the_tasks_less_a_little_for_speed(pair, trained):
-    price = 0.01 * np.mean((np.asarray(SPEEDS) / pair.servos.speed) ** 2)
+    price = 0.01 * np.mean((np.asarray(SPEEDS) / pair.drive.servos.speed) ** 2)
     np.testing.assert_allclose(trained.rows["reward"], trained.rows["of_task"] - price, atol=1e-6)
 
 
 def test_what_is_seen_lies_within_its_bounds(pair, trained):
-    terms = pair.observation
+    terms = pair.agent.observation
     assert [t.name for t in terms] == ["position", "velocity", "goal", "aim", "past position, velocity, goal"]
     unknown = (-np.inf,), (np.inf,)
     low, high = (np.concatenate([np.tile(getattr(t, b) or unknown[i], t.history) for t in terms])

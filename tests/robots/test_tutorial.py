@@ -61,9 +61,9 @@ def test_its_policy_sees_and_does_what_the_contract_says(head):
     nodes, task = robot.training(robot.nominal(), {}, {}, delays=False)
     assert set(nodes) == {"sensor", "agent", "actuator", "world"}
     params = task.params(jax.random.key(1))
-    np.testing.assert_allclose(params["world"].values["told"][:2], params["agent"].aim)
-    assert task.observation_size == robot.observation_size == 26
+    np.testing.assert_allclose(params["world"].values["aim"][:2], params["agent"].aim)
+    assert task.observation_size == robot.agent.observation_size == 26
     t_s, there = np.linspace(0, 3, 300), np.full(300, 0.4)
     states = {"position[0]": there, "position[1]": there, "aim[0]": there[:9], "aim[1]": there[:9]}
-    assert robot.score(t_s, states)["success"] == 1.0
-    assert robot.score(t_s, {**states, "position[0]": there + 0.1})["success"] == 0.0
+    assert robot.task.score(t_s, states)["success"] == 1.0
+    assert robot.task.score(t_s, {**states, "position[0]": there + 0.1})["success"] == 0.0

@@ -12,8 +12,9 @@ from flax import struct
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, InputState, StepState
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.contract import RecordedRobot, checked
+from sim2real.robots.contract import RecordedRobot, Robot
 from sim2real.robots.control_loop.messages import Goals
+from sim2real.robots.loading import checked
 from sim2real.robots.worlds import WorldModel, in_world
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.worlds.recorded import command_delay
@@ -46,11 +47,20 @@ class Twice(WorldModel):
         return [Parameter("gain", "rad/s^2/V", 50.0, 5.0, 100.0, leaf=self.leaf)]
 
     def make_world(self, resumed=False):
-        world = copy.copy(self.robot.make_nodes()[2] if hasattr(self.robot, "make_nodes") else self.robot.make_world())
+        world = copy.copy(
+            self.robot.model.make_world() if isinstance(self.robot, Robot) else self.robot.make_nodes()[2]
+        )
         world.name, world.rate = self.name, self.rate or world.rate
         if self.params_of:
             world.init_params = self.params_of
         return world
+
+
+class Torquer(Twice):
+    """The pendulum's world, with its motor's constant alone."""
+
+    def dynamics(self):
+        return [Parameter("K", "N m/A", 0.03, 0.01, 0.1, leaf="world.K")]
 
 
 class Nameless(Twice):
@@ -79,7 +89,9 @@ class Speedless(Twice):
         return world
 
 
-ENTRIES = {n.lower(): f"{__name__}:{n}" for n in ("Twice", "Nameless", "Fast", "Nowhere", "Startless", "Speedless")}
+ENTRIES = {
+    n.lower(): f"{__name__}:{n}" for n in ("Twice", "Torquer", "Nameless", "Fast", "Nowhere", "Startless", "Speedless")
+}
 
 
 @pytest.fixture
@@ -122,10 +134,10 @@ def test_without_a_name_a_robot_is_in_its_own_world(table):
 def test_another_world_has_its_own_parameters_and_the_robot_the_rest(table):
     oiled = checked(in_world(table, "oiled"), "here")
     assert isinstance(oiled, type(table))
-    assert [p.name for p in oiled.dynamics()] == ["loop", "friction", "drag"]
+    assert [p.name for p in oiled.model.dynamics()] == ["loop", "friction", "drag"]
     assert oiled.identifiable(0.05).parameters.names[2:] == ("drag", "sensor_delay", "actuator_delay")
-    assert [p.name for p in table.dynamics()] == ["loop", "friction"]
-    assert (oiled.embedded, oiled.units, oiled.rate_hz) == (table.embedded, table.units, table.rate_hz)
+    assert [p.name for p in table.model.dynamics()] == ["loop", "friction"]
+    assert (oiled.drive, oiled.units, oiled.rate_hz) == (table.drive, table.units, table.rate_hz)
     assert oiled.identified_mjcf(VALUES) is None
 
 
@@ -139,9 +151,9 @@ def test_a_world_gets_the_values_and_the_start_that_were_asked_for(table):
     own = table.identifiable(0.05).params(VALUES, jnp.array([0.5, -2.0]))
     assert float(params["sensor"].delay) == float(own["sensor"].delay) == pytest.approx(0.014)  # a tick more
     same = oiled.identifiable(0.05).params({**VALUES, "drag": 0.0}, jnp.array([0.5, -2.0]))["world"]
-    expected = turned(table.make_world(), own["world"], 6.0)
-    np.testing.assert_allclose(turned(oiled.make_world(), same, 6.0), expected, rtol=1e-5)
-    assert abs(turned(oiled.make_world(), world, 6.0)[-1, 1]) < 0.9 * abs(expected[-1, 1])
+    expected = turned(table.model.make_world(), own["world"], 6.0)
+    np.testing.assert_allclose(turned(oiled.model.make_world(), same, 6.0), expected, rtol=1e-5)
+    assert abs(turned(oiled.model.make_world(), world, 6.0)[-1, 1]) < 0.9 * abs(expected[-1, 1])
 
 
 def test_a_policy_is_trained_from_the_robots_own_starts_with_draws_of_the_worlds_parameters(table):
@@ -158,17 +170,16 @@ def test_a_policy_is_trained_from_the_robots_own_starts_with_draws_of_the_worlds
     assert trips == {0.015, 0.021}
     at_rest = oiled.simulation_params({**VALUES, "drag": 4.0}, None, trial=1)
     assert float(at_rest["world"].drag) == 4.0
-    np.testing.assert_allclose(at_rest["agent"].aim, table.aim(1))
+    np.testing.assert_allclose(at_rest["agent"].aim, table.task.at_rest(1).aim)
 
 
 def test_a_start_that_the_robots_own_world_draws_is_taken_over(installed):
     pendulum = load_pipeline("pendulum").load()
-    own = pendulum.rest_params(pendulum.nominal(), None, 0)["world"].start
-    model = type("Own", (Twice,), {"dynamics": lambda self: [Parameter("K", "N m/A", 0.03, 0.01, 0.1, leaf="world.K")]})
-    moved = in_world(pendulum, "twice")
-    moved.model = model(pendulum)
-    np.testing.assert_allclose(moved.rest_params({"K": 0.05}, None, 0)["world"].start, own)
-    assert float(moved.rest_params({"K": 0.05}, None, 0)["world"].K) == pytest.approx(0.05)
+    own = pendulum.simulation_params(pendulum.nominal(), None)["world"].start
+    moved = in_world(pendulum, "torquer")
+    params = moved.simulation_params({"K": 0.05}, None)["world"]
+    np.testing.assert_allclose(params.start, own)
+    assert float(params.K) == pytest.approx(0.05)
 
 
 def test_a_recorded_robot_keeps_its_sensors_parameters(installed):

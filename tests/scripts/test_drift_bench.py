@@ -23,7 +23,7 @@ KINDS = pytest.mark.parametrize("kind", [ReachingArm, ReachingSO101])
 
 def probed(robot, path):
     """Return when each measurement of the small steps was made [s], where the joints were, and their goals [rad]."""
-    robot.probe(path, 1)
+    robot.drive.probe(path, 1)
     log = read_log(path)
     return log.steps["sensor"].begun_s, log.outputs["sensor"]["position"], log.outputs["actuator"]["goal"]
 
@@ -109,7 +109,7 @@ class Solved:
     """Stands for a trained policy: it moves the goals to where the model's tip is at the target, or not at all."""
 
     def __init__(self, robot, aim, still=False):
-        self.robot, self.aim, self.goal, self.still = robot, aim, robot.servos.at_rest, still
+        self.robot, self.aim, self.goal, self.still = robot, aim, robot.drive.servos.at_rest, still
         self.tip = sys.modules[type(robot).__module__].tip_of
 
     def runner(self):
@@ -117,8 +117,8 @@ class Solved:
 
     def act(self, observation):
         assert observation.dtype == np.float32
-        assert observation.shape == (sum(t.size * t.history for t in self.robot.observation),)
-        servos, small = self.robot.servos, 1e-5
+        assert observation.shape == (sum(t.size * t.history for t in self.robot.agent.observation),)
+        servos, small = self.robot.drive.servos, 1e-5
         off = self.aim[:3] - self.tip(np, self.goal)
         moved = self.goal + small * np.eye(len(self.goal))
         J = ((self.tip(np, moved) - self.tip(np, self.goal)) / small).T
@@ -134,6 +134,6 @@ class Solved:
 @pytest.mark.parametrize("still", [False, True])
 def test_a_trained_policy_succeeds_where_it_brings_the_robots_own_tip_to_the_target(kind, still):
     robot = load_pipeline(kind.pipeline).load()
-    aim = np.asarray(robot.draw_aim(jax.random.key(100)))
+    aim = np.asarray(robot.task.aim.draw(jax.random.key(100)))
     found = kind.draw(0).success(Solved(robot, aim, still), Namespace(trials=1))
     assert found == [0.0 if still else 1.0]

@@ -29,13 +29,13 @@ def robot() -> hidden_robots.Hidden:
 def test_on_the_bus_it_moves_as_on_its_own_clock(robot: hidden_robots.Hidden) -> None:
     """The plant of the emulator and the simulation are the same robot."""
     pipeline = load_pipeline("pendulum")
-    before = pipeline.load().embedded
+    before = pipeline.load().drive.embedded
     try:
         hidden_wall.put_on_the_bus(robot, pipeline)
-        embedded = pipeline.load().embedded
+        embedded = pipeline.load().drive.embedded
         plant = load_plant(embedded.plant, embedded.plant_args)
     finally:
-        pipeline.load().embedded = before
+        pipeline.load().drive.embedded = before
     played = hidden_robots.play(robot, lambda angle, speed: 1.5, 1.0, 0)
     start = int(np.flatnonzero(played.speed)[0]) - 1
     plant.command(1, 16, 1.5 / 5.0)

@@ -30,9 +30,14 @@ def still(contract):
 
 def contract_of(robot, **changes):
     """Return the contract of a policy that fits, but for some changes."""
-    bounds = [(float(np.float32(a.low)), float(np.float32(a.high))) for a in robot.action]
-    actions = tuple(replace(a, low=low, high=high) for a, (low, high) in zip(robot.action, bounds, strict=True))
-    fits = {"observation": robot.observation, "action": actions, "rate_hz": robot.rate_hz, "limits": robot.limits}
+    bounds = [(float(np.float32(a.low)), float(np.float32(a.high))) for a in robot.agent.action]
+    actions = tuple(replace(a, low=low, high=high) for a, (low, high) in zip(robot.agent.action, bounds, strict=True))
+    fits = {
+        "observation": robot.agent.observation,
+        "action": actions,
+        "rate_hz": robot.rate_hz,
+        "limits": robot.agent.limits,
+    }
     return PolicyContract(**{**fits, **changes})
 
 
@@ -77,7 +82,7 @@ def test_a_policy_for_another_robot_is_refused(arm, what):
 
 def test_a_pendulum_policy_may_not_ask_for_100_volts():
     robot = load_pipeline("pendulum").load()
-    contract = contract_of(robot, action=(replace(robot.action[0], low=-100.0, high=100.0),))
+    contract = contract_of(robot, action=(replace(robot.agent.action[0], low=-100.0, high=100.0),))
     with pytest.raises(Sim2RealError, match="this robot allows -2 to 2"):
         preflight.require_fit(robot, Bundle(contract, still(contract)))
 

@@ -29,7 +29,7 @@ def robot():
 
 @pytest.fixture(scope="module")
 def contract(robot):
-    return PolicyContract(robot.observation, robot.action, robot.rate_hz)
+    return PolicyContract(robot.agent.observation, robot.agent.action, robot.rate_hz)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def root(contract, robot, tmp_path_factory):
     """A run with two trainings: of a teacher, then of a policy that is none."""
     root, run = tmp_path_factory.mktemp("runs"), None
     for known in (KNOWN, 0):
-        size, network = robot.observation_size + known, MLP((4, 1))
+        size, network = robot.agent.observation_size + known, MLP((4, 1))
         low, high = (np.array([getattr(contract.action[0], side)], np.float32) for side in ("low", "high"))
         zeros, ones = np.zeros(size, np.float32), np.ones(size, np.float32)
         params = network.init(np.random.default_rng(0), size, 1.0)

@@ -65,11 +65,11 @@ def test_the_command_is_what_was_sent_and_the_rest_is_the_supervisors(states):
 
 def test_the_arms_score_reads_them(states):
     _, t_s, found = states
-    assert set(ARM.score(t_s, found)) == {"success", "reached", "distance_m", "first_reached_s"}
+    assert set(ARM.task.score(t_s, found)) == {"success", "reached", "distance_m", "first_reached_s"}
 
 
 def test_numbers_keep_their_names():
-    robot = SimpleNamespace(command="action")
+    robot = SimpleNamespace(drive=SimpleNamespace(command="action"))
     sent = as_sent(robot, {"action": np.zeros((4, 1))}, {"action": np.arange(4.0)[:, None]})
     assert {n: v.tolist() for n, v in sent.items()} == {"command": [0.0, 1.0, 2.0, 3.0]}
     columns = as_columns({"th": np.arange(3.0), "pose": np.arange(12.0).reshape(3, 2, 2)})

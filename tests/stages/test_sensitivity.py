@@ -14,7 +14,6 @@ from sim2real.artifacts.identification import Estimate
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import Sim2RealError
 from sim2real.graph.schedule import draw
-from sim2real.robots.control_loop.loop import DelayParams
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train.sensitivity import MULTIPLES, models_of, moves_of, sensitivity, with_room
@@ -55,15 +54,20 @@ def found_with(errors, correlation=0.0, names=tuple(VALUES)):
 SURE = dict.fromkeys(VALUES, 1e-3) | {"sensor_delay": 1e-3, "actuator_delay": 1e-3}
 
 
-class Holding(type(load_pipeline("pendulum").load())):
+class Holding(type(load_pipeline("pendulum").load().task)):
     """Succeeds near the angle; all episodes start hanging at rest."""
 
-    def random_params(self, key, draw):
-        values = draw(key)
-        return self.resumed_params(values, jnp.array([np.pi, 0.0])) | {"sensor": DelayParams(values["sensor_delay"])}
+    def random(self, key, draw):
+        return draw(key), self.at_rest(0)
 
     def success(self, state):
         return jnp.abs(jnp.abs(state.th - jnp.pi) - ANGLE_RAD) < NEAR_RAD
+
+
+def holding():
+    robot = type(load_pipeline("pendulum").load())()
+    robot.task = Holding()
+    return robot
 
 
 @pytest.fixture(scope="module")
@@ -72,11 +76,11 @@ def judged():
     found = found_with({**SURE, "gain": 0.02})
     moves = moves_of(found)
     models = models_of(found.values, moves)
-    robot = with_room(Holding(), models)
+    robot = with_room(holding(), models)
     nodes, task = robot.training(found.values, {}, {}, True)
     env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, 1.5)), task)
-    layer = (jnp.zeros((robot.observation_size, 1)), jnp.full(1, VOLTS / 2.0))
-    zero, one = jnp.zeros(robot.observation_size), jnp.ones(1)
+    layer = (jnp.zeros((robot.agent.observation_size, 1)), jnp.full(1, VOLTS / 2.0))
+    zero, one = jnp.zeros(robot.agent.observation_size), jnp.ones(1)
     policy = Policy((layer,), one, zero, zero + 1.0, -2.0 * one, 2.0 * one, MLP((1,)))
     return sensitivity(robot, env, policy, moves, models, seed=0)
 

@@ -102,8 +102,8 @@ class ReachingArm:
         """
         robot, config = self._robot, load_pipeline(self.pipeline).record
         config = replace(config, duration_s=seconds, seed=1000 * self.number + session)
-        signal = robot.around(excitation(config, hidden.RATE_HZ, len(robot.servos.joints)))
-        away = np.asarray(robot.servos.at_rest) - signal[0]
+        signal = robot.drive.around(excitation(config, hidden.RATE_HZ, len(robot.drive.servos.joints)))
+        away = np.asarray(robot.drive.servos.at_rest) - signal[0]
         left = np.abs(away) - np.arange(len(signal))[:, None] / hidden.RATE_HZ
         signal = signal + np.sign(away) * np.maximum(left, 0.0)
         self._play(path, lambda k, *_: signal[k], seconds, session)
@@ -111,7 +111,7 @@ class ReachingArm:
     def probe(self, path: Path, session: int) -> None:
         """Write the log of the small steps before a deployment: away from rest and back."""
         robot = self._robot
-        rest, probe = np.asarray(robot.servos.at_rest, float), robot.probe
+        rest, probe = np.asarray(robot.drive.servos.at_rest, float), robot.drive.probe
         away = rest + STEP_RAD * (np.arange(len(rest)) == probe.joint)
         each = round(STEP_S * hidden.RATE_HZ)
         self._play(path, lambda k, *_: away if k // each % 2 else rest, STEP_S * (STEPS + 1), session)
@@ -125,7 +125,7 @@ class ReachingArm:
         robot, rng = self._robot, np.random.default_rng([self.number, session])
         low, high = self.targets()
         targets = rng.uniform(low, high, (int(seconds / TARGET_S) + 1, len(low)))
-        fastest = robot.servos.speed
+        fastest = robot.drive.servos.speed
 
         def policy(k: int, goal: np.ndarray, _: JointReading) -> np.ndarray:
             way = targets[int(k / hidden.RATE_HZ / TARGET_S)] - goal
@@ -139,11 +139,11 @@ class ReachingArm:
         robot, seconds = self._robot, load_pipeline(self.pipeline).deploy.duration_s
         reached = []
         for trial in range(100, 100 + options.trials):
-            aim = np.asarray(robot.draw_aim(jax.random.key(trial)))
+            aim = np.asarray(robot.task.aim.draw(jax.random.key(trial)))
             angles = self._play(Path(os.devnull), trained(robot, bundle, aim), seconds, trial)
             states = {f"position[{i}]": column for i, column in enumerate(angles.T)}
             states |= {f"aim[{i}]": np.full(len(angles), value) for i, value in enumerate(aim)}
-            reached.append(robot.score(np.arange(len(angles)) / hidden.RATE_HZ, states)["reached"])
+            reached.append(robot.task.score(np.arange(len(angles)) / hidden.RATE_HZ, states)["reached"])
         return reached
 
     def targets(self) -> tuple[Any, Any]:
@@ -159,15 +159,15 @@ class ReachingArm:
         """Run the loop on a simulated clock, from rest, and write its log; return the true angles ``(N, joints)``."""
         # Make the plant at rest, with the servos' settings, and the gate.
         robot, rng = self._robot, np.random.default_rng([self.number, session, 1])
-        plant: Any = load_plant(robot.embedded.plant, self.plant)
-        sheet, rest = robot.servos.sheet, robot.servos.at_rest
+        plant: Any = load_plant(robot.drive.embedded.plant, self.plant)
+        sheet, rest = robot.drive.servos.sheet, robot.drive.servos.at_rest
         plant.data.qpos[:] = rest
         truth = TruthLog(Path(os.devnull), {"state_names": list(plant.state())})
         clock = PlantClock(plant, _STEP_NS, 0, round(2e9 * self.sensing_s), truth)
         zero = [plant.measure(i)[0] - angle for i, angle in zip(plant.servo_ids, rest, strict=True)]
         for servo_id in plant.servo_ids:
             clock.configure(servo_id, sheet.p_gain, 0, sheet.profile_rad_s)
-        gate = SafetyGate(robot.gate(load_pipeline(self.pipeline).deploy.gate))
+        gate = SafetyGate(robot.drive.gate(load_pipeline(self.pipeline).deploy.gate))
         gate.reset(rest)
         goal, count, acts_ns = np.asarray(rest, float), int(seconds * hidden.RATE_HZ), 0
         starts, ends = ({n: np.zeros(count) for n in ("sensor", "agent", "actuator")} for _ in range(2))
@@ -203,8 +203,9 @@ class ReachingArm:
 
 def trained(robot: Any, bundle: Any, aim: np.ndarray) -> Policy:
     """Return a trained policy, as the robot runs it."""
-    agent, runner, rest = robot.make_agent(), bundle.runner(), np.asarray(robot.servos.at_rest, np.float32)
-    past = np.zeros((robot.history, 3 * len(rest)), np.float32)
+    agent, runner = robot.agent.make(robot.rate_hz), bundle.runner()
+    rest = np.asarray(robot.drive.servos.at_rest, np.float32)
+    past = np.zeros((robot.agent.history, 3 * len(rest)), np.float32)
     step = StepState(params=AgentParams(aim=np.float32(aim), start=rest), state=AgentState(rest, past))
 
     def act(k: int, goal: np.ndarray, reading: JointReading) -> np.ndarray:

@@ -22,7 +22,7 @@ def put_on_the_bus(robot: Hidden, pipeline: Any) -> None:
     pipeline_robot = pipeline.load()
     jitter = math.sqrt(3.0) * robot.jitter
     emulator = replace(
-        pipeline_robot.embedded.emulator,
+        pipeline_robot.drive.embedded.emulator,
         sensing_latency_s=robot.sensing,
         sensing_jitter_s=min(jitter, robot.sensing),
         actuation_latency_s=robot.acting,
@@ -34,7 +34,9 @@ def put_on_the_bus(robot: Hidden, pipeline: Any) -> None:
         "speed_noise": float(SPEED_NOISE * robot.noise),
         "seed": robot.seed,
     }
-    pipeline_robot.embedded = replace(pipeline_robot.embedded, plant=PLANT, emulator=emulator, plant_args=plant)
+    pipeline_robot.drive.embedded = replace(
+        pipeline_robot.drive.embedded, plant=PLANT, emulator=emulator, plant_args=plant
+    )
 
 
 def record(pipeline: Any, folder: Path, seconds: float, volts: float, seed: int) -> Any:

@@ -7,20 +7,22 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
-from sim2real.hardware.device import Device, Reading
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
-from sim2real.hardware.emulation.emulated_bus import BusEmulation
-from sim2real.hardware.joint import Joint
-from sim2real.hardware.safety.gate import GateConfig
-from sim2real.hardware.safety.rig import Rig
 from sim2real.robots.roles import ROLES
+
+if TYPE_CHECKING:
+    from sim2real.hardware.device import Device, Reading
+    from sim2real.hardware.emulation.embedded import EmbeddedRobot
+    from sim2real.hardware.emulation.emulated_bus import BusEmulation
+    from sim2real.hardware.joint import Joint
+    from sim2real.hardware.safety.gate import GateConfig
+    from sim2real.hardware.safety.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,10 @@ class ServoSession:
         seed: int,
         joints: Sequence[Joint] = (),
     ) -> None:
+        # Training makes robots, too, and must not import what opens them.
+        from sim2real.hardware.emulation.embedded import EmbeddedRobot
+        from sim2real.hardware.safety.rig import Rig
+
         self._stack = ExitStack()
         self.embedded: EmbeddedRobot | None = None
         with ExitStack() as opening:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
@@ -22,6 +22,8 @@ BURST = 3
 the other, so that commands come faster than its rate for a moment."""
 DELAYS = ("sensor_delay", "actuator_delay")
 """Names of the two delays: from the world to the sensor, and from the actuator to the world."""
+Draw = Callable[[jax.Array], dict[str, Any]]
+"""Draws dynamics and delays of an episode: key -> values by name."""
 EMPTY: Mapping[str, np.ndarray] = MappingProxyType({})
 """No samples."""
 

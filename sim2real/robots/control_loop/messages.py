@@ -44,3 +44,18 @@ class Decision(Base):
 
     goal: Any
     aim: Any
+
+
+@struct.dataclass
+class EpisodeStart(Base):
+    """Where an episode starts, and what it is about.
+
+    Attributes:
+        position: Shape ``(channels,)``: positions of the joints [rad].
+        velocity: Shape ``(channels,)`` [rad/s].
+        aim: Shape ``(k,)``: what the task asks for, e.g. a target's position ``(3,)`` [m].
+    """
+
+    position: Any
+    velocity: Any
+    aim: Any

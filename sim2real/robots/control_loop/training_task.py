@@ -3,72 +3,18 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState, StepState
-from sim2real.policy.contract import ActionTerm
-from sim2real.robots.control_loop.loop import DelayParams, draw_values
-from sim2real.robots.roles import Roles
+from sim2real.robots.control_loop.loop import draw_values
+from sim2real.robots.robot_parts import ConnectedParts
 from sim2real.train.environment.tasks import Rewards
-
-Draw = Callable[[jax.Array], dict[str, Any]]
-"""Draws dynamics and delays of an episode, by name."""
-
-
-class TrainableLoop(Protocol):
-    """What a task asks of its robot; see ``LoopRobot``."""
-
-    roles: Roles
-    channels: tuple[Any, ...]
-
-    @property
-    def action(self) -> tuple[ActionTerm, ...]:
-        """The policy's actions, with their bounds."""
-        ...
-
-    @property
-    def observation_size(self) -> int:
-        """Number of entries of the policy's observation."""
-        ...
-
-    def random_params(self, key: jax.Array, draw: Draw) -> dict[str, Any]:
-        """Return parameters of the nodes for a random episode."""
-        ...
-
-    def displaced(self, params: Mapping[str, Any], position: jax.Array, velocity: jax.Array) -> dict[str, Any]:
-        """Return an episode's parameters with another start, see ``LoopRobot``.
-
-        Args:
-            position: What is added to the joints' positions ``(joints,)`` [rad].
-            velocity: What is added to their velocities ``(joints,)`` [rad/s].
-        """
-        ...
-
-    def judged(self, graph_state: GraphState) -> Any:
-        """Return what reward and success are functions of."""
-        ...
-
-    def reward(self, state: Any, action: jax.Array) -> Rewards:
-        """Return the reward of a policy step, or its terms by name."""
-        ...
-
-    def success(self, state: Any) -> jax.Array:
-        """Return whether a state of the world is one that the task wants, bool."""
-        ...
-
-    def terminated(self, state: Any) -> jax.Array:
-        """Return whether a state of the world ends the episode, bool."""
-        ...
-
-    def true_state(self, state: Any) -> Any:
-        """Return what of a state of the world is worth knowing, a pytree of arrays."""
-        ...
 
 
 class LoopTask:
@@ -85,7 +31,7 @@ class LoopTask:
 
     def __init__(
         self,
-        robot: TrainableLoop,
+        robot: ConnectedParts,
         agent: Any,
         values: Mapping[str, float],
         draws: Mapping[str, np.ndarray],
@@ -94,9 +40,9 @@ class LoopTask:
         self.values: dict[str, Any] = dict(values)
         self.supervisor = robot.roles.supervisor
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
-        self.observation_size = robot.observation_size
+        self.observation_size = robot.agent.observation_size
         self.start = (0.0, 0.0)
-        self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.action], np.float32).T
+        self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.agent.action], np.float32).T
 
     @property
     def data(self) -> Any:
@@ -116,15 +62,18 @@ class LoopTask:
     def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, Any]:
         """Draw the parameters of an episode that has a share of all differences; None: all of them."""
         draw = partial(self._draw, width=width)
+        task = self.robot.task
         if any(self.start):
             key, key_start = jax.random.split(key)
-            params = self.robot.displaced(self.robot.random_params(key, draw), *self.offsets(key_start, width))
+            values, start = task.random(key, draw)
+            start = task.moved(start, *self.offsets(key_start, width))
         else:
-            params = self.robot.random_params(key, draw)
-        sensor = self.robot.roles.sensor
-        if width is None or not isinstance(params[sensor], DelayParams):
-            return params
-        return {**params, sensor: params[sensor].replace(noise=width)}
+            values, start = task.random(key, draw)
+        params = self.robot.node_parameters(values, start)
+        if width is not None:
+            sensor = self.robot.roles.sensor
+            params[sensor] = params[sensor].replace(noise=width)
+        return params
 
     def offsets(self, key: jax.Array, width: jax.Array | None) -> tuple[jax.Array, jax.Array]:
         """Draw how far from the robot's own start an episode starts: positions and velocities, ``(joints,)`` each.
@@ -133,7 +82,7 @@ class LoopTask:
             width: Share of the differences; None: all of them.
         """
         share = 1.0 if width is None else width
-        drawn = share * jax.random.uniform(key, (2, len(self.robot.channels)), minval=-1.0, maxval=1.0)
+        drawn = share * jax.random.uniform(key, (2, len(self.robot.sensor.channels)), minval=-1.0, maxval=1.0)
         return self.start[0] * drawn[0], self.start[1] * drawn[1]
 
     def observe(self, step_state: StepState) -> jax.Array:
@@ -146,21 +95,25 @@ class LoopTask:
 
     def reward(self, graph_state: GraphState, action: jax.Array) -> Rewards:
         """Return the robot's reward of a row."""
-        return self.robot.reward(self.robot.judged(graph_state), action)
+        return self.robot.task.reward(self._judged(graph_state), action)
 
     def success(self, graph_state: GraphState) -> jax.Array:
         """Return whether the task is fulfilled."""
-        return self.robot.success(self.robot.judged(graph_state))
+        return self.robot.task.success(self._judged(graph_state))
 
     def terminated(self, graph_state: GraphState) -> jax.Array:
         """Return whether the robot's episode ended."""
-        return self.robot.terminated(self.robot.judged(graph_state))
+        return self.robot.task.terminated(self._judged(graph_state))
 
     def privileged(self, graph_state: GraphState) -> jax.Array:
-        """Return what is true: the world's state, and the parameters that the episode has, shape ``(P,)``."""
-        known = (self.robot.true_state(self.robot.judged(graph_state)), graph_state.params)
-        numbers = [x for x in map(jnp.asarray, jax.tree.leaves(known)) if jnp.issubdtype(x.dtype, jnp.inexact)]
+        """Return the true state of the world, and the parameters of the episode, shape ``(P,)``."""
+        state = self.robot.model.true_state(graph_state.state[self.robot.roles.world])
+        numbers = [x for x in map(jnp.asarray, jax.tree.leaves((state, graph_state.params)))]
+        numbers = [x for x in numbers if jnp.issubdtype(x.dtype, jnp.inexact)]
         return jnp.concatenate([x.astype(jnp.float32).ravel() for x in numbers])
+
+    def _judged(self, graph_state: GraphState) -> Any:
+        return self.robot.task.judged(graph_state, self.robot.roles)
 
     def _draw(self, key: jax.Array, width: jax.Array | None) -> dict[str, Any]:
         drawn = draw_values(key, self.values, self.draws)

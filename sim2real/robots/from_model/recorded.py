@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
 
 import jax
 
@@ -14,30 +16,37 @@ from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.contract import Datum, RecordedRobot, tuple_of
+from sim2real.robots.completeness import complete, tuple_of
+from sim2real.robots.roles import ROLES, Roles
 from sim2real.worlds.recorded import RecordedActuator
 
 
-class LoggedRobot(RecordedRobot):
-    """A robot without a device: its nodes and parameters are a subclass's.
+class LoggedRobot(ABC):
+    """A ``RecordedRobot`` without a device; subclasses define its nodes and parameters.
 
     Attributes:
-        channels: What was measured of each joint.
-        delayed: What happens during the delay that is identified, e.g. ``"goal to angle"``.
+        channels: The measured quantities of each joint.
+        delayed: The chain with the estimated delay, e.g. ``"goal to angle"``.
         tick_s: The world's period, where samples fall between its ticks: the sensor then needs a tick of delay to
             interpolate. 0 where samples fall on ticks.
-        burst: By how many commands a delay's window is longer, for commands that came faster than their rate.
+        burst: Extra commands in a delay's window, for commands that came faster than their rate.
     """
 
+    units: Mapping[str, str]
+    roles: Roles = ROLES
+    profile_rad_s: float = math.inf
+    export_lead_s: float = 0.0
+    causes: Mapping[str, Mapping[str, float]] = MappingProxyType({})
     channels: tuple[Channel, ...]
     delayed: str = "command to measurement"
     tick_s: float = 0.0
     burst: int = 0
 
-    _DATA: ClassVar[Mapping[str, Datum]] = {
-        **RecordedRobot._DATA,
-        "channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel)),
-    }
+    _DATA: ClassVar = {"channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel))}
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make the robot, if its class has all methods."""
+        return complete(cls, *args, **options)
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
@@ -59,6 +68,20 @@ class LoggedRobot(RecordedRobot):
     def identifiable(self, max_delay_s: float) -> IdentifiableRecording:
         """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
         return IdentifiableRecording(self, max_delay_s)
+
+    def watched(self, max_delay_s: float) -> IdentifiableRecording:
+        """Return the model with all parameters that may change between recordings."""
+        return self.identifiable(max_delay_s)
+
+    def with_optional_terms(self, wanted: str) -> LoggedRobot:
+        """Return the robot with further optional terms; default: the robot, which has all of them."""
+        del wanted
+        return self
+
+    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+        """Return the model with identified values, as MJCF; None: there is none."""
+        del values
+        return None
 
 
 class IdentifiableRecording:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
-from sim2real.hardware.dynamixel.drive import PositionDrive
-from sim2real.hardware.dynamixel.registers import P_GAIN_UNIT, PWM_FULL_SCALE, RAD_PER_COUNT
-from sim2real.hardware.feetech.drive import StsDrive
-from sim2real.hardware.feetech.registers import P_GAIN_UNIT_PER_RAD
+if TYPE_CHECKING:
+    from sim2real.hardware.dynamixel.drive import PositionDrive
+    from sim2real.hardware.feetech.drive import StsDrive
+
+_PWM_FULL_SCALE, _P_GAIN_UNIT, _RAD_PER_COUNT = 885, 256, 2.0 * math.pi / 4096
+_STS_P_GAIN_UNIT_PER_RAD = 0.166
+"""As in the registers of ``sim2real.hardware``, which a model for training does not import; a test compares them."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class DataSheet:
     @property
     def full_rad(self) -> float:
         """Position error at which the duty is full [rad]."""
-        return PWM_FULL_SCALE * P_GAIN_UNIT / self.p_gain * RAD_PER_COUNT
+        return _PWM_FULL_SCALE * _P_GAIN_UNIT / self.p_gain * _RAD_PER_COUNT
 
     @property
     def gain(self) -> float:
@@ -52,8 +55,10 @@ class DataSheet:
         return self.stall / self.full_rad
 
     @property
-    def drive(self) -> Any:
+    def drive(self) -> PositionDrive | StsDrive:
         """The drive with these settings, for the robot's device."""
+        from sim2real.hardware.dynamixel.drive import PositionDrive
+
         return PositionDrive(self.p_gain, self.profile_rad_s)
 
 
@@ -68,9 +73,11 @@ class StsSheet(DataSheet):
     @property
     def full_rad(self) -> float:
         """Position error at which the duty is full [rad]."""
-        return 1.0 / (self.p_gain * P_GAIN_UNIT_PER_RAD)
+        return 1.0 / (self.p_gain * _STS_P_GAIN_UNIT_PER_RAD)
 
     @property
     def drive(self) -> StsDrive:
         """The drive with these settings; its joints are those of a calibration."""
+        from sim2real.hardware.feetech.drive import StsDrive
+
         return StsDrive(self.p_gain, speed_rad_s=self.profile_rad_s)

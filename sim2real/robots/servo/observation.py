@@ -1,18 +1,79 @@
-"""What the policy of a robot of servos sees, entry by entry: names, units, and how large it can get."""
+"""The policy of a robot of servos: its observation, entry by entry, and its actions."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
-from sim2real.policy.contract import ObservationTerm
+import jax.numpy as jnp
+
+from sim2real.arrays import namespace
+from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.robots.contract import RobotAgent
+from sim2real.robots.control_loop.messages import EpisodeStart, JointReading
+from sim2real.robots.roles import ROLES, Roles
+from sim2real.robots.servo.agent import AgentParams, GoalAgent
 from sim2real.robots.servo.servos import Servos
+from sim2real.robots.servo.task import NO_AIM, Aim
+from sim2real.types import Array
 
 Feature = tuple[str, tuple[str, ...]] | tuple[str, tuple[str, ...], float]
-"""Name and units of what a policy sees, and its largest magnitude [its units] where that is known."""
+"""Name and units of a term of the observation, and its largest magnitude [the units] where there is one."""
+Observe = Callable[[JointReading, Array, Array], Array]
+"""Returns the present part of the observation: (reading, goals ``(joints,)`` [rad], aim ``(k,)``) -> ``(features,)``.
 
-_OVER_RAD, _OVER_SPEED, _FASTEST_RAD_S = math.pi, 5.0, 1e3
-"""Bounds of what is measured: so far beyond the goals; so many times as fast as the servo turns without load; and the
-speed that is taken where the data sheet knows none."""
+In training it gets arrays of JAX, on the robot of NumPy: ``namespace(goals)`` of ``sim2real.arrays`` is the matching
+module. ``jax.numpy`` works too, but is slower on the robot."""
+
+_MARGIN_RAD, _SPEED_FACTOR, _FASTEST_RAD_S = math.pi, 5.0, 1e3
+"""Bounds of measurements: distance from the goals' bounds; factor on the servo's speed without load; and the speed
+where the data sheet has no damping."""
+
+
+class ServoAgent(RobotAgent):
+    """Speeds of the goals from positions, velocities, goals, the aim and a short history.
+
+    Args:
+        features: Names, units and largest magnitudes of the present part of the observation; None: positions,
+            velocities, goals and aim.
+        observe: Makes that part; see ``Observe``.
+        history: Number of past steps in the observation.
+    """
+
+    def __init__(
+        self,
+        servos: Servos,
+        aim: Aim = NO_AIM,
+        features: tuple[Feature, ...] | None = None,
+        observe: Observe | None = None,
+        history: int = 3,
+        roles: Roles = ROLES,
+    ) -> None:
+        self._servos, self._aim, self.history, self._roles = servos, aim, history, roles
+        self.observe = observe or observe_all
+        self.observation = servo_terms(servos, aim.entries, features, history)
+        speed, names = servos.speed, servos.names
+        self.action = tuple(ActionTerm(f"speed of {name}'s goal", "rad/s", -speed, speed) for name in names)
+        ends = {"lowest": servos.low, "highest": servos.high}
+        self.limits = {f"{end} goal of {n}": v for end, vs in ends.items() for n, v in zip(names, vs, strict=True)}
+        self.units = {f"aim[{i}]": unit for i, (_, unit) in enumerate(aim.entries)}
+
+    def make(self, rate_hz: float, **options: Any) -> GoalAgent:
+        """Return the policy's node."""
+        s, roles, aims = self._servos, self._roles, len(self._aim.entries)
+        return GoalAgent(
+            roles.supervisor, rate_hz, s.low, s.high, self.observe, self.history, aims, roles.sensor, **options
+        )
+
+    def params(self, start: EpisodeStart, policy: Any) -> AgentParams:
+        """Return the node's parameters: goals start at the joints' positions."""
+        return AgentParams(policy=policy, aim=start.aim, start=jnp.asarray(start.position, jnp.float32))
+
+
+def observe_all(reading: JointReading, goal: Array, aim: Array) -> Array:
+    """Return positions, velocities, goals and aim."""
+    return namespace(goal).concatenate([reading.position, reading.velocity, goal, aim])
 
 
 def servo_terms(
@@ -21,15 +82,15 @@ def servo_terms(
     """Return the terms of the observation that ``GoalAgent`` makes.
 
     Args:
-        aim: What an episode is about: names and units.
-        features: What the policy sees of the present; None: positions, velocities, goals and aim.
-        history: Past steps that it sees.
+        aim: Names and units of the aim's entries.
+        features: Terms of the present; None: positions, velocities, goals and aim.
+        history: Number of past steps.
     """
     n, sheet = len(servos.joints), servos.sheet
-    free = _OVER_SPEED * sheet.stall / sheet.damping if sheet.damping else _FASTEST_RAD_S
-    fast = tuple(free / joint.gear for joint in servos.mounting)
+    free = _SPEED_FACTOR * sheet.stall / sheet.damping if sheet.damping else _FASTEST_RAD_S
+    fast = tuple(free / gear for gear in servos.gears)
     position, velocity, goal = (
-        (tuple(v - _OVER_RAD for v in servos.low), tuple(v + _OVER_RAD for v in servos.high)),
+        (tuple(v - _MARGIN_RAD for v in servos.low), tuple(v + _MARGIN_RAD for v in servos.high)),
         (tuple(-v for v in fast), fast),
         (servos.low, servos.high),
     )

@@ -7,17 +7,20 @@ and gain, damping and inertia times its square.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
-from sim2real.hardware.joint import Joint
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.servo.datasheet import DataSheet
 from sim2real.robots.servo.parts import ServoDriven
+from sim2real.robots.servo.servos import gear_of, name_of
 from sim2real.robots.servo.simulated_world import STRIBECK
+
+if TYPE_CHECKING:
+    from sim2real.hardware.joint import Joint
 
 _NAMES = ("gain", "damping", "armature", "friction")
 MISSES = "goal_offset"
@@ -42,7 +45,7 @@ def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[st
         "friction": ("N m", 8, "dry friction"),
     }.items():
         value = getattr(sheet, name)
-        names = [f"{name}_{j.name}" for j in map(Joint.of, joints)] if name in own else [name]
+        names = [f"{name}_{name_of(j)}" for j in joints] if name in own else [name]
         gone = name != "gain"
         found += [Parameter(n, unit, value, value / factor, value * factor, about=about, vanishes=gone) for n in names]
     if (width := sheet.stribeck_rad_s) is not None:
@@ -58,13 +61,13 @@ def offsets(joints: Sequence[Joint | str]) -> list[Parameter]:
         joints: The joints, or their names.
     """
     about = "where it comes to rest without load, from its goal"
-    names = [f"{MISSES}_{joint.name}" for joint in map(Joint.of, joints)]
+    names = [f"{MISSES}_{name_of(joint)}" for joint in joints]
     return [Parameter(name, "rad", 0.0, -_MOST_RAD, _MOST_RAD, "linear", about=about) for name in names]
 
 
 def causes(joints: Sequence[Joint | str]) -> dict[str, dict[str, float]]:
     """Return what moves parameters of all joints at once: friction, with the temperature of grease and gears."""
-    return {"friction": {f"friction_{joint.name}": 1.0 for joint in map(Joint.of, joints)}}
+    return {"friction": {f"friction_{name_of(joint)}": 1.0 for joint in joints}}
 
 
 def of_joints(
@@ -77,7 +80,7 @@ def of_joints(
         joints: The joints, or their names.
         otherwise: The value where there is neither; None: one of them must be there.
     """
-    shared, labels = values.get(name, otherwise), [f"{name}_{j.name}" for j in map(Joint.of, joints)]
+    shared, labels = values.get(name, otherwise), [f"{name}_{name_of(j)}" for j in joints]
     found = [values.get(label, shared) for label in labels]
     if lacking := [label for label, value in zip(labels, found, strict=True) if value is None]:
         raise KeyError(lacking[0])
@@ -103,7 +106,7 @@ def place(values: Mapping[str, Any], sheet: DataSheet, joints: Sequence[Joint | 
         joints: The joints, or their names.
         step_s: The physics' time step [s].
     """
-    n, gear = len(joints), np.array([Joint.of(joint).gear for joint in joints], np.float32)
+    n, gear = len(joints), np.array([gear_of(joint) for joint in joints], np.float32)
     gain, damping, inertia, friction, full, off = (
         jnp.stack([jnp.asarray(v, jnp.float32) for v in of_joints(values, name, joints, otherwise)])
         for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", sheet.full_rad), (MISSES, 0.0))
@@ -135,7 +138,7 @@ def identified_mjcf(
     found += [of_joints(values, "saturation", joints, sheet.full_rad), of_joints(values, MISSES, joints, 0.0)]
     rows = zip(joints, robot.joints, robot.actuators, zip(*found, strict=True), strict=True)
     for mounted, element, actuator, numbers in rows:
-        gear = Joint.of(mounted).gear
+        gear = gear_of(mounted)
         gain, damping, armature, friction, full, off = (float(n) for n in numbers)
         joint, motor = spec.joint(element.full_identifier), spec.actuator(actuator.full_identifier)
         joint.damping = [damping * gear**2, *joint.damping[1:]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from dm_env import specs
@@ -12,8 +12,11 @@ from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.robot import Robot
 from sim2real.composer.task import Task
-from sim2real.hardware.joint import Joint
 from sim2real.robots.servo.datasheet import DataSheet
+from sim2real.robots.servo.servos import gear_of, name_of
+
+if TYPE_CHECKING:
+    from sim2real.hardware.joint import Joint
 
 GOAL, REFERENCE = "goal", "reference"
 """Variables of the physics, each ``(joints,)`` [rad]: the goal positions, and the setpoints of the servos' position
@@ -32,9 +35,8 @@ class Servo(Robot):
     """
 
     def _build(self, name: Joint | str, axis: tuple[float, float, float], sheet: DataSheet) -> None:
-        mounted = Joint.of(name)
-        gear = self.gear = mounted.gear
-        self._model = mjcf.RootElement(model=mounted.name)
+        gear = self.gear = gear_of(name)
+        self._model = mjcf.RootElement(model=name_of(name))
         horn = self._model.worldbody.add("body", name="horn")
         self.joint = horn.add(
             "joint",

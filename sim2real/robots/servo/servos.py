@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim2real.hardware.joint import Joint
 from sim2real.robots.servo.datasheet import DataSheet
+
+if TYPE_CHECKING:
+    from sim2real.hardware.joint import Joint
+
+
+def name_of(joint: Joint | str) -> str:
+    """Return the name of a joint."""
+    return joint if isinstance(joint, str) else joint.name
+
+
+def gear_of(joint: Joint | str) -> float:
+    """Return the turns of the servo for one of the joint; a name stands for a joint without a gear."""
+    return 1.0 if isinstance(joint, str) else joint.gear
 
 
 @dataclass(frozen=True)
@@ -43,12 +56,19 @@ class Servos:
     @property
     def mounting(self) -> tuple[Joint, ...]:
         """The joints."""
+        from sim2real.hardware.joint import Joint  # for the rig: training needs names and gears alone
+
         return tuple(Joint.of(joint) for joint in self.joints)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The joints' names."""
-        return tuple(joint.name for joint in self.mounting)
+        return tuple(name_of(joint) for joint in self.joints)
+
+    @property
+    def gears(self) -> tuple[float, ...]:
+        """Turns of each servo for one of its joint."""
+        return tuple(gear_of(joint) for joint in self.joints)
 
     @property
     def at_rest(self) -> np.ndarray:

@@ -68,8 +68,8 @@ def find_source(
         )
     # Simulate the planned commands with the nominal parameters.
     moving = moving_robot(pipeline)
-    commands = len(moving.action)
-    signal = moving.around(excitation(config.record, moving.rate_hz, commands).reshape(-1, commands))
+    commands = len(moving.agent.action)
+    signal = moving.drive.around(excitation(config.record, moving.rate_hz, commands).reshape(-1, commands))
     table = parameters.for_recordings(1)
     values = table.of_recording(table.decode(table.start()), 0)
     return JudgedLogs([PLANNED], [simulate(model, moving, signal, values, fitting, config.record.seed)], True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from sim2real.errors import UsageError
-from sim2real.hardware.safety.config import GateLimits
+from sim2real.robots.gate_limits import GateLimits
 from sim2real.stages.seed import check_seed
 
 

@@ -54,24 +54,25 @@ def check_timing(summaries: Sequence[Mapping[str, Json]], config: DeployConfig) 
 
 def require_tilt(robot: Robot, config: DeployConfig) -> None:
     """Refuse a limit of the tilt for a robot that does not measure its tilt."""
-    if config.max_tilt_rad is not None and type(robot).tilt_rad is Robot.tilt_rad:
-        raise UsageError("this robot does not measure its tilt", hint="run without --max-tilt-rad, or define tilt_rad")
+    if config.max_tilt_rad is not None and robot.agent.tilt_rad is None:
+        raise UsageError("this robot does not measure its tilt", hint="run without --max-tilt-rad, or set tilt_rad")
 
 
 def _policy_runner(bundle: Bundle, robot: Robot, config: DeployConfig) -> PolicyRunner:
     """Return the policy's runner. Its actions grow during ``blend_s``, and a limit of the tilt stops the robot."""
     blended = BlendedRunner(bundle.runner(config.backend), config.blend_s)
-    return blended if config.max_tilt_rad is None else UprightRunner(blended, robot.tilt_rad, config.max_tilt_rad)
+    tilt_rad, limit_rad = robot.agent.tilt_rad, config.max_tilt_rad
+    return blended if limit_rad is None or tilt_rad is None else UprightRunner(blended, tilt_rad, limit_rad)
 
 
 def _measure_delay(
     pipeline: Pipeline, robot: Robot, session: Session, bundle: Bundle, config: DeployConfig, folder: Path
 ) -> dict[str, str]:
     """Bring the robot to rest, measure its delay with small steps and log them; return a line of the summary."""
-    if config.dry_run or not config.measure_delay or robot.probe is None:
+    if config.dry_run or not config.measure_delay or robot.drive.probe is None:
         return {}
     note("waiting for the robot to come to rest, then a few small steps to measure its delay")
-    robot.prepare(session, config.settle_s)
+    robot.drive.prepare(session, config.settle_s)
     witness = Witness(session.rig)
     try:
         return check_delay(robot, witness, bundle.contract, config)
@@ -94,6 +95,6 @@ def _run_one(
         note(f"dry run: the robot is not moved to its start; {length}")
     else:
         note(f"waiting for the robot to come to rest, then {length}")
-        robot.prepare(session, config.settle_s)
+        robot.drive.prepare(session, config.settle_s)
     nodes, params = robot.deployment_nodes(session, policy, trial)
     return run_episode(pipeline, robot, session, nodes, params, log, config.duration_s, config, "deploy", config.hold)

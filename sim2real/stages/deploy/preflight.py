@@ -43,8 +43,8 @@ def require_fit(robot: Robot, bundle: Bundle) -> None:
     bundle.spec.refuse_teacher()
     contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
     for verb, in_bundle, of_robot in (
-        ("sees", _observations(contract.observation), _observations(robot.observation)),
-        ("sends", _actions(contract.action), _actions(robot.action)),
+        ("sees", _observations(contract.observation), _observations(robot.agent.observation)),
+        ("sends", _actions(contract.action), _actions(robot.agent.action)),
     ):
         if in_bundle != of_robot:
             raise Sim2RealError(f"the policy {where} {verb} {in_bundle}, this robot has {of_robot}", hint=_TRAIN)
@@ -52,7 +52,7 @@ def require_fit(robot: Robot, bundle: Bundle) -> None:
         raise Sim2RealError(
             f"the policy {where} runs at {contract.rate_hz:g} Hz, this robot at {robot.rate_hz:g} Hz", hint=_TRAIN
         )
-    for trained, term in zip(contract.observation, robot.observation, strict=True):
+    for trained, term in zip(contract.observation, robot.agent.observation, strict=True):
         bounds = [trained.low, trained.high], [term.low, term.high]
         if trained.low and term.low and not np.allclose(*bounds, rtol=1e-6):
             raise Sim2RealError(
@@ -60,7 +60,7 @@ def require_fit(robot: Robot, bundle: Bundle) -> None:
                 f"this robot has {term.low} to {term.high}",
                 hint=_TRAIN,
             )
-    for action, limit in zip(contract.action, robot.action, strict=True):
+    for action, limit in zip(contract.action, robot.agent.action, strict=True):
         # Training rounds the limits to float32.
         if action.low < np.float32(limit.low) or action.high > np.float32(limit.high):
             raise Sim2RealError(
@@ -69,10 +69,10 @@ def require_fit(robot: Robot, bundle: Bundle) -> None:
                 hint=_TRAIN,
             )
     for name, value in contract.limits.items():
-        if name not in robot.limits or not np.isclose(value, robot.limits[name], rtol=1e-6):
+        if name not in robot.agent.limits or not np.isclose(value, robot.agent.limits[name], rtol=1e-6):
             raise Sim2RealError(
                 f"the policy {where} was trained with {name!r} = {value:g}, "
-                f"this robot has {robot.limits.get(name, 'no such limit')}",
+                f"this robot has {robot.agent.limits.get(name, 'no such limit')}",
                 hint=_TRAIN,
             )
 
@@ -90,16 +90,16 @@ def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config
         DelayChanged: The delay, or its variation, lies outside of the range in training.
         Sim2RealError: The robot does not answer.
     """
-    if not config.measure_delay or config.dry_run or robot.probe is None:
+    if not config.measure_delay or config.dry_run or robot.drive.probe is None:
         return {}
     if (trained := contract.trained_s.get(ROUND_TRIP)) is None:
         note("warning: the bundle does not list the delays of its training, so the robot's delay is not measured")
         return {}
     # A busy machine may delay single steps, so a misfit is measured a second time.
-    answers = measure_delay(witness, robot.probe)
+    answers = measure_delay(witness, robot.drive.probe)
     if misfit(answers, trained, config.delay_tolerance_s):
         witness.rig.wait_until_still(config.settle_s)
-        answers = StepAnswers(np.append(answers.delays_s, measure_delay(witness, robot.probe).delays_s))
+        answers = StepAnswers(np.append(answers.delays_s, measure_delay(witness, robot.drive.probe).delays_s))
     measured = f"{1e3 * answers.delay_s:.0f} ms, the middle half within {1e3 * answers.jitter_s:.0f} ms"
     if reason := misfit(answers, trained, config.delay_tolerance_s):
         message = f"the delay is {measured}: {reason}"

@@ -10,7 +10,6 @@ from sim2real.artifacts.deployment import PROBE
 from sim2real.graph.episode import StepRecord
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.contract import Robot
-from sim2real.robots.control_loop.loop_robot import LoopRobot
 from sim2real.robots.probe import Witness
 from sim2real.stages.pipeline.pipeline import Pipeline
 
@@ -24,7 +23,7 @@ def write_probe(folder: Path, pipeline: Pipeline, robot: Robot, witness: Witness
     Returns:
         None if no step was made, or if the robot has no messages of a control loop.
     """
-    if not witness.measured or not witness.sent or not isinstance(robot, LoopRobot):
+    if not witness.measured or not witness.sent:
         return None
     # Select the measurements and commands at the robot's rate; a command that changes is always selected.
     sensor, actuator = robot.roles.sensor, robot.roles.actuator
@@ -33,14 +32,16 @@ def write_probe(folder: Path, pipeline: Pipeline, robot: Robot, witness: Witness
     changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]
     sent = _apart([begin_ns for begin_ns, *_ in witness.sent], period_ns, changed)
     # Write them as steps of the sensor and the actuator.
-    outputs = {sensor: robot.at_rest, actuator: robot.message(np.zeros(len(robot.action)))}
+    outputs = {sensor: robot.sensor.at_rest, actuator: robot.drive.message(np.zeros(len(robot.agent.action)))}
     graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
     metadata = {"pipeline": pipeline.name, "dry_run": False, "graph": graph, "probe": True}
-    joints, units = {sensor: robot.joints}, dict.fromkeys(outputs, robot.units)
+    joints, units = {sensor: robot.sensor.joints}, dict.fromkeys(outputs, robot.units)
     recorder = McapRecorder(folder / PROBE, metadata, {}, outputs, [], joints, units)
     recorder.start(0, start_ns)
-    rows = [(sensor, k, *witness.measured[i][:2], robot.read(witness.measured[i][2])) for k, i in enumerate(measured)]
-    rows += [(actuator, k, *witness.sent[i][:2], robot.message(witness.sent[i][2])) for k, i in enumerate(sent)]
+    rows = [
+        (sensor, k, *witness.measured[i][:2], robot.sensor.read(witness.measured[i][2])) for k, i in enumerate(measured)
+    ]
+    rows += [(actuator, k, *witness.sent[i][:2], robot.drive.message(witness.sent[i][2])) for k, i in enumerate(sent)]
     for node, seq, *times_ns, output in rows:
         begin, end = ((t_ns - start_ns) // 1000 for t_ns in times_ns)
         recorder.step(StepRecord(node, seq, begin, begin, begin, -1, end, 0), output)

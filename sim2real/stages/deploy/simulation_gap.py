@@ -128,7 +128,7 @@ def _scored(
 
 
 def _scores(robot: Robot, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float | None]:
-    return {name: value if math.isfinite(value) else None for name, value in robot.score(t_s, states).items()}
+    return {name: value if math.isfinite(value) else None for name, value in robot.task.score(t_s, states).items()}
 
 
 def _gap(quantity: str, real: float | None, simulated: float | None) -> Gap:

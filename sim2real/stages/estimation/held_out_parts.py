@@ -59,8 +59,7 @@ def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
     Args:
         wanted: As in ``widest``.
     """
-    offer = getattr(robot, "with_optional_terms", None)
-    return robot if offer is None or wanted in ("own", "none") else offer(wanted)
+    return robot if wanted in ("own", "none") else robot.with_optional_terms(wanted)
 
 
 def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:

@@ -34,7 +34,7 @@ def simulate(
 
     Args:
         robot: Its command is excited, at its rate.
-        signal: Shape ``(N, actions)``: one command a step, as ``Robot.around`` returns them.
+        signal: Shape ``(N, actions)``: one command a step, as ``RobotDrive.around`` returns them.
         config: Largest delay of the model, and the engine.
     """
     nodes = model.nodes(config.max_delay_s)
@@ -47,7 +47,7 @@ def simulate(
         rows = {n: np.repeat(np.asarray(v)[None], count, axis=0) for n, v in named_leaves(message).items()}
         if name == robot.roles.actuator:
             played = signal[np.minimum(np.arange(count), len(signal) - 1)]
-            rows[robot.command] = played.reshape(rows[robot.command].shape)
+            rows[robot.drive.command] = played.reshape(rows[robot.drive.command].shape)
         leaves, kind = jax.tree_util.tree_flatten(message)
         commands[name] = kind.unflatten(
             [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]

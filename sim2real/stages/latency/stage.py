@@ -31,7 +31,9 @@ def run(pipeline: Pipeline, config: LatencyConfig, root: Path, run_dir: Path | N
         run_dir: Run folder to add to; None makes a new one.
     """
     robot = moving_robot(pipeline)
-    excitation(config, robot.rate_hz, len(robot.action))  # what cannot be played is refused before a folder is made
+    excitation(
+        config, robot.rate_hz, len(robot.agent.action)
+    )  # what cannot be played is refused before a folder is made
     with open_stage(root, pipeline.name, "latency", config, run_dir=run_dir, dry_run=config.dry_run) as stage:
         stage.output("log", LOG)
         if config.port == "embedded":

@@ -197,7 +197,7 @@ def _recorder(
         "port": config.port,
     }
     inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
-    joints, units = {robot.roles.sensor: robot.joints}, dict.fromkeys(graph.nodes, robot.units)
+    joints, units = {robot.roles.sensor: robot.sensor.joints}, dict.fromkeys(graph.nodes, robot.units)
     recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
     if dry:
         recorder.write_event("dry run", "torque was withheld: no command in this log was sent, and nothing was moved")
@@ -205,7 +205,7 @@ def _recorder(
 
 
 def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
-    rig, command, counters = session.rig, robot.command, session.rig.device.counters
+    rig, command, counters = session.rig, robot.drive.command, session.rig.device.counters
     timing = {
         n: {
             "steps": s.steps,

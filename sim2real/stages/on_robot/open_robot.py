@@ -35,7 +35,7 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
-    with robot.connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
+    with robot.drive.connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
         _require_rig(session.rig)
         if config.dry_run:
             session.rig.withhold_torque()

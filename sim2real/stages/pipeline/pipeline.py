@@ -108,7 +108,7 @@ class Pipeline:
         found = importlib.import_module(f"{self.package}.{module or self.robot}")
         if module:
             return found
-        from sim2real.robots.contract import checked  # imports JAX
+        from sim2real.robots.loading import checked  # imports JAX
 
         robot = checked(getattr(found, "ROBOT", None), f"pipeline {self.name!r} ({found.__file__})")
         _LOADED[robot] = self
@@ -144,9 +144,10 @@ def pipeline_of(robot: RecordedRobot | Pipeline | str) -> Pipeline:
         return robot
     if isinstance(robot, str):
         return load_pipeline(robot)
-    from sim2real.robots.contract import RecordedRobot, checked  # imports JAX
+    from sim2real.robots.contract import RecordedRobot, Robot  # imports JAX
+    from sim2real.robots.loading import checked
 
-    if not isinstance(robot, RecordedRobot):
+    if not isinstance(robot, Robot | RecordedRobot):
         raise UsageError(
             f"{reprlib.repr(robot)} is neither a robot nor a pipeline",
             hint="sim2real.load_pipeline(NAME), or NAME alone, is a pipeline, and its load() a robot",

@@ -38,7 +38,7 @@ def record(
     pipeline, folder = pipeline_of(robot), folder_of(folder)
     config = config_of(config, pipeline.record)
     robot = moving_robot(pipeline)
-    signal = excitation(config, robot.rate_hz, len(robot.action))
+    signal = excitation(config, robot.rate_hz, len(robot.agent.action))
     note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
     log, truth = folder / LOG, folder / TRUTH
     with opened(robot, config, truth) as session:
@@ -54,7 +54,9 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         run_dir: Run folder to add to; None makes a new one.
     """
     robot = moving_robot(pipeline)
-    excitation(config, robot.rate_hz, len(robot.action))  # what cannot be played is refused before a folder is made
+    excitation(
+        config, robot.rate_hz, len(robot.agent.action)
+    )  # what cannot be played is refused before a folder is made
     with open_stage(root, pipeline.name, "record", config, {}, run_dir, config.dry_run) as stage:
         stage.output("log", LOG)
         if config.port == "embedded":

@@ -15,7 +15,7 @@ from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.episode import named_leaves
 from sim2real.policy.bundle import PolicyReference
 from sim2real.policy.runner import PolicyRunner
-from sim2real.robots.control_loop.loop_robot import LoopRobot
+from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.policy_node import in_numpy
 from sim2real.stages.terminal.console import note
 from sim2real.train.networks.policy import Policy
@@ -60,19 +60,19 @@ def load_recording(identification: Identification | None, run_dir: Path) -> Reco
         return None
 
 
-def observations_of(robot: LoopRobot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
+def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
     """Return the observations ``(N, O)`` that a policy would get from a recording's measurements.
 
     Args:
         runner: The policy, whose actions are part of its later observations.
     """
-    agent, sensor = robot.make_agent(), robot.roles.sensor
+    agent, sensor = robot.agent.make(robot.rate_hz), robot.roles.sensor
     if not isinstance(agent, _Agent):
         raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
 
     # Arrange the recorded readings as the leaves of a message.
-    leaves, form = jax.tree_util.tree_flatten(robot.at_rest)
-    columns = [recording.episode.outputs[sensor][name] for name in named_leaves(robot.at_rest)]
+    leaves, form = jax.tree_util.tree_flatten(robot.sensor.at_rest)
+    columns = [recording.episode.outputs[sensor][name] for name in named_leaves(robot.sensor.at_rest)]
     columns = [c.astype(np.float32).reshape(-1, *np.shape(leaf)) for c, leaf in zip(columns, leaves, strict=True)]
 
     # Play the agent over them.

@@ -15,8 +15,8 @@ from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import UsageError
 from sim2real.identify.problem.programs import Program
+from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.loop import DELAYS, in_a_loop
-from sim2real.robots.control_loop.loop_robot import LoopRobot
 from sim2real.robots.control_loop.training_task import LoopTask
 from sim2real.train.config import PPOConfig
 from sim2real.train.environment.graph_environment import GraphEnvironment, TrainingTask
@@ -105,7 +105,7 @@ def models_of(values: Mapping[str, float], moves: Sequence[Move]) -> list[dict[s
     return [dict(values), *({**values, **model} for model in models)]
 
 
-def with_room(robot: LoopRobot, models: Sequence[Mapping[str, float]]) -> LoopRobot:
+def with_room(robot: Robot, models: Sequence[Mapping[str, float]]) -> Robot:
     """Return a robot whose graph has room for the delays of all models.
 
     Args:
@@ -122,12 +122,12 @@ def _round_trip(values: Mapping[str, float]) -> float:
     return sum(values[name] for name in DELAYS)
 
 
-def _for_one_graph(robot: LoopRobot, models: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
+def _for_one_graph(robot: Robot, models: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
     """Return the models with the actuator's delay of the first; the sensor's delay takes the whole difference.
 
     Only the sum of both delays affects a policy's observations of its commands; see ``in_a_loop``.
     """
-    base = in_a_loop(models[0], robot.tick_s, robot.delay_spread_s)
+    base = in_a_loop(models[0], robot.model.tick_s, robot.delay_spread_s)
     if not set(DELAYS) <= set(base):
         return [dict(m) for m in models]
     sensor, actuator = DELAYS
@@ -136,7 +136,7 @@ def _for_one_graph(robot: LoopRobot, models: Sequence[Mapping[str, float]]) -> l
 
 
 def sensitivity(
-    robot: LoopRobot,
+    robot: Robot,
     env: GraphEnvironment,
     policy: Policy,
     moves: Sequence[Move],

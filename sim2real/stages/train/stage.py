@@ -21,7 +21,6 @@ from sim2real.artifacts.timing import Timing
 from sim2real.policy.bundle import make_runner
 from sim2real.policy.contract import PolicyContract
 from sim2real.robots.contract import Robot
-from sim2real.robots.control_loop.loop_robot import LoopRobot
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_parameters import open_identification
@@ -155,7 +154,7 @@ def _bundle(
 
     # Observations: the last ones of the training, and those of a robot's recording. A teacher runs on no robot.
     observations = {} if policy.spec.privileged else {"training": result.observations[:MAX_OBSERVATIONS]}
-    if observations and recording is not None and isinstance(setup.robot, LoopRobot):
+    if observations and recording is not None:
         runner = make_runner(weights, contract, None, policy.spec, graph)
         observations["log"] = observations_of(setup.robot, recording, runner)
     references = {name: reference_of(policy, array) for name, array in observations.items()}
@@ -186,7 +185,7 @@ def _sensitivity(
     policy: Policy,
 ) -> Sensitivity | None:
     """Return the success of the policy with each parameter moved; None without intervals of the parameters."""
-    if config.model == "nominal" or identification is None or not isinstance(robot, LoopRobot):
+    if config.model == "nominal" or identification is None:
         return None
     moves = moves_of(identification)
     models = models_of(identification.values, moves)

@@ -125,19 +125,11 @@ def _checked(pipeline: Pipeline, config: TrainConfig, identification: Identifica
     return identification
 
 
-def _set_start(task: TrainingTask, config: TrainConfig) -> None:
-    """Give the task the configured offsets of an episode's start.
-
-    Raises:
-        UsageError: The task, or its world, has no such offsets.
-    """
+def _set_start(task: LoopTask, config: TrainConfig) -> None:
+    """Give the task the configured offsets of an episode's start."""
     start = (config.vary.start_position, config.vary.start_velocity)
     if not any(start):
         return
-    if not isinstance(task, LoopTask):
-        raise UsageError(
-            f"the start of a {type(task).__name__} cannot be moved", hint="leave out --vary.start-*, or use a LoopRobot"
-        )
     task.start = start
     jax.eval_shape(task.params, jax.random.key(0))
 
@@ -300,15 +292,15 @@ def contract_of(
         values: Parameters by name.
     """
     return PolicyContract(
-        observation=robot.observation,
+        observation=robot.agent.observation,
         action=tuple(
             replace(term, low=float(low), high=float(high))
-            for term, low, high in zip(robot.action, task.action_low, task.action_high, strict=True)
+            for term, low, high in zip(robot.agent.action, task.action_low, task.action_high, strict=True)
         ),
         rate_hz=robot.rate_hz,
         delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
         trained_s={} if episodes is None else _trained(values, episodes),
-        limits=dict(robot.limits),
+        limits=dict(robot.agent.limits),
         hashes={},
     )
 

@@ -42,7 +42,7 @@ class OiledTable(WorldModel):
     def dynamics(self) -> list[Parameter]:
         """Return the robot's own parameters, and the drag."""
         drag = Parameter("drag", "1/s", 1.0, 0.0, 10.0, "linear", about="viscous friction", leaf="world.drag")
-        return [*self.robot.dynamics(), drag]
+        return [*self.robot.model.dynamics(), drag]
 
     def make_world(self, resumed: bool = False) -> BaseNode:
         """Return the node; all of its state is measured, so a resumed one is no other."""

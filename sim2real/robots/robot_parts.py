@@ -1,0 +1,298 @@
+"""The five parts of a robot: sensor, drive, agent, task and model. Their classes inherit these protocols."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Protocol, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.graph.base import GraphState
+from sim2real.graph.node import BaseNode
+from sim2real.identify.model import Channel
+from sim2real.identify.parameters import Parameter
+from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.robots.completeness import complete
+from sim2real.robots.control_loop.hardware import Embedded
+from sim2real.robots.control_loop.loop import Draw
+from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.probe import Probe
+from sim2real.robots.roles import Roles
+from sim2real.train.environment.graph_environment import TrainingTask
+from sim2real.train.environment.tasks import Rewards
+from sim2real.types import Array, Key, PyTree
+
+if TYPE_CHECKING:
+    from sim2real.hardware.device import Reading
+    from sim2real.hardware.emulation.embedded import EmbeddedRobot
+    from sim2real.hardware.safety.rig import Rig
+    from sim2real.robots.gate_limits import GateLimits
+
+
+class Session(AbstractContextManager["Session"], Protocol):
+    """An open robot, as a context manager; leaving it takes the torque off.
+
+    Attributes:
+        rig: The motors behind the safety gate.
+        embedded: The emulated robot, if the session has one.
+    """
+
+    rig: Rig
+    embedded: EmbeddedRobot | None
+
+
+class RobotSensor(Protocol):
+    """What is measured.
+
+    Attributes:
+        channels: The measured quantities of each joint, in the order of the motors.
+        joints: Joint -> quantity -> field of the message, for the log; see ``McapRecorder``.
+        units: Field of the message -> its unit.
+        at_rest: The message of a robot at rest.
+    """
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make the part, if its class has all methods."""
+        return complete(cls, *args, **options)
+
+    channels: tuple[Channel, ...]
+    joints: Mapping[str, Mapping[str, str]]
+    units: Mapping[str, str]
+    at_rest: PyTree
+
+    @abstractmethod
+    def read(self, reading: Reading) -> PyTree:
+        """Return the message of a reading."""
+
+
+class RobotDrive(Protocol):
+    """How the motors are commanded, and how the hardware is opened. Drivers are imported by ``connect``.
+
+    Attributes:
+        rate_hz: Rate of sensor, agent and actuator [Hz].
+        command: Field of the actuator's message that is sent to the motors, one entry per action.
+        units: Field of the message -> its unit.
+        message: Makes the actuator's message from a command ``(actions,)``.
+        expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
+            a policy with its thread's wake-up [s].
+        probe: The steps by which deploy measures the delay; None: the delay is not measured.
+        embedded: The emulated robot, for the port ``embedded``; None: there is none.
+    """
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make the part, if its class has all methods."""
+        return complete(cls, *args, **options)
+
+    rate_hz: float
+    command: str
+    units: Mapping[str, str]
+    message: Callable[[Any], PyTree]
+    expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
+    probe: Probe | None = None
+    embedded: Embedded | None = None
+
+    @abstractmethod
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:
+        """Open the robot, with torque off.
+
+        Args:
+            port: Device file of the port, or ``embedded`` for the emulated robot.
+            truth_path: File for the emulated robot's true states and latencies.
+        """
+
+    @abstractmethod
+    def prepare(self, session: Any, settle_s: float) -> None:
+        """Bring the robot to rest where the task starts; torque is off afterwards.
+
+        Args:
+            settle_s: Longest time to wait for rest, per attempt [s].
+        """
+
+    def around(self, signal: np.ndarray) -> np.ndarray:
+        """Return the commands ``(N, actions)`` of an excitation; default: the signal itself, around 0."""
+        return signal
+
+    def approach(self, session: Any, signal: np.ndarray) -> np.ndarray:
+        """Return the commands ``(N, actions)`` with which a recording plays an excitation; default: ``around``."""
+        del session
+        return self.around(signal)
+
+    def measured_start(self, session: Any, start: EpisodeStart) -> EpisodeStart:
+        """Return the start of a deployment, from that of its trial; default: unchanged."""
+        del session
+        return start
+
+
+class RobotAgent(Protocol):
+    """What the policy observes and does.
+
+    Attributes:
+        observation: Terms of the policy's observation, in order.
+        action: The policy's actions, in order, with their bounds.
+        limits: Name -> limit that a policy is trained for, such as the ends of the joints' goals.
+        units: Field of the agent's message -> its unit, beside the command.
+        tilt_rad: Returns how far the robot leans, from an observation ``(O,)``, for ``deploy --max-tilt-rad`` [rad];
+            None: the robot does not measure that.
+    """
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make the part, if its class has all methods."""
+        return complete(cls, *args, **options)
+
+    observation: tuple[ObservationTerm, ...]
+    action: tuple[ActionTerm, ...]
+    limits: Mapping[str, float] = MappingProxyType({})
+    units: Mapping[str, str] = MappingProxyType({})
+    tilt_rad: Callable[[np.ndarray], float] | None = None
+
+    @property
+    def observation_size(self) -> int:
+        """Number of entries of the policy's observation."""
+        return sum(term.size * term.history for term in self.observation)
+
+    @abstractmethod
+    def make(self, rate_hz: float, **options: Any) -> BaseNode:
+        """Return the policy's node, with ``observe`` and ``act``; see ``PolicyNode``."""
+
+    @abstractmethod
+    def params(self, start: EpisodeStart, policy: Any) -> PyTree:
+        """Return the node's parameters for an episode."""
+
+
+class RobotTask(Protocol):
+    """Where episodes start, and how good they are.
+
+    Attributes:
+        aim_size: Number of entries of ``EpisodeStart.aim``.
+    """
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make the part, if its class has all methods."""
+        return complete(cls, *args, **options)
+
+    aim_size: int = 0
+
+    @abstractmethod
+    def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], EpisodeStart]:
+        """Return parameters by name and a start for a random episode of training.
+
+        Args:
+            draw: Draws dynamics and delays: key -> values by name.
+        """
+
+    @abstractmethod
+    def at_rest(self, trial: int) -> EpisodeStart:
+        """Return the start at rest of a trial. The same number gives the same aim, on hardware and in simulation."""
+
+    def moved(self, start: EpisodeStart, position: Array, velocity: Array) -> EpisodeStart:
+        """Return a start with an offset of positions ``(channels,)`` [rad] and velocities [rad/s]."""
+        return start.replace(position=start.position + position, velocity=start.velocity + velocity)
+
+    def judged(self, graph_state: GraphState, roles: Roles) -> Any:
+        """Return the state that ``reward``, ``success`` and ``terminated`` evaluate; default: the world's."""
+        return graph_state.state[roles.world]
+
+    @abstractmethod
+    def reward(self, state: Any, action: jax.Array) -> Rewards:
+        """Return the reward of a policy step: a number, or terms by name, which are added up.
+
+        Args:
+            action: Shape ``(actions,)``.
+        """
+
+    @abstractmethod
+    def success(self, state: Any) -> jax.Array:
+        """Return whether the task is fulfilled, bool."""
+
+    def terminated(self, state: Any) -> jax.Array:
+        """Return whether the episode ends, such as after a fall, bool; default: never."""
+        del state
+        return jnp.bool_(False)
+
+    @abstractmethod
+    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return figures of how well a deployment went, among them ``success``, from 0 to 1.
+
+        Args:
+            t_s: Times ``(N,)`` [s].
+            states: Name -> values ``(N,)``; entries of a vector are named ``name[i]``. They are the measured fields,
+                and one value per step of the agent's message and of ``command``, as it was sent to the motors.
+        """
+
+
+class RobotModel(Protocol):
+    """The robot in simulation, and the parameters that identification estimates.
+
+    Attributes:
+        tick_s: The world's period [s].
+        lead_s: Time that the world adds to the actuator's delay [s]; see ``ServoWorld.init_delays``.
+        watched_terms: Optional terms that may change between deployments.
+        profile_rad_s, causes, export_lead_s: See ``RecordedRobot``.
+    """
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make the part, if its class has all methods."""
+        return complete(cls, *args, **options)
+
+    tick_s: float
+    lead_s: float = 0.0
+    watched_terms: tuple[str, ...] = ()
+    profile_rad_s: float = math.inf
+    causes: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+    export_lead_s: float = 0.0
+
+    @abstractmethod
+    def dynamics(self) -> list[Parameter]:
+        """Return the parameters that may be identified, at nominal values, without delays."""
+
+    @abstractmethod
+    def make_world(self, resumed: bool = False) -> BaseNode:
+        """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
+
+    @abstractmethod
+    def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PyTree:
+        """Return the world's parameters for an episode, from values by name."""
+
+    def true_state(self, state: Any) -> PyTree:
+        """Return the part of the world's state that a value function may observe in simulation; default: all of it."""
+        return state
+
+    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+        """Return the model with identified values, as MJCF; None: there is none."""
+        del values
+        return None
+
+    def check_task(self, task: TrainingTask) -> None:
+        """Raise ``UsageError`` if the world's state lacks a field that the task reads; default: no check."""
+        del task
+
+
+class ConnectedParts(Protocol):
+    """The parts of a robot, and the nodes between them; see ``sim2real.robots.contract.Robot``."""
+
+    drive: RobotDrive
+    sensor: RobotSensor
+    agent: RobotAgent
+    task: RobotTask
+    model: RobotModel
+    roles: Roles
+
+    @property
+    def rate_hz(self) -> float:
+        """Rate of sensor, agent and actuator [Hz]."""
+        ...
+
+    def node_parameters(self, values: Mapping[str, Any], start: EpisodeStart, policy: Any = None) -> dict[str, PyTree]:
+        """Return the parameters of all nodes in simulation."""
+        ...
+
+    def sim_actuator(self, **options: Any) -> BaseNode:
+        """Return the bus in simulation."""
+        ...

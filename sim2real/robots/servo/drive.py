@@ -1,0 +1,134 @@
+"""Position-controlled servos on a bus: what they measure, how they are commanded, and how their port is opened."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sim2real.identify.model import Channel
+from sim2real.robots.contract import RobotDrive, RobotSensor
+from sim2real.robots.control_loop.hardware import Embedded, ServoSession
+from sim2real.robots.control_loop.messages import EpisodeStart, Goals, JointReading
+from sim2real.robots.probe import Probe
+from sim2real.robots.roles import ROLES
+from sim2real.robots.servo.homing import HOME_RAD_S, bring_home
+from sim2real.robots.servo.servos import Servos
+
+if TYPE_CHECKING:
+    from sim2real.hardware.device import Device, Reading
+    from sim2real.hardware.safety.gate import GateConfig
+    from sim2real.robots.gate_limits import GateLimits
+
+_HOLD_S = 1.0
+"""How long an excitation's last goals are repeated [s]."""
+
+
+class JointSensor(RobotSensor):
+    """Positions and velocities of all joints, of one reading.
+
+    Args:
+        position_sigma_rad: Standard deviation of a measured position.
+        velocity_sigma_rad_s: Standard deviation of a measured velocity.
+    """
+
+    units = MappingProxyType({"position": "rad", "velocity": "rad/s"})
+
+    def __init__(self, servos: Servos, position_sigma_rad: float = 0.002, velocity_sigma_rad_s: float = 0.05) -> None:
+        sigmas, names = (position_sigma_rad, velocity_sigma_rad_s), servos.names
+        self.channels = tuple(
+            Channel("position", "velocity", *sigmas, index=i, label=name, goal="goal") for i, name in enumerate(names)
+        )
+        self.joints = {
+            name: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, name in enumerate(names)
+        }
+        self.at_rest = JointReading(servos.at_rest, np.zeros(len(names)))
+
+    def read(self, reading: Reading) -> JointReading:
+        """Return the message of a reading."""
+        return JointReading(reading.position_rad, reading.velocity_rad_s)
+
+
+class ServoDrive(RobotDrive):
+    """Goals of all servos in one transaction.
+
+    Args:
+        embedded: Returns the emulated robot; None: there is none.
+        settings: Returns the settings of the device on a port; default: those of the data sheet.
+        actuator: Name of the actuator's node.
+    """
+
+    command, units, message = "goal", MappingProxyType({"goal": "rad"}), Goals
+    expected_delay_s = (0.004, 0.003, 0.002)
+
+    def __init__(
+        self,
+        servos: Servos,
+        *,
+        rate_hz: float = 50.0,
+        probe: Probe | None = None,
+        embedded: Callable[[], Embedded | None] | None = None,
+        settings: Callable[[str], Any] | None = None,
+        actuator: str = ROLES.actuator,
+    ) -> None:
+        self.servos, self.rate_hz, self.probe, self._actuator = servos, rate_hz, probe, actuator
+        self._embedded, self._settings = embedded, settings
+
+    @property
+    def embedded(self) -> Embedded | None:
+        """The emulated robot, for the port ``embedded``."""
+        return self._embedded() if self._embedded else None
+
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
+        """Open the servos, with torque off; see ``RobotDrive.connect``."""
+        settings = self._settings(port) if self._settings else self.servos.sheet.drive
+
+        def device(port: str) -> Device:
+            return self.make_device(port, settings, limits.servo_watchdog_s)
+
+        # Position 0 of a plain joint is where the servo's encoder is at half a turn.
+        embedded, mounting = self.embedded, self.servos.mounting
+        embedded = embedded and embedded.mounted(mounting, math.pi)
+        return ServoSession(port, device, self.gate(limits), embedded, truth_path, seed, mounting)
+
+    def make_device(self, port: str, settings: Any, silence_s: float) -> Device:
+        """Return the servos on a port, not opened yet; ``silence_s``: longest silence while torque is on [s]."""
+        from sim2real.hardware.registry import load_device
+
+        s = self.servos
+        return load_device(s.device)(port, s.ids, settings, baud_rate=s.baud_rate, silence_s=silence_s)
+
+    def gate(self, limits: GateLimits) -> GateConfig:
+        """Return a gate that holds the last goals when commands are stale."""
+        s = self.servos
+        low, high = np.maximum(s.low, -limits.limit), np.minimum(s.high, limits.limit)
+        return limits.gate((tuple(low), tuple(high)), stale="hold", node=self._actuator, joints=s.names)
+
+    def prepare(self, session: ServoSession, settle_s: float) -> None:
+        """Bring the joints to rest, slowly; torque is off before and afterwards.
+
+        Raises:
+            HardwareLost: The robot does not come to rest within ``settle_s`` [s] per attempt.
+            SafetyStop: The robot rests at another position, or the gate stopped it.
+        """
+        bring_home(session, self.servos, self.rate_hz, settle_s)
+
+    def around(self, signal: np.ndarray) -> np.ndarray:
+        """Return goals ``(N, joints)`` [rad] of an excitation around the middle positions."""
+        return signal + np.asarray(self.servos.middle or 0.0)
+
+    def approach(self, session: ServoSession, signal: np.ndarray) -> np.ndarray:
+        """Return goals ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s instead of in a leap."""
+        # After its end an excitation would be 0, which may be outside of the limits: repeat the last goals.
+        signal = self.around(np.vstack([signal, np.repeat(signal[-1:], round(_HOLD_S * self.rate_hz), axis=0)]))
+        offset = session.rig.measure().position_rad - signal[0]
+        covered = np.arange(len(signal))[:, None] * HOME_RAD_S / self.rate_hz
+        return signal + np.sign(offset) * np.maximum(np.abs(offset) - covered, 0.0)
+
+    def measured_start(self, session: ServoSession, start: EpisodeStart) -> EpisodeStart:
+        """Return a start at the measured positions: goals start there."""
+        return start.replace(position=np.asarray(session.rig.measure().position_rad, np.float32))

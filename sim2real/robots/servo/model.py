@@ -1,0 +1,158 @@
+"""A composed task as the model of a robot of servos: its world, its parameters, and its MJCF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+
+from sim2real.errors import UsageError
+from sim2real.identify.parameters import Parameter
+from sim2real.robots.contract import RobotModel
+from sim2real.robots.control_loop.hardware import Embedded
+from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.roles import ROLES, Roles
+from sim2real.robots.servo import parameters
+from sim2real.robots.servo.parts import REFERENCE, GoalTask
+from sim2real.robots.servo.payload import PAYLOAD, Hand
+from sim2real.robots.servo.servos import Servos
+from sim2real.robots.servo.simulated_world import ServoWorld
+from sim2real.robots.servo.task import NO_AIM, Aim
+from sim2real.types import PyTree
+
+if TYPE_CHECKING:
+    from sim2real.composer.world import WorldParams
+    from sim2real.hardware.emulation.emulated_bus import BusEmulation
+
+
+class ComposedModel(RobotModel):
+    """A composed task on MJX, whose control step is the world's tick.
+
+    Args:
+        make_task: Returns a new task.
+        hand: Where the robot holds things; its payload is an optional term.
+        dynamics: Returns the parameters; default: those of the servos, and the payload.
+        causes: See ``RecordedRobot``.
+    """
+
+    def __init__(
+        self,
+        servos: Servos,
+        make_task: Callable[[], GoalTask],
+        aim: Aim = NO_AIM,
+        hand: Hand | None = None,
+        dynamics: Callable[[], list[Parameter]] | None = None,
+        causes: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
+        roles: Roles = ROLES,
+    ) -> None:
+        self.servos, self.make_task, self.aim, self.hand, self.causes = servos, make_task, aim, hand, causes
+        self._dynamics, self._roles = dynamics, roles
+        self.profile_rad_s = servos.sheet.profile_rad_s
+        self.watched_terms = (PAYLOAD,) if hand else ()
+
+    @cached_property
+    def task(self) -> GoalTask:
+        """The composed task of this robot's world.
+
+        Raises:
+            UsageError: Its servos have other gears than the joints.
+        """
+        task, mounted = self.make_task(), list(self.servos.gears)
+        if (built := [s.gear for s in task.robot.servos]) != mounted:
+            raise UsageError(
+                f"the model's servos have the gears {built}, the joints {mounted}",
+                hint="make each part of its joint: `Servo(joint, axis, sheet)`, not of the joint's name",
+            )
+        return task
+
+    @property
+    def tick_s(self) -> float:
+        """The world's period [s]."""
+        return float(self.task.control_timestep)
+
+    @property
+    def lead_s(self) -> float:
+        """Half a step of the physics, which the world adds to the actuator's delay [s]."""
+        return 0.5 * float(self.task.physics_timestep)
+
+    @property
+    def export_lead_s(self) -> float:
+        """Time that C MuJoCo adds to the actuator's delay [s].
+
+        Half a step for the leapfrog, as in the graph, and half a step as MuJoCo's setpoints are those of a step's end.
+        Less a quarter of a tick: in the graph a goal acts as its mean over a tick, so a profile starts up to a tick
+        early. docs/guides/export.md has the remaining error.
+        """
+        return 2 * self.lead_s - 0.25 * self.tick_s
+
+    def dynamics(self) -> list[Parameter]:
+        """Return the parameters that may be identified, at their data sheet's values."""
+        if self._dynamics is not None:
+            return self._dynamics()
+        of_servos = parameters.parameters(self.servos.sheet, self.servos.joints)
+        return [*of_servos, self.hand.parameter()] if self.hand else of_servos
+
+    def make_world(self, resumed: bool = False) -> ServoWorld:
+        """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
+        fields, worn, roles = self.fields(self.task), self.servos.sheet.worn, self._roles
+        return ServoWorld(roles.world, self.task, fields, resumed, roles.actuator, worn)
+
+    def params(self, values: Mapping[str, Any], start: EpisodeStart) -> WorldParams:
+        """Return the world's parameters for an episode."""
+        position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
+        return self._world_params.replace(values=self.place(values, start.aim), qpos=position, qvel=velocity)
+
+    def true_state(self, state: Any) -> PyTree:
+        """Return positions and velocities of all bodies' joints, and the servos' setpoints."""
+        return state.data.qpos, state.data.qvel, state.variables[REFERENCE]
+
+    def fields(self, task: GoalTask) -> Mapping[str, tuple[Any, str]]:
+        """Return the parts of the model that differ between copies: name -> (elements, attribute)."""
+        in_hand = self.hand.fields(task) if self.hand else {}
+        return {**parameters.fields(task.robot), **in_hand, **self.aim.elements(task)}
+
+    def place(self, values: Mapping[str, Any], aim: Any) -> dict[str, Any]:
+        """Return the arrays of ``fields`` for parameters by name and an aim ``(k,)``."""
+        s = self.servos
+        of_servos = parameters.place(values, s.sheet, s.joints, self.task.physics_timestep)
+        in_hand = self.hand.place(values, self._world_params.values) if self.hand else {}
+        return {**of_servos, **in_hand, **self.aim.place(aim)}
+
+    def identified_mjcf(self, values: Mapping[str, Any]) -> str:
+        """Return the robot's model with identified values, as MJCF."""
+        s, task = self.servos, self.task
+        mjcf = parameters.identified_mjcf(self._mjcf, task.robot, values, s.sheet, s.joints)
+        return self.hand.loaded(mjcf, task, values) if self.hand else mjcf
+
+    def twin(self, emulator: BusEmulation, **factors: float) -> Embedded:
+        """Return an emulated robot with this model's physics.
+
+        Args:
+            emulator: Latencies and losses; the servos' model is the data sheet's.
+            **factors: Factors on the model's ``gain``, ``damping``, ``armature`` and ``friction``.
+        """
+        s = self.servos
+        arguments = {
+            "mjcf": self._mjcf,
+            "joints": {name: j.full_identifier for name, j in zip(s.names, self.task.joints, strict=True)},
+            "gears": list(s.gears),
+            "servo_ids": s.ids,
+            "p_gain": s.sheet.p_gain,
+            "factors": factors,
+        }
+        emulator = replace(emulator, model_number=s.sheet.model_number)
+        return Embedded("sim2real.hardware.emulation.twin:TwinPlant", emulator, arguments)
+
+    @property
+    def _mjcf(self) -> str:
+        return self.task.root_entity.mjcf_model.root_model.to_xml_string()
+
+    @cached_property
+    def _world_params(self) -> WorldParams:
+        with jax.ensure_compile_time_eval():  # a cached array must not belong to the function that JAX traces now
+            return self.make_world().init_params()

@@ -1,0 +1,26 @@
+"""Loading a robot and preparing its training imports no driver: a machine for training needs no pyserial."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+SCRIPT = """
+import json, sys
+sys.modules["serial"] = None  # an import of pyserial fails
+from sim2real.stages.config import TrainConfig
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.train import stage
+from sim2real.stages.train.training_setup import prepare
+pipeline = load_pipeline(sys.argv[1])
+prepare(pipeline, TrainConfig(model="nominal", episode_s=0.5, timelines=1), None)
+print(json.dumps([name for name in sys.modules if name.startswith("sim2real.hardware")]))
+"""
+
+
+@pytest.mark.parametrize("name", ["pendulum", "arm", "so101"])
+def test_training_imports_no_driver_and_no_pyserial(name):
+    done = subprocess.run([sys.executable, "-c", SCRIPT, name], capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == []
