@@ -21,7 +21,7 @@ def write_probe(folder: Path, pipeline: Pipeline, robot: Robot, witness: Witness
     a second of any other log, and it omits repeated commands.
 
     Returns:
-        None if no step was made, or if the robot has no messages of a control loop.
+        None if no step was made.
     """
     if not witness.measured or not witness.sent:
         return None
