@@ -141,7 +141,7 @@ def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
 
 def _check_start(model: IdentifiableModel, nodes: Mapping[str, Any]) -> None:
     """Check that parameters at nominal values are of nodes that there are, and finite."""
-    values = {p.name: p.nominal for p in model.parameters}
+    values = {p.name: jnp.asarray(p.nominal) for p in model.parameters}
     params = model.params(values, jnp.zeros(2 * len(model.channels)))
     _include(nodes, set(params), "nodes with parameters")
     for name, leaf in ((n, x) for n, own in params.items() for x in jax.tree_util.tree_leaves(own)):

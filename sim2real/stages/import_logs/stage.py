@@ -91,7 +91,7 @@ def description_of(config: ImportConfig) -> ImportHints:
     if home is not None:
         robot: RobotConfig = home.load().config  # pyright: ignore[reportAttributeAccessIssue] - checked by `described`
         return replace(
-            description_of_model(robot.model, home.name, robot.sensor.joints, config.rate_hz), as_told=config.as_told
+            description_of_model(robot.model, home.name, robot.joints, config.rate_hz), as_told=config.as_told
         )
     return ImportHints("robot", config.rate_hz, config.joints, as_told=config.as_told)
 
