@@ -146,7 +146,7 @@ def test_without_delays_and_intervals_there_is_nothing_to_randomise(terms, simul
 @pytest.mark.parametrize("source", [mjlab_source, isaaclab_source])
 def test_motors_are_refused_by_name(terms, source):
     motor = {"wheel": {"damping": Term(0, 0, 0), "gain": Term(1, 1, 1)}}
-    with pytest.raises(UsageError, match="the actuators of wheel are told something else"):
+    with pytest.raises(UsageError, match="the actuators of wheel take other commands"):
         source(Terms({**terms.joints, **motor}, {}, Delays(), 0.01, ()), "", ABOUT)
 
 

@@ -1,10 +1,9 @@
-"""The distribution of delays that no stamp shows, found from the motion together with the dynamics.
+"""The distribution of delays that no time stamp records, estimated from the motion together with the dynamics.
 
-A measurement with stamp t shows the motion at t - d. Neither d nor the motion is known, but the model predicts the
-motion, and where it is fast a measurement tells d well. So the likelihood of a measurement is a sum over a grid of
-delays: the share of each delay times how well the measurement agrees with the prediction at that delay. Parameters of
-the dynamics, initial states, the drift of the clock, the level of the noise and the shares are found by maximising the
-product over all measurements; nobody decides which delay a measurement had.
+A measurement with stamp t shows the motion at t - d. The model predicts the motion; where it is fast, a measurement
+determines d well. The likelihood of a measurement is a sum over a grid of delays: the share of each delay times the
+density of the measurement at that delay. Parameters of the dynamics, initial states, the drift of the clock, the noise
+and the shares maximise the product over all measurements.
 """
 
 from __future__ import annotations
@@ -129,10 +128,10 @@ def hidden(linearise: Linearise, x: np.ndarray, delay_s: float) -> Hidden:
 
 
 def _climb(linearise: Linearise, at: _At, grid: np.ndarray | None = None) -> tuple[_At, Likelihood, np.ndarray]:
-    """Linearise the model anew and maximise the likelihood; a new grid begins with equal shares.
+    """Linearise the model and maximise the likelihood; a new grid begins with equal shares.
 
     Returns:
-        Where it ends, the likelihood, and its place there.
+        The end, the likelihood, and its parameters there.
     """
     seen = linearise(at.x, at.mean_s)
     drift = at.drift + float(straight(seen, at.drift, at.mean_s, at.deviation_s, at.noise)[0][-1])
@@ -195,7 +194,7 @@ def rough(seen: Seen, x: np.ndarray, steps: int = 40) -> _At:
 
 
 def _support(seen: Seen, share: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return a grid of delays that holds those of all messages, finer than what a measurement tells."""
+    """Return a grid of delays that covers those of all messages, finer than the resolution of a measurement."""
     below, few = np.cumsum(share), 0.3 / len(seen.stamps)
     step = seen.delays[1] - seen.delays[0]
     low, high = np.interp([few, 1 - few], below, seen.delays) + np.array([-step, step])

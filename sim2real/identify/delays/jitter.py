@@ -33,7 +33,7 @@ _LATER_S, _SHORTEST_S = 0.002, 2e-4
 _MOST = 600
 """Most commands that are looked at: their deviation is then known to 3 % at best."""
 _SMALL = 0.02
-"""A command that changes less than this share of the usual is taken to change so much: it tells next to nothing."""
+"""Smallest change of a command, as a share of the usual change, that is not rounded up to this share."""
 _BOUNDS = [(-5.0, 5.0), (np.log(1e-5), np.log(0.05)), (np.log(1e-5), np.log(0.02)), (np.log(1e-5), np.log(10.0))]
 """Of the logarithms of: factor on the noise, deviations of measurements, of commands, of other pushes [s]. Commands
 that deviate by a period of 50 Hz are no matter of slopes any more; errors of the model have no such bound."""
@@ -42,9 +42,7 @@ _LATE = 2
 _PRECISE, _NEAR = 1e-6, 0.03
 """How precisely the likelihood is maximised, as a share of it, and an interval's ends are found, in their logarithm."""
 _DROP = 5.4
-"""By how much twice the log likelihood is lower at the ends of an interval of 95 %. With 3.84, which is right for an
-exact model, intervals held the truth in 151 of 160 emulated logs, with this in 156 (``log``, ``jitter`` of the tests:
-8 s, 1 and 3 ms, seeds 100 to 139 and 1000 to 1039); real models are not exact."""
+"""Drop of twice the log likelihood at the ends of a 95 % interval; see docs/reference/choices.md."""
 
 
 @dataclass(frozen=True)

@@ -66,8 +66,8 @@ def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray,
         slopes = seen.at(np.full((len(again), 1), found.mean[0]))[1][:, :, 0]
         moved = np.abs(slopes) * np.diff(seen.stamps, prepend=seen.stamps[0])[:, None]
         moves = np.any(moved > _MOVES * np.maximum(quantum, found.noise), axis=1)
-        tells = moves[again] & (share < _AT_REST)
-        chance[again] = np.where(tells, share, 1.0)
+        informative = moves[again] & (share < _AT_REST)
+        chance[again] = np.where(informative, share, 1.0)
     return Found(found, losses(again, chance))
 
 
@@ -75,7 +75,7 @@ def links(problem: Problem, z: np.ndarray) -> tuple[Link, ...]:
     """Return the links of a problem.
 
     Args:
-        z: Shape ``(P,)``: the estimate of a fit, from which dynamics and delays are found anew together.
+        z: Shape ``(P,)``: the estimate of a fit, from which dynamics and delays are estimated together.
 
     Raises:
         UsageError: When no delay of the measurements is identified.

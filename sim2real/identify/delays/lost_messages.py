@@ -1,4 +1,4 @@
-"""Messages that were lost: their reader saw the value before once more, every digit of it."""
+"""Lost messages: their reader repeats the value before, in every digit."""
 
 from __future__ import annotations
 

@@ -89,8 +89,8 @@ def ways(table: ParameterTable, causes: Causes) -> list[Way]:
 def drift(problem: Problem, posterior: Posterior, widening: float, causes: Causes) -> tuple[Drift, np.ndarray]:
     """Test whether a log is still of the robot that was identified.
 
-    Each change is fitted to the log by itself: one that comes alone leaves all else as it was, and a short log of a
-    policy that soon holds still says too little to fit everything anew. A linear step from what was identified does not
+    Each change is fitted to the log alone: one that comes alone leaves all else as it was, and a short log of a
+    policy that soon holds still says too little to fit all parameters. A linear step from what was identified does not
     do: where friction has doubled a joint stands still that should move, and there derivatives are those of another
     motion.
 

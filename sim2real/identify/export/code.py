@@ -11,16 +11,16 @@ from sim2real.identify.export.terms import Term, Terms
 
 
 def check_drives(terms: Terms, target: str) -> None:
-    """Refuse a robot whose actuators are told no positions.
+    """Raise an error if an actuator's command is no position.
 
     Raises:
         UsageError: With the joints.
     """
     others = [name for name, own in terms.joints.items() if "gain" in own]
-    if others or not terms.told_positions:
+    if others or not terms.all_positions:
         raise UsageError(
             f"{target} has position drives with a stiffness and a damping; "
-            + (f"the actuators of {', '.join(others)} are told something else" if others else "no actuator has one"),
+            + (f"the actuators of {', '.join(others)} take other commands" if others else "no actuator has one"),
             hint="export to mjcf or json",
         )
 

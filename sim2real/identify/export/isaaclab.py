@@ -13,8 +13,7 @@ _SAYS = (
     "Delays are the whole round trip, in steps of PHYSICS_DT, as only the sum of both delays reaches a policy.",
     "A joint's damping is viscous_friction, which the drive's effort limit does not clip.",
     "randomize_joint_parameters scales dry and viscous friction by one range, the dry one's: damping has none here.",
-    "A range is the 95 % interval of one number by itself: draw from the posterior of `--to json` to keep together",
-    "what was identified together.",
+    "A range is the 95 % interval of a single number: the posterior of `--to json` has their correlations.",
 )
 _FIELDS = {
     "stiffness": "stiffness",
@@ -33,7 +32,7 @@ def isaaclab_source(terms: Terms, title: str, about: Sequence[tuple[str, str]]) 
     """Return a Python file with a dict ``ACTUATORS`` and a class ``IdentifiedEvents``.
 
     Raises:
-        UsageError: When an actuator is told something else than a position.
+        UsageError: When an actuator's command is no position.
     """
     check_drives(terms, "Isaac Lab")
     least, most = lags(terms)

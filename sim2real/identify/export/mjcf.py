@@ -57,10 +57,10 @@ def _follow(actuator: Any, profile_rad_s: float) -> None:
     """Let an actuator's setpoint follow its goal with limited speed."""
     stiffness, damping, limited = -actuator.biasprm[1], -actuator.biasprm[2], actuator.forcelimited
     if stiffness <= 0:
-        raise UsageError(f"actuator {actuator.name!r} is told no position: it has no profile to move along")
+        raise UsageError(f"actuator {actuator.name!r} takes no position: it has no profile to move along")
     most = list(actuator.forcerange)
-    told = int(_mj.mjtCtrlInput.mjINPUT_POS)
-    actuator.set_to_pid(kp=stiffness, kv=max(damping, 0.0), slewmax=profile_rad_s, ctrlspec=told)
+    position_input = int(_mj.mjtCtrlInput.mjINPUT_POS)
+    actuator.set_to_pid(kp=stiffness, kv=max(damping, 0.0), slewmax=profile_rad_s, ctrlspec=position_input)
     actuator.forcerange, actuator.forcelimited = most, limited
 
 

@@ -17,8 +17,7 @@ _SAYS = (
     "ACTUATORS are those of an EntityArticulationInfoCfg, EVENTS those of the environment's configuration.",
     "The entity's model is that of `--to mjcf` without its actuators and sensors: joints have their damping there.",
     "Lags are the whole round trip, in steps of PHYSICS_DT, as only the sum of both delays reaches a policy.",
-    "A range is the 95 % interval of one number by itself: draw from the posterior of `--to json` to keep together",
-    "what was identified together.",
+    "A range is the 95 % interval of a single number: the posterior of `--to json` has their correlations.",
 )
 _JOINT_FIELDS = {"damping": "joint_damping", "armature": "joint_armature", "frictionloss": "joint_friction"}
 
@@ -27,7 +26,7 @@ def mjlab_source(terms: Terms, title: str, about: Sequence[tuple[str, str]]) -> 
     """Return a Python file with a tuple ``ACTUATORS`` and a dict ``EVENTS``.
 
     Raises:
-        UsageError: When an actuator is told something else than a position.
+        UsageError: When an actuator's command is no position.
     """
     check_drives(terms, "mjlab")
     least, most = lags(terms)

@@ -45,7 +45,7 @@ class Delays:
     Attributes:
         command: From a command's departure to its effect.
         measurement: From a motion to the stamp of its measurement.
-        round_trip: Both together, which a log determines even where it cannot tell them apart.
+        round_trip: Both together, which a log determines even if it does not separate them.
         computation: Node -> from the start of a step to its end, as recorded.
     """
 
@@ -61,7 +61,7 @@ class Terms:
 
     Attributes:
         joints: Joint -> ``damping``, ``armature``, ``frictionloss`` and, where an actuator drives it, ``stiffness``,
-            ``actuator_damping``, ``effort_limit``, and ``gain`` of one that is told no position.
+            ``actuator_damping``, ``effort_limit``, and ``gain`` if its command is no position.
         bodies: Body -> ``mass``, ``ipos[i]``, ``inertia[i]``, those that were identified.
         delays: The delays.
         timestep_s: Step of the model's physics [s].
@@ -75,8 +75,8 @@ class Terms:
     unexpressed: tuple[str, ...]
 
     @property
-    def told_positions(self) -> bool:
-        """Whether every actuator is told a position."""
+    def all_positions(self) -> bool:
+        """Whether the command of every actuator is a position."""
         driven = [t for t in self.joints.values() if "stiffness" in t or "gain" in t]
         return bool(driven) and all("stiffness" in t for t in driven)
 
@@ -181,7 +181,7 @@ def _unexpressed(
 ) -> list[str]:
     """Return the parameters without which the model would be the same, but for delays."""
     names = {p.name.partition("@")[0]: p for p in found.parameters if p.kind not in ("delay", "derived")}
-    # An optional term that was left out has nothing to express.
+    # An optional term that is not part of the model sets no field.
     names = {name: p for name, p in names.items() if p.verdict != "fixed" or p.estimate != p.nominal}
     text = mjcf(best)
     return [

@@ -87,7 +87,7 @@ class Uncertainty:
 def centred(table: ParameterTable, z: np.ndarray) -> np.ndarray:
     """Return ``z (P,)`` with the delays on either side of the world shifted to the middle of what their bounds admit.
 
-    The log does not tell them apart, so how a search shared their sum between them means nothing.
+    The log determines only their sum, so a search shares it between them by chance.
     """
     x, _ = table.scale(z)
     shift = time_shift(table)
@@ -134,10 +134,10 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     is still too small: standard errors then grow to what the estimate varies by between blocks of the recordings, but
     only where blocks differ more than by chance, as a standard error from a few blocks is itself off by a fifth.
 
-    A log does not tell the delays on either side of the world apart: with one longer and the other shorter by as much,
+    A log does not separate the delays on either side of the world: with one longer and the other shorter by as much,
     and a world that starts that much earlier or later, every message stays the same. Residuals do change a little along
     this shift, but only by rounding to the world's ticks and by noise in the initial states. So the shift counts as
-    unknown within the bounds, and neither delay is ever accepted by itself. Where initial states are free no other
+    unknown within the bounds, and neither delay is ever accepted alone. Where initial states are free no other
     estimate depends on it, and it is held while the others are judged; where they are given, the others move with it.
     """
     table, size = problem.table, len(at.x)
