@@ -78,7 +78,6 @@ def search(
 
     Args:
         start: Shape ``(P,)``: middle of the first generation.
-        data: Argument of ``losses``.
         weight: Shape ``(S,)``: batches are drawn from the segments with a weight above 0; None without batches.
         on_generations: Called with the number of generations since the last call, and the best loss and candidate of
             this run so far.
