@@ -60,10 +60,6 @@ class Hooks:
             raise UsageError(f"{hook!r} is not a callable")
         self._extra[name].append(hook)
 
-    def is_empty(self, name: str) -> bool:
-        """Return whether a hook of a name has no function to run."""
-        return not (_overrides(self._task, Task, name) or self._entity_hooks[name] or self._extra[name])
-
     def run(self, name: str, *args: PyTree) -> None:
         """Run all hooks of a name with the arguments that the task's hook takes."""
         self.call(self._labels[name], getattr(self._task, name), *args)

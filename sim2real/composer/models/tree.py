@@ -167,10 +167,6 @@ class Tree(Scope, Generic[H]):
             self._handles[key] = cast("H", self.handle_type(self, kind, native))
         return self._handles[key]
 
-    def find_handle(self, native: Native) -> H:
-        """Return the handle on an element that has one."""
-        return self._handles[native]
-
     def section_of(self, kind: str) -> Value:
         """Return the section that elements of a kind stand in."""
         return self._sections[SECTION_OF[kind]]

@@ -1,11 +1,44 @@
-"""``mujoco.mjx``, imported without a word: without Warp it prints so to stdout, which is for data."""
+"""``mujoco.mjx``, imported silently: without Warp it prints to stdout, which is for data."""
+
+from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+import jax
+import jax.numpy as jnp
 
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx as mjx
+    from mujoco.mjx._src import scan  # private: mujoco-mjx is pinned, and a test would show a change
 
-    from sim2real.composer.physics.mjx.chains import hold_links
+if TYPE_CHECKING:
+    from sim2real.types import PyTree
+
+T = TypeVar("T")
+_vmap = scan._nvmap
+
+
+def hold_links() -> None:
+    """Have MJX's walks along the tree of bodies end a fusion of XLA's at each link.
+
+    On a CPU XLA fuses the whole chain, and computes each link's pose at each use: twice as often with every link.
+    """
+    scan._nvmap = _held
+
+
+def _held(f: Callable[..., T], carry: T | None, *args: jax.Array) -> T:
+    if carry is not None:
+        carry = jax.tree.map(_barrier, carry)
+    return _vmap(f, carry, *args)
+
+
+def _barrier(leaf: PyTree) -> PyTree:
+    """Return a leaf behind a barrier, unless it is a type of joint: the trace depends on those."""
+    is_static = not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact)
+    return leaf if is_static else jax.lax.optimization_barrier(leaf)
+
 
 hold_links()
