@@ -8,19 +8,19 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 58_750,
-    "lines of composer": 12_210,
+    "lines without composer": 60_200,
+    "lines of composer": 12_195,
     "files in the fullest folder": 15,
-    "docstring lines [%]": 21.1,
+    "docstring lines [%]": 20.9,
     "Any in 1,000 lines": 13.2,
-    "words of the dialect": 140,
-    "other words of the dialect": 1_305,
-    "largest number of project imports": 32,
+    "words of the dialect": 14,
+    "other words of the dialect": 1_205,
+    "largest number of project imports": 31,
     "levels of robot classes": 2,
-    "public members of SO101Robot": 25,
+    "public members of SO101Robot": 18,
     "modules of hardware that train imports": 0,
 }
-AT_LEAST = {"comment lines [%]": 1.25}
+AT_LEAST = {"comment lines [%]": 1.29}
 
 
 @pytest.fixture(scope="module")

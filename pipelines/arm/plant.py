@@ -1,4 +1,4 @@
-"""The embedded arm's physics: C MuJoCo, with parameters that no stage of the pipeline is told.
+"""The embedded arm's physics: C MuJoCo, with parameters that no stage of the pipeline reads.
 
 Run by the emulator's process; imports neither JAX nor the pipeline's model, so nothing here can leak into it. The
 geometry is therefore written down a second time.
@@ -179,7 +179,7 @@ class ArmPlant:
         return {f"{name}[{i}]": value for name, row in rows.items() for i, value in enumerate(row.tolist())}
 
     def truth(self) -> dict[str, Any]:
-        """Return what a log can tell: position gain [N m/rad], damping, armature, friction, payload, in SI units.
+        """Return what a log can determine: position gain [N m/rad], damping, armature, friction, payload, in SI units.
 
         The gain is servo 1's, at the P gain that it has now; friction is the level at speed, without the bump.
         """

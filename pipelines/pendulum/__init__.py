@@ -11,7 +11,7 @@ PIPELINE = Pipeline(
     summary="disk pendulum on a DC motor: swing it up and keep it upright",
     package=__name__,
     scene="scene",
-    # Around the pendulum's own 1.7 Hz, where 2 V swing it far enough to tell damping from friction.
+    # Around the pendulum's own 1.7 Hz, where 2 V swing it far enough to separate damping from friction.
     record=RecordConfig(amplitude=2.0, low_hz=0.7, high_hz=2.0, gate=GATE),
     deploy=DeployConfig(gate=GATE),
 )

@@ -22,7 +22,7 @@ HISTORY = 4
 
 @struct.dataclass
 class Command(Base):
-    """What the motor is told; ``action`` has shape ``(1,)`` [V]."""
+    """The motor's command; ``action`` has shape ``(1,)`` [V]."""
 
     action: Any
 

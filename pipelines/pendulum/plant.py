@@ -1,4 +1,4 @@
-"""The embedded robot's physics: C MuJoCo, with parameters that no stage of the pipeline is told.
+"""The embedded robot's physics: C MuJoCo, with parameters that no stage of the pipeline reads.
 
 Run by the emulator's process; imports neither JAX nor the pipeline's model, so nothing here can leak into it.
 """
@@ -91,7 +91,7 @@ class PendulumPlant:
         return {"th": float(self.data.qpos[0]), "thdot": float(self.data.qvel[0]), "voltage": self._voltage or 0.0}
 
     def truth(self) -> dict[str, Any]:
-        """Return the groups that a log can tell, in the units of ``pipelines/pendulum/model.py``."""
+        """Return the groups that a log can determine, in the units of ``pipelines/pendulum/model.py``."""
         return {
             "gain": self._K / _R / self._J,
             "gravity": _MASS * 9.81 * _LENGTH / self._J,

@@ -1,4 +1,4 @@
-"""The embedded SO-101's physics: C MuJoCo, with parameters that no stage of the pipeline is told.
+"""The embedded SO-101's physics: C MuJoCo, with parameters that no stage of the pipeline reads.
 
 Run by the emulator's process; imports neither JAX nor the pipeline's model, so nothing here can leak into it. The
 geometry is therefore written down a second time (source: see parts.py).
@@ -174,7 +174,7 @@ class SO101Plant:
         return {f"{name}[{i}]": value for name, row in rows.items() for i, value in enumerate(row.tolist())}
 
     def truth(self) -> dict[str, Any]:
-        """Return what a log can tell, named as the stages do; friction at standstill."""
+        """Return what a log can determine, named as the stages do; friction at standstill."""
         joints = [self.model.joint(i).name for i in range(self.model.njnt)]
         return {
             "gain": self._gain,

@@ -143,7 +143,7 @@ def observe(reading: JointReading, goal: Array, aim: Array) -> Array:
 
 
 def success(state: Any) -> jax.Array:
-    """Return whether the tip is at the target, and the jaw as it is told."""
+    """Return whether the tip is at the target, and the jaw at its commanded opening."""
     return (state.variables["distance"] < CLOSE_M) & (state.variables["ajar"] < CLOSE_RAD)
 
 

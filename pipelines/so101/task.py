@@ -1,4 +1,4 @@
-"""Reach for a target with the point between the jaws, opened as far as it is told, and stay there."""
+"""Reach for a target with the point between the jaws, opened to a commanded width, and stay there."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def tip_of(np_: Any, position: Any) -> Any:
 
 
 class Reach(GoalTask):
-    """The arm starts where its joints are; the reward is highest at the target, with the jaw as it is told."""
+    """The arm starts where its joints are; the reward is highest at the target with the jaw open as commanded."""
 
     robot: Arm
 
@@ -55,8 +55,8 @@ class Reach(GoalTask):
         gap = physics.bind(self.robot.tip).xpos - physics.bind(self.table.target).xpos
         # The square root has no derivative at 0.
         physics.variables["distance"] = physics.np.sqrt(physics.np.sum(gap**2) + 1e-12)
-        told = physics.bind(self.table.opening).pos[0]
-        physics.variables["ajar"] = physics.np.abs(physics.bind(self.joints).qpos[5] - told)
+        opening = physics.bind(self.table.opening).pos[0]
+        physics.variables["ajar"] = physics.np.abs(physics.bind(self.joints).qpos[5] - opening)
 
     def get_reward(self, physics: Any) -> Any:
         """Return up to 2.5 at the target, less than 0 far away."""

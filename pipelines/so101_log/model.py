@@ -20,7 +20,7 @@ JOINTS = ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll", "jaw")
 
 @struct.dataclass
 class Goal(Base):
-    """Where the joints are told to be, shape ``(6,)`` [rad]."""
+    """Goals of the joints, shape ``(6,)`` [rad]."""
 
     goal: Any
 

@@ -22,7 +22,7 @@ _OPEN = 0.05
 
 @struct.dataclass
 class Command(Base):
-    """What the servo is told.
+    """The servo's command.
 
     Attributes:
         goal: [rad].
@@ -84,7 +84,7 @@ class ServoWorld(JointWorld):
         return ServoParams()
 
     def command(self, step_state: StepState) -> Command:
-        """Return what the servo is told during this tick."""
+        """Return the servo's command during this tick."""
         return step_state.inputs["actuator"][-1].data
 
     def forces(self, params: ServoParams, position: Any, velocity: Any, command: Command) -> Forces:

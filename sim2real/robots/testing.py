@@ -1,4 +1,4 @@
-"""For tests of robots: ``check_robot`` tells whether a robot keeps what ``sim2real.robots.contract`` asks of it.
+"""For tests of robots: ``check_robot`` checks that a robot keeps the contract in ``sim2real.robots.contract``.
 
     def test_it_is_a_robot(tmp_path):
         check_robot(load_pipeline("mine").load(), tmp_path)

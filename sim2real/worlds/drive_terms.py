@@ -118,5 +118,5 @@ class DriveLaw:
             xp.concatenate(pair, axis=-1)[..., self._order]
             for pair in zip((damping, friction, applied), beside, strict=True)
         ]
-        told = xp.concatenate([force, kp, kd], axis=-1)
-        return told, rows[2], dict(zip(self.fields, rows, strict=False))
+        controls = xp.concatenate([force, kp, kd], axis=-1)
+        return controls, rows[2], dict(zip(self.fields, rows, strict=False))

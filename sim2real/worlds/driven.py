@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @struct.dataclass
 class DriveCommand(Base):
-    """What the drives are told; each entry has shape ``(joints,)`` or ``(1,)``, and is None where the log has none.
+    """Command of the drives; each entry has shape ``(joints,)`` or ``(1,)``, and is None where the log has none.
 
     Attributes:
         goal: Where to be, by the encoder [rad].
@@ -151,15 +151,15 @@ class DrivenWorld(MjxWorld):
         With terms, 1 with torque on and 0 with torque off, and the goals, stand behind them: ``(5 * joints,)``.
         """
         p: DriveParams = step_state.params
-        told: DriveCommand = step_state.inputs[self.input_name][-1].data
+        command: DriveCommand = step_state.inputs[self.input_name][-1].data
         still = jnp.zeros(len(self.joints))
-        on = still + 1.0 if told.enabled is None else jnp.asarray(told.enabled) + still
-        kp = still if told.goal is None else on * p.kp * _of_log(told.kp, self.units[0])
-        kd = p.kd * _of_log(told.kd, self.units[1]) * (on + (1.0 - on) * p.released) + still
-        goal = still if told.goal is None else told.goal - p.zero + still
+        on = still + 1.0 if command.enabled is None else jnp.asarray(command.enabled) + still
+        kp = still if command.goal is None else on * p.kp * _of_log(command.kp, self.units[0])
+        kd = p.kd * _of_log(command.kd, self.units[1]) * (on + (1.0 - on) * p.released) + still
+        goal = still if command.goal is None else command.goal - p.zero + still
         force = kp * goal
-        force += still if told.goal_velocity is None else on * kd * told.goal_velocity
-        for pushed in (told.torque, told.duty):
+        force += still if command.goal_velocity is None else on * kd * command.goal_velocity
+        for pushed in (command.torque, command.duty):
             force += still if pushed is None else on * p.gain * pushed
         return jnp.concatenate([force, kp, kd, *([on, goal] if self.law else [])])
 

@@ -1,6 +1,6 @@
 """Friction of motors and gears as a sum of terms.
 
-A robot has the terms whose coefficients are numbers; terms whose coefficient is None are left out and cost nothing.
+A robot has the terms whose coefficients are numbers; terms whose coefficient is None are absent and cost nothing.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ def _between(model: Any, bodies: Sequence[int]) -> set[int]:
 
 
 def upwards(model: Any, body: int) -> set[int]:
-    """Return a body and those that it hangs on, the world left out."""
+    """Return a body and its ancestors without the world."""
     found: set[int] = set()
     while body > 0:
         found.add(body)

@@ -77,7 +77,7 @@ def _places(path: Path, package: str) -> list[Path]:
     """Return the folders in which a ROS package may be."""
     above = [folder / package for folder in path.resolve().parents]
     above += [folder for folder in path.resolve().parents if folder.name == package]
-    told = [Path(p) / package for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
-    told += [Path(p) / "share" / package for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+    configured = [Path(p) / package for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
+    configured += [Path(p) / "share" / package for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
     own = [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p and Path(p).name == package]
-    return [*told, *own, *above]
+    return [*configured, *own, *above]

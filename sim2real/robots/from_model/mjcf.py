@@ -125,14 +125,14 @@ class JointDrive:
     """One actuator of a joint.
 
     Attributes:
-        told: What its control is.
-        stiffness: Of one that is told a position [N m/rad].
-        damping: Of its own [N m s/rad]; of one that is told a velocity its gain, too.
-        gain: Torque for each unit of the control, of one that is told neither [N m].
+        control: Quantity of its control.
+        stiffness: With a position as control [N m/rad].
+        damping: Of its own [N m s/rad]; with a velocity as control also its gain.
+        gain: Torque for each unit of a torque control [N m].
         most: Largest torque [N m]; None: no limit.
     """
 
-    told: Literal["position", "velocity", "torque"]
+    control: Literal["position", "velocity", "torque"]
     stiffness: float
     damping: float
     gain: float
@@ -151,8 +151,8 @@ def set_drives(spec: Any, drives: Mapping[str, JointDrive]) -> None:
         for element in own[1:]:
             spec.delete(element)
         part: Any = own[0] if own else spec.add_actuator(name=joint, target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
-        gain = {"position": drive.stiffness, "velocity": drive.damping, "torque": drive.gain}[drive.told]
-        stiffness = drive.stiffness if drive.told == "position" else 0.0
+        gain = {"position": drive.stiffness, "velocity": drive.damping, "torque": drive.gain}[drive.control]
+        stiffness = drive.stiffness if drive.control == "position" else 0.0
         part.gaintype, part.biastype, part.dyntype = fixed, affine, mj.mjtDyn.mjDYN_NONE
         part.gear[:] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
         part.gainprm[:3], part.biasprm[:3] = [gain, 0.0, 0.0], [0.0, -stiffness, -drive.damping]

@@ -55,7 +55,7 @@ _ABOUT = {
 }
 _EXCITE = {
     "kp": "goals that change while the joint bears a load",
-    "kd": "motion with torque off (`enabled`) besides that with torque on, to tell the joint's damping from it",
+    "kd": "motion with torque off (`enabled`) besides that with torque on, to separate the joint's damping from it",
     "gain": "torques or duties that change",
     "torque": "commands that the drive cannot follow, so that it is at its limit",
     "speed": "commands that the drive cannot follow, so that it is at its limit",
@@ -80,7 +80,7 @@ _EXCITE = {
     "cogging_sin": "slow motion of each joint over many of its repeats, both ways",
     "cogging_per_turn": "slow motion of each joint over many of its repeats, both ways",
 }
-"""Which motion tells a quantity."""
+"""Motion that determines each quantity."""
 _VANISHING = ("kd", "damping", "armature", "frictionloss")
 """Quantities that a joint may be without."""
 _FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0),
@@ -112,7 +112,7 @@ OPTIONAL = {
 """Optional terms, and the quantities that each has."""
 TILT = OPTIONAL["tilt"]
 ASKED = ("tilt", "eccentricity", "cogging")
-"""Those that ``auto`` leaves out unless a parameter names them: few robots tell them from a zero or a stiffness."""
+"""Terms that ``auto`` omits unless a parameter names them: in few robots they differ from a zero or a stiffness."""
 LAWS = (*(q for own in OPTIONAL.values() if own != TILT for q in own), "cogging_per_turn")
 """Quantities that are set before every step."""
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
@@ -249,7 +249,7 @@ def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[Pa
             that ``auto`` leaves out, parameters that were named are offered without its others.
 
     Raises:
-        UsageError: When cogging is wanted, and nobody said how often it repeats.
+        UsageError: Cogging is requested without its number of repeats a turn.
     """
     said, names = {term.what for term in terms}, {n.strip() for n in wanted.split(",")}
     if "cogging" in names and "cogging_per_turn" not in said:

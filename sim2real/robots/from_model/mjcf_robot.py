@@ -311,7 +311,7 @@ class MjcfRobot(LoggedRobot):
 
     def _drives(self, values: Mapping[str, Any]) -> list[JointDrive]:
         """Return the joints' drives with identified values."""
-        told: Any = next(
+        control: Any = next(
             (t for n, t in (("goal", "position"), ("goal_velocity", "velocity")) if n in self.config.commands), "torque"
         )
         usual: dict[str, Any] = {"stiffness": FALLBACK["kp"], "damping": 0.0, "gain": FALLBACK["gain"]}
@@ -320,7 +320,7 @@ class MjcfRobot(LoggedRobot):
         for p in self.placed:
             for i in p.at if p.what in names else ():
                 found[i][names[p.what]] = float(values[p.parameter.name])
-        return [JointDrive(told, **one) for one in found]
+        return [JointDrive(control, **one) for one in found]
 
 
 class IdentifiableMjcf(IdentifiableRecording):
@@ -366,7 +366,7 @@ def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[Parame
     """Return what is identified unless somebody says otherwise.
 
     Stiffness or gain, damping and inertia are one value for all joints, dry friction is each joint's own. The drive's
-    damping and the joint's can be told apart only where torque is switched off or the log has gains of its own: else
+    damping and the joint's can be separated only where torque is switched off or the log has gains of its own: else
     there is one.
 
     Args:

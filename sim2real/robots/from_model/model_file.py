@@ -33,9 +33,9 @@ _UNITS: Final = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E"
 
 
 def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
-    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file, and the files that it names and that were left out.
+    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file, and the omitted files that it names.
 
-    A file that cannot be read is left out where only contacts or pictures need it.
+    A file that cannot be read is omitted where only contacts or pictures need it.
 
     Args:
         contacts: Whether bodies touch, so that all meshes are needed.
@@ -46,7 +46,7 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
     if not path.is_file():
         raise UsageError(f"there is no model {path}", hint="name an MJCF or URDF file with --mjcf")
     _Budget(path).check(path)
-    left_out: list[str] = []
+    omitted: list[str] = []
     notes: list[str] = []
     packaged = False
     try:
@@ -58,7 +58,7 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
         except (ValueError, RuntimeError, OSError):
             needed = meshes.needed_by(spec)
             notes += [f"meshes give the inertia of {', '.join(needed)}"] if needed else []
-            if contacts or not (left_out := meshes.leave_out(spec)):
+            if contacts or not (omitted := meshes.leave_out(spec)):
                 raise
             spec.copy().compile()
     except (ValueError, RuntimeError, OSError) as error:
@@ -68,7 +68,7 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
             if packaged
             else "correct the file; files that it names must lie where it says, or be taken out",
         ) from None
-    return spec, left_out
+    return spec, omitted
 
 
 def one_line(error: Exception) -> str:

@@ -22,7 +22,7 @@ _MASS, _CENTRE = "mass of the hand", "centre of the hand"
 class Hand:
     """Where a robot holds things.
 
-    Its inertia about its own centre is left out: behind gears the rotors' is larger by far.
+    Its inertia about its own centre is omitted: behind gears the rotors' is larger by far.
 
     Attributes:
         joint: The joint that moves the hand.
@@ -38,7 +38,7 @@ class Hand:
     least_kg: float = 0.0
 
     def parameter(self) -> Parameter:
-        """Return the payload: nothing, unless the term is asked for, as a gain and a mass are told apart less well."""
+        """Return the payload: 0 without the optional term, as a gain and a mass are hard to separate."""
         about = "mass in the hand, beyond that of the model"
         return Parameter(
             PAYLOAD, "kg", 0.0, self.least_kg, self.most_kg, "linear", about=about, free=False, term=PAYLOAD, off=0.0

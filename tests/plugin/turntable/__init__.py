@@ -8,7 +8,7 @@ GATE = GateLimits(limit=12.0, slew_per_s=200.0, max_speed_rad_s=30.0, servo_watc
 
 PIPELINE = Pipeline(
     name="turntable",
-    summary="a turntable on an ODrive: turn as fast as it is told",
+    summary="a turntable on an ODrive: turn at a commanded speed",
     package=__name__,
     record=RecordConfig(duration_s=20.0, amplitude=10.0, low_hz=0.2, high_hz=3.0, gate=GATE),
     identify=IdentifyConfig(population=16, generations=20, refine=1),

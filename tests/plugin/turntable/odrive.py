@@ -172,7 +172,7 @@ class ODrive(Device):
     def enable(self) -> None:
         """Switch the torque on at speed 0; from then on the board wants to be fed."""
         if self._halted:
-            raise SafetyStop("the torque was taken off for good", hint="open the device anew")
+            raise SafetyStop("the torque was taken off for good", hint="open the device again")
         self._require_no_error()
         if self._withheld:
             return
@@ -197,7 +197,7 @@ class ODrive(Device):
     def command(self, values: np.ndarray) -> Transaction:
         """Send a speed, which also feeds the watchdog."""
         if self._halted:
-            raise SafetyStop("the torque was taken off for good", hint="open the device anew")
+            raise SafetyStop("the torque was taken off for good", hint="open the device again")
         if not np.isfinite(values).all() or np.abs(values).max() > self._loop.speed:
             raise SafetyStop(f"{values} rad/s is no speed that the board would take")
         if self._withheld:
@@ -211,7 +211,7 @@ class ODrive(Device):
         return np.clip(self._loop.gain * (command - self._speed) / self._loop.torque, -1.0, 1.0)
 
     def check(self) -> None:
-        """Ask whether the axis has stopped itself, which an answer to `f` does not tell."""
+        """Ask whether the axis has stopped itself, which an answer to `f` does not contain."""
         self._require_no_error()
         if self._on and self._read(STATE) != CLOSED_LOOP:
             raise SafetyStop("the axis has left its speed loop", hint="was it switched off from elsewhere?")
