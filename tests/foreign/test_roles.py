@@ -45,7 +45,7 @@ def test_commands_that_are_the_measurements_are_refused(tmp_path, recorded, copy
 
 def test_a_mapping_of_such_commands_is_contradicted(recorded):
     t, _, q = recorded
-    assert "its commands are its measurements" in evidence.contradictions((t, t), q, q)[0]
+    assert "its commands are copies of its measurements" in evidence.contradictions((t, t), q, q)[0]
 
 
 SCHEMA = """std_msgs/Header header

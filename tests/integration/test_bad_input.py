@@ -171,7 +171,7 @@ def test_damaged_parameters(fails, tmp_path, finished_run_dir):
     )
     rows = [{**p, "estimate": float("nan")} if p["name"] == "gain" else p for p in good["parameters"]]
     assert "is malformed" in damaged(json.dumps({**good, "parameters": rows}))
-    assert "timing.json is not beside it" in damaged(json.dumps(good))
+    assert "there is no timing.json beside it" in damaged(json.dumps(good))
     path.unlink()
     assert "cannot read" in fails(errors.ERROR, "train", "pendulum", "--parameters", tmp_path)
     assert not (tmp_path / "pendulum").exists()

@@ -154,7 +154,7 @@ def test_a_task_that_draws_its_target_draws_one_that_can_be_reached():
 
 
 def test_the_command_line_tells_about_it(capsys, tmp_path):
-    assert cli.main(["info", "arm", "--runs", str(tmp_path)]) == 0
+    assert cli.main(["info", "arm", "--runs", str(tmp_path), "--verbose"]) == 0
     said = capsys.readouterr().out
     assert "three-joint arm" in said
     assert "skip" in said

@@ -23,7 +23,7 @@ KINDS = pytest.mark.parametrize("kind", [ReachingArm, ReachingSO101])
 
 def probed(robot, path):
     """Return when each measurement of the small steps was made [s], where the joints were, and their goals [rad]."""
-    robot.drive.probe(path, 1)
+    robot.probe(path, 1)
     log = read_log(path)
     return log.steps["sensor"].begun_s, log.outputs["sensor"]["position"], log.outputs["actuator"]["goal"]
 

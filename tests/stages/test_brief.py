@@ -46,7 +46,7 @@ def test_no_two_seconds_are_silent(capsys):
 
 
 @pytest.mark.parametrize("verbose", [False, True])
-def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys, shared_run_dir):
+def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys, run_copy):
     """The stages' artifacts are those of a finished run; each stage prints 100 lines of details."""
     from sim2real.artifacts.run.run_folder import finished
     from sim2real.commands import run_commands
@@ -55,7 +55,7 @@ def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys
         for i in range(100):
             console.note(f"{stage}: detail {i}")
             print(f"row {i} of {stage}")
-        return finished(shared_run_dir, stage)
+        return finished(run_copy, stage)
 
     monkeypatch.setattr(run_commands, "run_stage", call_stage)
     monkeypatch.chdir(tmp_path)

@@ -44,7 +44,7 @@ def make_initial_state(
 
     # Networks, optimiser and normalisers of each place on the leading axis.
     sizes = env.observation_size, np.shape(env.action_low)[0], privileged_size(env, first)
-    rngs = ((config, np.random.default_rng(seed)) for config in configs for seed in key_data)
+    rngs = ((config, np.random.default_rng(data)) for config in configs for data in key_data)
     learners = [_new_learner(config, networks, rng, sizes) for config, rng in rngs]
     params, optimiser, normaliser, privileged = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *learners)
 
