@@ -107,7 +107,10 @@ def _run_iterations(
             break
     if refusal is not None:
         raise refusal
+    from sim2real.view.page.page import report  # matplotlib and jinja2 take 0.5 s to import
+
     print(console.artifact_table(Iterations(rows).table().without("why")))
+    report(run_dir)
     return run_dir
 
 
