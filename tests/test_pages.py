@@ -132,7 +132,10 @@ def malformed(table: list[list[str]]) -> list[str]:
 
 def test_rows_of_choices_are_complete():
     text = (ROOT / "docs" / "reference" / "choices.md").read_text()
-    assert malformed(rows(text, "| constant | value | what was measured | commit or report |")) == []
+    lines = rows(text, "| constant | value | what was measured | commit or report |")
+    assert malformed(lines) == []
+    constants = [re.findall(r"^\| (.*?) \|", line)[0] for line in text.splitlines() if line.startswith("| `")]
+    assert constants == sorted(set(constants)), "one row for each constant, in order"
 
 
 @pytest.mark.parametrize(
