@@ -72,9 +72,8 @@ def search(
 
     A run ends early when its candidates are close together, or the median of the last ten generations is not below that
     of the ten before. The best candidate does not count, as one of the first generation may be best by chance. Restarts
-    follow
-    BIPOP: in turn with twice the largest population so far, and with the first population from a random place, with
-        smaller steps.
+    follow BIPOP: in turn with twice the largest population so far, and with the first population from a random place,
+    with smaller steps.
 
     Args:
         start: Shape ``(P,)``: middle of the first generation.

@@ -27,17 +27,17 @@ and ``update`` does::
 
 After each call the host checks the figures, writes a checkpoint, and reports progress (``trainer.train``).
 
-| file | content |
-|---|---|
-| ``trainer.py`` | ``train``; the compiled program; the loop on the host |
-| ``initial_state.py`` | networks, optimiser and copies before the first update |
-| ``rollout.py`` | ``collect``, ``evaluate`` |
-| ``update.py`` | ``TrainState``, ``prepare``, ``update`` |
-| ``losses.py`` | ``gae``, ``loss`` |
-| ``optimiser.py`` | Adam, its step size |
-| ``teacher.py`` | teachers, and imitation of them |
-| ``health.py`` | errors for figures that are not finite |
-| ``result.py`` | ``Progress``, ``TrainResult`` |
+Files:
+
+- ``trainer.py``: ``train``; the compiled program; the loop on the host
+- ``initial_state.py``: networks, optimiser and copies before the first update
+- ``rollout.py``: ``collect``, ``evaluate``
+- ``update.py``: ``TrainState``, ``prepare``, ``update``
+- ``losses.py``: ``gae``, ``loss``
+- ``optimiser.py``: Adam, its step size
+- ``teacher.py``: teachers, and imitation of them
+- ``health.py``: errors for figures that are not finite
+- ``result.py``: ``Progress``, ``TrainResult``
 """
 
 from __future__ import annotations
