@@ -48,7 +48,8 @@ def complete(cls: type, *args: Any, **options: Any) -> Any:
     """
     del args, options
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
-        base = next(base for base in reversed(cls.__mro__) if base.__module__.startswith("sim2real.robots"))
+        ours = [base for base in reversed(cls.__mro__) if base.__module__.startswith("sim2real.robots")]
+        base = next(base for base in ours if getattr(base, "__abstractmethods__", ()))
         raise UsageError(
             f"{cls.__module__}.{cls.__qualname__} is not complete: it "
             + "; it ".join(f"has no {name}()" for name in missing),

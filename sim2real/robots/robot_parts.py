@@ -48,7 +48,15 @@ class Session(AbstractContextManager["Session"], Protocol):
     embedded: EmbeddedRobot | None
 
 
-class RobotSensor(Protocol):
+class _Part(Protocol):
+    """What all parts share: an object of an incomplete class is refused with the names of the missing methods."""
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make the part, if its class has all methods."""
+        return complete(cls, *args, **options)
+
+
+class RobotSensor(_Part, Protocol):
     """What is measured.
 
     Attributes:
@@ -57,10 +65,6 @@ class RobotSensor(Protocol):
         units: Field of the message -> its unit.
         at_rest: The message of a robot at rest.
     """
-
-    def __new__(cls, *args: Any, **options: Any) -> Self:
-        """Make the part, if its class has all methods."""
-        return complete(cls, *args, **options)
 
     channels: tuple[Channel, ...]
     joints: Mapping[str, Mapping[str, str]]
@@ -72,7 +76,7 @@ class RobotSensor(Protocol):
         """Return the message of a reading."""
 
 
-class RobotDrive(Protocol):
+class RobotDrive(_Part, Protocol):
     """How the motors are commanded, and how the hardware is opened. Drivers are imported by ``connect``.
 
     Attributes:
@@ -85,10 +89,6 @@ class RobotDrive(Protocol):
         probe: The steps by which deploy measures the delay; None: the delay is not measured.
         embedded: The emulated robot, for the port ``embedded``; None: there is none.
     """
-
-    def __new__(cls, *args: Any, **options: Any) -> Self:
-        """Make the part, if its class has all methods."""
-        return complete(cls, *args, **options)
 
     rate_hz: float
     command: str
@@ -130,7 +130,7 @@ class RobotDrive(Protocol):
         return start
 
 
-class RobotAgent(Protocol):
+class RobotAgent(_Part, Protocol):
     """What the policy observes and does.
 
     Attributes:
@@ -141,10 +141,6 @@ class RobotAgent(Protocol):
         tilt_rad: Returns how far the robot leans, from an observation ``(O,)``, for ``deploy --max-tilt-rad`` [rad];
             None: the robot does not measure that.
     """
-
-    def __new__(cls, *args: Any, **options: Any) -> Self:
-        """Make the part, if its class has all methods."""
-        return complete(cls, *args, **options)
 
     observation: tuple[ObservationTerm, ...]
     action: tuple[ActionTerm, ...]
@@ -166,16 +162,12 @@ class RobotAgent(Protocol):
         """Return the node's parameters for an episode."""
 
 
-class RobotTask(Protocol):
+class RobotTask(_Part, Protocol):
     """Where episodes start, and how good they are.
 
     Attributes:
         aim_size: Number of entries of ``EpisodeStart.aim``.
     """
-
-    def __new__(cls, *args: Any, **options: Any) -> Self:
-        """Make the part, if its class has all methods."""
-        return complete(cls, *args, **options)
 
     aim_size: int = 0
 
@@ -227,7 +219,7 @@ class RobotTask(Protocol):
         """
 
 
-class RobotModel(Protocol):
+class RobotModel(_Part, Protocol):
     """The robot in simulation, and the parameters that identification estimates.
 
     Attributes:
@@ -236,10 +228,6 @@ class RobotModel(Protocol):
         watched_terms: Optional terms that may change between deployments.
         profile_rad_s, causes, export_lead_s: See ``RecordedRobot``.
     """
-
-    def __new__(cls, *args: Any, **options: Any) -> Self:
-        """Make the part, if its class has all methods."""
-        return complete(cls, *args, **options)
 
     tick_s: float
     lead_s: float = 0.0

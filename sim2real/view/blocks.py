@@ -143,11 +143,12 @@ def cell_text(cell: Cell, unit: bool = False) -> str:
 
 
 def _in_ms(row: Sequence[Cell], units: Sequence[bool]) -> Sequence[Cell]:
-    """Return a row in ms if its unit is s and all its numbers are below 1; other rows are unchanged."""
+    """Return a row in ms if its unit is s and its numbers are below 1; rows without numbers are unchanged, too."""
     if "s" not in [cell for cell, unit in zip(row, units, strict=True) if unit]:
         return row
     numbers = [x for cell in row for x in (_ends(cell) if isinstance(cell, Interval) else (cell,))]
-    if any(abs(x) >= 1.0 for x in numbers if isinstance(x, float) and math.isfinite(x)):
+    finite = [abs(x) for x in numbers if isinstance(x, float) and math.isfinite(x)]
+    if not finite or max(finite) >= 1.0:
         return row
     return ["ms" if unit else _scaled(cell, 1e3) for cell, unit in zip(row, units, strict=True)]
 

@@ -14,11 +14,12 @@ import pytest
 import synthetic_run
 from sketches import sketched
 
+from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.estimation.posterior import Alternative, Posterior
 from sim2real.artifacts.identification import HeldOutPart, Identification, Judgement
-from sim2real.artifacts.summary import words_and_unit
+from sim2real.artifacts.summary import ArtifactTable, words_and_unit
 from sim2real.errors import Sim2RealError
-from sim2real.view.blocks import MISSING, decimals_for, fixed, number
+from sim2real.view.blocks import MISSING, TableBlock, decimals_for, fixed, number
 from sim2real.view.identification.section import _alternatives, _banner, _parts
 from sim2real.view.page.page import deploy_page, identify_page, report
 
@@ -359,3 +360,13 @@ def test_models_that_explain_the_recordings_as_well_stand_beside_the_estimate():
     assert table.columns == ("parameter", "estimate", "with drag")
     assert table.rows == [["share of the draws", "70 %", "30 %"], ["gain", "2.00", "2.50"], ["drag", MISSING, "0.100"]]
     assert _alternatives(replace(found, posterior=replace(own, others=()))) == []
+
+
+def test_short_times_are_in_ms_and_numbers_without_their_unit_stay():
+    """A share is no time, and texts that hold seconds keep their unit."""
+    drift = Drift((Changed("delay", "s", 0.044, 0.041, 0.039, 0.043, 0.0286, 0.5),), 0.05, (), 10.0)
+    (row,) = TableBlock.of("drift", drift.rows()).rows
+    assert list(row) == ["delay", "44.00", "41.00", "39.00 to 43.00", "ms", "2.9 %", "no"]
+    table = ArtifactTable(("parameter", "unit", "run"), [["delay", "s", "0.044 ± 0.001"]])
+    (text,) = TableBlock.of("comparison", table).rows
+    assert list(text)[1:] == ["s", "0.044 ± 0.001"]

@@ -81,7 +81,7 @@ class Drift:
                 c.now,
                 Interval(c.low95, c.high95),
                 c.unit or "factor",
-                c.explains,
+                f"{100 * c.explains:.1f} %",  # a text: the number is not in the row's unit
                 c.name in self.alarms,
             ]
             for c in self.changes

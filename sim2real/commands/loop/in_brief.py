@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _FIGURES = {
     "record": ("seconds", "lost replies", "late replies"),
-    "identify": ("verdict", "round trip delay", "identified, 1 s ahead"),
+    "identify": ("verdict", "round trip delay", "identified, "),
     "train": ("success in simulation", "what breaks it"),
     "deploy": ("success, deployment", "measured delay"),
 }

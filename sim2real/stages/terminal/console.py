@@ -18,8 +18,6 @@ from sim2real.artifacts.paths import shown as shown
 if TYPE_CHECKING:
     from sim2real.artifacts.summary import ArtifactTable
 
-    pass
-
 _TICK_S = 1.0
 """How often a terminal's progress is drawn again, whatever is computed [s]."""
 _LINES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
