@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from types import ModuleType
 
 MOVED = {
+    "composer.constants": "composer.robot",
     "composer.mjx": "composer.physics.mjx",
     "composer.engine": "composer.physics.engine",
     "hardware.config": "robots.gate_limits",

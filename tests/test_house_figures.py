@@ -8,19 +8,19 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 60_200,
-    "lines of composer": 12_195,
+    "lines without composer": 60_340,
+    "lines of composer": 12_187,
     "files in the fullest folder": 15,
-    "docstring lines [%]": 20.9,
-    "Any in 1,000 lines": 13.2,
+    "docstring lines [%]": 20.8,
+    "Any in 1,000 lines": 13.0,
     "words of the dialect": 14,
-    "other words of the dialect": 1_205,
-    "largest number of project imports": 31,
+    "other words of the dialect": 1_185,
+    "largest number of project imports": 20,
     "levels of robot classes": 2,
     "public members of SO101Robot": 18,
     "modules of hardware that train imports": 0,
 }
-AT_LEAST = {"comment lines [%]": 1.29}
+AT_LEAST = {"comment lines [%]": 1.31}
 
 
 @pytest.fixture(scope="module")

@@ -188,7 +188,7 @@ PRINTED = {
         " on the bus, question and answer",
         " wakes and computes",
         ", from the motion",
-        "sum of the medians, without what is in ()",
+        "sum of the medians, without parts in ()",
     ],
     "guides/safety.md": ["the control process is gone"],
     "reference/runs.md": ["died", "dry run"],

@@ -11,7 +11,6 @@ import importlib
 from typing import TYPE_CHECKING
 
 from sim2real.composer.arena import Arena as Arena
-from sim2real.composer.constants import SENSOR_SITES_GROUP as SENSOR_SITES_GROUP
 from sim2real.composer.define import abstract_observable as abstract_observable
 from sim2real.composer.define import cached_property as cached_property
 from sim2real.composer.define import observable as observable
@@ -28,6 +27,7 @@ from sim2real.composer.initializers.prop_initializer import PropPlacer as PropPl
 from sim2real.composer.models.model import Model as Model
 from sim2real.composer.observables import Observables as Observables
 from sim2real.composer.physics.c.physics import Physics as Physics
+from sim2real.composer.robot import SENSOR_SITES_GROUP as SENSOR_SITES_GROUP
 from sim2real.composer.robot import Robot as Robot
 from sim2real.composer.task import NullTask as NullTask
 from sim2real.composer.task import Task as Task

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 DOWN_QUATERNION = np.array([0.0, 0.70710678118, 0.70710678118, 0.0])
 """The orientation of a hand that points down."""
+SENSOR_SITES_GROUP = 4
+"""The group of sites that sensors are attached to."""
 
 
 class Robot(Entity):

@@ -14,7 +14,9 @@ from sim2real.stages.pipeline.find_run import find_run
 from sim2real.stages.pipeline.open_parameters import open_identification
 from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline, pipeline_of
 from sim2real.stages.train.config import TrainConfig
-from sim2real.stages.train.training_setup import contract_of, find_parameters, prepare
+from sim2real.stages.train.inputs import find_parameters
+from sim2real.stages.train.trained_bundle import contract_of
+from sim2real.stages.train.training_setup import prepare
 
 if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode

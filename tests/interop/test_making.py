@@ -51,7 +51,7 @@ def test_a_robot_that_shows_more_than_it_names_is_refused(pendulum):
     from dataclasses import replace
 
     from sim2real.interop.environment import RobotEnvironment
-    from sim2real.stages.train.training_setup import contract_of
+    from sim2real.stages.train.trained_bundle import contract_of
 
     env = pendulum.steps.env
     contract = contract_of(sim2real.load_pipeline("pendulum").load(), env.task, {})

@@ -12,7 +12,7 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.run.run_folder import open_stage
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.stages.train import stage
+from sim2real.stages.train import learn_policy, resume
 from sim2real.stages.train.resume import CHECKPOINT, find_interrupted
 
 TINY = [
@@ -25,7 +25,7 @@ TINY = [
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     """Two runs: one that was interrupted after its second evaluation, and one that was not."""
-    root, report = tmp_path_factory.mktemp("runs"), stage.show_progress
+    root, report = tmp_path_factory.mktemp("runs"), learn_policy.show_progress
 
     def stop(bar, progress, watch):
         report(bar, progress, watch)
@@ -33,7 +33,7 @@ def runs(tmp_path_factory):
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stage, "show_progress", stop)
+        patch.setattr(learn_policy, "show_progress", stop)
         assert cli.main([*TINY, "--runs", str(root)]) == 130
     assert cli.main([*TINY, "--runs", str(root / "whole")]) == 0
     return root
@@ -65,7 +65,7 @@ def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_pa
 def test_a_stage_folder_and_a_run_name_it_too(runs):
     own = folder(runs)
     for target in (own, own.parent):
-        assert stage.find_interrupted("pendulum", settings(own, target), runs).folder == own
+        assert resume.find_interrupted("pendulum", settings(own, target), runs).folder == own
 
 
 def settings(own, target, **changes):
@@ -88,31 +88,31 @@ def settings(own, target, **changes):
 def test_other_settings_are_refused(runs, change, message):
     own = folder(runs)
     with pytest.raises(UsageError, match=message):
-        stage.find_interrupted("pendulum", settings(own, own, **change), runs)
+        resume.find_interrupted("pendulum", settings(own, own, **change), runs)
 
 
 def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
     own, whole = folder(runs), folder(runs / "whole")
     with pytest.raises(UsageError, match="is a training of pendulum, not of arm"):
-        stage.find_interrupted("arm", settings(own, own), runs)
+        resume.find_interrupted("arm", settings(own, own), runs)
     with pytest.raises(UsageError, match="there is no interrupted training of 'pendulum'"):
-        stage.find_interrupted("pendulum", settings(own, whole), runs)
+        resume.find_interrupted("pendulum", settings(own, whole), runs)
     early = tmp_path / "train"
     early.mkdir()
     shutil.copy(own / "manifest.json", early)
     with pytest.raises(Sim2RealError, match="interrupted before its first evaluation"):
-        stage.find_interrupted("pendulum", settings(own, early), runs)
+        resume.find_interrupted("pendulum", settings(own, early), runs)
     other = tmp_path / "parameters.json"
     other.write_text("{}")
-    found = stage.find_interrupted("pendulum", settings(own, own), runs)
+    found = resume.find_interrupted("pendulum", settings(own, own), runs)
     with pytest.raises(UsageError, match="trains on other parameters than"):
-        stage.check_same_parameters(found, other)
+        resume.check_same_parameters(found, other)
 
 
 def test_a_sweep_names_what_it_tried_and_no_checkpoint_is_written_where_that_is_said(tmp_path, capsys, monkeypatch):
-    report, left = stage.show_progress, []
+    report, left = learn_policy.show_progress, []
     monkeypatch.setattr(
-        stage, "show_progress", lambda *given: (report(*given), left.extend(tmp_path.rglob(CHECKPOINT)))
+        learn_policy, "show_progress", lambda *given: (report(*given), left.extend(tmp_path.rglob(CHECKPOINT)))
     )
     options = ("--sweep", "gamma=0.9,0.99", "--ppo.num-seeds", "2", "--no-checkpoint")
     assert cli.main([*TINY, "--runs", str(tmp_path), *options]) == 0

@@ -22,8 +22,9 @@ from sim2real.robots.from_model.mjcf import joints_of, read_model, slides_of, un
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.roles import ROLES
 from sim2real.stages.import_logs.config import ImportConfig
+from sim2real.stages.import_logs.show import show_log, show_notes, show_proposal
 from sim2real.stages.pipeline import pipeline
-from sim2real.stages.terminal import console
+from sim2real.stages.terminal.console import note
 
 
 def run(config: ImportConfig) -> None:
@@ -33,18 +34,21 @@ def run(config: ImportConfig) -> None:
         UsageError: When a file or the mapping cannot be read, they do not fit each other, or a mapping is to be
             proposed and something is ambiguous.
     """
+    # Open the files, and the mapping if one is named.
     files = [open_foreign(path, config.format, config.episode) for path in config.sources]
     files = [joined(files)] if config.together and len(files) > 1 else files
     mapping = configured_mapping(config)
     text = "" if mapping else None
     for file in files:
+        # Read the file by the mapping; propose a mapping for the first file if there is none.
         if mapping is None:
             mapping, text = proposed(file, description_of(config))
         else:
-            for line in file.notes:
-                console.note(line)
+            show_notes(file)
         episode = importer.import_opened(file, mapping, config.selection)
         refuse_contradictions(file.path, episode, config.as_told)
+
+        # Write the log, with the proposed mapping beside it.
         facts, log, written = importer.facts(episode), config.out, None
         if log is None:
             inputs = mapping.inputs(file.path) | {f"source_{i}": p for i, p in enumerate(file.beside, 1)}
@@ -59,12 +63,8 @@ def run(config: ImportConfig) -> None:
             importer.write_log(log, episode, mapping)
             if text:
                 (written := log.with_suffix(".import.toml")).write_text(text, encoding="utf-8")
-        print(console.pairs(facts))
-        console.wrote(log)
-        if written is not None:
-            console.wrote(written)
-            console.note(f"the next file of this recorder: sim2real import FILE --mapping {console.shown(written)}")
-            text = ""
+        show_log(facts, log, written)
+        text = text if written is None else ""
 
 
 def configured_mapping(config: ImportConfig) -> ImportMapping | None:
@@ -78,7 +78,7 @@ def configured_mapping(config: ImportConfig) -> ImportMapping | None:
 
 
 def described(home: pipeline.Pipeline) -> bool:
-    """Return whether a pipeline's robot takes what a proposed mapping calls its fields."""
+    """Return whether a pipeline's robot has the fields of a proposed mapping."""
     return isinstance(home.load(), MjcfRobot)
 
 
@@ -126,16 +126,13 @@ def proposed(file: ForeignFile, description: ImportHints) -> tuple[ImportMapping
         proposal = propose(file, description)
     except UsageError:
         # A signal that the file's reader omitted may be the cause.
-        for line in file.notes:
-            console.note(line)
+        show_notes(file)
         raise
-    console.note(f"proposed mapping for {file.path.name}:")
     lines, mapping = list(proposal.evidence), proposal.mapping
     if description.slides:
         mapping, line = in_lengths(mapping, description, file.path)
         lines.append(line)
-    for line in lines:
-        console.note(f"  {line}")
+    show_proposal(file, lines)
     names = f"Joints: {', '.join(proposal.joints)}"
     return mapping, to_toml(mapping, [f"Proposed by `sim2real import {file.path.name}`:", *lines, names])
 
@@ -177,7 +174,7 @@ def refuse_contradictions(path: Path, episode: Episode, as_told: bool) -> None:
             hint="correct order, signs or units in the mapping; --as-told imports it all the same",
         )
     for line in sentences:
-        console.note(f"warning: {line}")
+        note(f"warning: {line}")
 
 
 def contradictions(episode: Episode) -> list[str]:

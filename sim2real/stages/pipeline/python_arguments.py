@@ -28,6 +28,8 @@ AnyIdentification: TypeAlias = Identification | AnyPath
 """An identification, its ``parameters.json``, or the folder of an identify stage."""
 AnyBundle: TypeAlias = Bundle | AnyPath
 """A bundle, its folder, or that of a train stage."""
+AnyTiming: TypeAlias = Timing | AnyPath
+"""A timing, or its file."""
 
 
 def is_robot(value: object) -> bool:

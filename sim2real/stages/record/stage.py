@@ -4,36 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
 from sim2real.robots.contract import Robot
 from sim2real.stages.excitation.signals import excitation
-from sim2real.stages.on_robot.episode import check_deadlines, run_episode, timing_rows
-from sim2real.stages.on_robot.open_robot import opened, show_withheld, warn
+from sim2real.stages.on_robot.episode import check_deadlines, run_episode
+from sim2real.stages.on_robot.open_robot import opened
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyPath, config_of, folder_of
 from sim2real.stages.record.config import RecordConfig
-from sim2real.stages.terminal.console import note, table
+from sim2real.stages.record.show import show
+from sim2real.stages.terminal.console import note
+from sim2real.types import Json
 
 
 def record(
-    robot: Robot | Pipeline | str, folder: AnyPath, config: RecordConfig | Mapping[str, Any] | None = None
+    robot: Robot | Pipeline | str, folder: AnyPath, config: RecordConfig | Mapping[str, Json] | None = None
 ) -> Recording:
     """Play the excitation on the robot and record it.
 
     Args:
         robot: The robot, its pipeline, or the pipeline's name.
-        folder: Takes the log; a log is never overwritten.
-        config: How; default: that of the pipeline that loaded the robot. A dict has what is different from it.
+        folder: Folder for the log; a log is never overwritten.
+        config: Settings; default: those of the robot's pipeline. A dict has the settings that differ from these.
 
     Returns:
         The recording; its ``summary`` is that of the session.
 
     Raises:
-        Sim2RealError: What stopped the robot; the log holds everything up to then.
+        Sim2RealError: The robot was stopped; the log holds everything up to then.
     """
     pipeline, folder = pipeline_of(robot), folder_of(folder)
     config = config_of(config, pipeline.record)
@@ -51,12 +52,11 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
     """Record in a stage folder.
 
     Args:
-        run_dir: Run folder to add to; None makes a new one.
+        run_dir: Run folder to add to; None: a new one.
     """
+    # Refuse an excitation that the robot cannot play, before a folder is made.
     robot = moving_robot(pipeline)
-    excitation(
-        config, robot.rate_hz, len(robot.agent.action)
-    )  # what cannot be played is refused before a folder is made
+    excitation(config, robot.rate_hz, len(robot.agent.action))
     with open_stage(root, pipeline.name, "record", config, {}, run_dir, config.dry_run) as stage:
         stage.output("log", LOG)
         if config.port == "embedded":
@@ -65,10 +65,7 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         summary = recording.summary
         for name, path in recording.timing.save(stage.folder).items():
             stage.output(name, path)
-        print(table(*timing_rows(summary)))
-        warn(summary)
-        if config.dry_run:
-            show_withheld([summary])
+        show(summary, config.dry_run)
         stage.summary(
             {
                 "seconds": config.duration_s,

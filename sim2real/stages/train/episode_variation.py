@@ -1,7 +1,8 @@
-"""Pushes and starts of a training's episodes, shown beside the parameters."""
+"""Differences between the episodes of a training: parameters, noise, starts, pushes; as distributions to show."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import jax
@@ -9,13 +10,110 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.artifacts.episodes import Episodes, Varied
+from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.timing import Timing
+from sim2real.graph.node import TICKS_PER_S, BaseNode
+from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.robots.control_loop.simulated_devices import SimSensor
 from sim2real.robots.control_loop.training_task import LoopTask
+from sim2real.stages.terminal.console import note
+from sim2real.stages.train.config import TrainConfig
 from sim2real.train.environment.graph_environment import TrainingTask
 from sim2real.train.environment.pushes import Pushes
+from sim2real.train.environment.timelines import TimelineDraw
 from sim2real.train.environment.variation import VariationConfig
 
+_MAX_TIMES = 5000
+"""Number of times that are kept for pictures."""
 COUNT = 1024
 """Number of starts that are drawn to be shown, and the approximate number of pushes."""
+
+
+def set_start(task: LoopTask, config: TrainConfig) -> None:
+    """Give the task the configured offsets of an episode's start."""
+    start = (config.vary.start_position, config.vary.start_velocity)
+    if not any(start):
+        return
+    task.start = start
+    jax.eval_shape(task.params, jax.random.key(0))
+
+
+def set_noise(sensor: BaseNode, identification: Identification | None, config: TrainConfig) -> tuple[Noise, ...]:
+    """Give the simulated sensor the noise of the log; return it."""
+    factor = config.vary.noise
+    if identification is None or not identification.noise or not factor:
+        return ()
+    noise = tuple(
+        replace(n, deviation=factor * n.deviation, quantum=factor * n.quantum, bias=factor * n.bias)
+        for n in identification.noise
+    )
+    if not isinstance(sensor, SimSensor):
+        note(
+            f"readings are exact: {type(sensor).__name__} takes no noise, as "
+            "sim2real.robots.control_loop.simulated_devices.SimSensor does"
+        )
+        return ()
+    sensor.noise = noise
+    return noise
+
+
+def episodes_of(
+    identification: Identification | None,
+    values: Mapping[str, float],
+    draws: Mapping[str, np.ndarray],
+    noise: tuple[Noise, ...],
+    drawn: TimelineDraw,
+    timing: Timing | None,
+    config: TrainConfig,
+) -> Episodes:
+    """Return the distributions of the episodes, with one row for the sum of the delays."""
+    # A row for each drawn parameter, with its interval.
+    estimates = {p.name: p for p in identification.parameters} if identification is not None else {}
+    columns = {n: d for n, d in draws.items() if n not in DELAYS}
+    rows = [
+        Varied(n, p.unit, values[n], p.low95, p.high95, p.verdict == "not identifiable")
+        if (p := estimates.get(n)) is not None
+        else Varied(n, "", values[n])
+        for n in columns
+    ]
+    if delays := [n for n in DELAYS if n in draws]:
+        trip = estimates.get(ROUND_TRIP)
+        columns[ROUND_TRIP] = np.sum([draws[n] for n in delays], axis=0)
+        ends = (trip.low95, trip.high95) if trip is not None else (None, None)
+        rows.append(Varied(ROUND_TRIP, "s", sum(values[n] for n in delays), *ends))
+
+    # Computation times of each node, drawn and recorded.
+    drawn_s = {
+        n: ((v.end - v.start)[np.arange(v.start.shape[1]) < v.count[:, None]] / TICKS_PER_S)
+        for n, v in drawn.timeline.vertices.items()
+    }
+    recorded_s = {} if identification is None or timing is None else timing.steps_s
+    widens = config.vary.misfit and not config.vary.uniform
+    return Episodes(
+        parameters=tuple(rows),
+        widening=(identification.widening if identification and widens else None) or 1.0,
+        noise=noise,
+        timelines=config.timelines,
+        cut=drawn.cut,
+        again=drawn.redrawn,
+        longest_pause_s=drawn.longest_pause_s,
+        draws={n: np.asarray(d, np.float64) for n, d in columns.items()},
+        recorded_s={n: np.asarray(s, np.float64)[:_MAX_TIMES] for n, s in recorded_s.items()},
+        drawn_s={n: np.asarray(s, np.float64)[:_MAX_TIMES] for n, s in drawn_s.items() if n in recorded_s},
+        off=_deviations(identification, noise),
+    )
+
+
+def _deviations(identification: Identification | None, noise: tuple[Noise, ...]) -> dict[str, np.ndarray]:
+    """Return the measurements minus the predictions of the identified model, for columns with predictions."""
+    deviations = {}
+    for n in noise:
+        measured, model = f"{n.column}_measured", f"{n.column}_identified"
+        if identification is not None and {measured, model} <= set(identification.samples):
+            values = np.asarray(identification.samples[measured] - identification.samples[model], np.float64)
+            deviations[n.column] = values[np.isfinite(values)][:_MAX_TIMES]
+    return deviations
 
 
 def with_disturbances(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import jax
 import numpy as np
 
-from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.base import GraphState, InputState, StepState
@@ -17,7 +15,6 @@ from sim2real.policy.bundle import PolicyReference
 from sim2real.policy.runner import PolicyRunner
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.policy_node import in_numpy
-from sim2real.stages.terminal.console import note
 from sim2real.train.networks.policy import Policy
 from sim2real.types import Array, PyTree
 
@@ -46,18 +43,6 @@ class _Agent(Protocol):
     def act(self, step_state: StepState, action: Array) -> tuple[StepState, PyTree]:
         """Return the new step state and the output."""
         ...
-
-
-def load_recording(identification: Identification | None, run_dir: Path) -> Recording | None:
-    """Return the recording of an identification; None without its file, which training does not need."""
-    if identification is None or not identification.logs:
-        return None
-    path = run_dir / identification.logs[0].path
-    try:
-        return Recording.load(path) if path.is_file() else None
-    except Sim2RealError as error:
-        note(f"warning: the runner is not compared with JAX on the log: {error}")
-        return None
 
 
 def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:

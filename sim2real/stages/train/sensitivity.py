@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,15 @@ import numpy as np
 from sim2real.artifacts.estimation.posterior import TRANSFORMS, Posterior, from_scale
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
+from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.identify.problem.programs import Program
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.loop import DELAYS, in_a_loop
 from sim2real.robots.control_loop.training_task import LoopTask
+from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.train.config import TrainConfig
+from sim2real.stages.train.training_setup import prepare
 from sim2real.train.config import PPOConfig
 from sim2real.train.environment.graph_environment import GraphEnvironment, TrainingTask
 from sim2real.train.networks.policy import Policy
@@ -30,6 +34,24 @@ TIMELINES = 8
 MULTIPLES = np.array([-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0])
 _EPISODES = 16
 """Episodes of each model. All models play the same episodes, so differences come from the parameter."""
+
+
+def policy_sensitivity(
+    pipeline: Pipeline,
+    config: TrainConfig,
+    identification: Identification | None,
+    timing: Timing | None,
+    robot: Robot,
+    policy: Policy,
+) -> Sensitivity | None:
+    """Return the success of the policy with each parameter moved; None without intervals of the parameters."""
+    if config.model == "nominal" or identification is None:
+        return None
+    moves = moves_of(identification)
+    models = models_of(identification.values, moves)
+    wide = with_room(robot, models)
+    env = prepare(pipeline, replace(config, timelines=TIMELINES), identification, timing, robot=wide).env
+    return sensitivity(wide, env, policy, moves, models, config.seed)
 
 
 @dataclass(frozen=True)

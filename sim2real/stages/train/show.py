@@ -18,6 +18,10 @@ Table = tuple[list[list[Cell]], list[str]]
 """Rows and headers."""
 
 
+Watch = Callable[[Progress], None]
+"""A function that receives the figures of each evaluation."""
+
+
 class ProgressBar(Protocol):
     """The part of tqdm's bar that is used here."""
 
@@ -34,7 +38,7 @@ class ProgressBar(Protocol):
         ...
 
 
-def show_progress(bar: ProgressBar, p: Progress, watch: Callable[[Progress], None] | None) -> None:
+def show_progress(bar: ProgressBar, p: Progress, watch: Watch | None) -> None:
     """Show an evaluation's figures behind the progress bar, after ``watch`` has received them."""
     if watch is not None:
         watch(p)

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sim2real.artifacts.run.run_folder import OpenStage
 from sim2real.errors import Sim2RealError
+from sim2real.stages.train.config import TrainConfig
+from sim2real.stages.train.show import Watch
 from sim2real.train.ppo.result import Progress
+from sim2real.train.sweep import Sweep
 
 if TYPE_CHECKING:
     from tensorboardX import SummaryWriter
 
 
+def watching(stage: OpenStage, config: TrainConfig) -> AbstractContextManager[Watch | None]:
+    """Yield the function that receives each evaluation: the writer of TensorBoard's files, or None."""
+    if not config.tensorboard:
+        return nullcontext()
+    names = Sweep.parse(config.sweep).names(config.ppo.num_seeds)
+    return event_files(stage.output("tensorboard", "tensorboard"), names)
+
+
 @contextmanager
-def event_files(folder: Path, names: Sequence[str]) -> Iterator[Callable[[Progress], None]]:
+def event_files(folder: Path, names: Sequence[str]) -> Iterator[Watch]:
     """Yield a function that writes the figures of an evaluation into event files, one for each policy.
 
     Args:

@@ -1,4 +1,4 @@
-"""Errors for figures of a training that are not finite."""
+"""Errors for figures of a training that are missing or not finite."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.train.config import PPOConfig
+from sim2real.train.environment.protocol import TrainingEnvironment, metric_names
 
 FINITE = {
     "finite_observation": ("the observation", "reset or step"),
@@ -53,3 +54,12 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
         metrics = sorted(name for name, value in values.items() if not np.isfinite(value[seed]).all())
         if metrics:
             raise Sim2RealError(f"metrics {', '.join(metrics)} of finished episodes are not finite {when}")
+
+
+def check_target(env: TrainingEnvironment, config: PPOConfig) -> None:
+    """Raise a ``UsageError`` if the configuration has a target and the environment reports no success."""
+    if config.target is not None and "success" not in (names := metric_names(env)):
+        raise UsageError(
+            f"target={config.target} is a share of success, and the environment's metrics have none: {sorted(names)}",
+            hint="add 'success' to the metrics of its steps",
+        )

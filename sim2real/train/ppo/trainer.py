@@ -15,14 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.errors import UsageError
 from sim2real.runtime.program_arguments import data_of, with_data
 from sim2real.train.config import PPOConfig as PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, check_environment, get_width, metric_names
+from sim2real.train.environment.protocol import TrainingEnvironment, check_environment, get_width
 from sim2real.train.networks.architectures import Factory
 from sim2real.train.networks.policy import Policy
 from sim2real.train.networks.sequences import ActorCritic
-from sim2real.train.ppo.health import FINITE, check_values
+from sim2real.train.ppo.health import FINITE, check_target, check_values
 from sim2real.train.ppo.initial_state import make_initial_state, make_networks, swept_numbers
 from sim2real.train.ppo.result import Progress as Progress
 from sim2real.train.ppo.result import TrainResult as TrainResult
@@ -135,7 +134,7 @@ class _Session(NamedTuple):
         """Check the environment, make the networks and the first state, and trace the program."""
         check_environment(env)
         env = TeacherEnvironment(env) if config.teacher else env
-        _check_target(env, config)
+        check_target(env, config)
         networks = make_networks(env, config, *makers)
         state = make_initial_state(env, sweep.configs(config), key, networks)
 
@@ -259,14 +258,6 @@ def _result(session: _Session, training: Checkpoint, first: int, compile_s: floa
         compile_s=compile_s,
         train_s=train_s,
     )
-
-
-def _check_target(env: TrainingEnvironment, config: PPOConfig) -> None:
-    if config.target is not None and "success" not in (names := metric_names(env)):
-        raise UsageError(
-            f"target={config.target} is a share of success, and the environment's metrics have none: {sorted(names)}",
-            hint="add 'success' to the metrics of its steps",
-        )
 
 
 def _is_over(config: PPOConfig, log: list[Progress]) -> bool:

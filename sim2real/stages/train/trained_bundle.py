@@ -1,0 +1,112 @@
+"""The bundle of a trained policy: contract, weights, graph, history, and JAX's actions to compare a runner with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from sim2real.artifacts.bundle import Bundle, History
+from sim2real.artifacts.episodes import Episodes
+from sim2real.artifacts.identification import ROUND_TRIP
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.sensitivity import Sensitivity
+from sim2real.policy.bundle import make_runner
+from sim2real.policy.contract import PolicyContract
+from sim2real.robots.contract import Robot
+from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.stages.train.config import TrainConfig
+from sim2real.stages.train.parity import MAX_OBSERVATIONS, observations_of, reference_of
+from sim2real.stages.train.show import training_summary
+from sim2real.stages.train.teacher_bundle import policy_contract
+from sim2real.stages.train.training_setup import TrainingSetup
+from sim2real.train.environment.graph_environment import TrainingTask
+from sim2real.train.networks.onnx_export import export_graph
+from sim2real.train.ppo.trainer import TrainResult
+from sim2real.train.sweep import Sweep, format_point
+
+
+def bundle_of_training(
+    setup: TrainingSetup,
+    config: TrainConfig,
+    contract: PolicyContract,
+    result: TrainResult,
+    weakness: Sensitivity | None,
+    recording: Recording | None,
+) -> Bundle:
+    """Return the best policy as a bundle, with JAX's actions on observations of training and log to compare with."""
+    policy, weights = result.best, result.best.to_weights()
+    contract, graph = policy_contract(contract, policy), export_graph(policy)
+
+    # Observations: the last ones of the training, and those of a robot's recording. A teacher runs on no robot.
+    observations = {} if policy.spec.privileged else {"training": result.observations[:MAX_OBSERVATIONS]}
+    if observations and recording is not None:
+        runner = make_runner(weights, contract, None, policy.spec, graph)
+        observations["log"] = observations_of(setup.robot, recording, runner)
+    references = {name: reference_of(policy, array) for name, array in observations.items()}
+
+    summary = {"model": config.model}
+    summary |= training_summary(result, config.ppo, Sweep.parse(config.sweep), setup.episodes)
+    summary |= {} if weakness is None else {"what breaks it": weakness.advice}
+    return Bundle(
+        contract=contract,
+        weights=weights,
+        history=_history(result),
+        episodes=setup.episodes,
+        path=None,
+        sensitivity=weakness,
+        spec=policy.spec,
+        graph=graph,
+        references=references,
+        summary=summary,
+    )
+
+
+def _history(result: TrainResult) -> History:
+    curves = {name: np.asarray(v, np.float64) for name, v in result.history.items()}
+    return History(
+        steps=np.asarray(result.env_steps, np.float64),
+        seconds=np.asarray(result.elapsed_s, np.float64),
+        returns=curves.pop("return"),
+        success=curves.pop("success"),
+        best_seed=result.best_seed,
+        compile_s=result.compile_s,
+        train_s=result.train_s,
+        env_steps_per_s=result.env_steps_per_s,
+        settings=tuple(map(format_point, result.members)) if any(result.members) else (),
+        others=curves,
+    )
+
+
+def contract_of(
+    robot: Robot, task: TrainingTask, values: Mapping[str, float], episodes: Episodes | None = None
+) -> PolicyContract:
+    """Return the contract of a policy: observation, action, and the delays of its training.
+
+    Args:
+        values: Parameters by name.
+    """
+    return PolicyContract(
+        observation=robot.agent.observation,
+        action=tuple(
+            replace(term, low=float(low), high=float(high))
+            for term, low, high in zip(robot.agent.action, task.action_low, task.action_high, strict=True)
+        ),
+        rate_hz=robot.rate_hz,
+        delays_s={n: v for n, v in values.items() if n.endswith("_delay")},
+        trained_s={} if episodes is None else _trained(values, episodes),
+        limits=dict(robot.agent.limits),
+        hashes={},
+    )
+
+
+def _trained(values: Mapping[str, float], episodes: Episodes) -> dict[str, tuple[float, float]]:
+    """Return the range of the round trip over the episodes, and the 1 and 99 % quantiles of each node's steps [s]."""
+    trained: dict[str, tuple[float, float]] = {}
+    if set(DELAYS) <= set(values):
+        trips = np.append(episodes.draws.get(ROUND_TRIP, []), sum(values[n] for n in DELAYS))
+        trained[ROUND_TRIP] = (float(trips.min()), float(trips.max()))
+    for node, took_s in episodes.drawn_s.items():
+        trained[node] = (float(np.quantile(took_s, 0.01)), float(np.quantile(took_s, 0.99)))
+    return trained
