@@ -104,7 +104,7 @@ def test_every_command_has_help(capsys, command):
         (["record"], "pendulum"),
         (["record", "no_such_robot"], "pendulum"),
         (["record", "pendulum", "--durations-s", "3"], "did you mean --duration-s?"),
-        (["record", "pendulum", "--gate.limt", "3"], "--gate.slew-per-s"),
+        (["record", "pendulum", "--gate.limt", "3"], "--gate.limit?"),
         (["record", "pendulum", "--duration-s", "long"], "long"),
         (["record", "pendulum", "--excitation", "noise"], "multisine"),
         (["record", "pendulum", "--duration-s", "0"], "[1, 3600] s"),

@@ -175,6 +175,10 @@ def flag_names(config: Any, prefix: str = "") -> list[str]:
     return names
 
 
+_MAX_LISTED_FLAGS = 20
+"""A refusal lists at most this many flags; ``run`` has 120."""
+
+
 def _unknown(unknown: Sequence[str], default: Any, prog: str) -> UsageError:
     """Return the error for arguments that no flag took."""
     known = flag_names(default)
@@ -182,10 +186,9 @@ def _unknown(unknown: Sequence[str], default: Any, prog: str) -> UsageError:
     if not flags:
         return UsageError(f"unexpected argument {unknown[0]!r}", hint=f"see `{prog} --help`")
     close = difflib.get_close_matches(flags[0].replace("_", "-"), known, n=1)
-    return UsageError(
-        f"unknown flag {', '.join(flags)}. Available: {', '.join(known)}",
-        hint=f"did you mean {close[0]}?" if close else f"see `{prog} --help`",
-    )
+    available = f". Available: {', '.join(known)}" if len(known) <= _MAX_LISTED_FLAGS else ""
+    guess = f"did you mean {close[0]}? " if close else ""
+    return UsageError(f"unknown flag {', '.join(flags)}{available}", hint=f"{guess}`{prog} --help` lists all flags")
 
 
 def _usage_error(end: BaseException, talk: str, prog: str) -> Sim2RealError:

@@ -237,10 +237,22 @@ class Robot:
         self.model.check_task(task)
         return nodes, task
 
-    def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, PyTree]:
-        """Return the nodes' parameters for an episode in simulation that starts at rest."""
-        values = in_a_loop(values, self.model.tick_s, self.delay_spread_s)
-        return self.node_parameters(values, self.task.at_rest(trial), policy)
+    def simulation_params(
+        self, values: Mapping[str, float], policy: Any, trial: int = 0, measured: np.ndarray | None = None
+    ) -> dict[str, PyTree]:
+        """Return the nodes' parameters for an episode in simulation that starts at rest.
+
+        Args:
+            measured: Positions ``(channels,)`` where the robot rested, which may differ from the task's by friction.
+        """
+        values, start = in_a_loop(values, self.model.tick_s, self.delay_spread_s), self.task.at_rest(trial)
+        if measured is not None:
+            offset = measured - np.asarray(start.position)
+            angles = [self.sensor.units.get(channel.position) == "rad" for channel in self.sensor.channels]
+            # Whole turns of a hinge without range are no offset.
+            offset -= np.where(angles, 2 * np.pi * np.round(offset / (2 * np.pi)), 0.0)
+            start = self.task.moved(start, offset, np.zeros_like(offset))
+        return self.node_parameters(values, start, policy)
 
     def node_parameters(self, values: Mapping[str, Any], start: EpisodeStart, policy: Any = None) -> dict[str, PyTree]:
         """Return the parameters of all nodes in simulation, from values by name and a start."""

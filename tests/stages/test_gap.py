@@ -103,7 +103,8 @@ def test_a_deployment_on_a_machine_that_was_too_busy_is_reported_without_a_simul
     slow = steps(50)
     busy = Steps(**{**vars(slow), "end": slow.start + 100_000})
     episode = Episode(steps={"agent": busy}, messages={}, outputs={})
-    assert simulations.simulate(ARM, None, [{"gain": 1.0}], Timing.of(episode), 1.0, 1, "world") == (None, None)
+    rest = [np.zeros(1)]
+    assert simulations.simulate(ARM, None, [{"gain": 1.0}], Timing.of(episode), 1.0, rest, "world") == (None, None)
     assert (
         "warning: nothing to compare with: only 0 of 50 steps of node 'agent' took less than" in capsys.readouterr().err
     )
@@ -125,9 +126,10 @@ def test_simulated_measurements_are_compared_with_measurements():
     values = robot.nominal() | {"sensor_delay": late_s, "actuator_delay": 0.01}
     episode = Episode(steps={n: steps(30) for n in ("sensor", "agent", "actuator")}, messages={}, outputs={})
     policy = Push(jnp.full(1, 1.5))
-    (t_s, world), (at_s, sensor) = simulations.simulate(robot, policy, [values], Timing.of(episode), 0.6, 1, "world")[
-        0
-    ][0]
+    # The robot rested beside the start of its task, a turn away.
+    rest, timing = [np.array([3 * np.pi + 0.06])], Timing.of(episode)
+    (t_s, world), (at_s, sensor) = simulations.simulate(robot, policy, [values], timing, 0.6, rest, "world")[0][0]
+    assert float(sensor["th"][0]) == pytest.approx(np.pi + 0.06, abs=1e-4)
     assert set(sensor) == set(world) == {"th", "thdot", "command", "t_command"}
     assert len(sensor["th"]) == len(at_s) < len(t_s)
     then = np.interp(at_s - late_s, t_s, world["th"])

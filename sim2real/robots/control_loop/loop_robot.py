@@ -98,8 +98,11 @@ class LoopRobot(Robot):
             port, lambda p: robot.make_device(p, silence_s), gate, embedded, truth_path, seed, self.mounting
         )
 
-    def simulation_params(self, values: Mapping[str, float], policy: Any, trial: int = 0) -> dict[str, PyTree]:
-        """Return the nodes' parameters for an episode in simulation that starts at rest."""
+    def simulation_params(
+        self, values: Mapping[str, float], policy: Any, trial: int = 0, measured: np.ndarray | None = None
+    ) -> dict[str, PyTree]:
+        """Return the nodes' parameters for an episode in simulation that starts at rest, as ``rest_params`` says."""
+        del measured
         robot: Any = self
         return robot.rest_params(in_a_loop(values, self.model.tick_s, self.delay_spread_s), policy, trial)
 

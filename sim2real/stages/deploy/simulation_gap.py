@@ -11,7 +11,7 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import Deployment, Gap, Scores
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.graph.episode import Episode
+from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import newest_message
@@ -52,9 +52,10 @@ def compare(
         policy = Policy.from_weights(bundle.weights, bundle.spec)
         parameters = plausible_parameters(identification, len(recordings))
         node = robot.roles.world if use_truth else robot.roles.sensor
+        rest = [_rest(robot, recording.episode) for recording in recordings]
         with progress(None, "simulate the same"):
             simulated, timeline = patiently(
-                lambda: simulate(robot, policy, parameters, recordings[0].timing, duration_s, len(recordings), node)
+                lambda: simulate(robot, policy, parameters, recordings[0].timing, duration_s, rest, node)
             )
     scored = None if simulated is None else [states for states, _ in simulated]
     measured = [] if simulated is None else [states for _, states in simulated]
@@ -82,6 +83,12 @@ def _states(recording: Recording, robot: Robot, use_truth: bool) -> States:
 
 def _sensed(robot: Robot, episode: Episode) -> dict[str, np.ndarray]:
     return as_columns(episode.outputs[robot.roles.sensor])
+
+
+def _rest(robot: Robot, episode: Episode) -> np.ndarray:
+    """Return the first measured position of each channel ``(channels,)``."""
+    fields = dict(named_leaves(episode.outputs[robot.roles.sensor]))
+    return np.array([float(c.of(np.asarray(fields[c.position])).ravel()[0]) for c in robot.sensor.channels])
 
 
 def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:

@@ -47,16 +47,17 @@ def simulate(
     parameters: Sequence[Mapping[str, float]],
     timing: Timing,
     duration_s: float,
-    episodes: int,
+    rest: Sequence[np.ndarray],
     scored_node: str,
 ) -> tuple[list[tuple[States, States]] | None, Timeline | None]:
-    """Simulate the policy from rest; steps that took longer than a period of the policy are not drawn.
+    """Simulate the policy from where the robot rested; steps longer than a period of the policy are not drawn.
 
     After such a hiccup a node makes several steps at once, and the program would have to hold each of them. The ages
     in the gap report show the hiccups on the robot.
 
     Args:
-        parameters: Parameters of each simulation; simulation e is of episode ``e % episodes``.
+        parameters: Parameters of each simulation; simulation e is of episode ``e % len(rest)``.
+        rest: The measured positions ``(channels,)`` at the start of each episode on the robot.
         scored_node: The node whose states are scored: the world, or the sensor.
 
     Returns:
@@ -78,8 +79,10 @@ def simulate(
     make_room(nodes, timeline)
     graph = CompiledGraph(nodes, robot.roles.supervisor, timeline)
 
-    # Each simulation does the trial of its episode.
-    trials = [robot.simulation_params(values, policy, e % episodes) for e, values in enumerate(parameters)]
+    # Each simulation does the trial of its episode, from where the robot rested: friction holds it beside the task's
+    # start, and a swing-up from there may go to the other side.
+    episodes = [(e % len(rest), rest[e % len(rest)]) for e in range(count)]
+    trials = [robot.simulation_params(v, policy, *e) for v, e in zip(parameters, episodes, strict=True)]
     params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
     recorded = tuple({scored_node, robot.roles.sensor, robot.roles.supervisor, robot.roles.actuator})
 
