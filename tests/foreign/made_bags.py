@@ -55,7 +55,7 @@ def motion(count=600, joints=2):
         np.sin(2 * np.pi * np.outer(t, rng.uniform(0.5, 4, 5)) + rng.uniform(0, 6, 5)).sum(1) for _ in range(joints)
     ]
     goal = 0.1 * np.stack(waves, 1) + 0.3 * np.arange(joints)
-    return goal[LATE:], goal[:-LATE]
+    return goal[LATE:], goal[:-LATE] + 1e-4 * rng.standard_normal((count, joints))
 
 
 GOAL, Q = motion()

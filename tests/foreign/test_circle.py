@@ -80,7 +80,7 @@ def test_a_mapping_that_does_not_count_turns_is_refused(tmp_path):
 def test_a_joint_that_is_sent_from_end_to_end_does_not_turn(tmp_path, end):
     goal = np.where((T % 4) < 2, -end, end)
     q = servo(T, goal, wn=5.0)
-    episode, _ = imported(csv(tmp_path / "run.csv", {"t_s": T, "goal_pan": goal, "q_pan": q}))
+    episode, _ = imported(csv(tmp_path / "run.csv", {"t_s": T, "goal_pan_rad": goal, "q_pan_rad": q}))
     np.testing.assert_allclose(episode.outputs["actuator"]["goal"][:, 0], goal, atol=1e-6)
     np.testing.assert_allclose(episode.outputs["sensor"]["position"][:, 0], q, atol=1e-6)
 

@@ -165,7 +165,10 @@ TIME = np.arange(COUNT) * 0.005
 def following(stamps):
     """Return a table of a joint that follows its goal 20 ms later, with these stamps."""
     tones = lambda t: sum(0.2 * math.sin(6.3 * w * t + w) for w in (0.7, 1.9, 3.1))  # noqa: E731
-    lines = [f"{stamp};{tones(t):.6f};{tones(t - 0.02):.6f}" for stamp, t in zip(stamps, TIME.tolist(), strict=True)]
+    lines = [
+        f"{stamp};{tones(t):.6f};{tones(t - 0.02) + 1e-4 * math.sin(1e4 * t):.6f}"
+        for stamp, t in zip(stamps, TIME.tolist(), strict=True)
+    ]
     return "t;goal_rad;q_rad\n" + "\n".join(lines)
 
 

@@ -13,11 +13,11 @@ def recorded():
     return motion()
 
 
-def saved(path, recorded, rows, value, unit=1.0, **more):
+def saved(path, recorded, rows, value, unit=1.0):
     t, goal, q = recorded
     q = q.copy()
     q[rows, 0] = value
-    np.savez(path, t_s=t, goal=unit * goal, q=unit * q, **more)
+    np.savez(path, t_s=t, goal=unit * goal, q=unit * q)
     return path
 
 
@@ -39,7 +39,7 @@ def test_readings_that_leap_away_and_back_are_left_out(tmp_path, recorded, rows,
 @pytest.mark.parametrize("rows", [range(500, 530), range(1500, 2000)])
 def test_a_zero_that_changes_is_refused(tmp_path, recorded, rows):
     with pytest.raises(UsageError, match=rf"changes by .* rad before sample {rows[0]}, .* faster than a joint can"):
-        imported(saved(tmp_path / "run.npz", recorded, list(rows), -np.pi))
+        imported(saved(tmp_path / "run.npz", recorded, list(rows), -np.pi, 180 / np.pi))
 
 
 def test_many_leaps_are_refused(tmp_path, recorded):
@@ -51,7 +51,7 @@ def test_fast_motions_are_no_leaps(tmp_path, recorded):
     t, _, _ = recorded
     goal = np.where((t % 1.0) < 0.5, -1.0, 1.0)[:, None]
     q = servo(t, goal[:, 0], wn=40.0)[:, None]
-    np.savez(tmp_path / "run.npz", t_s=t, goal=goal, q=q)
+    np.savez(tmp_path / "run.npz", t_s=t, goal=goal, q_rad=q)
     np.testing.assert_allclose(imported(tmp_path / "run.npz")[0].outputs["sensor"]["position"], q)
 
 

@@ -14,7 +14,6 @@ SHAPES = {
     "sine": lambda f, t: 0.5 * np.sin(2 * np.pi * f * t),
     "sine about a level": lambda f, t: 0.3 + 0.5 * np.sin(2 * np.pi * f * t + 1),
     "triangle": lambda f, t: 0.4 * np.arcsin(np.sin(2 * np.pi * f * t)),
-    "square": lambda f, t: 0.4 * np.sign(np.sin(2 * np.pi * f * t + 0.3)),
     "gait": lambda f, t: 0.4 * np.sin(2 * np.pi * f * t + 1) + 0.2 * np.sin(4 * np.pi * f * t),
     "rest first": lambda f, t: 0.5 * np.sin(2 * np.pi * f * np.maximum(t - 1.0, 0.0)),
 }
@@ -50,10 +49,19 @@ def test_a_reversed_sign_is_claimed_where_the_data_tells_it(tmp_path, shape, f):
     assert 70 <= lag_ms(found) <= 88
 
 
-@pytest.mark.parametrize(("shape", "f"), [("sine", 0.55), ("sine", 1.0), ("triangle", 1.7), ("square", 2.5)])
-def test_a_sign_that_no_data_can_tell_is_refused_with_both_candidates(tmp_path, shape, f):
-    goal = SHAPES[shape](f, T)
-    path = log(tmp_path, goal, -servo(T, goal))
+def square(f, t):
+    return 0.4 * np.sign(np.sin(2 * np.pi * f * t + 0.3))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(
+    ("shape", "f", "late"),
+    [("sine", 0.55, 0.05), ("sine", 1.0, 0.1), ("sine", 3.0, 0.25), ("triangle", 1.7, 0.4), ("square", 2.5, 0.3)],
+)
+def test_a_sign_that_no_data_can_tell_is_refused_with_both_candidates(tmp_path, shape, f, late, sign):
+    """One joint, one tone, no start from rest: the opposite sign half a period later is the same log."""
+    wave = SHAPES.get(shape, square)
+    path = log(tmp_path, wave(f, T), sign * wave(f, T - late))
     with pytest.raises(
         UsageError, match=r"signs are ambiguous: a follows \d+ ms later, or with the opposite sign \d+ ms"
     ):
@@ -80,6 +88,20 @@ def test_other_joints_tell_a_sign_that_one_alone_leaves_open(tmp_path):
         UsageError, match="signs are ambiguous: a follows 113 ms later, or with the opposite sign 280 ms"
     ):
         imported(csv(tmp_path / "run.csv", columns))
+
+
+def test_joints_of_other_periods_exclude_the_wrong_sign(tmp_path):
+    """Each joint alone fits with either sign; only one lag fits all three."""
+    waves, late = [(2.0, 1), (2.7, -1), (1.3, 1)], 0.07
+    goal = np.stack([SHAPES["sine"](f, T) for f, _ in waves], axis=1)
+    q = np.stack([sign * SHAPES["sine"](f, T - late) + NOISE for f, sign in waves], axis=1)
+    columns = {"t_s": T} | {f"{kind}_{'abc'[i]}": x[:, i] for kind, x in (("goal", goal), ("q", q)) for i in range(3)}
+    path = csv(tmp_path / "run.csv", columns)
+    with pytest.raises(UsageError, match="signs are ambiguous: b follows"):
+        imported(path)  # the positive sign of b has the longer lag
+    columns["q_b"] = -columns["q_b"]
+    _, found = imported(csv(tmp_path / "right.csv", columns))
+    assert goal_scales(found).tolist() == [1.0, 1.0, 1.0]
 
 
 def test_the_order_of_commands_that_look_alike_is_refused_without_names(tmp_path):

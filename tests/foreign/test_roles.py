@@ -28,6 +28,7 @@ COPIES = {
     "the next state": lambda goal, q: np.roll(q, -1, axis=0),
     "the state before": lambda goal, q: np.roll(q, 1, axis=0),
     "the state after three": lambda goal, q: np.roll(q, -3, axis=0),
+    "the state after 100 ms": lambda goal, q: np.roll(q, -20, axis=0),
     "in degrees": lambda goal, q: np.degrees(q),
     "turned": lambda goal, q: -q,
     "rounded": lambda goal, q: np.round(q, 2),
@@ -40,6 +41,18 @@ def test_commands_that_are_the_measurements_are_refused(tmp_path, recorded, copy
     t, goal, q = recorded
     np.savez(tmp_path / "run.npz", t_s=t, goal=COPIES[copy](goal, q), q=q)
     with pytest.raises(UsageError, match=r"are copies of the measurements: goal\[:,0\] is q\[:,0\]"):
+        imported(tmp_path / "run.npz")
+
+
+@pytest.mark.parametrize("rows", [4, 20, 90])
+@pytest.mark.parametrize("form", ["motion", "gait"])
+def test_commands_that_are_late_copies_are_refused(tmp_path, recorded, rows, form):
+    """A gait that repeats follows its late copy one period later, too."""
+    t, _, q = recorded
+    if form == "gait":
+        q = np.stack([np.sin(4 * np.pi * t + p) + 0.3 * np.sin(8 * np.pi * t) for p in (0.3, 1.1)], axis=1)
+    np.savez(tmp_path / "run.npz", t_s=t, goal=np.roll(q, rows, axis=0), q_rad=q)
+    with pytest.raises(UsageError, match="copies of"):
         imported(tmp_path / "run.npz")
 
 
@@ -115,6 +128,21 @@ def test_what_is_zero_throughout_is_left_out(tmp_path, monkeypatch, recorded, na
     assert set(episode.outputs["actuator"]) == {"goal"}
     assert f"skipped: '{name}' is 0 throughout" in "\n".join(found.evidence)
     assert from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description.commands == ("goal",)
+
+
+@pytest.mark.parametrize("name", ["kd", "kp", "torque_enable"])
+def test_what_is_zero_for_some_joints_that_follow_is_left_out(tmp_path, recorded, name):
+    t, goal, q = recorded
+    gain = np.tile([1.0, 0.0], (len(t), 1))
+    np.savez(tmp_path / "run.npz", t_s=t, goal_rad=goal, q_rad=q, **{name: gain})
+    episode, found = imported(tmp_path / "run.npz")
+    assert set(episode.outputs["actuator"]) == {"goal"}
+    assert f"skipped: '{name}' is 0 throughout for q_rad[:,1]" in "\n".join(found.evidence)
+    # A joint that does not follow has no drive: its gain is 0.
+    q = q * [1.0, 0.0] + 1e-3 * np.random.default_rng(0).standard_normal(q.shape)
+    np.savez(tmp_path / "run.npz", t_s=t, goal_rad=goal, q_rad=q, **{name: gain})
+    episode, _ = imported(tmp_path / "run.npz")
+    assert len(set(episode.outputs["actuator"]) - {"goal"}) == 1
 
 
 def test_a_mapping_with_a_gain_of_zero_describes_a_robot_without_it(tmp_path, monkeypatch, recorded):

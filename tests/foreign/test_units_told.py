@@ -28,7 +28,8 @@ DEG = np.radians(1.0)
         ({"goal": GOAL, "q": Q, "dq_deg_s": -RATE}, DEG, DEG, -DEG),
         ({"goal_rad": GOAL * DEG, "q": Q, "dq": RATE * DEG}, DEG, 1.0, 1.0),
         ({"goal": GOAL, "q": np.round(Q * 4096 / 360) * 360 / 4096}, DEG, DEG, None),
-        ({"goal": GOAL, "q": Q}, 1.0, 1.0, None),  # nothing tells: said, with the reach
+        ({"goal": 0.5 * GOAL, "q": 0.5 * Q}, 1.0, 1.0, None),  # 1.5 degrees would be hardly a motion
+        ({"goal": GOAL, "qpos": Q}, 1.0, 1.0, None),
         ({"goal": GOAL, "q_rad": Q, "dq_deg_s": RATE}, 1.0, 1.0, None),  # the name of one is wrong: left out
     ],
 )
@@ -45,6 +46,8 @@ def test_units_by_what_goes_with_positions(tmp_path, columns, q, goal, velocity)
 @pytest.mark.parametrize(
     ("columns", "named"),
     [
+        ({"goal": GOAL, "q": Q}, "'q' .* in radians or degrees. It reaches 1.47.*Candidates: rad, deg"),
+        ({"goal": 4 * GOAL, "q": 4 * Q, "dq": 4 * RATE}, "'q' .* in radians or degrees.*It reaches 5.88"),
         ({"goal_deg": GOAL, "q": Q, "dq_rad_s": RATE}, "(?s)'q' .* in radians or degrees.*contradict each other"),
         ({"goal_rad": GOAL, "q": Q, "dq": RATE * DEG}, "(?s)'q' .* in radians or degrees.*contradict each other"),
         (

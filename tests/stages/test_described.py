@@ -33,7 +33,7 @@ RATE_HZ = 100.0
 def recorded():
     t = np.arange(1000) / RATE_HZ
     goal = np.stack([0.4 * np.sin(3.1 * t), 0.3 * np.sin(5.7 * t + 1.0)], axis=1)
-    q = np.stack([0.4 * np.sin(3.1 * (t - 0.04)), 0.3 * np.sin(5.7 * (t - 0.04) + 1.0)], axis=1)
+    q = 0.98 * np.stack([0.4 * np.sin(3.1 * (t - 0.04)), 0.3 * np.sin(5.7 * (t - 0.04) + 1.0)], axis=1)
     return t, goal, q
 
 

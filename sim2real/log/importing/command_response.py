@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
 from scipy.signal import find_peaks
 
@@ -283,6 +284,8 @@ def _chosen(
         if not same:
             return other[0], [np.nan, late[other[1]] if other[1:] else np.nan], either
         return same[0], [late[other[0]], np.nan], either
+    if same and other and _moves_early(late[same[0]], late[other[0]], measured, command):
+        other = []
     if not same:
         # All lags are too early: take the smallest.
         return min(pool, key=lambda p: (p.r < 0, abs(late[p]))), [np.nan, np.nan], either
@@ -297,6 +300,24 @@ def _rests(early: float, late: float, measured: np.ndarray, command: np.ndarray)
         return False
     predicted = np.ptp(command[: stop - begin]) * measured.std() / command.std()
     return bool(predicted > 0.5 * measured.std() and np.ptp(measured[:stop]) < _REST_SHARE * predicted)
+
+
+def _moves_early(early: float, late: float, measured: np.ndarray, command: np.ndarray) -> bool:
+    """Return whether a column starts from rest with its command, and moves before the later of two lags [rows].
+
+    Half a period is between the lags. Only a start differs from the motion one period later.
+    """
+    period, within = round(2.0 * abs(late - early)), int(late)
+    if within < 4 or period < 4 or len(measured) < 4 * period:
+        return False
+    spread, begin = measured.std(), measured[:within]
+    # The column starts where the command starts, with either sign, and rests.
+    centred = abs(measured[0] - measured.mean()), abs(command[0] - command.mean()) * spread / command.std()
+    few = max(3, int(0.5 * early) + 1)
+    rests = np.ptp(measured[:few]) < _REST_SHARE * np.median(np.ptp(sliding_window_view(measured, few), axis=1))
+    change = np.abs(measured[within:-period] - measured[within + period :])
+    differs = np.abs(begin - measured[period : period + within]).max() > 3.0 * np.quantile(change, 0.99) + 0.1 * spread
+    return bool(rests and differs and abs(centred[0] - centred[1]) < 0.2 * spread and np.ptp(begin) > 0.5 * spread)
 
 
 def _coarse(command: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -16,8 +16,8 @@ EQUAL_R, EQUAL_SLOPE = 0.95, 0.9
 """A column equals another, apart from a lag, if correlation and slope in one unit are above these."""
 _MAX_DISTANCE = 10.0
 """Distance between a column that moves and one that does not."""
-_COPIED_ROWS = 3
-"""A command is compared with measurements up to this number of samples away."""
+_COPIED_S, _FEW_ROWS = 1.0, 200
+"""A command is compared with measurements up to this time before and after it [s], first at this number of samples."""
 
 
 def order(relation: Following, scale: float = 1.0) -> np.ndarray:
@@ -166,7 +166,10 @@ def contradictions(
 
 
 def copied(t_command: np.ndarray, t_measured: np.ndarray, command: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return whether commands are copies of measurements at the same or a neighbouring sample, ``(joints,)``.
+    """Return whether commands are copies of measurements up to 1 s before or after them, ``(joints,)``.
+
+    Measurements that equal commands apart from a lag lack the response of a motor.
+
 
     Args:
         t_command: Shape ``(N,)`` [s].
@@ -176,19 +179,26 @@ def copied(t_command: np.ndarray, t_measured: np.ndarray, command: np.ndarray, m
     """
     newest = np.searchsorted(t_command, t_measured + 1e-6, side="right") - 1
     spread = measured.std(axis=0)
+    exact = 1e-5 * spread + 1.1e-6 * np.abs(measured).max(axis=0, initial=0.0)
+    # Allow rounding of one of both, as to the steps of an encoder, for the same and the neighbouring sample.
+    rounded = 0.51 * np.array([max(_step(c), _step(m)) for c, m in zip(command.T, measured.T, strict=True)])
+    # Compare only rows in motion: resting columns are equal at every lag.
+    moves = np.abs(np.diff(measured, axis=0, prepend=measured[:1]))
+    moves = moves > 0.01 * moves.max(axis=0, initial=0.0)
+    rows = [np.flatnonzero(m) for m in moves.T]
+    most = round(_COPIED_S / max(float(np.median(np.diff(t_command))), 1e-4)) if len(command) > 2 else 0
     copies = np.zeros(measured.shape[1], bool)
-    for shift in range(-_COPIED_ROWS, _COPIED_ROWS + 1):
-        at = newest + shift
-        inside = (at >= 0) & (at < len(command))
-        if inside.sum() < 50:
-            continue
-        off = np.quantile(np.abs(measured[inside] - command[at[inside]]), 0.98, axis=0)
-        copies |= off <= 1e-5 * spread + 1.1e-6 * np.abs(measured).max(axis=0, initial=0.0)
-        if abs(shift) <= 1:
-            # Allow rounding of one of both, as to the steps of an encoder.
-            copies |= off <= 0.51 * np.array(
-                [max(_step(c), _step(m)) for c, m in zip(command.T, measured.T, strict=True)]
-            )
+    for i, shift in product(range(len(rows)), range(-most, most + 1)):
+        limit = max(exact[i], rounded[i]) if abs(shift) <= 1 else exact[i]
+        # Look at a few rows first, and at all rows if the few are equal.
+        for some, share in ((rows[i][:: max(len(rows[i]) // _FEW_ROWS, 1)], 0.9), (rows[i], 0.98)):
+            at = newest[some] + shift
+            inside = (at >= 0) & (at < len(command))
+            off = np.abs(measured[some[inside], i] - command[at[inside], i])
+            if inside.sum() < 20 or np.mean(off <= limit) < share:
+                break
+        else:
+            copies[i] = True
     return copies & (spread > 1e-9)
 
 

@@ -17,6 +17,8 @@ _MIN_GOAL_R = 0.9
 """A command without a name is a goal from this correlation on."""
 _SAME_S = 0.01
 """Lags of one robot's joints differ by at most this [s], plus two samples."""
+_MAX_COMMON_S = 0.5
+"""Largest common lag of several joints [s]: beyond, lags of periodic commands agree by chance."""
 _MIN_SLOPE = 0.15
 """A position follows a command from this slope on, in one unit."""
 KEEP_ORDER_HINT = (
@@ -105,45 +107,65 @@ def goal(
 
 
 def _signs(names: Sequence[str], ordered: Following, sure: np.ndarray, path: str, as_told: bool) -> list[str]:
-    """Return notes on commands that repeat."""
+    """Return notes on commands that repeat.
+
+    Raises:
+        UsageError: When a sign is ambiguous, unless ``as_told``.
+    """
     lag, against, repeats = (np.diag(a) for a in (ordered.lag_s, ordered.against_s, ordered.repeats_s))
-    with np.errstate(invalid="ignore"):
-        ambiguous = sure & ((against < lag) | _others_agree(ordered, sure))
-    # Refuse an ambiguous sign, unless the user accepts the file.
+    ambiguous = _open_signs(ordered, sure)
     if ambiguous.any():
         listed = "; ".join(
             f"{names[i]} follows {_ms(lag[i])} ms later, or with the opposite sign {_ms(against[i])} ms later"
             for i in np.flatnonzero(ambiguous).tolist()
         )
+        why = f"repeat, so their signs are ambiguous: {listed}"
         if not as_told:
-            raise UsageError(
-                f"the commands of {path} repeat, so their signs are ambiguous: {listed}", hint=KEEP_ORDER_HINT
-            )
-        return [f"the commands repeat, so their signs are ambiguous: {listed}; the signs of the file are kept"]
+            raise UsageError(f"the commands of {path} {why}", hint=KEEP_ORDER_HINT)
+        return [f"the commands {why}; the signs of the file are kept"]
     # Mention other lags that fit equally well.
-    repeated = sure & (np.isfinite(against) | np.isfinite(repeats))
-    for i in np.flatnonzero(repeated)[:1].tolist():
-        alternatives = ((repeats[i], ""), (against[i], " with the opposite sign"))
-        fits = [f"{_ms(late)} ms{sign}" for late, sign in alternatives if np.isfinite(late)]
+    for i in np.flatnonzero(sure & np.isfinite(repeats))[:1].tolist():
         return [
-            f"commands repeat, so lags and signs are ambiguous: {names[i]} follows {_ms(lag[i])} ms later, and "
-            f"{' and '.join(fits)} would fit equally well: the least lag and the same sign are taken"
+            f"commands repeat, so lags are ambiguous: {names[i]} follows {_ms(lag[i])} ms later, and "
+            f"{_ms(repeats[i])} ms would fit equally well: the least lag is taken"
         ]
     return []
 
 
-def _others_agree(ordered: Following, sure: np.ndarray) -> np.ndarray:
-    """Return whether a joint has the lag of the others only with the opposite sign, ``(joints,)``."""
+def _open_signs(ordered: Following, sure: np.ndarray) -> np.ndarray:
+    """Return whether both signs fit a joint, and the lags of the other joints do not exclude one, ``(joints,)``.
+
+    A periodic command fits with the opposite sign half a period later. Joints of one robot have similar lags, so a
+    joint with another period, or without one, excludes the wrong sign.
+    """
+    same, other = _lags(ordered)
+    margin, joints = 2.0 * ordered.period_s + _SAME_S, np.flatnonzero(sure)
+    ambiguous = np.zeros(len(sure), bool)
+    for i in (i for i in joints if other[i].size):
+        rest = [np.concatenate([same[k], other[k]]) for k in joints if k != i]
+        # The farthest of the other joints counts, at the lag of each candidate.
+        off = [
+            min((max(np.abs(lags - late).min() for lags in rest) for late in own), default=np.inf) if rest else 0.0
+            for own in (same[i], other[i])
+        ]
+        ambiguous[i] = off[0] + margin > 0.5 * off[1]
+    return ambiguous
+
+
+def _lags(ordered: Following) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the lags [s] that fit each joint with the selected sign, and those with the opposite sign."""
     lag, against, repeats = (np.diag(a) for a in (ordered.lag_s, ordered.against_s, ordered.repeats_s))
-    options = np.stack([lag, repeats, against])[:, sure]
-    most = 2.0 * ordered.period_s + _SAME_S
-    disagree = np.zeros(len(lag), bool)
-    for common in options[np.isfinite(options)]:
-        off = np.abs(options - common)
-        # The selected lag of at least one joint must be this lag.
-        if (np.nanmin(off, axis=0) <= most).all() and (off[0] <= most).any():
-            disagree[sure] |= (off[2] <= most) & (off[0] > 2.0 * most)
-    return disagree
+    periods = np.where(np.isfinite(repeats), repeats - lag, 2.0 * np.abs(against - lag))
+    same, other = ([_repeated(*each) for each in zip(first, periods, strict=True)] for first in (lag, against))
+    return same, other
+
+
+def _repeated(first: float, period: float) -> np.ndarray:
+    """Return a lag, and the lags whole periods later, up to ``_MAX_COMMON_S``; empty without a lag [s]."""
+    if not np.isfinite(first):
+        return np.zeros(0)
+    later = np.arange(first + period, _MAX_COMMON_S, period) if period > 0 else np.zeros(0)
+    return np.array([first, *later])
 
 
 def _too_early(
@@ -161,7 +183,7 @@ def _too_early(
     if equal.any() and not as_told:
         raise UsageError(
             f"positions in {path} move before their commands: {listed}. The names of measurements and commands are "
-            "exchanged, or their stamps are of clocks that do not agree",
+            "exchanged, commands are late copies of measurements, or their stamps are of clocks that do not agree",
             hint="correct the names; --as-told imports the file without this check",
         )
     return [f"warning: positions move before their commands: {listed}"]

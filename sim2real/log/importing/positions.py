@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,6 +22,10 @@ _MAX_RAD = 2.2 * np.pi
 """Larger positions are not taken for radians or metres without evidence."""
 _FAST_RAD_S, _SMALL_RAD = 30.0, 2.0
 """Positions that would be faster and larger in radians can be in degrees: their unit is ambiguous."""
+_SMALL_WAY = 2.0
+"""Positions that move farther can be a small motion in degrees, or a large one in radians."""
+_RADIAN_WORDS = {"qpos", "dof"}
+"""Names that simulators give to positions in radians."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +144,11 @@ def _radian(
     if are_degrees(file.facts, _names_of(file, measured), q, path):
         return DEGREES, "its steps are those of encoders of 4096 a turn"
     ranges = hints.ranges[hinges] if hints.ranges is not None and len(hints.ranges) == len(hinges) else None
-    return radian(measured, q[:, hinges], t_s, replace(hints, ranges=ranges), path, jumping, others)
+    # Small positions can have either unit, unless the format prescribes one.
+    usual = "messages of ROS hold radians" if file.format == "mcap" else ""
+    if {w.lower() for w in re.findall("[A-Za-z]+", measured.name)} & _RADIAN_WORDS:
+        usual = "simulators that write this name use radians"
+    return radian(measured, q[:, hinges], t_s, replace(hints, ranges=ranges), path, jumping, others, usual)
 
 
 def radian(
@@ -150,6 +159,7 @@ def radian(
     path: str,
     jumping: list[float],
     others: Sequence[tuple[float, str]],
+    usual: str = "",
 ) -> tuple[float, str]:
     """Return the number of units in a radian, and the reason.
 
@@ -158,6 +168,7 @@ def radian(
         t_s: Shape ``(N,)``: stamps of these rows [s].
         jumping: Units whose turn is the size of jumps in the positions.
         others: Units from other signals, with the reasons.
+        usual: Reason why the file's format has radians; empty without one.
 
     Raises:
         UsageError: When the unit is unclear.
@@ -182,8 +193,11 @@ def radian(
         return by_ranges
     largest = float(np.abs(q).max())
     speed = float(np.quantile(np.abs(np.diff(q, axis=0)) / np.diff(t_s)[:, None], 0.99))
-    if largest <= _MAX_RAD and (speed <= _FAST_RAD_S or largest <= _SMALL_RAD):
-        return 1.0, f"it stays within {largest:.3g}"
+    way, slow = float(np.ptp(q, axis=0).max()), speed <= _FAST_RAD_S or largest <= _SMALL_RAD
+    if largest <= _MAX_RAD and slow and usual:
+        return 1.0, f"it stays within {largest:.3g}, and {usual}"
+    if largest <= _MAX_RAD and way <= _SMALL_WAY:
+        return 1.0, f"as degrees it would move by {way:.2g} degrees only"
     if 30.0 < largest <= 400.0 and speed > 2.0 * _FAST_RAD_S:
         return DEGREES, f"as radians it would move at {speed:.3g} rad/s"
     # A joint that turns without limit has such values also in radians.
@@ -193,7 +207,8 @@ def radian(
     raise UsageError(
         f"is {measured.name!r} in {path} in radians or degrees? It reaches {largest:.4g}, at up to {speed:.3g} a "
         "second. Candidates: rad, deg",
-        hint="end its name with the unit, as in q_rad, or write a mapping with a scale",
+        hint="end its name with the unit, as in q_rad, give the robot's model with --mjcf, or write a mapping with a "
+        "scale",
     )
 
 

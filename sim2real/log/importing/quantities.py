@@ -22,6 +22,8 @@ _EXTRA = {
     "torque": ("torque", "command", "N m"),
 }
 """Commands beside a goal: field -> quantity, side or None for any, and unit."""
+_GAINS = ("kp", "kd", "enabled")
+"""Factors of a drive: one that is 0 throughout contradicts a position that follows its goal."""
 
 
 @dataclass(frozen=True)
@@ -149,14 +151,14 @@ def velocity_of(
 
 
 def extras(
-    signals: Sequence[Signal], command: Signal, measured: Signal, places: np.ndarray, path: str, followed: bool
+    signals: Sequence[Signal], command: Signal, measured: Signal, places: np.ndarray, path: str, followed: np.ndarray
 ) -> tuple[dict[str, FieldMapping], list[str]]:
     """Return the fields of further commands, found by name: gains, torque on or off, velocity and torque beside a goal.
 
     Args:
         measured: Positions, in the order of the joints.
         places: Column of each joint, for signals without names.
-        followed: Whether positions follow the command.
+        followed: Whether positions follow a command, ``(joints,)``.
 
     Raises:
         UsageError: When several signals can be the same quantity.
@@ -173,7 +175,7 @@ def extras(
             and (s.values.ndim == 1 or len(s.values) == len(command.values))
         ]
         notes += [f"skipped: {s.name!r} lacks numbers" for s in named if s is not command and not s.finite.all()]
-        idle = [s for s in fitting if not s.values.any() and followed]
+        idle = [s for s in fitting if not s.values.any() and followed.any()]
         if idle:
             # Skip zeros: a factor of 0 leaves its parameter open, and recorders write 0 for an unknown gain.
             notes.append(f"skipped: {', '.join(repr(s.name) for s in idle)} is 0 throughout, so it is not {name}")
@@ -184,8 +186,11 @@ def extras(
                 hint="write a mapping: the guide 'Import' has one with every key",
             )
         if fitting and not (name == "enabled" and not set(np.unique(fitting[0].values)) <= {0.0, 1.0}):
-            single = fitting[0].width == 1 or fitting[0].values.ndim == 1
-            columns = fitting[0] if single else matched(fitting[0], measured, places)
+            columns = fitting[0] if fitting[0].width == 1 else matched(fitting[0], measured, places)
+            if name in _GAINS and (zero := followed & ~columns.values.any(axis=0)).any():
+                listed = ", ".join(np.array(measured.sources)[zero])
+                notes.append(f"skipped: {fitting[0].name!r} is 0 throughout for {listed}, so it is not {name}")
+                continue
             fields[name] = field_of(columns, unit, [1.0] * columns.width)
             values = np.unique(fitting[0].values)
             listed = ", ".join(f"{v:g}" for v in values[:4]) + (" ..." if len(values) > 4 else "")
