@@ -107,11 +107,7 @@ def goal(
 
 
 def _signs(names: Sequence[str], ordered: Following, sure: np.ndarray, path: str, as_told: bool) -> list[str]:
-    """Return notes on commands that repeat.
-
-    Raises:
-        UsageError: When a sign is ambiguous, unless ``as_told``.
-    """
+    """Return notes on commands that repeat; raise a UsageError if a sign is ambiguous."""
     lag, against, repeats = (np.diag(a) for a in (ordered.lag_s, ordered.against_s, ordered.repeats_s))
     ambiguous = _open_signs(ordered, sure)
     if ambiguous.any():
@@ -145,8 +141,8 @@ def _open_signs(ordered: Following, sure: np.ndarray) -> np.ndarray:
         rest = [np.concatenate([same[k], other[k]]) for k in joints if k != i]
         # The farthest of the other joints counts, at the lag of each candidate.
         off = [
-            min((max(np.abs(lags - late).min() for lags in rest) for late in own), default=np.inf) if rest else 0.0
-            for own in (same[i], other[i])
+            min(max(np.abs(lags - late).min() for lags in rest) for late in candidates) if rest else 0.0
+            for candidates in (same[i], other[i])
         ]
         ambiguous[i] = off[0] + margin > 0.5 * off[1]
     return ambiguous
