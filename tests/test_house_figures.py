@@ -8,13 +8,13 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 60_340,
+    "lines without composer": 60_430,
     "lines of composer": 12_187,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.8,
     "Any in 1,000 lines": 13.0,
     "words of the dialect": 14,
-    "other words of the dialect": 1_185,
+    "other words of the dialect": 1_184,
     "largest number of project imports": 20,
     "levels of robot classes": 2,
     "public members of SO101Robot": 18,

@@ -36,9 +36,9 @@ _UNITS = {
     "raw": "raw counts ticks",
 }
 _WEAK_WORDS = {"state", "states"}
-_SIDE = {word: side for side, words in _SIDES.items() for word in words.split()}
-_QUANTITY = {word: quantity for quantity, words in _QUANTITIES.items() for word in words.split()}
-_UNIT = {word: unit for unit, words in _UNITS.items() for word in words.split()}
+_SIDE = {word: side for side, listed in _SIDES.items() for word in listed.split()}
+_QUANTITY = {word: quantity for quantity, listed in _QUANTITIES.items() for word in listed.split()}
+_UNIT = {word: unit for unit, listed in _UNITS.items() for word in listed.split()}
 # Words without meaning: parts of messages, and names of lists of records.
 _FILLERS = {
     "data",
