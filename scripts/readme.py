@@ -138,7 +138,7 @@ def league(report: Mapping[str, Any]) -> str:
 
 
 def randomise(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
-    """Return the table of the hidden robots: a line for what was trained on, with exact 95 % intervals.
+    """Return the table of the hidden robots: a line for each training model, with exact 95 % intervals.
 
     Args:
         ideal: The report of robots that are nearly ideal.
@@ -183,16 +183,16 @@ def evidence(ideal: Mapping[str, Any], judged: Mapping[str, Any]) -> str:
         )
         (lines if errors["ours"] < errors[best] else lost).append(line)
     text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
-    return text + "".join(f"\nsim2real loses on one set, {what}: {own} against {other}.\n"
-                          for what, own, other in lost)  # fmt: skip
+    return text + "".join(f"\nsim2real loses on one set, {what}: {ours} against {other}.\n"
+                          for what, ours, other in lost)  # fmt: skip
 
 
 def _mean_errors(judged: Mapping[str, Any], name: str) -> dict[str, float]:
     """Return entrant -> mean error on a set of the league [mrad]."""
     scale = {"rad": 1e3, "mrad": 1.0}
     means = {r["name"]: scale[r["unit"]] * r["value"] for r in judged["rows"] if r["value"] is not None}
-    found = {entrant: means.get(f"league/{name}/{entrant}/mean") for entrant in ("ours", *LEAGUE_ENTRANTS)}
-    return {entrant: value for entrant, value in found.items() if value is not None}
+    means_of = {entrant: means.get(f"league/{name}/{entrant}/mean") for entrant in ("ours", *LEAGUE_ENTRANTS)}
+    return {entrant: value for entrant, value in means_of.items() if value is not None}
 
 
 def what_training_knows(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
@@ -303,7 +303,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     names = [name for table in TABLES.values() for name in table]
     parser.add_argument(
         "--stale-ok", nargs="+", default=[], choices=names, metavar="REPORT",
-        help=f"take these reports although what they measure has changed since: {', '.join(names)}",
+        help=f"take these reports although their measured files have changed since: {', '.join(names)}",
     )  # fmt: skip
     accepted = parser.parse_args(arguments).stale_ok
     reports = read_reports()

@@ -1,4 +1,4 @@
-"""Arithmetic on whatever a caller computes with: numpy arrays, or JAX arrays and tracers. Imports no JAX."""
+"""Arithmetic on a caller's numbers: numpy arrays, or JAX arrays and tracers. Imports no JAX."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ DEADLINE = 5
 
 
 class Sim2RealError(ValueError):
-    """An error with a message for the user: what happened, to which name, and what was available.
+    """An error with a message for the user: the event, the name, and the available names.
 
     Args:
         hint: What to do next; printed as a separate paragraph.
@@ -48,7 +48,7 @@ class SafetyStop(Sim2RealError):  # noqa: N818 - an event, not a mistake in the 
 
 
 class DelayChanged(SafetyStop):
-    """The robot's delay is not what its policy was trained with, and nothing was moved by it (exit code 3)."""
+    """The robot's delay differs from that of its policy's training, and the policy moved no joint (exit code 3)."""
 
 
 class HardwareLost(Sim2RealError):  # noqa: N818

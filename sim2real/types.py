@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
     Array: TypeAlias = jax.Array | np.ndarray
     """Numbers of NumPy, or of JAX inside and outside of a traced function."""
+    Scalar: TypeAlias = float | Array
+    """One number; an array of shape ``()`` inside of a traced function."""
     Key: TypeAlias = jax.Array
     """A key of JAX's random numbers."""
 else:
-    Array = Key = MjSpec = MjData = MjModel = Any
+    Array = Scalar = Key = MjSpec = MjData = MjModel = Any

@@ -8,19 +8,21 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 60_430,
-    "lines of composer": 12_187,
+    "lines without composer": 60_415,
+    "lines of composer": 12_165,
     "files in the fullest folder": 15,
-    "docstring lines [%]": 20.8,
-    "Any in 1,000 lines": 13.0,
+    "docstring lines [%]": 20.3,
+    "Any in 1,000 lines": 4.8,
     "words of the dialect": 14,
-    "other words of the dialect": 1_184,
+    "other words of the dialect": 260,
     "largest number of project imports": 20,
     "levels of robot classes": 2,
     "public members of SO101Robot": 18,
     "modules of hardware that train imports": 0,
 }
-AT_LEAST = {"comment lines [%]": 1.31}
+"""The 14 words that remain are names in file formats (``left_out`` in parameters.json, the column ``told``), evosax's
+``tell``, and a word in the column names of recorders."""
+AT_LEAST = {"comment lines [%]": 1.62}
 
 
 @pytest.fixture(scope="module")

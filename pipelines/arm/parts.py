@@ -20,7 +20,7 @@ _GRAY, _BLUE = (0.3, 0.33, 0.36, 1.0), (0.25, 0.5, 0.85, 1.0)
 
 
 class Link(composer.Entity):
-    """A rigid link with what is fixed to it; its end is where the next servo goes."""
+    """A rigid link with its fixed parts; the next servo is attached to its end."""
 
     def _build(
         self,
@@ -95,9 +95,9 @@ class Gantry(composer.Arena):
         self.target = world.add("site", name="target", pos=[0.2, 0, 0.25], size=[0.012], rgba=[0.85, 0.3, 0.2, 1])
 
     def _build_observables(self) -> composer.Observables:
-        found = super()._build_observables()
-        found.disable_all()  # what is enabled is computed in every step, and the graph's sensor needs none of it
-        return found
+        observables = super()._build_observables()
+        observables.disable_all()  # each would be computed in every step, and the graph's sensor needs none
+        return observables
 
     @composer.observable
     def target_position(self, physics: Any) -> Any:

@@ -21,7 +21,7 @@ NOMINAL_P_GAIN: Final = 800
 """Position P Gain that ``gain`` is given for until the host writes another."""
 
 _STALL, _BACK_EMF, _ARMATURE, _VISCOUS, _COULOMB = 1.4, 0.22, 0.0045, 0.01, 0.03  # data sheet, at 12 V
-_P_GAIN_UNIT = 256  # counts of PWM per count of error, as the recordings in pipelines/xl330 show; the e-Manual says 128
+_P_GAIN_UNIT = 256  # counts of PWM per count of error, as the recordings in pipelines/xl330 show; 128 in the e-Manual
 _STRIBECK_RAD_S = 0.1
 
 _MODEL = """
@@ -98,7 +98,7 @@ class ArmPlant:
     Servos 1, 2, 3 turn pan, shoulder and elbow. Modes 3 (position) and 16 (PWM) are emulated, any other one is torque
     off. Position D Gain is not emulated, as the pipeline sets it to 0, nor are I Gain and Profile Acceleration.
 
-    Against the data sheet: a weaker motor, heavier rotors, and more friction, of which some only shows near standstill.
+    Compared with the data sheet: a weaker motor, heavier rotors, and more friction, part of it only near standstill.
 
     Args:
         stall: Factor on the stall torque.

@@ -63,7 +63,7 @@ def log_scene(rec: Any, t_s: np.ndarray, columns: Mapping[str, np.ndarray], enti
         t_s: Times ``(N,)`` [s].
         columns: Fields ``(N,)``; ``position[0]`` to ``position[2]`` [rad] are needed. Where there are ``aim[0]`` to
             ``aim[2]`` ``(M,)`` [m], a sphere stands at the last of them.
-        ghost: Whether a model says so: a wire frame around the robot, so that both can be compared.
+        ghost: Whether this is a model's motion: a wire frame around the robot, to compare both.
     """
     import rerun as rr  # the viewer is an extra
 

@@ -13,7 +13,7 @@ from .parts import GANTRY_M, LINK_M, SHOULDER_M, Arm, Gantry
 CLOSE_M = 0.02
 """How near the tip must come [m]."""
 LOW, HIGH = (-1.2, -0.3, -0.2), (1.2, 1.2, 1.4)
-"""Joint angles between which targets are drawn [rad]: whatever is drawn can be reached."""
+"""Joint angles between which targets are drawn [rad]: every target can be reached."""
 
 
 def tip_of(np_: Any, position: Any) -> Any:

@@ -16,7 +16,7 @@ from sim2real.errors import SafetyStop
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
+from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask, Session
 from sim2real.robots.control_loop.hardware import Embedded, ServoSession
 from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
@@ -114,7 +114,7 @@ class HingeDrive(RobotDrive):
         """Return a gate that falls back to 0 V."""
         return limits.gate(limits.limit, joints=(HINGE,))
 
-    def prepare(self, session: ServoSession, settle_s: float) -> None:
+    def prepare(self, session: Session, settle_s: float) -> None:
         """Bring the pendulum to rest hanging down: friction can hold it upright, and then it is pushed over.
 
         Raises:

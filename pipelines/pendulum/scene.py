@@ -20,14 +20,14 @@ def log_scene(rec: Any, t_s: np.ndarray, columns: Mapping[str, np.ndarray], enti
         rec: The ``rerun.RecordingStream``.
         t_s: Times ``(N,)`` [s].
         columns: Fields ``(N,)``; ``th`` [rad] is needed.
-        ghost: Whether a model says so: a wire frame a little in front of the robot, so that both can be compared.
+        ghost: Whether this is a model's motion: a wire frame a little in front of the robot, to compare both.
     """
     import rerun as rr  # the viewer is an extra
 
     fill = "majorwireframe" if ghost else "solid"
     front = -_THICKNESS_M * (1.2 if ghost else 0.5)
     color = {name: _GHOST if ghost else shade for name, shade in _SOLID.items()}
-    # The axis of rotation is y, towards the back; the pendulum is seen from the front, gravity points down.
+    # The axis of rotation is y, towards the back; the camera is in front, gravity points down.
     flat = rr.RotationAxisAngle((1.0, 0.0, 0.0), degrees=90.0)
     rec.log(entity, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     if not ghost:

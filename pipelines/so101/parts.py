@@ -87,7 +87,7 @@ class Link(composer.Entity):
 
 
 class Arm(ServoDriven):
-    """Six servos and what they carry; between its goals' bounds it stays above the table."""
+    """Six servos and their links; between its goals' bounds it stays above the table."""
 
     low, high = (-1.4, -1.65, 0.2, -1.6, -1.5, -0.8), (1.4, -0.3, 1.6, -1.0, 1.5, 0.8)
 
@@ -118,7 +118,7 @@ class Table(composer.Arena):
     def _build(self, name: str = "table") -> None:
         super()._build(name=name)
         model = self.mjcf_model
-        # As in pipelines/arm, where it says what each of these costs and saves.
+        # As in pipelines/arm, which lists the cost and the gain of each option.
         model.option.integrator = "implicitfast"
         model.option.iterations, model.option.ls_iterations = 1, 4
         model.compiler.fusestatic = True
@@ -131,9 +131,9 @@ class Table(composer.Arena):
         self.opening = world.add("site", name="opening")  # x holds the jaw's angle [rad]
 
     def _build_observables(self) -> composer.Observables:
-        found = super()._build_observables()
-        found.disable_all()  # what is enabled is computed in every step, and the graph's sensor needs none of it
-        return found
+        observables = super()._build_observables()
+        observables.disable_all()  # each would be computed in every step, and the graph's sensor needs none
+        return observables
 
     @composer.observable
     def target_position(self, physics: Any) -> Any:

@@ -8,11 +8,11 @@ The parameters are those that were identified on recordings of a real SO-101, is
 divided by a joint's inertia, or by its servo's stiffness. In units of torque:
 
 - Gain. Rotation's servo pushes no harder beyond 0.45 rad; taken for the 2.94 N m of its data sheet, the gain is 6.53
-  N m/rad. The driver's source for the gain (BAM's oscilloscope) says 7.8.
+  N m/rad. The driver's source for the gain (BAM's oscilloscope) is 7.8.
 - Rotors. The gain over the identified stiffness is a joint's inertia. What the public description has for the links in
   the recordings' pose explains it for five joints, 11 % off (rms), with 0.00266 kg m^2 more on every joint. The jaw's
   is not determined by samples 20 ms apart.
-- Damping, dry friction, saturation: what was identified times inertia, or gain.
+- Damping, dry friction, saturation: identified value times inertia, or gain.
 
 The same recordings have the hand on the table from elbow 0.934 rad on; by the public description it is 0.93.
 """

@@ -195,14 +195,14 @@ def find() -> Path:
         return Path(named).expanduser()
     home = os.environ.get("HF_LEROBOT_HOME", "~/.cache/huggingface/lerobot")
     folder = Path(os.environ.get("HF_LEROBOT_CALIBRATION", f"{home}/calibration")).expanduser() / "robots"
-    found = [path for kind in ("so101_follower", "so_follower") for path in sorted((folder / kind).glob("*.json"))]
-    if len(found) != 1:
-        there = f"several calibrations: {', '.join(path.name for path in found)}" if found else "no calibration"
+    paths = [path for kind in ("so101_follower", "so_follower") for path in sorted((folder / kind).glob("*.json"))]
+    if len(paths) != 1:
+        there = f"several calibrations: {', '.join(path.name for path in paths)}" if paths else "no calibration"
         raise UsageError(
             f"there is {there} in {folder}",
             hint=f"set {CALIBRATION} to the file of this arm; lerobot-calibrate writes one",
         )
-    return found[0]
+    return paths[0]
 
 
 ROBOT = SO101Robot()

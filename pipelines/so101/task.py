@@ -45,7 +45,7 @@ class Reach(GoalTask):
         return self.table
 
     def initialize_episode(self, physics: Any, random_state: Any) -> None:
-        """Nothing is near until the first step."""
+        """The target counts as far until the first step."""
         del random_state
         physics.variables["distance"] = physics.variables["ajar"] = physics.np.asarray(physics.np.inf)
 

@@ -7,7 +7,7 @@ PIPELINE = Pipeline(
     name="so101_log",
     summary="recorded arm of six position servos: identify loops, friction, gravity and contact",
     package=__name__,
-    # Forty-five parameters: a search would need thousands of generations, and rough values are known.
+    # Forty-five parameters: a search would need thousands of generations, and rough values are available.
     identify=IdentifyConfig(
         initial_state="measured",
         settle_s=0.0,

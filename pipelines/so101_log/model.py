@@ -64,7 +64,7 @@ class Table(Base):
 
 @struct.dataclass
 class ArmParams(Base):
-    """Servos and what they carry; every leaf of the servos has shape ``(6,)``.
+    """Servos and their links; every leaf of the servos has shape ``(6,)``.
 
     Attributes:
         stiffness: Firmware's gain over inertia [1/s^2].

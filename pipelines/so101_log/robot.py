@@ -49,8 +49,8 @@ class SO101(LoggedRobot):
             for leaf, (unit, low, high, transform, text) in about.items():
                 value = float(np.asarray(get_leaf(nominal(), leaf))[i])
                 name = f"{joint}_{leaf.rpartition('.')[2].removesuffix('_rad_s')}"
-                own: Any = {"about": text, "leaf": f"world.{leaf}[{i}]", "vanishes": leaf in _VANISHING}
-                rows.append(Parameter(name, unit, value, low, high, transform, **own))
+                fields: Any = {"about": text, "leaf": f"world.{leaf}[{i}]", "vanishes": leaf in _VANISHING}
+                rows.append(Parameter(name, unit, value, low, high, transform, **fields))
         rows += [
             # Read off single_joint_wrist_roll, where the joint stops short of its goal.
             Parameter("wrist_roll_low", "rad", -1.034, -3.0, -0.5, linear, leaf="world.low[4]", about="stop"),

@@ -8,7 +8,7 @@ PIPELINE = Pipeline(
     summary="recorded DYNAMIXEL XL330 lifting a mass: identify motor, gears and friction",
     package=__name__,
     # The loss has kinks wherever the arm sticks or breaks loose: short windows, and differences wide enough to look
-    # past them. Rough values are known; a search of as many seconds ends elsewhere with every seed.
+    # past them. Rough values are available; a search of as many seconds ends elsewhere with every seed.
     identify=IdentifyConfig(
         initial_state="measured",
         settle_s=0.0,

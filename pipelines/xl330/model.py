@@ -1,6 +1,6 @@
 """The servo and its arm as a graph: goals in, angles out. Angle 0 hangs down.
 
-The firmware is known: the PWM that it reports follows ``kp / 256`` times the error in counts within one step.
+The recordings show the firmware's law: the reported PWM follows ``kp / 256`` times the error in counts within one step.
 """
 
 from __future__ import annotations

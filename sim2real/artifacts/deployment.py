@@ -98,7 +98,6 @@ class Advice:
     """The verdict on a deployment, and the next command.
 
     Attributes:
-        reasons: Sentences.
         next: The command to type; "" if none is needed.
         joint: The joint to look at; "" for none.
     """

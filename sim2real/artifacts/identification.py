@@ -40,9 +40,7 @@ class Estimate:
 
     Attributes:
         name: Its name; ``NAME@RECORDING`` if each recording has a value of its own.
-        unit: Unit of all numbers.
         kind: Kind of the parameter; a ``derived`` one is computed from others.
-        about: Description in one line.
         nominal: The data sheet's value.
         low95: Lower end of the 95 % interval.
         lower: Lower bound of the search.
@@ -120,7 +118,6 @@ class Search:
 
     Attributes:
         history: Best loss of each generation ``(G,)``.
-        evaluations: Number of simulated candidates.
         loss: Best loss of an interrupted search.
         done: Completed shares of an interrupted search and refinement.
         engine: The simulator, and the reason for its choice.
@@ -152,7 +149,6 @@ class HeldOut:
     """Errors of one position on held-out data, up to the longest horizon.
 
     Attributes:
-        name: Its name in tables.
         column: Its name among the fields, such as ``position[1]``.
         rmse: Model -> root mean square error; None if it is infinite.
         beaten_by: Baselines with an error that is not larger.
@@ -219,7 +215,6 @@ class Identification(Shown):
         terms: Optional terms of the model in the fit; None if the model has no optional terms.
         noise: Noise of the sensor; empty in older files.
         widening: Factor on the posterior's deviations that covers errors of the model; None in older files.
-        segments: Number of simulated segments.
         held_out_from_s: Start of the first held-out segment [s].
         settle_s: Length of the first part of a held-out segment, to which its initial state is fitted [s].
         sigma: Field -> assumed deviation of a measurement.
@@ -372,6 +367,7 @@ class Identification(Shown):
                     f"{file} has format {identification.format}, this version reads {FORMAT}", hint=_AGAIN
                 )
             check(all(np.isfinite(p.estimate) for p in identification.parameters), "an estimate is no number")
+        # Files beside it may be missing: a copy of the estimates alone can be read.
         others: dict[str, Json] = {}
         if file.with_name(TIMING).is_file():
             others["timing"] = Timing.load(file.with_name(TIMING))

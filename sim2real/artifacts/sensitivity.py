@@ -45,7 +45,6 @@ class Sensitivity:
     """A policy's success on models in which one parameter is wrong.
 
     Attributes:
-        format: Version of the file.
         multiples: Shape ``(M,)``: distances from the estimate, in half-widths of the 95 % interval, ascending.
         success: Mean success on the identified model.
         episodes: Number of episodes of each mean; all values use the same episodes.
@@ -92,6 +91,7 @@ class Sensitivity:
                 f"No parameter breaks this policy within {largest} half-widths of its 95 % interval: success stays "
                 f"above {BROKEN:.0%} of {self.success:.2f}, and is lowest, {lowest:.2f}, with {worst.name!r} moved."
             )
+        # Name the smallest move that breaks the policy.
         i = int(np.flatnonzero(self.multiples == at)[0])
         return (
             f"Measure {worst.name!r} better: {abs(at):g} half-width{'s' if abs(at) != 1 else ''} of its 95 % interval "

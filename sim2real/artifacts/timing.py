@@ -93,9 +93,6 @@ class BusTiming:
     """Transactions, losses and late answers on a device's bus.
 
     Attributes:
-        transactions: Number of requests.
-        lost: Number of requests without an answer.
-        retries: Number of repeated requests.
         late: Number of answers with an uncertain sample time, or after a repeated request.
         lateness: Time of an answer beyond the time of its bytes.
     """
@@ -138,6 +135,7 @@ class Timing(Shown):
         # A session's own summary has the nodes in their graph's order, with overruns; other logs lack only that.
         names = [*(n for n in counted if n in episode.steps), *(n for n in episode.steps if n not in counted)]
         stamps = episode.metadata.get("stamps", {})
+        # The times on the bus, in seconds, of the log's nodes.
         bus = {
             n: {kind: np.asarray(us, np.float64) * 1e-6 for kind, us in use.items()}
             for n, use in end.get("bus", {}).items()

@@ -64,6 +64,7 @@ class PipelineStage:
         config_class = load(f"stages.{folder}.config.{name}")
         default = getattr(pipeline, command, None)
         default = default if isinstance(default, config_class) else config_class()
+        # Parse the flags, then run the stage in its run folder.
         parsed = flags.parse(
             flags.StageFlags(default),
             rest,
@@ -145,10 +146,6 @@ def load(name: str) -> Any:
 
 def run_stage(stage: str, pipeline: Pipeline, config: Any, runs: Path, run_dir: Path | None) -> StageFolder | None:
     """Run a stage, then print its summary and the names of its files.
-
-    Args:
-        stage: The stage's folder below ``sim2real/stages``.
-        config: The stage's configuration.
 
     Returns:
         The stage's folder; None in a training of several processes, where another process writes it.

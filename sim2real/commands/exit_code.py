@@ -77,7 +77,7 @@ def _notes(error: BaseException) -> list[str]:
 
 
 def _save_traceback() -> str:
-    """Write the traceback of the current exception to a file; return a text that says where."""
+    """Write the traceback of the current exception to a file; return a text with its path."""
     try:
         with tempfile.NamedTemporaryFile("w", prefix="sim2real-", suffix=".traceback.txt", delete=False) as file:
             file.write(traceback.format_exc())

@@ -109,11 +109,13 @@ def write(
     Args:
         to: ``mjcf``, ``mjlab``, ``isaaclab`` or ``json``.
     """
+    # Put the estimates into the robot's model.
     sides = {p.name: p.side for p in table}
     # Optional terms that were not identified have their nominal values, which switch them off.
     off = {p.name: p.nominal for p in table}
     text = robot.identified_mjcf({**off, **values_of(identification)})
     terms = None if text is None else find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
+    # Write the format: JSON needs no model, the others need one.
     if to == "json":
         write_json(out, json_document(identification, terms, find_delays(identification, sides), about))
         return

@@ -35,7 +35,7 @@ class StageFlags(Generic[Config]):
     runs: Folder = Path("runs")
     """Folder of all runs."""
     run: OptionalFolder = None
-    """Run folder to add to; default: a new one for record, for the others the newest one with what they need."""
+    """Run folder to add to; default: a new one for record, for the others the newest one with their inputs."""
     cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
     """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
 
@@ -61,7 +61,7 @@ class RunFlags(DemoFlags):
     """Flags of all four stages."""
 
     iterations: int = 1
-    """How often a run goes around at most, in all: the verdict on a deployment says what is done again."""
+    """Largest number of iterations of a run; the verdict on a deployment chooses the stages that run again."""
     until: Annotated[str | None, tyro.conf.arg(metavar="QUANTITY=VALUE")] = None
     """Go around until a quantity of the gap report is at least so large on the robot, such as success=0.95; default:
     until the verdict is 'fine'."""
@@ -89,7 +89,7 @@ class RunFlags(DemoFlags):
         """The quantity to reach, and its least value; None: no goal.
 
         Raises:
-            UsageError: When ``until`` says neither.
+            UsageError: When ``until`` is neither.
         """
         if self.until is None:
             return None
@@ -141,9 +141,10 @@ def parse(
         UsageError: When a flag is unknown or a value does not fit.
         SystemExit: With code 0 after ``--help``.
     """
+    # Hide tyro's own messages: an error here has a hint.
     talk = io.StringIO()
     try:
-        with _plain_if_asked(), contextlib.redirect_stderr(talk):
+        with _plain_if_requested(), contextlib.redirect_stderr(talk):
             parsed, unknown = tyro.cli(
                 kind or type(default),
                 default=default,
@@ -181,12 +182,12 @@ _MAX_LISTED_FLAGS = 20
 
 def _unknown(unknown: Sequence[str], default: Any, prog: str) -> UsageError:
     """Return the error for arguments that no flag took."""
-    known = flag_names(default)
+    names = flag_names(default)
     flags = [word.split("=")[0] for word in unknown if word.startswith("-")]
     if not flags:
         return UsageError(f"unexpected argument {unknown[0]!r}", hint=f"see `{prog} --help`")
-    close = difflib.get_close_matches(flags[0].replace("_", "-"), known, n=1)
-    available = f". Available: {', '.join(known)}" if len(known) <= _MAX_LISTED_FLAGS else ""
+    close = difflib.get_close_matches(flags[0].replace("_", "-"), names, n=1)
+    available = f". Available: {', '.join(names)}" if len(names) <= _MAX_LISTED_FLAGS else ""
     guess = f"did you mean {close[0]}? " if close else ""
     return UsageError(f"unknown flag {', '.join(flags)}{available}", hint=f"{guess}`{prog} --help` lists all flags")
 
@@ -205,7 +206,7 @@ def _usage_error(end: BaseException, talk: str, prog: str) -> Sim2RealError:
 
 
 @contextlib.contextmanager
-def _plain_if_asked() -> Iterator[None]:
+def _plain_if_requested() -> Iterator[None]:
     """Print the help without colour where NO_COLOR is set, which the parser itself ignores."""
     options = tyro._experimental_options
     before = options["ansi_codes"]

@@ -64,9 +64,9 @@ class Run(Shown):
         return {"folder": shown(self.folder), "finished": ", ".join(done) or "nothing"}
 
     def _stage(self, stage: str) -> Path:
-        if (found := finished(self.folder, stage)) is None:
+        if (result := finished(self.folder, stage)) is None:
             raise UsageError(f"{stage} is not finished in {self.folder}", hint="sim2real.run(..., resume=FOLDER)")
-        return found.folder
+        return result.folder
 
 
 def run(
@@ -84,7 +84,7 @@ def run(
 
     Args:
         robot: The robot, its pipeline, or the pipeline's name.
-        record: How to record; default: that of the pipeline. A dict has what is different from it.
+        record: Settings of record; default: the pipeline's. A dict has the settings that differ from these.
         resume: A run folder to go on with, from the first stage that is not finished there.
         iterations: How often to go around at most; see ``sim2real run --help``.
         until: ``QUANTITY=VALUE`` that ends going around.
@@ -95,9 +95,10 @@ def run(
     from sim2real.commands.flags import RunFlags
     from sim2real.commands.loop.run_loop import run_all
 
+    # Turn names and dicts into objects; each stage then runs as from the command line.
     pipeline, root = pipeline_of(robot), folder_of(runs, "runs")
-    given = {"record": record, "identify": identify, "train": train, "deploy": deploy}
-    configs: dict[str, Any] = {n: config_of(c, getattr(pipeline, n), n) for n, c in given.items()}
+    settings = {"record": record, "identify": identify, "train": train, "deploy": deploy}
+    configs: dict[str, Any] = {n: config_of(c, getattr(pipeline, n), n) for n, c in settings.items()}
     home = None if resume is None else find_run(root, folder_of(resume, "resume"), pipeline.name)
 
     def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:

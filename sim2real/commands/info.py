@@ -29,15 +29,15 @@ def installation() -> str:
         rows.append([name, summary, _origin(source)])
     blocks = [pairs({**versions(), "compiled programs": _programs()}), table(rows, ["pipeline", "summary", "from"])]
     for what, group in (("device", entries.DEVICES), ("world", entries.WORLDS)):
-        if found := entries.available(group):
-            blocks.append(table([[name, _origin(found[name])] for name in sorted(found)], [what, "from"]))
+        if plugins := entries.available(group):
+            blocks.append(table([[name, _origin(plugins[name])] for name in sorted(plugins)], [what, "from"]))
     return "\n\n".join(blocks)
 
 
 def _programs() -> str:
     """Return where compiled programs are kept, and how much there is of them."""
-    if (own := os.environ.get("JAX_COMPILATION_CACHE_DIR")) is not None:
-        return f"{own} (JAX_COMPILATION_CACHE_DIR)"
+    if (configured := os.environ.get("JAX_COMPILATION_CACHE_DIR")) is not None:
+        return f"{configured} (JAX_COMPILATION_CACHE_DIR)"
     folder = compilation_cache.location()
     if folder is None:
         return f"not kept: {compilation_cache.VARIABLE} is {compilation_cache.OFF}"
@@ -46,6 +46,7 @@ def _programs() -> str:
 
 def pipeline(name: str, root: Path, verbose: bool) -> str:
     """Return a pipeline's files, runs and next command, in ten lines; ``verbose`` adds the default of each flag."""
+    # Names, folder and the state of the newest run.
     definition = load_pipeline(name)
     runs = run_folders(root, name)
     head = {
@@ -61,6 +62,7 @@ def pipeline(name: str, root: Path, verbose: bool) -> str:
     head["all four stages"] = f"sim2real run {name}"
     if not verbose:
         return pairs(head | {"defaults of flags": f"sim2real info {name} --verbose"})
+    # The default of each flag, one table for each stage.
     blocks = [pairs(head)]
     for stage in STAGES:
         config = getattr(definition, stage)
@@ -71,6 +73,7 @@ def pipeline(name: str, root: Path, verbose: bool) -> str:
 
 def run(run_dir: Path) -> str:
     """Return the stages of a run, their inputs and outputs."""
+    # One row for each attempt of a stage, and one for each of its files.
     rows, files = [], []
     stale = {s.newest.folder.name: s.stale for s in stage_status(run_dir).values() if s.stale}
     for stage in STAGES:
@@ -94,7 +97,7 @@ def run(run_dir: Path) -> str:
 
 
 def log(path: Path) -> str:
-    """Return what a log says about itself, and its topics; a log that was cut is read up to the cut.
+    """Return a log's own description, and its topics; a log that was cut is read up to the cut.
 
     Raises:
         Sim2RealError: When the file is no log, or cut within its first record.

@@ -37,7 +37,7 @@ PIPELINE = Pipeline(
     identify=replace(MODEL_IDENTIFY, horizon_s={horizon_s:g}, max_delay_s={max_delay_s:g}),
 )
 '''
-_ROBOT = '''"""The robot: robot.toml says which joints were recorded, what drives them, and what is identified."""
+_ROBOT = '''"""The robot: robot.toml has the recorded joints, their drives, and the parameters to identify."""
 
 from pathlib import Path
 
@@ -53,6 +53,7 @@ def run(config: NewConfig) -> None:
     Raises:
         UsageError: When the name is none, the folder exists, or the model cannot be driven.
     """
+    # Check name, model and folder.
     if config.model is None or not re.fullmatch(r"[a-z]\w*", config.name):
         raise UsageError(
             f"new needs a name of small letters, digits and underscores, and a model, got {config.name!r} and "
@@ -67,6 +68,7 @@ def run(config: NewConfig) -> None:
     expand(description.terms, description.joints, description.driven(), read_model(description.model))
     if config.log is None:
         from_model.note_held(description)
+    # Write the files of the pipeline.
     default = from_model.MODEL_IDENTIFY
     summary = f"recorded robot of {len(description.joints)} joints, identified from its model"
     texts = {
@@ -85,11 +87,13 @@ def run(config: NewConfig) -> None:
 
 def _described(config: NewConfig) -> tuple[RobotConfig, str]:
     """Return what there is to know about the robot, and its mapping file; without a log, what flags say."""
+    # With a log, describe the robot by the log and its mapping.
     flags = replace(config.robot, mjcf=config.model)
     if config.log is not None:
-        found = from_model.from_flags(flags, [config.log])
-        mapping = "" if found.mapping is None else to_toml(replace(found.mapping, pipeline=config.name))
-        return found.description, mapping
+        model_robot = from_model.from_flags(flags, [config.log])
+        mapping = "" if model_robot.mapping is None else to_toml(replace(model_robot.mapping, pipeline=config.name))
+        return model_robot.description, mapping
+    # Without a log, by the kind of drive.
     commands = _COMMANDS[config.drive]
     terms = tuple(ParameterPattern.parse(p) for p in flags.parameter) or usual_terms(
         commands, physical=config.drive == "mit"

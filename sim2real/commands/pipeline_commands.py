@@ -34,6 +34,7 @@ def check(command: str, arguments: list[str]) -> None:
     from sim2real.commands import flags, model_flags
     from sim2real.stages.check.config import CheckConfig
 
+    # The robot is a model file, or a pipeline.
     if model_flags.by_model(arguments):
         model = model_flags.parse_check(arguments, EXIT_CODES)
         from sim2real.stages.pipeline import from_model  # imports JAX

@@ -23,6 +23,7 @@ def run(command: str, arguments: list[str]) -> None:
     from sim2real.artifacts.run.run_folder import STAGES
     from sim2real.commands import flags
 
+    # The flags of all stages, with the pipeline's defaults.
     pipeline, rest = split_pipeline(command, arguments)
     default = flags.RunFlags(**{stage: getattr(pipeline, stage) for stage in STAGES})
     texts = {
@@ -96,11 +97,13 @@ def info(command: str, arguments: list[str]) -> None:
     from sim2real.stages.pipeline import find_run
     from sim2real.stages.pipeline.pipeline import available
 
+    # The first word that is no flag is the target.
     has_target = bool(arguments) and not arguments[0].startswith("-")
     target, rest = (arguments[0], arguments[1:]) if has_target else (None, arguments)
     description = "About the installation; or about a pipeline, an MCAP log, a run folder."
     examples = epilog("sim2real info", f"sim2real info {DEMO_PIPELINE}", f"sim2real info runs/{DEMO_PIPELINE}/TIME")
     parsed = flags.parse(flags.InfoFlags(), rest, f"sim2real {command} [PIPELINE|LOG|RUN]", description, examples)
+    # The kind of target decides the printed text.
     if target is None:
         print(texts.installation())
     elif Path(target).is_file():

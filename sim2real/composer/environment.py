@@ -53,7 +53,6 @@ class Environment(dm_env.Environment):
 
     Args:
         time_limit: Longest episode [s]; it ends after the first control step that reaches it.
-        random_state: A ``numpy.random.RandomState`` or a seed.
         n_sub_steps: Physics steps in a control step; deprecated, set the task's time steps.
         raise_exception_on_physics_error: Raise MuJoCo's warnings; else they end the episode with discount 0.
         strip_singleton_obs_buffer_dim: Leave the first axis out of observations whose buffer holds one sample.
@@ -83,6 +82,7 @@ class Environment(dm_env.Environment):
         *,
         arena: Entity | None = None,
     ) -> None:
+        # Arguments of dm_control, some of them deprecated.
         if not isinstance(delayed_observation_padding, ObservationPadding):
             raise UsageError(
                 "`delayed_observation_padding` should be an `ObservationPadding` enum value: "
@@ -100,6 +100,7 @@ class Environment(dm_env.Environment):
         self._strip, self._padding = strip_singleton_obs_buffer_dim, delayed_observation_padding
         self._max_reset_attempts, self._recompile = max_reset_attempts, recompile_mjcf_every_episode
         self._fixed_initial_state, self._legacy_step = fixed_initial_state, legacy_step
+        # The state of the environment; ``_build`` compiles the physics.
         self._compiled_by_reset = False
         self._physics: PyTree = None
         self._compiler = Compiler(task)

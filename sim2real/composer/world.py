@@ -64,7 +64,6 @@ class ComposedWorld(BaseWorld):
     send another message: see ``output``.
 
     Args:
-        command: Name of the input that carries the action.
         field: Field of that input's message: shape ``(nu,)``.
         parameters: Name -> (element or elements, attribute), such as ``{"friction": (joint, "frictionloss")}``.
         rate: Ticks per second [Hz]; default, and only choice: once a control step.
@@ -72,9 +71,6 @@ class ComposedWorld(BaseWorld):
 
     Raises:
         UsageError: When the rate is another, a parameter cannot vary on MJX, or MJX cannot run the world.
-
-    Attributes:
-        environment: The task as a pure environment.
     """
 
     def __init__(

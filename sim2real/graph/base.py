@@ -119,7 +119,6 @@ class GraphState(Base):
         eps: int32: index of the timeline that is played.
         step: int32: position in the timeline: the row in a compiled graph, the supervisor's step elsewhere; -1 before
             the start.
-        rng: JAX keys.
         seq: int32: each node's number of steps. In a compiled graph it is empty, except after ``reset``, ``step`` and
             ``observe``: then it has the number of the supervisor's step that the caller makes next.
         delays: Node -> input name -> trainable delay, for the connections that have one.

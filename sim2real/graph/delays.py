@@ -47,11 +47,7 @@ class DelayDistribution(ABC):
 
 
 class StaticDist(DelayDistribution):
-    """A constant delay, or a distrax distribution clipped at 0.
-
-    Args:
-        dist: A ``distrax.Distribution`` over seconds, or a number of seconds.
-    """
+    """A constant delay, or a distrax distribution clipped at 0."""
 
     def __init__(self, dist: PyTree) -> None:
         self.dist = dist
@@ -247,7 +243,6 @@ class TrainableDist(Base, DelayDistribution):
         Args:
             inputs: The lengthened window, leaves ``(W, ...)``; its arrival times are those at the smallest delay.
             age_s: Shape ``(W,)``: step start minus sent time of each message [s]; large for empty slots.
-            window: Number of messages in the returned window.
             period_s: The reader's period [s]; for ``zoh_mean``.
             ts_s: The step's start [s from the episode's start]; for ``linear``.
             skip: Whether a message that arrives exactly at the start belongs to the next step.

@@ -86,7 +86,7 @@ class StepStateRecorder(Recorder, Protocol):
         """Take the step state that a node's step gets, before the record of the step."""
 
 
-KEPT = ("state", "params", "inputs")
+PARTS_OF_STEPS = ("state", "params", "inputs")
 """Parts of a step state that a recorder may keep."""
 
 
@@ -181,9 +181,9 @@ class MemoryRecorder:
 
     def __init__(self, keep: Sequence[str] = ()) -> None:
         self.keep = frozenset([keep] if isinstance(keep, str) else keep)
-        if unknown := sorted(self.keep - set(KEPT)):
-            raise UsageError(f"a recorder cannot keep {', '.join(unknown)}. Available: {', '.join(KEPT)}")
-        self._given: dict[str, list[StepState]] = {}
+        if unknown := sorted(self.keep - set(PARTS_OF_STEPS)):
+            raise UsageError(f"a recorder cannot keep {', '.join(unknown)}. Available: {', '.join(PARTS_OF_STEPS)}")
+        self._offered: dict[str, list[StepState]] = {}
         self._steps: dict[str, list[StepRecord]] = {}
         self._outputs: dict[str, list[PyTree]] = {}
         self._messages: dict[tuple[str, str], list[MessageRecord]] = {}
@@ -191,12 +191,12 @@ class MemoryRecorder:
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
         """Drop the records of the episode before."""
         del epoch_ns, monotonic_ns
-        self._steps, self._outputs, self._messages, self._given = {}, {}, {}, {}
+        self._steps, self._outputs, self._messages, self._offered = {}, {}, {}, {}
 
     def given(self, node: str, step_state: StepState) -> None:
         """Keep parts of a step state."""
-        parts = {part: getattr(step_state, part) if part in self.keep else None for part in KEPT}
-        self._given.setdefault(node, []).append(_copied(step_state.replace(rng=None, **parts)))
+        parts = {part: getattr(step_state, part) if part in self.keep else None for part in PARTS_OF_STEPS}
+        self._offered.setdefault(node, []).append(_copied(step_state.replace(rng=None, **parts)))
 
     def step(self, record: StepRecord, output: PyTree) -> None:
         """Keep a step and its output."""
@@ -217,19 +217,19 @@ class MemoryRecorder:
             params=self._part("params"),
             inputs={
                 (n, i): _stack([step.inputs[i].replace(delay_dist=None) for step in self._of_steps(n)])
-                for n in (self._given if "inputs" in self.keep else ())
-                for i in self._given[n][0].inputs
+                for n in (self._offered if "inputs" in self.keep else ())
+                for i in self._offered[n][0].inputs
             },
         )
 
     def _part(self, part: str) -> dict[str, dict[str, np.ndarray]]:
         if part not in self.keep:
             return {}
-        return {n: _stack([getattr(step, part) for step in self._of_steps(n)]) for n in self._given}
+        return {n: _stack([getattr(step, part) for step in self._of_steps(n)]) for n in self._offered}
 
     def _of_steps(self, node: str) -> list[StepState]:
         """Return the step states of finished steps: a step that failed has no record."""
-        return self._given[node][: len(self._steps.get(node, ()))]
+        return self._offered[node][: len(self._steps.get(node, ()))]
 
 
 def steps_from_records(records: list[StepRecord]) -> Steps:

@@ -46,6 +46,7 @@ def fit_mixture(samples: np.ndarray, components: int = 4, seed: int = 0) -> Stat
     scaled = ((x - x.mean()) / x.std())[:, None]
     fits = [GaussianMixture(k, random_state=seed, reg_covar=1e-6).fit(scaled) for k in range(1, components + 1)]
     best = min(fits, key=lambda fit: fit.bic(scaled))
+    # Return to seconds: the fit is on samples without mean and scale.
     loc = np.asarray(best.means_)[:, 0] * x.std() + x.mean()
     scale = np.sqrt(np.asarray(best.covariances_)[:, 0, 0]) * x.std()
     return StaticDist(

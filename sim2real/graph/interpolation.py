@@ -42,7 +42,6 @@ def mean_of(leaf: Array, share: jax.Array, held: jax.Array, rounded: bool) -> ja
     Args:
         leaf: The messages, shape ``(W, ...)``.
         share: Shape ``(W,)``: part of the time in which each message, or a newer one, holds.
-        held: The messages that hold.
     """
     leaf = jnp.asarray(leaf)
     if not _on_a_line(leaf, rounded):

@@ -7,7 +7,7 @@ import operator
 from collections.abc import Callable
 from enum import Enum
 from numbers import Real
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import Empty, GraphState, StepState, Value
@@ -107,6 +107,17 @@ class Connection:
 
     def __repr__(self) -> str:
         return f"Connection({self.output_node.name!r} -> {self.input_node.name!r}, name={self.name!r})"
+
+
+class NodeOptions(TypedDict, total=False):
+    """Options of a ``BaseNode``, for subclasses that hand them on."""
+
+    delay: float | None
+    delay_dist: PyTree
+    advance: bool
+    scheduling: Scheduling
+    color: str | None
+    order: int | None
 
 
 class BaseNode:

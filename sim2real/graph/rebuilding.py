@@ -85,6 +85,7 @@ def _replacement(old: BaseNode, other: Callable[..., BaseNode] | BaseNode) -> Ba
         if isinstance(new, BaseNode) and not isinstance(new, BaseWorld):
             for name in (*_TIMING, *_LOOKS):  # also those that its constructor does not take
                 setattr(new, name, options[name])
+    # Refuse a replacement that the connections do not fit.
     if not isinstance(new, BaseNode):
         raise UsageError(f"node {old.name!r}: a node was expected in its place, got {new!r}", hint="pass a class")
     if new.name != old.name:

@@ -39,6 +39,7 @@ def draw(
     """
     nodes = by_name(nodes)
     check_senders(nodes)
+    # Refuse lengths that are not finite.
     if not (math.isfinite(duration_s) and episodes >= 1):
         raise UsageError(
             f"{episodes} timelines of {duration_s} s cannot be drawn", hint="draw one or more, of a few seconds"
@@ -105,10 +106,6 @@ def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
     The result equals ``Timeline.from_episode(episode, nodes)`` if the recorded run kept the rules. Starts that a step
     has set itself are copied from the record.
 
-    Args:
-        episode: A record of all of ``nodes``.
-        nodes: The nodes that ran, by name.
-
     Raises:
         UsageError: When the record lacks one of them.
     """
@@ -151,7 +148,6 @@ def transport_delays(
     """Draw a connection's communication delays [ticks].
 
     Args:
-        shape: Number of episodes, and of messages.
         earlier: Delays that were drawn for fewer messages; they stay at the front.
     """
     return _extend(connection.delay_dist, rng, shape, repr(connection), earlier)
@@ -186,6 +182,7 @@ def _run_in_order(
     received: dict[tuple[str, str], np.ndarray],
 ) -> None:
     """Fill ``vertices`` and ``received`` (rules 3 to 5): nodes without blocking inputs first, others in slot order."""
+    # Nodes without blocking inputs run at once, all steps in one array operation.
     linked = []
     for name, busy in delays.items():
         if any(c.blocking for c in nodes[name].inputs.values()):
@@ -195,6 +192,7 @@ def _run_in_order(
             vertices[name] = _free_running(nodes[name], busy)
     if not linked:
         return
+    # Steps with blocking inputs run one by one, in the order of their schedule; senders come first at equal times.
     rank = {name: i for i, name in enumerate(topological(nodes))}
     steps = [
         (int(s), rank[name], name, k)

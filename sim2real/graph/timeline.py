@@ -99,6 +99,7 @@ class Timeline:
         for t in timelines[1:]:
             if set(t.vertices) != set(first.vertices) or set(t.edges) != set(first.edges):
                 raise UsageError("only timelines of the same nodes and connections can be stacked")
+        # Pad steps and messages to the longest timeline.
         vertices = {
             n: Vertex(
                 _pad([t.vertices[n].start for t in timelines], NEVER),
@@ -140,6 +141,7 @@ class Timeline:
                 arrays = dict(data)
             if int(arrays["format"]) != _FORMAT:
                 raise Sim2RealError(f"{path} is a timeline of format {arrays['format']}, not {_FORMAT}", hint=hint)
+            # Rebuild vertices and edges from the numbered arrays.
             names = json.loads(str(arrays["names"]))
             return Timeline(
                 {

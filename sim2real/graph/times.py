@@ -34,7 +34,6 @@ class Edge:
         received: Shape ``(E, M)``, int64: arrivals [ticks]. Message m is the output of the sender's step m, sent at
             the end of that step.
         seq_in: Shape ``(E, M)``, int64: number of the reader's step that consumed it; -1 if none did.
-        sender: Name of the sender.
     """
 
     received: np.ndarray
@@ -48,7 +47,6 @@ def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "rig
     Args:
         rows: Shape ``(E, N)``, int64, not decreasing along the last axis.
         values: Shape ``(E, M)``, int64; all times around ``NEVER`` count as equal.
-        side: As in ``np.searchsorted``.
 
     Returns:
         Shape ``(E, M)``: index of each value in its row.

@@ -21,7 +21,6 @@ class DeviceFactory(Protocol):
             port: Its connection, e.g. a serial port's device file.
             ids: The motors' numbers, in the order of the joints.
             drive: Settings of the motors, of a type that the robot and the device agree on.
-            baud_rate: Bits per second.
             silence_s: Longest time without an instruction while torque is on [s].
         """
         ...
@@ -42,6 +41,7 @@ def load_entry(what: str, name: str, group: str, contract: str) -> Callable[...,
     Raises:
         UsageError: There is no entry of this name, or it cannot be imported or called.
     """
+    # Find the entry among the installed packages.
     entries = available(group)
     if name not in entries:
         raise UsageError(
@@ -51,6 +51,7 @@ def load_entry(what: str, name: str, group: str, contract: str) -> Callable[...,
     source = entries[name]
     if isinstance(source, str):
         return load_named(source, what)
+    # Import it.
     try:
         factory = source.load()
     except (ImportError, AttributeError) as error:

@@ -142,6 +142,7 @@ class DeviceConformance(ABC):
             readings = [device.measure() for _ in range(20)]
             end_ns = time.monotonic_ns()
             done = device.counters
+        # Stamps increase, and lie within the session.
         stamps = np.array([r.transaction.t_sent_ns for r in readings])
         assert begin_ns <= stamps[0]
         assert stamps[-1] <= end_ns
@@ -150,6 +151,7 @@ class DeviceConformance(ABC):
         assert all(r.position_rad.shape == r.velocity_rad_s.shape == r.load.shape == (n,) for r in readings)
         assert done.transactions - before.transactions >= 20
         assert done.late_s.size >= 20
+        # Compare them with the emulator's true times of sampling.
         robot.stop()
         samples = robot.truth().of(Kind.SAMPLE)
         nearest = np.array([np.min(np.abs(samples["t_host_ns"] - t)) for t in stamps])

@@ -39,7 +39,7 @@ class FitConfig:
     refine: int = 3
     """Number of best candidates that Levenberg-Marquardt refines; 0 skips the refinement."""
     refine_steps: int = 25
-    """Most steps of Levenberg-Marquardt in a round, of which there are up to three."""
+    """Largest number of steps of Levenberg-Marquardt in a round; there are up to three rounds."""
     long_s: float = 0.0
     """Length of the segments of a last refinement [s]; 0 skips it."""
     engine: Literal["auto", "c", "compiled"] = "auto"

@@ -72,14 +72,16 @@ class Fit:
         return uncertainty(self.problem, self.z)
 
 
-def as_numbers(table: ParameterTable, z: np.ndarray, kept: np.ndarray | None = None) -> dict[str, Value]:
+def as_numbers(table: ParameterTable, z: np.ndarray, present: np.ndarray | None = None) -> dict[str, Value]:
     """Return values by name as Python numbers; lists for parameters that each recording has its own value of.
 
     Args:
         z: Shape ``(P,)``: the unbounded vector.
-        kept: Shape ``(P,)``, bool: as in ``table.decode``.
+        present: Shape ``(P,)``, bool: as in ``table.decode``.
     """
-    return {n: np.asarray(v, np.float64).tolist() for n, v in table.decode(jnp.asarray(z, jnp.float32), kept).items()}
+    return {
+        n: np.asarray(v, np.float64).tolist() for n, v in table.decode(jnp.asarray(z, jnp.float32), present).items()
+    }
 
 
 def fit(
@@ -98,7 +100,6 @@ def fit(
     Args:
         spans: Segments to fit, and segments to predict.
         length_s: Length of a segment [s].
-        table: Default: the model's parameters.
         long_spans: Segments of ``config.long_s`` for the last refinement.
     """
     problem = windows = Problem(model, recordings, spans, length_s, config, table)
@@ -129,19 +130,18 @@ def fit(
     return Fit(problem, z, loss, result, tuple(refined), windows, left, converged)
 
 
-def refit(problem: Problem, kept: np.ndarray, near: np.ndarray) -> dict[str, Value]:
+def refit(problem: Problem, present: np.ndarray, near: np.ndarray) -> dict[str, Value]:
     """Return the estimate of fewer parameters, by refinement; the others have their values in a model without them.
 
     Args:
-        problem: The residuals, with all parameters.
-        kept: Shape ``(P,)``, bool: which free parameters are estimated.
+        present: Shape ``(P,)``, bool: which free parameters are estimated.
         near: Shape ``(P,)``: the estimate of all parameters, one of two starts; the other is the table's.
     """
     table = problem.table
-    if not kept.any():
-        return as_numbers(table, near, kept)
+    if not present.any():
+        return as_numbers(table, near, present)
     starts = np.stack([table.encode(as_numbers(table, near)), table.start()])
-    return as_numbers(table, refine(problem, starts, problem.part(kept=kept), coarse=True).z, kept)
+    return as_numbers(table, refine(problem, starts, problem.part(present=present), coarse=True).z, present)
 
 
 def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = None) -> SearchResult:

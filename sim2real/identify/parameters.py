@@ -72,6 +72,7 @@ class Parameter:
 
     def __post_init__(self) -> None:
         """Check the bounds."""
+        # Bounds that fit the scale.
         if self.transform not in TRANSFORMS:
             raise UsageError(
                 f"parameter {self.name!r}: unknown transform {self.transform!r}. Available: {', '.join(TRANSFORMS)}"
@@ -84,6 +85,7 @@ class Parameter:
             )
         if self.transform == "logit" and not 0.0 < self.low < self.high < 1.0:
             raise UsageError(f"parameter {self.name!r}: a logit scale needs bounds within (0, 1)")
+        # Value of an absent term, and the prior.
         if self.off is not None and not (self.term and math.isfinite(self.off)):
             raise UsageError(
                 f"parameter {self.name!r}: off = {self.off} is its value without a term, and its term is {self.term!r}",
@@ -228,27 +230,27 @@ class ParameterTable:
         )
         return ParameterTable(rows, self.recordings)
 
-    def of_terms(self, kept: np.ndarray) -> np.ndarray:
+    def of_terms(self, present: np.ndarray) -> np.ndarray:
         """Return which entries are part of a model with some of ``terms``, ``(P,)``, bool.
 
         Args:
-            kept: Shape ``(T,)``, bool: which terms.
+            present: Shape ``(T,)``, bool: which terms.
         """
-        present = dict(zip(self.terms, kept, strict=True)) | {"": True}
-        return np.array([present[c.parameter.term] for c in self.columns], bool)
+        chosen = dict(zip(self.terms, present, strict=True)) | {"": True}
+        return np.array([chosen[c.parameter.term] for c in self.columns], bool)
 
-    def decode(self, z: Array, kept: Array | None = None) -> dict[str, jax.Array]:
+    def decode(self, z: Array, present: Array | None = None) -> dict[str, jax.Array]:
         """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` if each has its own; traceable.
 
         Args:
-            kept: Shape ``(P,)``, bool: others have their values in a model without them; default: all are kept.
+            present: Shape ``(P,)``, bool: others have their values in a model without them; default: all are kept.
         """
         x = self._low + (self._high - self._low) * jax.nn.sigmoid(jnp.asarray(z))
         columns: dict[str, list[jax.Array]] = {}
         for i, c in enumerate(self.columns):
             p, value = c.parameter, from_scale(c.parameter.transform, x[i], jnp)
-            if kept is not None:
-                value = jnp.where(kept[i], value, p.without)
+            if present is not None:
+                value = jnp.where(present[i], value, p.without)
             columns.setdefault(p.name, []).append(value)
         # Add the fixed parameters, and stack those that each recording has its own value of.
         values: dict[str, jax.Array] = {}

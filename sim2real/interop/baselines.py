@@ -44,6 +44,7 @@ def to_baselines(env: CopiesVectorEnv[Any], seed: int | None = None) -> Any:
             "Stable-Baselines3 is not installed", hint="pip install stable-baselines3, which installs PyTorch"
         ) from error
 
+    # The adapter's class inherits from theirs, so it is made here.
     kind: Any = type("BaselinesVecEnv", (_Copies, base), {})
     adapted = kind(env.num_envs, env.single_observation_space, env.single_action_space)
     adapted.env = env

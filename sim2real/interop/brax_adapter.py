@@ -123,9 +123,6 @@ class BraxEnv(PureBraxEnv):
 
     The observation is a vector: the task's observables, one after the other, in their order. Actions follow the task's
     ``action_spec``. ``info["failed"]`` is 1 where no acceptable initial state was drawn.
-
-    Args:
-        fresh_starts: See ``PureBraxEnv``.
     """
 
     def __init__(self, environment: MjxEnvironment, fresh_starts: bool = True) -> None:
@@ -138,9 +135,6 @@ class RobotBraxEnv(PureBraxEnv):
 
     brax has no bounds of actions; its learners send values between -1 and 1. Here an action of -1 stands for the lower
     bound of ``robot.action`` and 1 for the upper one. ``metrics`` has an episode's ``return`` and ``success``.
-
-    Args:
-        fresh_starts: See ``PureBraxEnv``.
 
     Attributes:
         robot: One copy; ``robot.observation`` and ``robot.action`` name each entry, with unit and bounds.

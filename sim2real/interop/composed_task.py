@@ -34,6 +34,7 @@ class PureTask:
         self.period_s, self.length = environment.task.control_timestep, environment.step_limit
         shapes = environment.observation_spec()
         task = environment.task
+        # Refuse a task without observations or with a nested action.
         if not shapes:
             available = ", ".join(map(repr, task.observables)) or "none"
             raise UsageError(
@@ -48,6 +49,7 @@ class PureTask:
                 f"an action must be one array, and the task's action_spec is {action!r}",
                 hint="override action_spec in the task",
             )
+        # Observations are one vector, or an array for each name.
         self.action_spec = action
         self.observation_spec: specs.Array | dict[str, specs.Array]
         if flat:

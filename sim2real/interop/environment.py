@@ -57,7 +57,6 @@ class Copy(NamedTuple):
     """The state of one copy.
 
     Attributes:
-        env: The environment's state.
         key: Source of the random numbers in an episode.
         truncated: Whether the time limit has ended the episode.
     """

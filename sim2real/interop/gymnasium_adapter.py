@@ -47,9 +47,6 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
     Copy i of ``reset(seed=s)`` has the seed s + i, as in gymnasium's own vector environments. The episodes of a copy
     depend on its seed and its actions alone.
 
-    Args:
-        autoreset_mode: An ``AutoresetMode`` or its value, e.g. ``"SameStep"``.
-
     Raises:
         UsageError: When ``num_envs`` is below 1, or there is no such mode.
     """
@@ -68,6 +65,7 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self.num_envs = num_envs
+        # Spaces of one copy, and of all copies.
         observation = pure.observation_spec
         if isinstance(observation, Mapping):
             self.single_observation_space = gymnasium.spaces.Dict({k: _box(v) for k, v in observation.items()})
@@ -77,6 +75,7 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, num_envs)
         self.action_space = batch(self.single_action_space, num_envs)
+        # Compiled functions over all copies.
         self._pure = pure
         self._step = jax.jit(jax.vmap(pure.step))
         self._start, self._restart = jax.jit(self._reset_all), jax.jit(self._reset_some)

@@ -19,8 +19,6 @@ class Backlog:
     """The records that the writer of a log has not written yet.
 
     Attributes:
-        records: Number of queued records.
-        bytes: Their estimated memory.
         behind_s: Age of the record that is being written [s]; 0 for an empty queue.
         idle_s: Time since the writer began the present record or flush [s]; 0 for an empty queue.
     """

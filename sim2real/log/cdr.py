@@ -95,9 +95,6 @@ class Layout:
 
     ``pack`` encodes one message; ``np.frombuffer(data, layout.dtype)`` decodes any number of adjacent ones.
 
-    Args:
-        parts: The message's fields and constants, in order.
-
     Attributes:
         fields: The fields among the parts, in the order in which ``pack`` takes their values.
         dtype: A structured dtype of one message, encapsulation included.

@@ -24,9 +24,6 @@ def encode(name: str, document: Mapping[str, Json]) -> dict[str, str]:
     ``json`` is the whole document, and ``crc32`` its checksum, as MCAP has none for metadata. Top-level strings,
     numbers and booleans are also stored under their names, for other viewers.
 
-    Args:
-        name: The record's name, for errors.
-
     Raises:
         Sim2RealError: When a value cannot be written as JSON.
     """

@@ -62,6 +62,7 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         node: int(s[-1]) + 1 - len(s) - (firsts[node] if start_s else 0) for node, s in sequences.items() if len(s)
     }
     _warn(path, contents, missing)
+    # Figures of the log beside the session's metadata.
     log_metadata = {
         "epoch_ns": contents.epoch_ns,
         "session_end": contents.end,
@@ -161,6 +162,7 @@ def _steps_and_outputs(
                 outputs[node][name] = (
                     np.ascontiguousarray(values["data"][name]) if in_payload else np.zeros(shape, entry["dtype"])
                 )
+        # The columns of the step records.
         data = rows["data"]
         steps[node] = Steps(*(np.ascontiguousarray(data[f]) for f in Steps.__dataclass_fields__))
         sequences[node] = np.ascontiguousarray(data["seq"])

@@ -83,7 +83,6 @@ class Damage:
     Attributes:
         skipped: Descriptions of the places, in the order of the file; the last one counts those beyond the first 100.
         cut: Whether the file ends before the end of its data section.
-        count: Number of unreadable places.
     """
 
     skipped: list[str] = field(default_factory=list)
@@ -136,9 +135,6 @@ def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
     The length of each record leads to the next one. If a length is damaged, reading resumes at the next bytes that look
     like a chunk or the session's end.
 
-    Args:
-        damage: Receives the damage.
-
     Raises:
         Sim2RealError: When records overlap.
     """
@@ -173,11 +169,7 @@ def chunk_times(data: mmap.mmap, record: Record) -> tuple[int, int]:
 
 
 def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
-    """Return the content of a chunk, decompressed and checked; empty if it is damaged.
-
-    Args:
-        damage: Receives the damage.
-    """
+    """Return the content of a chunk, decompressed and checked; empty if it is damaged."""
     try:
         return _decompressed(Chunk.read(stream_of(data, record)))
     except Exception as error:  # decompressors have their own exceptions
@@ -204,12 +196,7 @@ def chunk_records(content: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def parsed(kind: RecordType[R], data: mmap.mmap | bytes, record: Record, damage: Damage) -> R | None:
-    """Return a record parsed by a class of ``mcap.records``; None if it is damaged.
-
-    Args:
-        data: The file, or a chunk's content.
-        damage: Receives the damage.
-    """
+    """Return a record parsed by a class of ``mcap.records``; None if it is damaged."""
     try:
         return kind.read(stream_of(data, record))
     except BROKEN as error:

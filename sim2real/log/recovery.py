@@ -50,6 +50,7 @@ def recover(source: str | Path, target: str | Path) -> Recovery:
     with opened(source) as data:
         # Collect all definitions first, as a damaged file can hold them after their messages.
         definitions = _definitions(data)
+        # Copy record by record; a failure leaves no file.
         try:
             with open(target, "xb") as stream:
                 copier = _Copier(Writer(stream, chunk_size=64 * 1024, compression=CompressionType.LZ4), definitions)
@@ -125,11 +126,7 @@ class _Copier:
         self._channels: dict[int, int] = {}
 
     def take(self, data: mmap.mmap, record: Record, damage: Damage) -> None:
-        """Copy a record of the data section.
-
-        Args:
-            damage: Receives the damage.
-        """
+        """Copy a record of the data section."""
         if record.opcode == Opcode.HEADER:
             self._header = parsed(Header, data, record, damage) or self._header
         elif record.opcode == Opcode.CHUNK:

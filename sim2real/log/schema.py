@@ -38,7 +38,6 @@ class Topic:
 
     Attributes:
         name: The topic, e.g. ``/node/output``.
-        schema: Name of the message type.
         schema_text: Definition of the message type, in ``ros2msg`` format.
         layout: Byte layout of the message type.
         metadata: The channel's metadata: role, original names of node and input, and fields with original names.
@@ -76,7 +75,6 @@ def output_topic(node: str, example: PyTree, units: Mapping[str, str] | None = N
     """Return the topic of a node's output.
 
     Args:
-        example: An output, such as ``init_output`` returns.
         units: Field, or entry of one (``"aim[0]"``) -> unit.
 
     Raises:
@@ -195,10 +193,6 @@ def joint_source(
 
 def unique_names(originals: Iterable[str], where: str, kind: str) -> dict[str, str]:
     """Return original name -> ROS name.
-
-    Args:
-        where: Place of the names, for errors.
-        kind: Kind of the named things, for errors.
 
     Raises:
         Sim2RealError: When two names become the same ROS name.

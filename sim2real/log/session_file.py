@@ -47,10 +47,7 @@ class _Node:
     """The topics of one node.
 
     Attributes:
-        step: Topic of its step records.
-        output: Topic of its outputs.
         filled: Indices of the output's leaves with elements; empty leaves are not written.
-        leaves: Number of leaves of the output.
         joints: Source of its joint states, or None.
     """
 
@@ -69,7 +66,6 @@ class SessionFile:
     Args:
         path: The file; it must not exist.
         outputs: Node -> an example of its output.
-        inputs: The connections, as (node, input name).
         joint_states: Node -> joint -> quantity -> field of the node's output; see ``McapRecorder``.
         units: Node -> field, or entry of one -> unit.
 
@@ -152,6 +148,7 @@ class SessionFile:
 
     def step(self, record: StepRecord, leaves: Sequence[npt.ArrayLike]) -> None:
         """Write a step, its output and its joint states."""
+        # Refuse a node or an output that the session did not announce.
         node = self._nodes.get(record.node)
         if node is None:
             raise Sim2RealError(f"node {record.node!r} is not in this log. Available: {', '.join(self._nodes)}")

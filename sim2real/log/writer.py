@@ -47,7 +47,6 @@ class McapRecorder:
             reserved.
         attachments: File name -> content.
         outputs: Node -> an example of its output, such as ``init_output`` returns; all outputs must have its shapes.
-        inputs: The connections, as (node, input name).
         joint_states: Node -> joint -> quantity (``position``, ``velocity``, ``effort``) -> field of the node's output
             (``"th"``, ``"q[2]"``): also written as ``/joint_states``, which viewers plot without configuration.
         units: Node -> field, or entry of one (``"aim[0]"``) -> unit.
@@ -72,6 +71,7 @@ class McapRecorder:
         self.path = Path(path)
         self._names = {node: dict.fromkeys(named_leaves(example)) for node, example in outputs.items()}
         self._file = SessionFile(self.path, metadata, attachments, outputs, inputs, joint_states or {}, units)
+        # The queue between the control loops and the writer's thread.
         self._queue: queue.SimpleQueue[tuple[float, Callable[..., None], tuple[Any, ...]] | None]
         self._queue = queue.SimpleQueue()
         self._longest_queue = 0
@@ -93,6 +93,7 @@ class McapRecorder:
         self._started = False
         self._closed = False
         self._lock = threading.Lock()
+        # Start the thread; at exit it writes the rest of the queue.
         self._thread = threading.Thread(target=self._run, name="log-writer", daemon=True)
         self._thread.start()
         atexit.register(self._close_at_exit)
@@ -124,7 +125,6 @@ class McapRecorder:
         """Queue an event, such as a safety stop, which viewers show as a log line; also allowed before ``start``.
 
         Args:
-            kind: A short name, for example ``"watchdog"``.
             level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
             ticks: Time of the event on a simulated clock [us from the episode's start]; None: now.
         """
@@ -246,6 +246,7 @@ class McapRecorder:
     def _run(self) -> None:
         """Write the records of the queue until None comes."""
         try:
+            # Write queued records until the queue holds None.
             flush_at = time.monotonic() + FLUSH_PERIOD_S
             sync_at = time.monotonic() + SYNC_PERIOD_S
             while True:

@@ -78,7 +78,7 @@ def save_bundle(
         samples: Shape ``(n, O)``: observations of one episode, logged ones if possible, for the comparison of numpy and
             ONNX if onnxruntime is installed. None: those of the references, or else drawn from the normaliser.
         spec: Default: a perceptron whose output is clipped.
-        graph: The policy as an ONNX model, for a network that is not in ``OWN``.
+        graph: The policy as an ONNX model, for a network that is not in ``BUILT_IN``.
         references: Source of the observations, such as ``log`` -> JAX's actions; the runner is compared with them, and
             ``policy.json`` has the differences.
 
@@ -97,10 +97,10 @@ def save_bundle(
     # Compare the runner with JAX, and numpy with ONNX.
     has_onnxruntime = importlib.util.find_spec("onnxruntime") is not None
     parity = {}
-    if spec.own or has_onnxruntime:
-        runner = PolicyRunner(contract, NumpyBackend(weights, spec) if spec.own else OnnxBackend(graph))
+    if spec.built_in or has_onnxruntime:
+        runner = PolicyRunner(contract, NumpyBackend(weights, spec) if spec.built_in else OnnxBackend(graph))
         parity = {name: _parity(weights, runner, reference, name) for name, reference in references.items()}
-    if spec.own and has_onnxruntime:
+    if spec.built_in and has_onnxruntime:
         if samples is None and references:
             samples = np.concatenate([reference.observations for reference in references.values()])
         _check_parity(weights, graph, contract, spec, samples)
@@ -141,7 +141,6 @@ def load_bundle(folder: str | Path, backend: str | None = None) -> PolicyRunner:
     """Read a bundle.
 
     Args:
-        folder: A folder that ``save_bundle`` has written.
         backend: ``"numpy"``, or, if onnxruntime is installed, ``"onnx"``, which runs networks of any kind; default:
             numpy if it runs this network.
 
@@ -156,7 +155,7 @@ def load_bundle(folder: str | Path, backend: str | None = None) -> PolicyRunner:
     _check_backend(backend)
     contract, spec = read_contract(folder)
     weights, folder = read_weights(folder), Path(folder)
-    if backend == "onnx" or (backend is None and not spec.own):
+    if backend == "onnx" or (backend is None and not spec.built_in):
         spec.refuse_teacher()
         return PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, _read_about(folder))))
     return make_runner(weights, contract, "numpy", spec)
@@ -180,7 +179,7 @@ def make_runner(
     spec.refuse_teacher()
     weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
     _check_fit(weights, contract, spec)
-    if spec.own and backend != "onnx":
+    if spec.built_in and backend != "onnx":
         return PolicyRunner(contract, NumpyBackend(weights, spec))
     if backend == "numpy":
         raise UsageError(f"numpy does not run network {spec.name!r}", hint="backend='onnx' runs any")
@@ -190,9 +189,11 @@ def make_runner(
 def _graph_of(
     weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec, graph: bytes | None
 ) -> bytes:
-    """Return the policy as an ONNX model with the contract's names; ``graph``: that of a network not in ``OWN``."""
-    if (graph is None) != spec.own:
-        raise UsageError(f"network {spec.name!r} needs {'no ONNX model' if spec.own else 'an ONNX model'} of its own")
+    """Return the policy as an ONNX model with the contract's names; ``graph``: that of a user's network."""
+    if (graph is None) != spec.built_in:
+        raise UsageError(
+            f"network {spec.name!r} needs {'no ONNX model' if spec.built_in else 'an ONNX model'} of its own"
+        )
     return build_onnx(weights, contract, spec) if graph is None else with_contract(graph, contract)
 
 
@@ -237,6 +238,7 @@ def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
 def _read_about(folder: Path) -> dict[str, Json]:
     """Return the content of ``policy.json``, after checking its format version."""
     path = folder / CONTRACT
+    # Read the contract's file.
     try:
         about = json.loads(path.read_text())
     except FileNotFoundError as error:
@@ -248,6 +250,7 @@ def _read_about(folder: Path) -> dict[str, Json]:
         raise Sim2RealError(f"{path} cannot be read: {error.strerror}", hint="check its permissions") from error
     except (ValueError, RecursionError) as error:  # a decoder's errors are ValueErrors
         raise Sim2RealError(f"{path} is no JSON: {error}", hint="copy or export the bundle again") from error
+    # Check its version, and its list of files.
     version = about.get("format_version") if isinstance(about, dict) else None
     if type(version) is not int or version not in FORMAT_VERSIONS:
         raise Sim2RealError(
@@ -285,7 +288,7 @@ def _shapes(
     require(weights, BESIDES)
     size, actions = contract.observation_size, len(contract.action)
     expected = {"mean": (size,), "std": (size,), "low": (actions,), "high": (actions,), "log_std": (actions,)}
-    if not spec.own:
+    if not spec.built_in:
         return {name: weights[name].shape for name in weights} | expected
     width = size
     if spec.name == "gru":

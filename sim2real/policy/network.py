@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from sim2real.errors import Sim2RealError
 from sim2real.types import Json
 
-OWN = ("mlp", "gru")
+BUILT_IN = ("mlp", "gru")
 """Networks that numpy runs."""
 
 
@@ -28,9 +28,9 @@ class NetworkSpec:
     privileged: int = 0
 
     @property
-    def own(self) -> bool:
+    def built_in(self) -> bool:
         """Whether numpy runs it."""
-        return self.name in OWN
+        return self.name in BUILT_IN
 
     def to_dict(self) -> dict[str, Json]:
         """Return the description as plain data for JSON."""

@@ -27,7 +27,7 @@ def build_onnx(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
     an output ``next_carry_0``.
 
     Args:
-        spec: One of the networks in ``OWN``; default: a perceptron whose output is clipped.
+        spec: One of the networks in ``BUILT_IN``; default: a perceptron whose output is clipped.
     """
     from onnx import helper
 

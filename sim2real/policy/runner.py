@@ -73,8 +73,7 @@ class NumpyBackend:
     """The network in numpy: needs no other package and no warm-up.
 
     Args:
-        weights: As ``Policy.to_weights`` returns them, float32.
-        spec: One of the networks in ``OWN``; default: a perceptron whose output is clipped.
+        spec: One of the networks in ``BUILT_IN``; default: a perceptron whose output is clipped.
     """
 
     def __init__(self, weights: Mapping[str, np.ndarray], spec: NetworkSpec | None = None) -> None:

@@ -10,12 +10,12 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack, runtime_checkable
 
 import numpy as np
 
 from sim2real.graph.delays import DelayDistribution
-from sim2real.graph.node import BaseNode
+from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.identify.model import IdentifiableModel
 from sim2real.policy.upright import Runner
 from sim2real.robots.completeness import complete
@@ -41,7 +41,7 @@ from sim2real.robots.robot_parts import RobotSensor as RobotSensor
 from sim2real.robots.robot_parts import RobotTask as RobotTask
 from sim2real.robots.robot_parts import Session as Session
 from sim2real.robots.roles import ROLES, Roles
-from sim2real.types import PyTree
+from sim2real.types import PyTree, Scalar
 
 
 @runtime_checkable
@@ -51,7 +51,7 @@ class RecordedRobot(Protocol):
     Attributes:
         units: Field of a message -> its unit.
         roles: Names of the nodes.
-        profile_rad_s: How fast the actuators' setpoints move to their goals [rad/s]; infinite: at once.
+        profile_rad_s: Speed of the actuators' setpoints towards their goals [rad/s]; infinite: at once.
         causes: Causes that change several parameters at once: name -> parameter -> change of the parameter on its scale
             when the cause grows by a factor of e.
         export_lead_s: Time that a simulation of ``identified_mjcf`` in C MuJoCo adds to the delay of commands [s].
@@ -97,7 +97,7 @@ class RecordedRobot(Protocol):
         del wanted
         return self
 
-    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""
         del values
         return None
@@ -107,8 +107,7 @@ class Robot:
     """A robot that can be recorded, trained for and deployed to. It has five parts, which its ``__init__`` sets.
 
     Attributes:
-        delay_spread_s: Largest deviation of a delay that the simulated loop is given from the one that it was made for,
-            either way [s].
+        delay_spread_s: Largest deviation, up or down, of an episode's delay from that of the simulated loop [s].
     """
 
     drive: RobotDrive
@@ -133,7 +132,7 @@ class Robot:
 
     @property
     def profile_rad_s(self) -> float:
-        """How fast the actuators' setpoints move to their goals [rad/s]."""
+        """Speed of the actuators' setpoints towards their goals [rad/s]."""
         return self.model.profile_rad_s
 
     @property
@@ -165,35 +164,34 @@ class Robot:
         del wanted
         return self
 
-    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""
         return self.model.identified_mjcf(values)
 
     # -- graphs on hardware
 
-    def recording_nodes(self, session: Any, signal: np.ndarray) -> dict[str, BaseNode]:
+    def recording_nodes(self, session: Session, signal: np.ndarray) -> dict[str, BaseNode]:
         """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step."""
         rows = np.asarray(signal, np.float64).reshape(-1, len(self.agent.action))
         rows, drive = self.drive.approach(session, rows), self.drive
-        options = {"delay": drive.expected_delay_s[1]}
-        player = Excitation(self.roles.supervisor, self.rate_hz, rows, drive.message, **options)
+        delay_s = drive.expected_delay_s[1]
+        player = Excitation(self.roles.supervisor, self.rate_hz, rows, drive.message, delay=delay_s)
         return self._on_hardware(session, player)
 
     def deployment_nodes(
-        self, session: Any, policy: Runner, trial: int = 0
+        self, session: Session, policy: Runner, trial: int = 0
     ) -> tuple[dict[str, BaseNode], dict[str, PyTree]]:
         """Return the graph on hardware that runs a policy, and the agent's parameters.
 
         Args:
             policy: ``reset()`` begins an episode; a call with an observation ``(O,)`` returns the action ``(A,)``.
-            trial: Number of the trial; see ``RobotTask.at_rest``.
         """
         start = self.drive.measured_start(session, self.task.at_rest(trial))
         params = {self.roles.supervisor: in_numpy(self.agent.params(start, None))}
         node = self.agent.make(self.rate_hz, delay=self.drive.expected_delay_s[1])
         return self._on_hardware(session, PolicyNode(node, policy)), params
 
-    def _on_hardware(self, session: Any, agent: BaseNode) -> dict[str, BaseNode]:
+    def _on_hardware(self, session: Session, agent: BaseNode) -> dict[str, BaseNode]:
         rate, rig, (sensing_s, _, acting_s) = self.rate_hz, session.rig, self.drive.expected_delay_s
         roles, drive = self.roles, self.drive
         sensor = ServoSensor(roles.sensor, rate, rig, self.sensor.read, self.sensor.at_rest, delay=sensing_s)
@@ -220,7 +218,7 @@ class Robot:
             delays: Whether the connections have delays.
         """
         roles, rate, tick_s = self.roles, self.rate_hz, self.model.tick_s
-        # Move the delays to where a simulated loop can have them, and make room for all draws.
+        # Share the delays between sensor and actuator as a simulated loop needs, and make room for all draws.
         draws = drawn_in_a_loop(values, draws, tick_s, self.delay_spread_s)
         values = in_a_loop(values, tick_s, self.delay_spread_s)
         bounds = delay_bounds(values, tick_s, self.delay_spread_s, self.model.lead_s, draws) if delays else None
@@ -238,7 +236,7 @@ class Robot:
         return nodes, task
 
     def simulation_params(
-        self, values: Mapping[str, float], policy: Any, trial: int = 0, measured: np.ndarray | None = None
+        self, values: Mapping[str, float], policy: PyTree, trial: int = 0, measured: np.ndarray | None = None
     ) -> dict[str, PyTree]:
         """Return the nodes' parameters for an episode in simulation that starts at rest.
 
@@ -254,7 +252,9 @@ class Robot:
             start = self.task.moved(start, offset, np.zeros_like(offset))
         return self.node_parameters(values, start, policy)
 
-    def node_parameters(self, values: Mapping[str, Any], start: EpisodeStart, policy: Any = None) -> dict[str, PyTree]:
+    def node_parameters(
+        self, values: Mapping[str, Scalar], start: EpisodeStart, policy: PyTree = None
+    ) -> dict[str, PyTree]:
         """Return the parameters of all nodes in simulation, from values by name and a start."""
         return {
             self.roles.world: self.model.params(values, start),
@@ -263,7 +263,7 @@ class Robot:
             self.roles.supervisor: self.agent.params(start, policy),
         }
 
-    def sim_actuator(self, **options: Any) -> SimActuator:
+    def sim_actuator(self, **options: Unpack[NodeOptions]) -> SimActuator:
         """Return the bus in simulation, with options of ``BaseNode``."""
         name, agent, drive = self.roles.actuator, self.roles.supervisor, self.drive
         actions = len(self.agent.action)

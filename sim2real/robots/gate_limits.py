@@ -62,7 +62,6 @@ class GateLimits:
 
         Args:
             limit: Largest magnitude of a command, or (low, high) [the command's unit].
-            **settings: The robot's own fields of ``GateConfig``.
         """
         # Imported here because numpy takes 0.1 s, for which --help would wait.
         from sim2real.hardware.safety.gate import GateConfig

@@ -56,11 +56,11 @@ def checked(robot: Any, where: str) -> RecordedRobot:
 
     Args:
         robot: The module's ``ROBOT``; None if it has none.
-        where: The module, for the message.
 
     Raises:
         UsageError: It is no robot, or it is incomplete.
     """
+    # List the gaps of a robot and of its parts.
     if isinstance(robot, Robot):
         gaps = [gap for name, part in PARTS.items() for gap in _gaps_of_part(robot, name, *part)]
         gaps += [] if gaps else _gaps(robot, Robot, RECORDED_DATA)

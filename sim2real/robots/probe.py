@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from sim2real.hardware.safety.rig import Rig
 
 _PERIOD_S, _WATCHED_S = 0.004, 0.16
-"""Time between two samples; how long a step is watched."""
+"""Time between two samples; duration of the measurement of a step."""
 _BUSY_S, _TRIES, _FEWEST = 0.012, 5, 4
-"""A step with a longer pause than this between two samples is made again: so many times as many steps at most, and so
-few undisturbed ones must do."""
+"""A step with a longer pause than this between two samples is repeated. Largest number of steps, as a multiple of the
+configured one; least number of undisturbed steps."""
 _RISE_RAD = 0.05
-"""The part of the answer up to here is fitted: later, weight and friction make it no polynomial."""
+"""The answer is fitted up to this angle; beyond it, weight and friction make it no polynomial."""
 _GRID_S = 0.0005
 _AGAIN = 5
 """Samples after which a command is sent again: it must not become stale."""
@@ -31,7 +31,7 @@ _STILL_RAD_S, _STILL_S, _REST_S = 0.05, 0.1, 3.0
 
 @dataclass(frozen=True)
 class StepAnswers:
-    """What the answers to some steps say.
+    """Delays of the answers to some steps.
 
     Attributes:
         delays_s: From each command's departure to the motion, in time stamps of measurements ``(N,)`` [s].
@@ -46,7 +46,7 @@ class StepAnswers:
 
     @property
     def jitter_s(self) -> float:
-        """By how much they differ: the range of the middle half [s]."""
+        """The range of their middle half [s]."""
         return float(np.subtract(*np.quantile(self.delays_s, [0.75, 0.25])))
 
 
@@ -56,10 +56,8 @@ class Probe:
 
     Attributes:
         step: Size of a step [the command's unit].
-        lag_s: How much later than it does an answer seem to begin [s]: what starts softly is seen late. As found on the
-            robot in the computer, whose delay is known.
-        joint: The joint that is moved.
-        steps: How many steps.
+        lag_s: Time by which an answer seems to begin too late, because motion starts softly [s]; measured on the
+            embedded robot with its configured delay.
     """
 
     step: float
@@ -70,12 +68,12 @@ class Probe:
 
 @dataclass
 class Witness:
-    """Who makes the steps, and keeps what was measured and sent: that is a recording, too.
+    """Makes the steps, and stores measurements and commands: they are a recording, too.
 
     Attributes:
         rig: The robot.
-        measured: When each measurement was asked for, when it was there, CLOCK_MONOTONIC [ns], and what it was.
-        sent: When each command was on its way, when it had left [ns], and what the gate let through ``(n,)``.
+        measured: Times of the request and of the answer, CLOCK_MONOTONIC [ns], and the reading, of each measurement.
+        sent: Start and end of sending [ns], and the command after the gate ``(n,)``, of each command.
     """
 
     rig: Rig
@@ -99,7 +97,7 @@ def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
     """Step one joint to and fro, through the gate, and see when it answers; torque is off before and afterwards.
 
     Args:
-        witness: Has the robot, at rest; what it kept of earlier steps goes.
+        witness: Has the robot, at rest; its earlier measurements are dropped.
 
     Raises:
         Sim2RealError: The joint does not answer.
@@ -113,8 +111,8 @@ def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
         witness.rig.stop_quietly()  # the reason must not be lost to what else fails
         raise
     witness.rig.stop()
-    found = delays_of(answers)
-    return StepAnswers(found.delays_s - probe.lag_s)
+    estimates = delays_of(answers)
+    return StepAnswers(estimates.delays_s - probe.lag_s)
 
 
 def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
@@ -136,7 +134,7 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
         )
     end_s = float(np.median([a[np.argmax(a[:, 1] >= _RISE_RAD), 0] for a in answers if a[:, 1].max() >= _RISE_RAD]))
     grid = np.arange(0.0, end_s - 4 * _PERIOD_S, _GRID_S)
-    answers = [a[a[:, 0] <= end_s] for a in answers]  # the same samples, whatever the delay: else none fit best
+    answers = [a[a[:, 0] <= end_s] for a in answers]  # the same samples for every delay: otherwise no samples fit best
     samples = np.concatenate(answers)
     delay = min(grid, key=lambda d: _misfit(samples, d, _fit(samples, d)))
     curve = _fit(samples, delay)
@@ -147,8 +145,8 @@ def _answers(witness: Witness, probe: Probe) -> list[np.ndarray]:
     """Return the answers to some steps; those during which this machine was busy are made again."""
     answers: list[np.ndarray] = []
     for before, goal in itertools.islice(itertools.cycle(_steps(witness.rig, probe)), _TRIES * probe.steps):
-        found = _answer(witness, probe.joint, before, goal)
-        answers += [] if found is None else [found]
+        answer = _answer(witness, probe.joint, before, goal)
+        answers += [] if answer is None else [answer]
         if len(answers) == probe.steps:
             return answers
     if len(answers) >= _FEWEST:

@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState
-from sim2real.graph.node import BaseNode
+from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
@@ -27,7 +27,7 @@ from sim2real.robots.probe import Probe
 from sim2real.robots.roles import Roles
 from sim2real.train.environment.graph_environment import TrainingTask
 from sim2real.train.environment.tasks import Rewards
-from sim2real.types import Array, Key, PyTree
+from sim2real.types import Array, Key, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Reading
@@ -40,7 +40,6 @@ class Session(AbstractContextManager["Session"], Protocol):
     """An open robot, as a context manager; leaving it takes the torque off.
 
     Attributes:
-        rig: The motors behind the safety gate.
         embedded: The emulated robot, if the session has one.
     """
 
@@ -49,7 +48,7 @@ class Session(AbstractContextManager["Session"], Protocol):
 
 
 class _Part(Protocol):
-    """What all parts share: an object of an incomplete class is refused with the names of the missing methods."""
+    """Base of all parts: it refuses an object of an incomplete class, with the names of the missing methods."""
 
     def __new__(cls, *args: Any, **options: Any) -> Self:
         """Make the part, if its class has all methods."""
@@ -57,7 +56,7 @@ class _Part(Protocol):
 
 
 class RobotSensor(_Part, Protocol):
-    """What is measured.
+    """The measured quantities.
 
     Attributes:
         channels: The measured quantities of each joint, in the order of the motors.
@@ -77,11 +76,11 @@ class RobotSensor(_Part, Protocol):
 
 
 class RobotDrive(_Part, Protocol):
-    """How the motors are commanded, and how the hardware is opened. Drivers are imported by ``connect``.
+    """The commands to the motors, and the session on hardware. Drivers are imported by ``connect``.
 
     Attributes:
         rate_hz: Rate of sensor, agent and actuator [Hz].
-        command: Field of the actuator's message that is sent to the motors, one entry per action.
+        command: Field of the actuator's message that is sent to the motors, one entry for each action.
         units: Field of the message -> its unit.
         message: Makes the actuator's message from a command ``(actions,)``.
         expected_delay_s: Computation delays of sensor, agent and actuator that phases allow for: a bus transaction, and
@@ -93,7 +92,7 @@ class RobotDrive(_Part, Protocol):
     rate_hz: float
     command: str
     units: Mapping[str, str]
-    message: Callable[[Any], PyTree]
+    message: Callable[[PyTree], PyTree]
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     probe: Probe | None = None
     embedded: Embedded | None = None
@@ -108,37 +107,37 @@ class RobotDrive(_Part, Protocol):
         """
 
     @abstractmethod
-    def prepare(self, session: Any, settle_s: float) -> None:
+    def prepare(self, session: Session, settle_s: float) -> None:
         """Bring the robot to rest where the task starts; torque is off afterwards.
 
         Args:
-            settle_s: Longest time to wait for rest, per attempt [s].
+            settle_s: Longest time to wait for rest, for each attempt [s].
         """
 
     def around(self, signal: np.ndarray) -> np.ndarray:
         """Return the commands ``(N, actions)`` of an excitation; default: the signal itself, around 0."""
         return signal
 
-    def approach(self, session: Any, signal: np.ndarray) -> np.ndarray:
+    def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
         """Return the commands ``(N, actions)`` with which a recording plays an excitation; default: ``around``."""
         del session
         return self.around(signal)
 
-    def measured_start(self, session: Any, start: EpisodeStart) -> EpisodeStart:
+    def measured_start(self, session: Session, start: EpisodeStart) -> EpisodeStart:
         """Return the start of a deployment, from that of its trial; default: unchanged."""
         del session
         return start
 
 
 class RobotAgent(_Part, Protocol):
-    """What the policy observes and does.
+    """The observation and the action of the policy.
 
     Attributes:
         observation: Terms of the policy's observation, in order.
         action: The policy's actions, in order, with their bounds.
         limits: Name -> limit that a policy is trained for, such as the ends of the joints' goals.
         units: Field of the agent's message -> its unit, beside the command.
-        tilt_rad: Returns how far the robot leans, from an observation ``(O,)``, for ``deploy --max-tilt-rad`` [rad];
+        tilt_rad: Returns the robot's tilt from an observation ``(O,)``, for ``deploy --max-tilt-rad`` [rad];
             None: the robot does not measure that.
     """
 
@@ -154,16 +153,16 @@ class RobotAgent(_Part, Protocol):
         return sum(term.size * term.history for term in self.observation)
 
     @abstractmethod
-    def make(self, rate_hz: float, **options: Any) -> BaseNode:
+    def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> BaseNode:
         """Return the policy's node, with ``observe`` and ``act``; see ``PolicyNode``."""
 
     @abstractmethod
-    def params(self, start: EpisodeStart, policy: Any) -> PyTree:
+    def params(self, start: EpisodeStart, policy: PyTree) -> PyTree:
         """Return the node's parameters for an episode."""
 
 
 class RobotTask(_Part, Protocol):
-    """Where episodes start, and how good they are.
+    """The starts and the rewards of episodes.
 
     Attributes:
         aim_size: Number of entries of ``EpisodeStart.aim``.
@@ -172,7 +171,7 @@ class RobotTask(_Part, Protocol):
     aim_size: int = 0
 
     @abstractmethod
-    def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], EpisodeStart]:
+    def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], EpisodeStart]:
         """Return parameters by name and a start for a random episode of training.
 
         Args:
@@ -187,12 +186,12 @@ class RobotTask(_Part, Protocol):
         """Return a start with an offset of positions ``(channels,)`` [rad] and velocities [rad/s]."""
         return start.replace(position=start.position + position, velocity=start.velocity + velocity)
 
-    def judged(self, graph_state: GraphState, roles: Roles) -> Any:
+    def judged(self, graph_state: GraphState, roles: Roles) -> PyTree:
         """Return the state that ``reward``, ``success`` and ``terminated`` evaluate; default: the world's."""
         return graph_state.state[roles.world]
 
     @abstractmethod
-    def reward(self, state: Any, action: jax.Array) -> Rewards:
+    def reward(self, state: PyTree, action: jax.Array) -> Rewards:
         """Return the reward of a policy step: a number, or terms by name, which are added up.
 
         Args:
@@ -200,22 +199,22 @@ class RobotTask(_Part, Protocol):
         """
 
     @abstractmethod
-    def success(self, state: Any) -> jax.Array:
+    def success(self, state: PyTree) -> jax.Array:
         """Return whether the task is fulfilled, bool."""
 
-    def terminated(self, state: Any) -> jax.Array:
+    def terminated(self, state: PyTree) -> jax.Array:
         """Return whether the episode ends, such as after a fall, bool; default: never."""
         del state
         return jnp.bool_(False)
 
     @abstractmethod
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return figures of how well a deployment went, among them ``success``, from 0 to 1.
+        """Return the figures of a deployment, among them ``success``, from 0 to 1.
 
         Args:
             t_s: Times ``(N,)`` [s].
             states: Name -> values ``(N,)``; entries of a vector are named ``name[i]``. They are the measured fields,
-                and one value per step of the agent's message and of ``command``, as it was sent to the motors.
+                and the agent's message and ``command``, as sent to the motors, at each step.
         """
 
 
@@ -245,14 +244,14 @@ class RobotModel(_Part, Protocol):
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
 
     @abstractmethod
-    def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PyTree:
+    def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> PyTree:
         """Return the world's parameters for an episode, from values by name."""
 
-    def true_state(self, state: Any) -> PyTree:
+    def true_state(self, state: PyTree) -> PyTree:
         """Return the part of the world's state that a value function may observe in simulation; default: all of it."""
         return state
 
-    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""
         del values
         return None
@@ -277,10 +276,12 @@ class ConnectedParts(Protocol):
         """Rate of sensor, agent and actuator [Hz]."""
         ...
 
-    def node_parameters(self, values: Mapping[str, Any], start: EpisodeStart, policy: Any = None) -> dict[str, PyTree]:
+    def node_parameters(
+        self, values: Mapping[str, Scalar], start: EpisodeStart, policy: PyTree = None
+    ) -> dict[str, PyTree]:
         """Return the parameters of all nodes in simulation."""
         ...
 
-    def sim_actuator(self, **options: Any) -> BaseNode:
+    def sim_actuator(self, **options: Unpack[NodeOptions]) -> BaseNode:
         """Return the bus in simulation."""
         ...

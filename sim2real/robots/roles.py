@@ -1,4 +1,4 @@
-"""Who is who in a robot's graph: the stages go by roles, not by names."""
+"""Roles of the nodes in a robot's graph: the stages find nodes by role, not by name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Roles:
         sensor: Measures.
         supervisor: Decides: the policy makes its steps.
         actuator: Sends the commands to the motors.
-        world: Is the robot and what is around it, in simulation.
+        world: The robot and its surroundings, in simulation.
     """
 
     sensor: str = "sensor"

@@ -1,4 +1,4 @@
-"""What a deployment is scored on: the columns that robots and simulations of them leave."""
+"""The columns that a deployment and its simulation are scored on."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 
 from sim2real.robots.contract import Robot
+from sim2real.types import PyTree
 
 
-def as_columns(fields: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def as_columns(fields: Mapping[str, PyTree]) -> dict[str, np.ndarray]:
     """Return the fields ``(N, ...)`` as columns ``(N,)``: a vector's entries become ``name[i]``."""
-    found = {}
+    columns = {}
     for name, values in fields.items():
         flat = np.asarray(values).reshape(len(values), -1)
-        found |= {name if flat.shape[1] == 1 else f"{name}[{i}]": column for i, column in enumerate(flat.T)}
-    return found
+        columns |= {name if flat.shape[1] == 1 else f"{name}[{i}]": column for i, column in enumerate(flat.T)}
+    return columns
 
 
 def as_sent(robot: Robot, decided: Mapping[str, Any], commanded: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return the columns of what the supervisor sent besides its command, and of the command to the motors."""
+    """Return the columns of the supervisor's message without its command, and of the command to the motors."""
     field = robot.drive.command
     return as_columns({**{n: v for n, v in decided.items() if n != field}, "command": commanded[field]})

@@ -3,7 +3,7 @@
     def test_it_is_a_robot(tmp_path):
         check_robot(load_pipeline("mine").load(), tmp_path)
 
-Each function raises an ``AssertionError`` that says what does not fit. Torque comes on for a moment, and only on the
+Each function raises an ``AssertionError`` that names the defect. Torque comes on for a moment, and only on the
 embedded robot.
 """
 
@@ -30,16 +30,16 @@ from sim2real.robots.loading import checked
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.train.environment.graph_environment import TrainingTask
 from sim2real.train.environment.tasks import EndingTask, PrivilegedTask, terms_of
+from sim2real.types import PyTree
 
 _EPISODE_S = 0.2
 
 
 def check_robot(robot: RecordedRobot, folder: Path, limits: GateLimits | None = None) -> None:
-    """Check all that the stages need of a robot; of a recorded one, what identification needs.
+    """Check the parts of a robot that the stages use; of a recorded robot, those that identification uses.
 
     Args:
-        robot: The robot, e.g. ``load_pipeline("mine").load()``.
-        folder: Takes what the embedded robot writes, where there is one.
+        folder: Folder for the files of the embedded robot, if there is one.
         limits: Limits of the safety gate; default: those of ``GateLimits``.
 
     Raises:
@@ -73,57 +73,56 @@ def check_identification(robot: RecordedRobot, max_delay_s: float = 0.06) -> Non
     )
     measured = {name for c in model.channels for name, _ in c.fields}
     _include(named_leaves(read), measured, "fields that the sensor measures")
-    given = set(jax.tree_util.tree_leaves(model.given[roles.actuator]))
-    _include(named_leaves(commanded), given, "fields of a command")
+    commands = set(jax.tree_util.tree_leaves(model.given[roles.actuator]))
+    _include(named_leaves(commanded), commands, "fields of a command")
     _include(robot.units, measured, "units")
     _check_start(model, nodes)
 
 
 def check_simulation(robot: Robot) -> None:
     """Check names, shapes and scores by an episode in simulation at the nominal values; it is compiled."""
+    # Parameters and nodes.
     roles, values, size = robot.roles, robot.nominal(), robot.agent.observation_size
-    known = {p.name: p for p in robot.identifiable(0.06).parameters}
-    _include(known, set(values), "parameters that can be identified")
+    identifiable = {p.name: p for p in robot.identifiable(0.06).parameters}
+    _include(identifiable, set(values), "parameters that can be identified")
     for name, value in values.items():
-        _hold(known[name].low <= value <= known[name].high, f"{name} = {value} is outside its bounds")
+        p = identifiable[name]
+        _hold(p.low <= value <= p.high, f"{name} = {value} is outside its bounds")
     nodes, task = robot.training(values, {}, {}, False)
     _include(nodes, {roles.sensor, roles.supervisor, roles.actuator, roles.world}, "nodes of the loop")
     _hold(task.supervisor == roles.supervisor, f"the task's supervisor is {task.supervisor!r}")
-    for sign, own in (("low", task.action_low), ("high", task.action_high)):
-        bears = np.array([getattr(term, sign) for term in robot.agent.action], np.float32)
-        _hold(np.shape(own) == bears.shape, f"the task has {np.shape(own)} actions, the robot {bears.shape}")
-        excess = (own - bears) * (1 if sign == "high" else -1)
-        _hold(bool((excess <= 0).all()), f"the task's actions go beyond what the robot bears: {own} and {bears}")
+    for sign, limit in (("low", task.action_low), ("high", task.action_high)):
+        limits = np.array([getattr(term, sign) for term in robot.agent.action], np.float32)
+        _hold(np.shape(limit) == limits.shape, f"the task has {np.shape(limit)} actions, the robot {limits.shape}")
+        excess = (limit - limits) * (1 if sign == "high" else -1)
+        _hold(bool((excess <= 0).all()), f"the task's actions are outside of the robot's limits: {limit} and {limits}")
+
+    # One episode, compiled.
     graph = CompiledGraph(nodes, roles.supervisor, draw(nodes, _EPISODE_S))
     recorded = (roles.sensor, roles.supervisor, roles.actuator)
 
-    def episode(key: jax.Array) -> Any:
+    def episode(key: jax.Array) -> PyTree:
         gs = graph.init(key, params=robot.simulation_params(values, None, 0))
         return task.observe(graph.observe(gs)[1]), graph.rollout(gs, record=recorded)[1], _judged(task, gs)
 
-    seen, records, judged = jax.jit(episode)(jax.random.key(0))
+    observation, records, judged = jax.jit(episode)(jax.random.key(0))
     _check_judgement(judged)
-    _hold(
-        seen.shape == (robot.agent.observation_size,),
-        f"the policy sees {seen.shape}, not ({robot.agent.observation_size},)",
-    )
+    _hold(observation.shape == (size,), f"an observation has shape {observation.shape}, not ({size},)")
     _hold(task.observation_size == size, f"the task shows {task.observation_size} entries")
-    _hold(bool(jnp.isfinite(seen).all()), f"the policy sees {seen}")
+    _hold(bool(jnp.isfinite(observation).all()), f"an observation is not finite: {observation}")
     _include(nodes, set(jax.eval_shape(task.params, jax.random.key(0))), "nodes with parameters")
-    found = {name: _ran(records[name]) for name in recorded}
+
+    # Fields, units and score of its messages.
+    outputs = {name: _ran(records[name]) for name in recorded}
     fields = {field for row in robot.sensor.joints.values() for field in row.values()}
-    measured = score_columns.as_columns(found[roles.sensor])
+    measured = score_columns.as_columns(outputs[roles.sensor])
     _include(measured, fields, "fields of joints")
-    _include(found[roles.actuator], {robot.drive.command}, "fields of a command")
-    _include(robot.units, {*found[roles.sensor], robot.drive.command}, "units")
-    width = (
-        found[roles.actuator][robot.drive.command].reshape(len(found[roles.actuator][robot.drive.command]), -1).shape[1]
-    )
-    _hold(
-        width == len(robot.agent.action),
-        f"a command has {width} entries, and there are {len(robot.agent.action)} actions",
-    )
-    _check_score(robot, measured, score_columns.as_sent(robot, found[roles.supervisor], found[roles.actuator]))
+    _include(outputs[roles.actuator], {robot.drive.command}, "fields of a command")
+    _include(robot.units, {*outputs[roles.sensor], robot.drive.command}, "units")
+    command, actions = outputs[roles.actuator][robot.drive.command], len(robot.agent.action)
+    width = command.reshape(len(command), -1).shape[1]
+    _hold(width == actions, f"a command has {width} entries, and there are {actions} actions")
+    _check_score(robot, measured, score_columns.as_sent(robot, outputs[roles.supervisor], outputs[roles.actuator]))
 
 
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:
@@ -144,17 +143,17 @@ def _check_start(model: IdentifiableModel, nodes: Mapping[str, Any]) -> None:
     values = {p.name: jnp.asarray(p.nominal) for p in model.parameters}
     params = model.params(values, jnp.zeros(2 * len(model.channels)))
     _include(nodes, set(params), "nodes with parameters")
-    for name, leaf in ((n, x) for n, own in params.items() for x in jax.tree_util.tree_leaves(own)):
+    for name, leaf in ((n, x) for n, leaves in params.items() for x in jax.tree_util.tree_leaves(leaves)):
         _hold(bool(jnp.isfinite(leaf).all()), f"a parameter of {name!r} is {leaf} at nominal values")
 
 
-def _judged(task: TrainingTask, graph_state: GraphState) -> dict[str, Any]:
-    """Return what a task says of the graph's state."""
+def _judged(task: TrainingTask, graph_state: GraphState) -> dict[str, PyTree]:
+    """Return a task's results for the graph's state."""
     reward = task.reward(graph_state, jnp.asarray(task.action_low))
-    said = {f"reward {name!r}": term for name, term in terms_of(reward).items()} or {"reward": reward}
-    said |= {"success": task.success(graph_state)}
-    said |= {"terminated": task.terminated(graph_state)} if isinstance(task, EndingTask) else {}
-    return said | ({"privileged": task.privileged(graph_state)} if isinstance(task, PrivilegedTask) else {})
+    results = {f"reward {name!r}": term for name, term in terms_of(reward).items()} or {"reward": reward}
+    results |= {"success": task.success(graph_state)}
+    results |= {"terminated": task.terminated(graph_state)} if isinstance(task, EndingTask) else {}
+    return results | ({"privileged": task.privileged(graph_state)} if isinstance(task, PrivilegedTask) else {})
 
 
 def _check_judgement(judged: Mapping[str, Any]) -> None:
@@ -177,8 +176,8 @@ def _check_score(robot: Robot, measured: Mapping[str, np.ndarray], sent: Mapping
 
 def _ran(record: Any) -> dict[str, np.ndarray]:
     """Return the fields of the steps that were made, ``(N, ...)``."""
-    made = np.asarray(record.seq) >= 0
-    return {name: np.asarray(leaf)[made] for name, leaf in named_leaves(record.output).items()}
+    finished = np.asarray(record.seq) >= 0
+    return {name: np.asarray(leaf)[finished] for name, leaf in named_leaves(record.output).items()}
 
 
 def _include(there: Iterable[str], wanted: set[str], what: str) -> None:
@@ -186,6 +185,6 @@ def _include(there: Iterable[str], wanted: set[str], what: str) -> None:
     _hold(not missing, f"{what}: there are {', '.join(sorted(there)) or 'none'}, but not {', '.join(missing)}")
 
 
-def _hold(condition: bool, said: str) -> None:
+def _hold(condition: bool, message: str) -> None:
     if not condition:
-        raise AssertionError(said)
+        raise AssertionError(message)

@@ -1,4 +1,4 @@
-"""Worlds by name: another simulation of a robot, in the place of its own, that an installed package brings."""
+"""Worlds by name: an installed package provides another simulation of a robot, which replaces its own."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,20 +23,17 @@ from sim2real.robots.from_model.recorded import LoggedRobot
 from sim2real.robots.roles import Roles
 from sim2real.train.environment.graph_environment import TrainingTask
 from sim2real.train.environment.tasks import EndingTask, Rewards
-from sim2real.types import Array, Key, PyTree
+from sim2real.types import Array, Key, PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
 
 AnyRobot = TypeVar("AnyRobot", bound=RecordedRobot)
 
 
 class WorldModel(ABC):
-    """A simulation of a robot: what an entry point of the group ``sim2real.worlds`` makes, called with the robot.
+    """A simulation of a robot. An entry point of the group ``sim2real.worlds`` makes it from the robot.
 
-    Its node hears the messages of the robot's actuator, and sends what the robot's own world sends. A field ``start``
-    of the node's parameters, shape ``(2 * channels,)``, is where an episode begins: positions, then velocities.
-
-    Args:
-        robot: The robot, with a world of its own.
+    The input of its node is the robot's actuator, and its output has the fields of the robot's own world. A field
+    ``start`` of the node's parameters, shape ``(2 * channels,)``, is an episode's start: positions, then velocities.
     """
 
     def __init__(self, robot: RecordedRobot) -> None:
@@ -44,7 +41,7 @@ class WorldModel(ABC):
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
-        """Return what may be identified; each has a ``leaf``, where it belongs: ``world.FIELD``."""
+        """Return the parameters that can be identified; the ``leaf`` of each is ``world.FIELD``."""
 
     @abstractmethod
     def make_world(self, resumed: bool = False) -> BaseNode:
@@ -52,10 +49,10 @@ class WorldModel(ABC):
 
     @cached_property
     def node(self) -> BaseNode:
-        """A node of this world, for what it says about itself."""
+        """A node of this world, for its descriptions."""
         return self.make_world()
 
-    def params(self, values: Mapping[str, Any], start: Any) -> Any:
+    def params(self, values: Mapping[str, Scalar], start: PyTree) -> PyTree:
         """Return the node's parameters.
 
         Args:
@@ -73,10 +70,11 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
         name: The world; None: the robot's own.
 
     Raises:
-        UsageError: There is no such world, it is none, or the robot cannot be put into another one.
+        UsageError: There is no such world, it is no ``WorldModel``, or the robot cannot use another world.
     """
     if name is None:
         return robot
+    # Load the world of an installed package.
     from sim2real.hardware.entries import WORLDS
     from sim2real.hardware.registry import load_entry
 
@@ -86,8 +84,9 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
             f"world {name!r} makes a {type(model).__name__}", hint="it has to be a sim2real.robots.worlds.WorldModel"
         )
     _check(name, robot, model)
+    # Put it in the place of the robot's own.
     if isinstance(robot, Robot):
-        moved: Any = copy.copy(robot)
+        moved: PyTree = copy.copy(robot)
         moved.model, moved.task = _OtherWorld(model, name), _OtherWorldsTask(robot.task)
         return moved
     if isinstance(robot, LoggedRobot):
@@ -95,7 +94,7 @@ def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
         moved.__class__ = type(type(robot).__name__, (_LogInWorld, type(robot)), {"model": model, "world": name})
         return moved
     raise UsageError(
-        f"{type(robot).__name__} makes its nodes itself: it cannot be put into world {name!r}",
+        f"{type(robot).__name__} makes its nodes itself: it cannot use world {name!r}",
         hint="only robots that inherit from Robot or LoggedRobot can",
     )
 
@@ -105,9 +104,7 @@ def _check(name: str, robot: RecordedRobot, model: WorldModel) -> None:
     if node.name != role:
         raise UsageError(f"the node of world {name!r} is called {node.name!r}", hint=f"this robot calls it {role!r}")
     if lost := [p.name for p in model.dynamics() if not (p.leaf or "").startswith(f"{role}.")]:
-        raise UsageError(
-            f"world {name!r} does not say where {', '.join(lost)} belongs", hint=f'give it a leaf="{role}.FIELD"'
-        )
+        raise UsageError(f"world {name!r} has no leaf for {', '.join(lost)}", hint=f'give it a leaf="{role}.FIELD"')
     if not hasattr(node.init_params(), "start"):
         raise UsageError(f"the parameters of world {name!r} have no field 'start'", hint="positions, then velocities")
 
@@ -125,13 +122,13 @@ class _OtherWorld(RobotModel):
     def make_world(self, resumed: bool = False) -> BaseNode:
         return self._model.make_world(resumed)
 
-    def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PyTree:
+    def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> PyTree:
         return self._model.params(values, jnp.concatenate([*map(jnp.asarray, (start.position, start.velocity))]))
 
     def check_task(self, task: TrainingTask) -> None:
         node = self.make_world()
 
-        def judged() -> Any:
+        def judged() -> PyTree:
             gs = GraphState(params=task.params(jax.random.key(0)))
             gs = gs.replace(state={node.name: node.init_state(None, gs)})
             ended = task.terminated(gs) if isinstance(task, EndingTask) else None
@@ -153,7 +150,7 @@ class _OtherWorldsTask(RobotTask):
     def __init__(self, task: RobotTask) -> None:
         self._task, self.aim_size = task, task.aim_size
 
-    def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], EpisodeStart]:
+    def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], EpisodeStart]:
         of_task, of_world = jax.random.split(key)
         values = draw(of_world)
         return values, self._task.random(of_task, lambda _: values)[1]
@@ -164,16 +161,16 @@ class _OtherWorldsTask(RobotTask):
     def moved(self, start: EpisodeStart, position: Array, velocity: Array) -> EpisodeStart:
         return self._task.moved(start, position, velocity)
 
-    def judged(self, graph_state: GraphState, roles: Roles) -> Any:
+    def judged(self, graph_state: GraphState, roles: Roles) -> PyTree:
         return self._task.judged(graph_state, roles)
 
-    def reward(self, state: Any, action: jax.Array) -> Rewards:
+    def reward(self, state: PyTree, action: jax.Array) -> Rewards:
         return self._task.reward(state, action)
 
-    def success(self, state: Any) -> jax.Array:
+    def success(self, state: PyTree) -> jax.Array:
         return self._task.success(state)
 
-    def terminated(self, state: Any) -> jax.Array:
+    def terminated(self, state: PyTree) -> jax.Array:
         return self._task.terminated(state)
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -187,15 +184,15 @@ class _LogInWorld(LoggedRobot):
     world: str
 
     def dynamics(self) -> list[Parameter]:
-        own, role = super().dynamics(), f"{self.roles.world}."
-        return [*self.model.dynamics(), *(p for p in own if not (p.leaf or "").startswith(role))]
+        rows, role = super().dynamics(), f"{self.roles.world}."
+        return [*self.model.dynamics(), *(p for p in rows if not (p.leaf or "").startswith(role))]
 
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
-        sensor, actuator, own = super().make_nodes()
+        sensor, actuator, replaced = super().make_nodes()
         world = self.model.make_world(resumed=True)
-        if world.rate != own.rate:
+        if world.rate != replaced.rate:
             raise UsageError(
-                f"world {self.world!r} has {world.rate:g} ticks a second, that of these recordings {own.rate:g}",
-                hint="samples of the recordings fall on the ticks of the latter",
+                f"world {self.world!r} has {world.rate:g} ticks a second, that of these recordings {replaced.rate:g}",
+                hint="samples of the recordings must fall on ticks of the world",
             )
         return sensor, actuator, world

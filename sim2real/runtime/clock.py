@@ -90,6 +90,7 @@ def realtime() -> Iterator[None]:
     """
     global _realtime_users, _realtime_before
     with _realtime_lock:
+        # The first user changes the settings of the process.
         _realtime_users += 1
         if _realtime_users == 1:
             _realtime_before = (gc.isenabled(), sys.getswitchinterval(), gc.get_freeze_count() > 0)
@@ -101,6 +102,7 @@ def realtime() -> Iterator[None]:
         yield
     finally:
         with _realtime_lock:
+            # The last user restores them.
             _realtime_users -= 1
             if _realtime_users == 0:
                 enabled, interval, frozen = _realtime_before

@@ -59,9 +59,6 @@ def enable(place: str | None = None) -> Path | None:
     """Let JAX keep compiled programs; return the folder, None where the cache is off or its folder cannot be written.
 
     A cache that the user configured for JAX stays as it is.
-
-    Args:
-        place: See ``location``.
     """
     folder = location(place)
     if folder is None or os.environ.get(_JAX):

@@ -33,7 +33,6 @@ class Format:
     """The structure, shapes and dtypes of a node's output: those of its default output.
 
     Args:
-        node: The node's name, for errors.
         default: The default output.
     """
 
@@ -78,7 +77,6 @@ class Window:
     memory of a numpy argument without copying it.
 
     Args:
-        size: Number of messages that are kept.
         delay_dist: The trainable delay that steps see in ``InputState.delay_dist``, or None.
     """
 
@@ -115,7 +113,6 @@ class NodeData:
     """The windows, random key, parameters and state of one node.
 
     Args:
-        graph_state: The state at the episode's start.
         emulate_delays: Whether trainable delays are applied to the windows, which are then longer. False on the wall
             clock, where the messages' delays are real.
 
@@ -129,6 +126,7 @@ class NodeData:
         self.windows: dict[str, Window] = {}
         self._eps = np.int32(graph_state.eps)
         self._emulated = [n for n, c in node.inputs.items() if c.trainable and emulate_delays]
+        # One window for each input, long enough for emulated delays.
         for name, c in node.inputs.items():
             sender = c.output_node.name
             form = Format(sender, default_output(graph_state, sender))
@@ -136,6 +134,7 @@ class NodeData:
             size = c.total_window if name in self._emulated else c.window
             self.windows[name] = Window(c, form, size, dist)
         try:
+            # The random numbers, parameters and state at the start.
             parts = [getattr(graph_state, field)[node.name] for field in ("rng", "params", "state")]
         except KeyError:
             raise UsageError(
@@ -166,11 +165,7 @@ class NodeData:
 
 
 def snapshot(graph_state: GraphState, data: dict[str, NodeData], supervisor: str) -> GraphState:
-    """Return the graph's state after the last finished step of each node.
-
-    Args:
-        supervisor: The node whose steps ``GraphState.step`` counts.
-    """
+    """Return the graph's state after the last finished step of each node."""
     carried = {name: d.carried for name, d in data.items()}
     return graph_state.replace(
         step=np.int32(carried[supervisor][3]),

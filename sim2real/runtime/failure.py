@@ -9,11 +9,7 @@ from sim2real.errors import Sim2RealError
 
 
 class NodeFailed(Sim2RealError):  # noqa: N818 - an event, as in sim2real.errors
-    """A node raised an exception other than a ``Sim2RealError``; that exception is the cause.
-
-    Attributes:
-        node: The node's name.
-    """
+    """A node raised an exception other than a ``Sim2RealError``; that exception is the cause."""
 
     def __init__(self, message: str, node: str, hint: str | None = None) -> None:
         super().__init__(message, hint)
@@ -32,9 +28,6 @@ def named(error: BaseException, node: str, during: str) -> Sim2RealError:
     """Return the error to raise in the caller's thread for ``error``, which ``node`` raised.
 
     A ``Sim2RealError`` is returned unchanged, with a note; any other is wrapped in a ``NodeFailed``.
-
-    Args:
-        during: The node's call, e.g. ``startup``, ``step 12`` or ``stop``.
     """
     if isinstance(error, Sim2RealError):
         error.add_note(f"node {node!r}, {during}")

@@ -58,7 +58,6 @@ def init_graph_state(
     alone.
 
     Args:
-        nodes: The nodes by name; their senders may be missing.
         params: Parameters to use; for nodes without an entry ``init_params`` is called.
         order: Names of nodes that are initialised first; then comes the supervisor, then the others.
         bounds: Bounds of the trainable delays; None: those of the connections.

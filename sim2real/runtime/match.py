@@ -35,12 +35,6 @@ def check_match(node: str, what: str, got: object, reference: str, like: object)
     Dtypes may differ where JAX converts without loss: a Python number takes the dtype of ``like`` (``0`` may become a
     float, ``0.5`` not an integer), and float64 counts as float32 unless 64 bits are enabled.
 
-    Args:
-        what: Description of ``got``, for errors.
-        got: Arrays, or shapes and dtypes.
-        reference: Description of ``like``, for errors.
-        like: Arrays, or shapes and dtypes.
-
     Raises:
         UsageError: They differ; the message names the first leaf that does.
     """

@@ -32,10 +32,6 @@ class _Link:
 
     The two differ for a trainable delay: the window takes messages in at the smallest delay, and the step picks those
     that have arrived at the current delay. The log has the arrivals at the current delay.
-
-    Args:
-        edge: The messages at the smallest delay.
-        recorded: The messages at the current delay.
     """
 
     def __init__(self, edge: Edge, recorded: Edge, episode: int, steps: int) -> None:
@@ -124,9 +120,7 @@ class SimulatedRun:
     """One episode on the simulated clock.
 
     Args:
-        graph_state: The state at the episode's start.
         recorder: Receives all steps and messages, or None.
-        autonomous: Whether the supervisor makes its own steps.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit.
         growing: Draws longer timelines that begin with ``timeline``; None: the episode ends with ``timeline``.
     """
@@ -191,6 +185,7 @@ class SimulatedRun:
                 f"the supervisor {self._supervisor!r} makes its own steps",
                 hint="call reset() instead of start() to make them yourself",
             )
+        # Run events until the supervisor has a step to make.
         deadline = time.monotonic() + timeout_s
         player = self._players[self._supervisor]
         while self._pending is None:
@@ -285,6 +280,7 @@ class SimulatedRun:
 
     def _event(self) -> None:
         """Make the step that comes next in time, or offer it to the caller; do nothing in a stopped graph."""
+        # Choose the earliest step whose messages are there.
         ready = [p for p in self._players.values() if p.begins[p.k] < _NEVER and p.ready(self._players)]
         if not ready:
             raise Sim2RealError(
@@ -314,6 +310,7 @@ class SimulatedRun:
 
     def _make(self, player: _Player, offered: StepState, reply: Reply) -> None:
         """Make a step, send its output and record it."""
+        # Make the step; an exception ends the episode.
         node, k = player.data.node, player.k
         begin, end = player.begins[k], player.ends[k]
         ages = player.data.ages(begin)

@@ -21,7 +21,6 @@ class NodeStatistics(NamedTuple):
     """Timing statistics of one node.
 
     Attributes:
-        steps: Number of finished steps.
         period_s: Time from one step's wake-up to the next one's.
         lateness_s: Time from a step's start by the timing rules to its wake-up.
         overruns: Number of steps that started late only because the previous step had not ended.
@@ -38,11 +37,7 @@ class NodeStatistics(NamedTuple):
 
 
 class StepLog:
-    """Collects the times of one node's steps: 16 bytes per step, and 8 more per input.
-
-    Args:
-        inputs: Names of the inputs whose messages' ages are collected.
-    """
+    """Collects the times of one node's steps: 16 bytes per step, and 8 more per input."""
 
     def __init__(self, inputs: Iterable[str] = ()) -> None:
         self._woken = array("q")

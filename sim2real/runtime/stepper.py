@@ -54,7 +54,6 @@ class Stepper:
         """Compile the step for data of this form, unless it is compiled already; a step with side effects is not run.
 
         Args:
-            data: The node's data at the start of an episode.
             jit: Whether to compile; nodes with ``jittable = False`` are never compiled.
 
         Raises:
@@ -62,11 +61,13 @@ class Stepper:
         """
         jit = jit and self.node.jittable
         arguments = (data.step_state(0, 0), data.ages(0))
+        # Keep the compiled step while the types of its arguments stay the same.
         leaves, tree = jax.tree_util.tree_flatten((arguments, data.form.default))
         signature = (jit, tree, [(np.shape(x), jnp.result_type(x)) for x in leaves] if jit else None)
         if signature == self._signature:
             return
         self._compiled = None
+        # Compile the step, and call it once.
         if jit:
             default = data.form.unpack(data.form.default)
 
@@ -96,12 +97,7 @@ class Stepper:
         return Result(changed, changed.pop("ts", None), leaves)
 
     def answer(self, data: NodeData, offered: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> Result:
-        """Return the results of a step after the caller's reply; the node runs if the reply has no output.
-
-        Args:
-            offered: The step state before the reply.
-            ages: As in ``run``.
-        """
+        """Return the results of a step after the caller's reply; the node runs if the reply has no output."""
         before = {} if reply.step_state is None else _changed(offered, reply.step_state)
         if reply.leaves is not None:
             return Result(before, before.pop("ts", None), reply.leaves)
@@ -109,12 +105,7 @@ class Stepper:
         return Result({**before, **result.changed}, result.ts, result.leaves)
 
     def show(self, recorder: Recorder | None, offered: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> None:
-        """Give the next step's input to a recorder that keeps such inputs.
-
-        Args:
-            offered: The step state before the reply, with whole windows.
-            ages: As in ``run``.
-        """
+        """Give the next step's input to a recorder that keeps such inputs."""
         if isinstance(recorder, StepStateRecorder) and recorder.keep:
             recorder.given(self.node.name, _with_delays(self.node, reply.step_state or offered, ages))
 

@@ -30,7 +30,6 @@ def interpret(
 
     Args:
         step: Makes a step: (node, seq, windows) -> output.
-        recorded: Outputs of nodes that do not run.
 
     Raises:
         TableError: A window has another message than its table, or a node's steps are not in order.

@@ -6,7 +6,7 @@ from sim2real.errors import UsageError
 
 
 def check_seed(seed: int) -> None:
-    """Refuse what is no seed.
+    """Refuse a value that is no seed.
 
     Raises:
         UsageError: When it is negative, or above 31 bits.

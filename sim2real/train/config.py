@@ -95,6 +95,7 @@ class PPOConfig:
         for name in ("gamma", "gae_lambda"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
+        # Choices and sizes.
         if self.schedule not in ("linear", "adaptive"):
             raise UsageError(f"schedule must be 'linear' or 'adaptive', got {self.schedule!r}")
         if self.target is not None and not 0 < self.target <= 1:

@@ -37,6 +37,7 @@ class Sweep:
         """
         values: dict[str, tuple[float, ...]] = {}
         for text in texts:
+            # Split NAME=VALUE,VALUE...
             name, sign, listed = text.partition("=")
             name = name.strip().replace("-", "_").removeprefix("ppo.")
             try:

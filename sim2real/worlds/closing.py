@@ -12,6 +12,7 @@ import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.composer.physics.mjx.import_mjx import mjx
+from sim2real.types import MjModel, PyTree
 
 if TYPE_CHECKING:
     from sim2real.composer.types import MjModel
@@ -83,7 +84,7 @@ class Closing:
 
     def _rows(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return errors ``(rows,)`` and Jacobian ``(rows, nv)`` of the equalities."""
-        data: Any = mjx.com_pos(self._model, mjx.kinematics(self._model, self._data.replace(qpos=qpos)))
+        data: PyTree = mjx.com_pos(self._model, mjx.kinematics(self._model, self._data.replace(qpos=qpos)))
         if self._model.ntendon:
             data = mjx.tendon(self._model, data)
         data = mjx.make_constraint(self._model, data)
@@ -91,19 +92,19 @@ class Closing:
 
     def _solved(self, jacobian: jax.Array, error: jax.Array, most: float = _MOST) -> jax.Array:
         """Return the smallest motion ``(nv,)`` of the other joints that makes an error, by least squares, in bounds."""
-        own = jacobian[:, self._others]
-        square = own @ own.T
+        passive = jacobian[:, self._others]
+        square = passive @ passive.T
         damping = _DAMPING * jnp.trace(square) / max(len(error), 1) + 1e-12
-        found = own.T @ jnp.linalg.solve(square + damping * jnp.eye(len(error)), error)
-        found *= jnp.minimum(1.0, most / (jnp.abs(found).max() + 1e-12))
-        return jnp.zeros(jacobian.shape[1], found.dtype).at[self._others].set(found)
+        move = passive.T @ jnp.linalg.solve(square + damping * jnp.eye(len(error)), error)
+        move *= jnp.minimum(1.0, most / (jnp.abs(move).max() + 1e-12))
+        return jnp.zeros(jacobian.shape[1], move.dtype).at[self._others].set(move)
 
     def _moved(self, qpos: jax.Array, step: jax.Array) -> jax.Array:
         """Return positions ``(nq,)`` after a small motion ``(nv,)``."""
-        found = qpos.at[self._straight].add(step[self._straight_dofs])
+        closed = qpos.at[self._straight].add(step[self._straight_dofs])
         for q, v in self._turning:
             x = jnp.concatenate([jnp.ones(1), 0.5 * step[v : v + 3]])
             a, b = qpos[q], qpos[q + 1 : q + 4]
             turned = jnp.concatenate([(a * x[0] - b @ x[1:])[None], a * x[1:] + x[0] * b + jnp.cross(b, x[1:])])
-            found = found.at[q : q + 4].set(turned / jnp.linalg.norm(turned))
-        return found
+            closed = closed.at[q : q + 4].set(turned / jnp.linalg.norm(turned))
+        return closed

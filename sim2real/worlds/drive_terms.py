@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base
+from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Value
@@ -73,23 +74,22 @@ class DriveLaw:
     Args:
         qpos_at: Shape ``(joints,)``: where the joints' positions are.
         qvel_at: Shape ``(joints,)``: where their velocities are.
-        others: Where the velocities of joints without a drive are; qvel_at and others are all that the model has.
+        others: Indices of the velocities of joints without a drive; ``qvel_at`` and ``others`` cover the model.
     """
 
     fields: tuple[str, ...] = ("dof_damping", "dof_frictionloss")
-    """What it sets of the model, ``(nv,)`` each."""
+    """Fields of the model that it sets, ``(nv,)`` each."""
 
     def __init__(self, qpos_at: np.ndarray, qvel_at: np.ndarray, others: np.ndarray) -> None:
         self._qpos_at, self._qvel_at = qpos_at, qvel_at
         self._order = np.argsort(np.concatenate([qvel_at, others]))
 
     def __call__(
-        self, xp: Any, values: Mapping[str, Any], control: Any, qpos: Any, qvel: Any
-    ) -> tuple[Any, Any, dict[str, Any]]:
+        self, xp: Any, values: Mapping[str, Scalar], control: Array, qpos: Array, qvel: Array
+    ) -> tuple[Any, Any, dict[str, PyTree]]:
         """Return controls ``(..., nu)``, applied forces ``(..., nv)`` and fields of the model for the next step.
 
         Args:
-            xp: ``numpy`` or ``jax.numpy``.
             values: Coefficients and the model's own ``damping``, ``frictionloss`` and ``limit``, ``(..., joints)``;
                 ``other_damping`` and ``other_frictionloss`` of the joints without a drive, ``(..., others)``.
             control: Forces, stiffnesses, dampings, 1 with torque on, goals: ``(..., 5 * joints)``.

@@ -10,6 +10,7 @@ import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.types import MjModel
 from sim2real.worlds.closing import Closing
 from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
 from sim2real.worlds.mjx import MjxParams, MjxWorld
@@ -18,7 +19,6 @@ from sim2real.worlds.recorded import command_delay
 if TYPE_CHECKING:
     import jax
 
-    from sim2real.composer.types import MjModel
     from sim2real.graph.base import Value
 
 
@@ -29,7 +29,7 @@ class DriveCommand(Base):
     Attributes:
         goal: Where to be, by the encoder [rad].
         goal_velocity: How fast to turn [rad/s].
-        torque: Feed-forward, or all that there is [N m].
+        torque: Feed-forward torque; without a goal, the whole torque [N m].
         duty: Share of the voltage, or the voltage, or what else is proportional to it.
         kp: Stiffness, in the log's unit.
         kd: Damping, in the log's unit.
@@ -103,11 +103,11 @@ class DrivenWorld(MjxWorld):
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> DriveParams:
         """Return the model at its reference, with drives that do nothing."""
-        own = super().init_params(rng, graph_state)
+        params = super().init_params(rng, graph_state)
         zero = jnp.zeros(len(self.joints))
         off = DriveTerms()
         terms = off.replace(**{f.name: zero + getattr(off, f.name) for f in fields(off)}) if self.law else None
-        return DriveParams(own.model, own.qpos, own.qvel, terms=terms)
+        return DriveParams(params.model, params.qpos, params.qvel, terms=terms)
 
     def law_values(self, params: DriveParams) -> dict[str, jax.Array]:
         """Return what the law needs of the joints: the model's own friction and limits, and the terms' coefficients."""

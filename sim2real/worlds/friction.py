@@ -78,7 +78,7 @@ def smooth(velocity: Value, width_rad_s: float) -> jax.Array:
 def stopped(velocity: Value, most: Value) -> jax.Array:
     """Return the velocity after dry friction: its magnitude is reduced by ``most`` [rad/s], but not below 0.
 
-    Exact for a friction that is constant during the step, whatever the step's length: the joint sticks without
+    Exact for a friction that is constant during the step, for every length of step: the joint sticks without
     chattering or creeping.
     """
     return jnp.sign(velocity) * jnp.maximum(jnp.abs(velocity) - most, 0.0)

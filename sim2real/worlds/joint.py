@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState
+from sim2real.types import PyTree
 from sim2real.worlds.friction import rubbed
 from sim2real.worlds.stepped import SteppedWorld
 
@@ -70,7 +71,7 @@ class JointWorld(SteppedWorld):
         half = len(start) // 2
         return JointState(start[0], start[1]) if half == 1 else JointState(start[:half], start[half:])
 
-    def velocity(self, state: JointState) -> Any:
+    def velocity(self, state: JointState) -> Value:
         """Return the joints' velocities, ``()`` or ``(joints,)`` [rad/s]."""
         return state.velocity
 
@@ -79,25 +80,23 @@ class JointWorld(SteppedWorld):
         return state.replace(velocity=velocity)
 
     @abstractmethod
-    def forces(self, params: Any, position: Value, velocity: Value, command: Any) -> Forces:
+    def forces(self, params: PyTree, position: Value, velocity: Value, command: PyTree) -> Forces:
         """Return the forces on the joints.
 
         Args:
             position: [rad].
             velocity: [rad/s].
-            command: What ``command`` returned for this tick.
         """
 
-    def confine(self, params: Any, state: JointState) -> JointState:
+    def confine(self, params: PyTree, state: JointState) -> JointState:
         """Return the state with the joints kept within their stops; called after every substep."""
         del params
         return state
 
-    def integrate(self, params: Any, state: JointState, command: Any) -> JointState:
+    def integrate(self, params: PyTree, state: JointState, command: PyTree) -> JointState:
         """Return the state one tick later.
 
         Args:
-            state: The state, with fields ``position`` and ``velocity``.
             command: The command, constant during the tick.
         """
 

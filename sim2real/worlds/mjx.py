@@ -19,6 +19,7 @@ from sim2real.composer.physics.mjx.warp import warp
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, Empty, GraphState, StepState
 from sim2real.graph.node import BaseWorld
+from sim2real.types import MjModel, PyTree
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -32,7 +33,6 @@ class MjxParams(Base):
     """Parameters of an MJX world; each copy of a graph may have its own.
 
     Attributes:
-        model: The MJX model.
         qpos: Shape ``(nq,)``: positions at the start of an episode [rad or m].
         qvel: Shape ``(nv,)``: velocities at the start [rad/s or m/s].
     """
@@ -60,7 +60,6 @@ class MjxWorld(BaseWorld):
 
     Args:
         rate: Ticks per second [Hz]; a tick is a whole number of the model's time steps.
-        command: Name of the input that carries the controls.
         field: Field of that input's message: shape ``(nu,)`` [the actuators' unit].
         impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, in single precision and without derivatives.
         nconmax: On Warp: contacts that there is room for, times the number of copies, which share it; default: a guess.
@@ -106,14 +105,14 @@ class MjxWorld(BaseWorld):
         self._mjx_model: mjx.Model = self._warp.model if self._warp else mjx.put_model(model, impl="jax")
         self._apart = False
         self.law: StepLaw | None = None
-        """What is set before every physics step from the state then; a subclass's."""
+        """Fields of the model that a subclass sets before every physics step, from the state."""
 
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> MjxParams:
         """Return the model and its reference position at rest."""
         del rng, graph_state
         return MjxParams(self._mjx_model, jnp.asarray(self.model.qpos0, float), jnp.zeros(self.model.nv))
 
-    def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return MJX data at the parameters' start."""
         if self._apart:
             return Empty()
@@ -132,7 +131,7 @@ class MjxWorld(BaseWorld):
         data = step_state.state
         data = data if self.law else data.replace(ctrl=jnp.asarray(control, float))
 
-        def once(data: Any, _: Any = None) -> tuple[Any, None]:
+        def once(data: PyTree, _: Any = None) -> tuple[Any, None]:
             model = params.model
             if self.law:
                 law = self.law(jnp, self.law_values(params), control, data.qpos, data.qvel)
@@ -144,15 +143,15 @@ class MjxWorld(BaseWorld):
         data = once(data)[0] if self.substeps == 1 else jax.lax.scan(once, data, length=self.substeps)[0]
         return step_state.replace(state=data), MjxState(data.qpos, data.qvel)
 
-    def velocity(self, state: Any) -> jax.Array:
+    def velocity(self, state: PyTree) -> jax.Array:
         """Return the velocities ``(nv,)`` [rad/s or m/s]."""
         return state.qvel
 
-    def with_velocity(self, state: Any, velocity: jax.Array) -> Any:
+    def with_velocity(self, state: PyTree, velocity: jax.Array) -> PyTree:
         """Return the data with other velocities ``(nv,)`` [rad/s or m/s]."""
         return state.replace(qvel=velocity)
 
-    def law_values(self, params: Any) -> dict[str, jax.Array]:
+    def law_values(self, params: PyTree) -> dict[str, jax.Array]:
         """Return the numbers that ``law`` needs; they may differ from copy to copy."""
         del params
         return {}
@@ -167,18 +166,18 @@ class MjxWorld(BaseWorld):
         self._apart = True
         return self.model
 
-    def fields(self, params: MjxParams, state: Any) -> dict[str, jax.Array]:
+    def fields(self, params: MjxParams, state: PyTree) -> dict[str, jax.Array]:
         """Return the fields of the model that differ from the compiled one."""
         del state
-        found = {}
+        changes = {}
         old, new = (jax.tree_util.tree_flatten_with_path(m)[0] for m in (self._mjx_model, params.model))
         for (path, before), (_, after) in zip(old, new, strict=True):
-            known = not isinstance(after, Tracer)
-            if after is not before and not (known and np.array_equal(before, after)):
-                found[jax.tree_util.keystr(path).lstrip(".")] = after
-        return found
+            concrete = not isinstance(after, Tracer)
+            if after is not before and not (concrete and np.array_equal(before, after)):
+                changes[jax.tree_util.keystr(path).lstrip(".")] = after
+        return changes
 
-    def start(self, params: MjxParams, state: Any) -> Start:
+    def start(self, params: MjxParams, state: PyTree) -> Start:
         """Return where the physics starts."""
         del state
         return Start(jnp.asarray(params.qpos), jnp.asarray(params.qvel), jnp.zeros(self.model.nv))
@@ -188,7 +187,7 @@ class MjxWorld(BaseWorld):
         control = jnp.asarray(self._control(step_state), float)
         return step_state, jnp.broadcast_to(control, (self.substeps, *control.shape))
 
-    def message(self, state: Any, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> MjxState:
+    def message(self, state: PyTree, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> MjxState:
         """Return what the world sends.
 
         Args:
@@ -199,5 +198,5 @@ class MjxWorld(BaseWorld):
         return MjxState(qpos, qvel)
 
     def _control(self, step_state: StepState) -> jax.Array:
-        """Return the controls ``(nu,)`` of a tick; they may depend on what it hears and on parameters."""
+        """Return the controls ``(nu,)`` of a tick; they may depend on its inputs and on parameters."""
         return getattr(step_state.inputs[self.input_name].data, self.field)[-1]

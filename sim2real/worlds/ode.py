@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 
+from sim2real.types import PyTree
 from sim2real.worlds.stepped import SteppedWorld
 
 T = TypeVar("T")
@@ -26,7 +27,7 @@ class OdeWorld(SteppedWorld):
         super().__init__(name, rate, substep_s, color=color, order=order)
 
     @abstractmethod
-    def derivative(self, params: Any, state: Any, command: Any) -> Any:
+    def derivative(self, params: PyTree, state: PyTree, command: PyTree) -> PyTree:
         """Return the time derivative of the state.
 
         Args:
@@ -36,19 +37,19 @@ class OdeWorld(SteppedWorld):
             A tree with the structure of ``state`` [the state's units per second].
         """
 
-    def limit(self, params: Any, state: Any) -> Any:
+    def limit(self, params: PyTree, state: PyTree) -> PyTree:
         """Return the state inside its limits; called after every substep."""
         del params
         return state
 
-    def integrate(self, params: Any, state: Any, command: Any) -> Any:
+    def integrate(self, params: PyTree, state: PyTree, command: PyTree) -> PyTree:
         """Return the state one tick later.
 
         Args:
             command: The command, constant during the tick.
         """
 
-        def substep(x: Any, h: float) -> Any:
+        def substep(x: PyTree, h: float) -> PyTree:
             f = lambda y: self.derivative(params, y, command)  # noqa: E731
             k1 = f(x)
             k2 = f(_axpy(x, k1, h / 2))

@@ -11,6 +11,7 @@ from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
+from sim2real.types import PyTree
 from sim2real.worlds.encoder import Encoder
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class RecordedActuator(BaseNode):
         message: A command; it is the node's default output.
     """
 
-    def __init__(self, name: str, rate: float, message: Any) -> None:
+    def __init__(self, name: str, rate: float, message: PyTree) -> None:
         super().__init__(name, rate)
         self._message = message
 
@@ -45,7 +46,7 @@ class RecordedActuator(BaseNode):
         del rng, graph_state
         return CommandDelay()
 
-    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the command that the node was made with."""
         del rng, graph_state
         return jax.tree_util.tree_map(lambda leaf: leaf, self._message)
@@ -65,16 +66,16 @@ class RecordedSensor(BaseNode):
         super().__init__(name, rate)
         self._message, self._encoder = message, encoder
 
-    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the encoder."""
         return self._encoder or super().init_params(rng, graph_state)
 
-    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the message of a position of 0."""
         del rng, graph_state
         return self._message(jnp.float32(0.0))
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Read."""
         position = step_state.inputs["world"][-1].data.position
         return step_state, self._message(step_state.params.read(position) if self._encoder else position)

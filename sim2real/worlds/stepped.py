@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseWorld
+from sim2real.types import PyTree
 from sim2real.worlds.recorded import command_delay
 
 if TYPE_CHECKING:
@@ -41,23 +42,23 @@ class SteppedWorld(BaseWorld):
         self.substeps = max(1, math.ceil(round(1.0 / (self.rate * substep_s), 9)))
 
     @abstractmethod
-    def command(self, step_state: StepState) -> Any:
+    def command(self, step_state: StepState) -> PyTree:
         """Return the command, which is constant during this tick."""
 
     @abstractmethod
-    def integrate(self, params: Any, state: Any, command: Any) -> Any:
+    def integrate(self, params: PyTree, state: PyTree, command: PyTree) -> PyTree:
         """Return the state one tick later.
 
         Args:
             command: The command, constant during the tick.
         """
 
-    def output(self, params: Any, state: Any) -> Any:
+    def output(self, params: PyTree, state: PyTree) -> PyTree:
         """Return the message that leaves at the end of the tick; default: the state."""
         del params
         return state
 
-    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the output of the initial state: what a sensor sees before the first tick has ended."""
         gs = graph_state or GraphState()
         state = gs.state.get(self.name) or self.init_state(rng, graph_state)
@@ -68,7 +69,7 @@ class SteppedWorld(BaseWorld):
         del rng
         return command_delay(graph_state)
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Integrate over one tick."""
         params = step_state.params
         state = self.integrate(params, step_state.state, self.command(step_state))

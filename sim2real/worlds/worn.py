@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sim2real.types import Array, PyTree, Scalar
+
 
 class WornFriction:
     """Sets dry friction before every step: ``frictionloss * exp(-|velocity| / stribeck_rad_s)``.
@@ -13,15 +15,14 @@ class WornFriction:
     """
 
     fields: tuple[str, ...] = ("dof_frictionloss",)
-    """What it sets of the model, ``(nv,)``."""
+    """Field of the model that it sets, ``(nv,)``."""
 
     def __call__(
-        self, xp: Any, values: Mapping[str, Any], control: Any, qpos: Any, qvel: Any
-    ) -> tuple[Any, Any, dict[str, Any]]:
+        self, xp: Any, values: Mapping[str, Scalar], control: Array, qpos: Array, qvel: Array
+    ) -> tuple[Any, Any, dict[str, PyTree]]:
         """Return controls ``(..., nu)`` as they are, forces of 0 ``(..., nv)``, and the friction of the next step.
 
         Args:
-            xp: ``numpy`` or ``jax.numpy``.
             values: ``frictionloss`` at standstill [N m] and ``stribeck_rad_s``, where 1/e of it is left, ``(..., nv)``.
             control: Controls ``(..., nu)``.
             qvel: Velocities ``(..., nv)`` [rad/s].

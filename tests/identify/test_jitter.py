@@ -10,7 +10,7 @@ from test_links import COMMAND_DELAY_S, COUNT_RAD, GAIN, GRID, NOISE_RAD, PERIOD
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
 from sim2real.identify.delays.jitter import LateCommands, Variances, deviation, one_later
-from sim2real.identify.delays.likelihood import Seen
+from sim2real.identify.delays.likelihood import DelayEvidence
 from sim2real.identify.delays.links import find, links
 
 SENT_S, PART_S, LATER_S = 0.02, 1.0, 0.002
@@ -70,7 +70,9 @@ def watch(log):
             J.append(np.stack([columns(e, delay_s, (angles(x + s, e) - motion) / 1e-3) for s in 1e-3 * np.eye(len(x))]))
             stamps.append(log.stamps[own])
         stamps, J = np.concatenate(stamps), np.concatenate(J, axis=1).T
-        return Seen(stamps - stamps.mean(), GRID, np.concatenate(errors)[:, None], J[:, None], 1e-4 * np.eye(len(x)))
+        return DelayEvidence(
+            stamps - stamps.mean(), GRID, np.concatenate(errors)[:, None], J[:, None], 1e-4 * np.eye(len(x))
+        )
 
     def moved(x, delay_s):
         size = np.abs(np.diff(log.volts, prepend=log.volts[0]))

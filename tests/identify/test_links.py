@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.errors import UsageError
-from sim2real.identify.delays.likelihood import Seen
+from sim2real.identify.delays.likelihood import DelayEvidence
 from sim2real.identify.delays.links import describe, find, links, measured
 from sim2real.identify.delays.lost_messages import losses
 from sim2real.stages.identify.show import show
@@ -73,7 +73,7 @@ def identify(log):
         errors = np.interp(log.stamps[:, None] - GRID, log.at, own) - log.seen[:, None]
         slopes = [np.interp(log.stamps - delay_s, log.at, angles(x + s) - own) / 1e-3 for s in 1e-3 * np.eye(4)]
         J = np.stack(slopes, axis=1)[:, None] / NOISE_RAD
-        return Seen(log.stamps - log.stamps.mean(), GRID, errors[:, None] / NOISE_RAD, J, 1e-4 * np.eye(4))
+        return DelayEvidence(log.stamps - log.stamps.mean(), GRID, errors[:, None] / NOISE_RAD, J, 1e-4 * np.eye(4))
 
     start = np.array([np.log(GAIN) + 0.1, np.log(RATE) - 0.2, 0.0, 0.0])
     found = find(linearise, start, 0.01, again, np.array([COUNT_RAD / NOISE_RAD]))
@@ -153,7 +153,7 @@ def test_a_problem_knows_its_links(fitted):
 
 
 def test_without_a_delay_of_the_measurements_there_is_no_link(fitted):
-    with pytest.raises(UsageError, match="has none"):
+    with pytest.raises(UsageError, match="there is none"):
         measured(fitted.problem.table.with_fixed({"sensor_delay": 0.02}))
 
 

@@ -69,7 +69,7 @@ def test_leaving_parts_out_and_fewer_parameters_compile_nothing():
     problem = problem_of(0)
     z, kept = problem.table.start(), np.arange(len(problem.table)) < 2
     losses = [
-        problem.at(z, d).loss for d in (None, problem.part([0, 3]), problem.part(kept=kept), problem.part([1], kept))
+        problem.at(z, d).loss for d in (None, problem.part([0, 3]), problem.part(present=kept), problem.part([1], kept))
     ]
     assert len(problem.residuals.programs["linearised"]._compiled) == 1
     assert len(set(losses)) >= 3

@@ -44,7 +44,7 @@ def too_strong(robot, values, draws, computation, delays):
         (None, {"roles": Roles(world="plant")}, "nodes of the model: there are .* but not plant"),
         (None, {"nominal": lambda _: {"gain": 1e9}}, "gain = 1000000000.0 is outside its bounds"),
         (None, {"nominal": lambda _: {"mass": 1.0}}, "parameters that can be identified: .* but not mass"),
-        (None, {"training": too_strong}, "go beyond what the robot bears"),
+        (None, {"training": too_strong}, "are outside of the robot's limits"),
         (
             "sensor",
             {"joints": {"hinge": {"position": "angle"}}},
@@ -59,7 +59,7 @@ def too_strong(robot, values, draws, computation, delays):
         (
             "agent",
             {"observation": load_pipeline("pendulum").load().agent.observation[:2]},
-            r"the policy sees \(19,\), not \(15,\)",
+            r"an observation has shape \(19,\), not \(15,\)",
         ),
     ],
 )

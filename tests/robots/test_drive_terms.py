@@ -19,8 +19,8 @@ from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.uncertainty import linearise
 from sim2real.robots.from_model.mjcf import driven
 from sim2real.robots.from_model.mjcf_parameters import (
-    ASKED,
     LAWS,
+    ONLY_NAMED,
     OPTIONAL,
     ParameterPattern,
     expand,
@@ -207,7 +207,7 @@ def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
     assert held_out_parts.offering(robot, "own") is robot
     assert robot.make_nodes()[2].law is None
     table = held_out_parts.offering(robot, "auto").identifiable(0.02).parameters
-    assert {p.term for p in table} - {""} == set(OPTIONAL) - set(ASKED)
+    assert {p.term for p in table} - {""} == set(OPTIONAL) - set(ONLY_NAMED)
     assert table.terms == ()  # none is free by itself
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms))
     every = held_out_parts.widest(held_out_parts.offering(robot, "all").identifiable(0.02).parameters, "all")
@@ -220,19 +220,19 @@ def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
     assert held_out_parts.widest(table, "load").terms == ("load",)
 
 
-@pytest.mark.parametrize("one", ASKED)
+@pytest.mark.parametrize("one", ONLY_NAMED)
 def test_terms_that_few_robots_tell_are_offered_where_they_are_asked_for(model_file, one):
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=(*usual_terms(("goal",)), PER_TURN)))
     table = held_out_parts.offering(robot, f"load,{one}").identifiable(0.02).parameters
     assert held_out_parts.widest(table, f"load,{one}").terms == ("load", one)
     own = optional((ParameterPattern(OPTIONAL[one][0]),), "auto")
-    assert {t.term for t in own} == set(OPTIONAL) - set(ASKED) | {one}
+    assert {t.term for t in own} == set(OPTIONAL) - set(ONLY_NAMED) | {one}
     assert [t.what for t in own if t.term == one] == [OPTIONAL[one][0]], "a robot may feel tilt_y and not tilt_x"
 
 
 def test_cogging_is_refused_without_how_often_it_repeats(model_file):
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_terms(("goal",))))
-    with pytest.raises(UsageError, match="how often"):
+    with pytest.raises(UsageError, match="number of repeats"):
         held_out_parts.offering(robot, "cogging")
     with pytest.raises(UsageError, match="counted"):
         ParameterPattern("cogging_per_turn")

@@ -201,7 +201,7 @@ def test_a_recorded_robot_keeps_its_sensors_parameters(installed):
         ("disk", "number", r"world 'number' \(math:pi\) is float, not a callable"),
         ("disk", "text", "world 'text' makes a str"),
         ("disk", "nameless", "the node of world 'nameless' is called 'planet'"),
-        ("disk", "nowhere", "does not say where gain belongs"),
+        ("disk", "nowhere", "has no leaf for gain"),
         ("disk", "startless", "have no field 'start'"),
     ],
 )

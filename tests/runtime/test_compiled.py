@@ -48,7 +48,7 @@ DEAR = (topologies.open_loop, topologies.random_one, topologies.two_in_five, top
 
 
 def rolled(graph, eps, record=None, params=None):
-    record = tuple(n for n in graph.nodes if n not in graph.given) if record is None else record
+    record = tuple(n for n in graph.nodes if n not in graph.replayed) if record is None else record
     return graph.rollout(graph.init(KEY, params, eps=eps), record=record)
 
 

@@ -17,7 +17,6 @@ class Noise:
 
     Attributes:
         column: A field of the sensor's message, with an index ``[i]`` if the field is a vector.
-        unit: Unit of all numbers.
         deviation: Standard deviation of the part that changes from sample to sample; includes jitter of sampling times.
         quantum: Step between neighbouring readings; 0 if readings have no step.
         bias: Standard deviation of the part that is constant over a segment.

@@ -37,7 +37,6 @@ class Alternative:
     """Another model that fits the recordings as well as the estimate.
 
     Attributes:
-        about: Description of the model.
         weight: Share of the draws that come from this model, in [0, 1].
         posterior: Parameters of the model; has no alternatives.
     """

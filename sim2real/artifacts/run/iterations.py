@@ -44,7 +44,6 @@ class Plan:
 
     Attributes:
         stages: The stages to run, in order; empty if the run stops.
-        words: The plan as text.
         log: The logs to identify from, relative to the run folder; empty for the newest recording.
         terms: The optional terms to identify with; None for the flags' value.
         seed: The seed of the training; None for the flags' value.
@@ -64,7 +63,6 @@ class Iterations:
     """All iterations of a run, the oldest first.
 
     Attributes:
-        rows: The finished iterations.
         plan: Plan of the next one; None after the last.
     """
 

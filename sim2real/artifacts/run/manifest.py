@@ -119,6 +119,7 @@ def plain(value: object) -> Json:
         TypeError: When the value, or one inside it, is of another type.
     """
     # Test scalars first, then containers; arrays come last, as they need NumPy.
+    # Values of JSON, then numbers, paths and containers.
     if value is None or isinstance(value, bool | str):
         return value
     if isinstance(value, Enum):
@@ -134,6 +135,7 @@ def plain(value: object) -> Json:
         return {str(name): plain(v) for name, v in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
+    # Dataclasses by field, arrays as lists.
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     import numpy as np  # here, as `sim2real info` starts faster without it

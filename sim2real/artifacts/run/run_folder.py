@@ -116,11 +116,7 @@ class OpenStage:
         return self.folder.parent
 
     def output(self, name: str, path: Path | str) -> Path:
-        """Register an output, before or after it is written, and return its absolute path; the stage's end hashes it.
-
-        Args:
-            path: A file or folder, relative to the stage's folder.
-        """
+        """Register an output by its path in the stage's folder; return the absolute path. The stage's end hashes it."""
         full = self.folder / path
         if not full.resolve().is_relative_to(self.folder.resolve()):
             raise UsageError(f"output {name!r} must lie in {self.folder}, got {path}")

@@ -49,9 +49,6 @@ def judge(
 def next_plan(pipeline: Pipeline, flags: RunFlags, run_dir: Path, folder: StageFolder, deployment: Deployment) -> Plan:
     """Return the plan that follows from a deployment; a plan without stages ends the run.
 
-    Args:
-        folder: The stage folder of the deployment.
-
     Raises:
         UsageError: The gap report has no quantity of the goal's name.
     """

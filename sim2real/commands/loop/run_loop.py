@@ -31,6 +31,7 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None
     Raises:
         UsageError: The recording is a dry run, or the gap report has no quantity of the goal's name.
     """
+    # Refuse a dry recording, and find an interrupted run.
     if flags.record.dry_run:
         raise UsageError(
             "a dry recording holds no motion: a run cannot identify from it",

@@ -39,7 +39,6 @@ class PropPlacer(Initializer):
         ignore_collisions: Take the first pose, with or without contacts.
         max_qvel_tol: Velocity below which a prop has settled [rad/s or m/s].
         max_qacc_tol: Acceleration below which a prop has settled [rad/s^2 or m/s^2].
-        max_attempts_per_prop: Poses that are tried for each prop.
         settle_physics: Let the physics run until the props rest; everything else is held.
         min_settle_physics_time: Shortest time to settle [s].
         max_settle_physics_time: Longest time to settle [s].
@@ -180,6 +179,7 @@ class PropPlacer(Initializer):
                         return
             finally:
                 physics.data.time = start
+        # The props did not settle: raise, or warn.
         message = (
             f"Failed to settle physics after {self._settle_attempts} attempts of {self._max_time} seconds. "
             f"Last residual velocity={speed} and acceleration={acceleration}."

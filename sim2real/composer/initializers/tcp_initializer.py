@@ -31,7 +31,6 @@ class ToolCenterPointInitializer(Initializer):
         quaternion: Of the tool in the world, ``(4,)``, or a variation; default: pointing down.
         ignore_collisions: Take the first pose that is reached.
         max_ik_attempts: Positions of the joints to start from for each pose: as they are, then by chance.
-        max_rejection_samples: Poses that are tried.
     """
 
     def __init__(
@@ -56,6 +55,7 @@ class ToolCenterPointInitializer(Initializer):
             EpisodeInitializationError: When no pose was reached without contact.
             UsageError: On MJX.
         """
+        # Refuse MJX, whose resets cannot repeat.
         if hasattr(physics, "retry"):
             raise UsageError(
                 "ToolCenterPointInitializer does not run on MJX: it tries until it succeeds",
@@ -80,6 +80,7 @@ class ToolCenterPointInitializer(Initializer):
     def _reach(
         self, physics: Physics, random_state: RandomState, site: Element, position: ArrayLike, quaternion: ArrayLike
     ) -> bool:
+        # Use the arm's own solver if it has one.
         solve = getattr(self._arm, "set_site_to_xpos", None)
         if solve is not None:
             return solve(

@@ -171,6 +171,7 @@ class DefaultElement(Element):
         return value
 
     def __setattr__(self, name: str, value: Value) -> None:
+        # Translate the value, and check that the tag has this attribute.
         if value is None:
             raise UsageError(
                 f"{name} of {self!r} cannot be taken back", hint="set it to the value that is to hold instead"

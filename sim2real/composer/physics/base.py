@@ -294,11 +294,7 @@ class EmptyBinding:
 
 
 def updated(xp: ArrayModule, array: PyTree, index: Index, value: ArrayLike) -> Array:
-    """Return a copy of an array with another value in a part of it.
-
-    Args:
-        xp: ``numpy`` or ``jax.numpy``.
-    """
+    """Return a copy of an array with another value in a part of it."""
     if xp is not np:
         array = xp.asarray(array)
         return array.at[index].set(xp.asarray(value, array.dtype))

@@ -152,11 +152,7 @@ class NamedFields:
 
 
 class Named:
-    """``physics.named``: the arrays of ``named.model`` and ``named.data`` by name.
-
-    Args:
-        model_holder: What has the model's arrays as attributes.
-    """
+    """``physics.named``: the arrays of ``named.model`` and ``named.data`` by name."""
 
     def __init__(self, model: MjModel, model_holder: object, data_holder: object) -> None:
         self.model = NamedFields(model, "model", model_holder)

@@ -24,7 +24,6 @@ def first_step_state(nodes: Mapping[str, BaseNode], name: str, key: jax.Array) -
     """Return the step state of a node's first step, before any message has arrived.
 
     Args:
-        nodes: The node and its senders, by name.
         key: JAX key of parameters, states and default outputs.
     """
     keys = {n: jax.random.split(jax.random.fold_in(key, i), 4) for i, n in enumerate(nodes)}

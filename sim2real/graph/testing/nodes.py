@@ -217,6 +217,7 @@ def random_graph(
     size = int(rng.integers(2, 5)) if size is None else size
     worlds = int(rng.choice([0, 1, 1, 2])) if worlds is None else worlds
     nodes = []
+    # Draw the nodes, then the connections; those against the order of nodes are skipped.
     for i in range(size):
         rate = float(rng.choice([20, 30, 40, 50, 64, 100]))
         scheduling = [Scheduling.FREQUENCY, Scheduling.PHASE][int(rng.integers(2))]
@@ -228,6 +229,7 @@ def random_graph(
                 connect_at_random(rng, reader, sender, skip=j > i)
         if any(c.blocking for c in reader.inputs.values()):
             reader.advance = bool(rng.random() < 0.4)
+    # Make some delays trainable.
     if trainable:
         for sender in nodes:
             sender.dtype = DTYPES[int(rng.integers(len(DTYPES)))]
@@ -259,7 +261,6 @@ def connect_at_random(rng: np.random.Generator, reader: BaseNode, sender: BaseNo
 
     Args:
         reader: The node that reads; if it is a world, its inputs do not block.
-        sender: The node that sends.
         skip: True: the connection is skipped; False: it may be.
     """
     for name in (None, f"{sender.name} again")[: 2 if rng.random() < 0.15 else 1]:

@@ -18,7 +18,6 @@ class Reference:
 
     Args:
         timeline: Source of the computation and communication delays and of the number of steps.
-        episode: Index of the episode in ``timeline``.
 
     Attributes:
         starts: Node -> start of each step [ticks].
@@ -139,6 +138,7 @@ class Reference:
         k, blocked = len(starts), 0
         if k == len(self.busy[name]):
             return False
+        # Wait for the messages of the blocking inputs.
         for c in node.inputs.values():
             if c.blocking:
                 group = self.group(c, k)
@@ -146,10 +146,12 @@ class Reference:
                     return False
                 if group:
                     blocked = max(blocked, self.received(c, group[-1]))
+        # Start at the schedule, unless all inputs are blocking and the node advances.
         previous = ends[-1] if ends else 0
         begin = max(previous, blocked)
         if not (node.advance and all(c.blocking for c in node.inputs.values())):
             begin = max(begin, self.slot(node, k) + self._drift[name])
+        # An overrun moves the later schedule.
         if node.scheduling is Scheduling.FREQUENCY:
             self._drift[name] += max(0, previous - self.slot(node, k) - self._drift[name])
         starts.append(begin)

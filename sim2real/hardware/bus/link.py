@@ -94,7 +94,6 @@ class ServoLink(ABC):
         """Read the same bytes of several servos' memory with one instruction; return those of each servo.
 
         Args:
-            what: Description of the instruction, for errors.
             despite_error: Whether errors in the answers are ignored.
         """
         # After a missing answer, more bytes are requested: if it still comes, it is recognised by its length. Taken for
@@ -111,12 +110,7 @@ class ServoLink(ABC):
     def read_counts(
         self, servo_ids: Sequence[int], registers: Sequence[Register], what: str
     ) -> tuple[np.ndarray, Transaction]:
-        """Read neighbouring registers of several servos with one instruction, ``(servos, registers)`` [counts].
-
-        Args:
-            registers: In the order of their addresses.
-            what: Description of the instruction, for errors.
-        """
+        """Read neighbouring registers, sorted by address, of several servos: ``(servos, registers)`` [counts]."""
         begin = registers[0].address
         blocks, transaction = self.read_each(servo_ids, begin, registers[-1].end - begin, what)
         counts = [[r.decode(block[r.address - begin : r.end - begin]) for r in registers] for block in blocks]
@@ -215,7 +209,6 @@ class ServoLink(ABC):
         Args:
             instruction: Returns its bytes, and the number of data bytes of each answer.
             servo_ids: The servos that answer, in this order.
-            what: Description of the instruction, for errors.
             despite_error: Whether errors in the answers are ignored.
 
         Raises:

@@ -14,7 +14,6 @@ class ServoModel:
     """A servo model.
 
     Args:
-        name: The model's name, as printed on the servo.
         stops_alone: Whether it stops when its own bus watchdog trips; None: it has no watchdog.
         source: Where that is documented, or who measured it.
     """

@@ -18,7 +18,6 @@ class LinkConfig:
 
     Args:
         port: Device file, e.g. /dev/ttyUSB0.
-        baud_rate: Bits per second.
         reply_timeout_s: Longest wait for an answer, beyond the time of its bytes on the wire [s]. It must exceed the
             latency timer of a USB adapter: 16 ms by default, better set it to 1 ms.
         max_silence_s: Time without any answer after which the bus counts as lost [s].

@@ -119,9 +119,6 @@ class GuardedServos(Generic[L]):
     def find(self, servo_id: int, whose: str = "") -> bytes:
         """Return the data of a servo's answer to a ping.
 
-        Args:
-            whose: The joint of the servo, for errors.
-
         Raises:
             HardwareLost: It does not answer, the message has the ids that do; or two servos have this id.
         """

@@ -106,7 +106,6 @@ class PlannedBus(ABC):
     Args:
         send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
         start_ns: Time 0 of the plant.
-        now_ns: Clock by which lateness is measured.
         servos: Id -> servo, ordered by id.
     """
 
@@ -129,12 +128,14 @@ class PlannedBus(ABC):
         self.random = random.Random(config.seed)
         self._byte_ns = 1e10 / config.baud_rate
         history_s = config.sensing_latency_s + config.sensing_jitter_s
+        # The plant, with a history as long as the sensing latency.
         self._clock = PlantClock(plant, round(config.plant_step_s * 1e9), start_ns, round(history_s * 1e9), truth)
         self._firmware = servos
         self._controllers: dict[int, tuple[int, int, float]] = {}
         for servo in servos.values():
             self.configure(servo)
         self._last_effect_ns = dict.fromkeys(servos, 0)
+        # The state of the wire: its bytes, faults and events.
         self._parser = parser
         self._wire_free_ns = start_ns
         self._last_bytes_ns = start_ns
@@ -244,7 +245,6 @@ class PlannedBus(ABC):
 
         Args:
             return_delay_s: Time between instruction and answer [s].
-            sample: The measurement, if the answer has present values.
         """
         begin_ns = max(request.t_ns, self._wire_free_ns) + round(return_delay_s * 1e9)
         self._wire_free_ns = begin_ns + round(len(answer) * self._byte_ns)

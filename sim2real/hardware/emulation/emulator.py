@@ -145,6 +145,7 @@ def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
     parser.add_argument(
         "--emulation", required=True, metavar=place, help="the class of the settings, which makes the bus"
     )
+    # The class of the settings decides the other flags.
     named = parser.parse_known_args(arguments)[0]
     settings = load_named(named.emulation, "emulation")
     if not (isinstance(settings, type) and issubclass(settings, BusEmulation)):
@@ -159,6 +160,7 @@ def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
     parser.add_argument(
         "--until-stdin-closes", action="store_true", help="also stop when stdin ends, as when the parent dies"
     )
+    # One flag for each setting.
     for field in fields(settings):
         flag = f"--{field.name.replace('_', '-')}"
         parser.add_argument(flag, type=_TYPES[str(field.type).split()[0]], default=field.default)

@@ -24,7 +24,6 @@ class InstructedBus(PlannedBus, Generic[S, E]):
     Args:
         send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
         start_ns: Time 0 of the plant.
-        now_ns: Clock by which lateness is measured.
 
     Attributes:
         present: The first and the last register of present values.

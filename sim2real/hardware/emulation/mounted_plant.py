@@ -16,7 +16,6 @@ class MountedPlant:
     The plant inside works on the joints' side: it gets their angles, speeds and voltages, and has their true states.
 
     Args:
-        plant: The plant inside, as `load_plant` takes it.
         joints: Fields of `Joint`, one row per servo, in the order of the plant's `servo_ids`.
         zero_rad: The encoder's angle from count 0 where the device reports 0 [rad]; in the plant inside, that of a
             joint at 0.

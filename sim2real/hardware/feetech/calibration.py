@@ -119,11 +119,13 @@ def _check_range(path: Path, joint: CalibratedJoint, travel_rad: float | None) -
     """Refuse a range that is far from the joint's travel; None: any range is accepted."""
     if travel_rad is None:
         return
+    # Compare the recorded range with the joint's travel.
     counts = joint.high_count - joint.low_count
     travel_counts = travel_rad / abs(joint.rad_per_count)
     least, most = (share * travel_counts for share in _SHARE_OF_TRAVEL)
     if least <= counts <= most:
         return
+    # Name the probable cause.
     cause = (
         "the joint passed from count 4095 to count 0 while its range was recorded"
         if counts >= _WHOLE_TURN * reg.COUNTS_PER_REVOLUTION
@@ -156,6 +158,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _joint(path: Path, name: str, entry: Any) -> CalibratedJoint:
+    # Check the fields and their values.
     where = f"calibration file {path}: motor {name!r}"
     if not isinstance(entry, dict):
         raise UsageError(f"{where} is no object with {', '.join(_FIELDS)}", hint=_HINT)
@@ -171,6 +174,7 @@ def _joint(path: Path, name: str, entry: Any) -> CalibratedJoint:
             f"{where}: range_min = {entry['range_min']} is not below range_max = {entry['range_max']}",
             hint="was the joint moved while its range was recorded? calibrate again",
         )
+    # The zero is the middle of the range, as in LeRobot.
     return CalibratedJoint(
         name=name,
         servo_id=entry["id"],

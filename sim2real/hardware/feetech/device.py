@@ -205,6 +205,7 @@ class StsServos(GuardedServos[StsLink], Device):
 
     def _prepare(self, joint: CalibratedJoint) -> None:
         """Write a servo's settings, with torque off, and check that it can go wherever its joint may."""
+        # The unit of speeds depends on the firmware's phase setting.
         servo_id, link = joint.servo_id, self.link
         phase = self._phases[servo_id] = link.read(servo_id, reg.PHASE)
         self._unit_rad_s[self.ids.index(servo_id)] = reg.speed_unit_rad_s(phase)
@@ -215,6 +216,7 @@ class StsServos(GuardedServos[StsLink], Device):
                 f"{joint.low_count} to {joint.high_count}",
                 hint="run lerobot-calibrate, or narrow the joint's range",
             )
+        # Set the registers that the driver relies on.
         for register, value in (
             (reg.RESPONSE_LEVEL, 1),
             (reg.LOCK, 1),

@@ -22,9 +22,7 @@ class GateConfig:
         command_timeout_s: Age from which a command is stale [s].
         max_speed_rad_s: Speed above which the robot is stopped, whether measured or computed from successive positions;
             one value or one per joint [rad/s]; None: not checked.
-        node: Name of the actuator's node, for errors.
         stale: Replacement of a stale command: ``zero``, or ``hold``, the last command that was sent (for positions).
-        joints: The joints' names, for errors.
         stuck_effort: Fraction of a joint's torque: a joint that is driven with more than this in both directions must
             move, or the robot is stopped; one value or one per joint; above 1: not checked. See
             `sim2real.hardware.safety.plausibility`.

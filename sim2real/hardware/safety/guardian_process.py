@@ -33,6 +33,7 @@ class Guard:
         Args:
             silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
         """
+        # Report readiness; the control process then arms it with each beat.
         armed, tripped, heard_s = False, False, time.monotonic()
         _write(link, READY)
         while True:

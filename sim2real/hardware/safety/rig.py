@@ -68,6 +68,7 @@ class Rig:
     """
 
     def __init__(self, device: Device, gate: GateConfig, joints: Sequence[Joint] = ()) -> None:
+        # The gate, the joints, and the last commands and measurements.
         _require_stale(gate, device)
         self._mounting = Mounting(joints, device)
         self.device = device
@@ -84,6 +85,7 @@ class Rig:
         self._failure: Sim2RealError | None = None
         self.timeouts = 0
         self.measuring, self.commanding = BusUse(), BusUse()
+        # Open the device, and refuse a gate beyond its reach.
         device.open()
         try:
             self._require_reach()
@@ -283,6 +285,7 @@ class Rig:
     def _watch(self, done: threading.Event) -> None:
         """Send the gate's fallback before the first command, and when the last one is too old: its loop may hang."""
         keep_time()
+        # Look five times in each timeout of the motors' own watchdog.
         timeout_s = self.gate.config.command_timeout_s
         period_s = min(timeout_s, self.device.silence_s or timeout_s) / 5
         while not done.is_set():

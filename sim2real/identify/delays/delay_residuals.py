@@ -1,9 +1,8 @@
-"""What a problem's residuals are at every delay that a measurement may have had, and how its unknowns change them."""
+"""The residuals of a problem at every possible delay of a measurement, and their derivative by its unknowns."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +10,11 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.identify.delays.hidden_delays import Linearise
-from sim2real.identify.delays.likelihood import Seen
+from sim2real.identify.delays.likelihood import DelayEvidence
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.programs import Program
 from sim2real.identify.problem.segments import Data
+from sim2real.types import Array, Scalar
 
 _STEP_S = 0.001
 """Distance of the delays at which the motion is predicted [s]."""
@@ -22,17 +22,17 @@ _STEP_S = 0.001
 
 @dataclass(frozen=True)
 class Watched:
-    """A problem, as the search for hidden delays sees it.
+    """A problem for the search of hidden delays.
 
     Unknowns are the entries of ``z`` that are no delays and, where they are fitted, the initial states of segments.
 
     Attributes:
-        linearise: From unknowns and a delay to what is seen.
+        linearise: From unknowns and a delay to the linearised measurements.
         x: Shape ``(P,)``: the unknowns at the estimate.
         delay_s: The measurements' delay at the estimate [s].
-        again: Shape ``(N,)``, bool: whether a measurement has the values of the one before.
+        again: Shape ``(N,)``, bool: whether a measurement repeats the previous values.
         quantum: Shape ``(F,)``: resolution of the measurements, in deviations.
-        pick: Shape ``(E,)``: the segments that are looked at.
+        pick: Shape ``(E,)``: the segments that are used.
         counts: Shape ``(E, C)``, bool: which of their measurements are the ``N`` that count.
     """
 
@@ -53,63 +53,63 @@ def motion(problem: Problem, z: np.ndarray, late: str) -> Watched:
     """
     data, table = problem.data, problem.table
     pick = _apart(problem)
-    own = np.array([i for i, c in enumerate(table.columns) if c.parameter.kind != "delay"], int)
+    moved = np.array([i for i, c in enumerate(table.columns) if c.parameter.kind != "delay"], int)
     delays = np.linspace(0.0, table[late].high, max(2, round(table[late].high / _STEP_S) + 1))
     states = 2 * len(problem.channels) if problem.config.initial_state == "free" else 0
-    x = np.concatenate([np.asarray(z, np.float64)[own], np.zeros(states * len(pick))])
+    x = np.concatenate([np.asarray(z, np.float64)[moved], np.zeros(states * len(pick))])
     delay_s = float(table.decode(jnp.asarray(z, jnp.float32))[late])
-    curves, slopes = _programs(problem, jnp.asarray(z, jnp.float32), late, pick, data, delay_s, own)
-    ts = np.asarray(slopes(jnp.asarray(x[: len(own)], jnp.float32), _shifts(x, own, states, pick), delay_s)[2])
+    curves, slopes = _programs(problem, jnp.asarray(z, jnp.float32), late, pick, data, delay_s, moved)
+    ts = np.asarray(slopes(jnp.asarray(x[: len(moved)], jnp.float32), _shifts(x, moved, states, pick), delay_s)[2])
     counts = ts >= 0.0
     recording, stamps = problem.recording[pick], (ts + problem.begins_s[pick][:, None])
     for r in np.unique(recording):
         stamps[recording == r] -= stamps[recording == r][counts[recording == r]].mean()
-    stretch = np.abs(table.scale(np.asarray(z))[1])[own] / table.span[own]
+    stretch = np.abs(table.scale(np.asarray(z))[1])[moved] / table.span[moved]
     prior = np.diag(np.concatenate([12.0 * stretch**2 + 1e-6, np.ones(states * len(pick))]))
 
-    def linearise(x: np.ndarray, about_s: float) -> Seen:
-        at, shift = jnp.asarray(x[: len(own)], jnp.float32), _shifts(x, own, states, pick)
+    def linearise(x: np.ndarray, about_s: float) -> DelayEvidence:
+        at, shift = jnp.asarray(x[: len(moved)], jnp.float32), _shifts(x, moved, states, pick)
         errors = np.asarray(curves(at, shift, jnp.asarray(delays, jnp.float32)), np.float64)  # (G, E, C, F)
         by_value, by_state, _ = (np.asarray(a, np.float64) for a in slopes(at, shift, about_s))
         jacobian = np.zeros((*by_value.shape[1:], len(x)))
-        jacobian[..., : len(own)] = np.moveaxis(by_value, 0, -1)
+        jacobian[..., : len(moved)] = np.moveaxis(by_value, 0, -1)
         for e in range(len(pick) if states else 0):
-            jacobian[e, :, :, len(own) + states * e : len(own) + states * (e + 1)] = np.moveaxis(by_state[e], 0, -1)
-        return Seen(stamps[counts], delays, np.moveaxis(errors, 0, -1)[counts], jacobian[counts], prior)
+            jacobian[e, :, :, len(moved) + states * e : len(moved) + states * (e + 1)] = np.moveaxis(by_state[e], 0, -1)
+        return DelayEvidence(stamps[counts], delays, np.moveaxis(errors, 0, -1)[counts], jacobian[counts], prior)
 
     again, quantum = _again(problem, data, pick)
     return Watched(linearise, x, delay_s, again[counts], quantum, pick, counts)
 
 
 def _programs(
-    seen: Problem, z: Any, late: str, pick: np.ndarray, data: Data, delay_s: float, own: np.ndarray
-) -> tuple[Any, Any]:
+    watched: Problem, z: jax.Array, late: str, pick: np.ndarray, data: Data, delay_s: float, moved: np.ndarray
+) -> tuple[Program, Program]:
     """Return two compiled functions of unknowns, shifts of initial states ``(E, states)`` and delays.
 
     The first returns residuals ``(G, E, C, F)``. The second returns their derivative by the unknowns
     ``(P, E, C, F)`` and by the states ``(E, states, C, F)``, and the times of the measurements ``(E, C)``.
     """
-    every, problem = jnp.asarray(pick), seen.residuals
+    every, problem = jnp.asarray(pick), watched.residuals
 
-    def residuals(at: Any, shifts: Any, delay: Any) -> tuple[Any, Any]:
-        values = {**problem.table.decode(z.at[own].set(at)), late: jnp.asarray(delay, jnp.float32)}
+    def residuals(at: jax.Array, shifts: jax.Array, delay: Scalar) -> tuple[jax.Array, jax.Array]:
+        values = {**problem.table.decode(z.at[moved].set(at)), late: jnp.asarray(delay, jnp.float32)}
         if problem.table[late].per_recording:
             values[late] = jnp.full(problem.table.recordings, values[late])
 
-        def one(eps: Any, shift: Any) -> tuple[Any, Any]:
-            # The world is the same for all delays; only when it was measured differs.
+        def one(eps: Array, shift: Array) -> tuple[jax.Array, jax.Array]:
+            # The world is the same for all delays; only the time of the measurement differs.
             same = problem.start(eps, delay_s, data) - problem.start(eps, delay, data)
             error = problem.residuals(values, eps, shift * problem.prior + same, data)
             return error, data.ts[eps]
 
         return jax.vmap(one)(every, shifts)
 
-    def curves(at: Any, shifts: Any, delays: Any) -> Any:
+    def curves(at: jax.Array, shifts: jax.Array, delays: jax.Array) -> jax.Array:
         return jax.lax.map(lambda d: residuals(at, shifts, d)[0], delays)
 
-    def slopes(at: Any, shifts: Any, delay: Any) -> tuple[Any, Any, Any]:
+    def slopes(at: jax.Array, shifts: jax.Array, delay: Scalar) -> tuple[jax.Array, jax.Array, jax.Array]:
         f = problem.differentiable(lambda a: residuals(a, shifts, delay)[0])
-        by_value = jax.vmap(lambda d: jax.jvp(f, (at,), (d,))[1])(jnp.eye(len(own), dtype=at.dtype))
+        by_value = jax.vmap(lambda d: jax.jvp(f, (at,), (d,))[1])(jnp.eye(len(moved), dtype=at.dtype))
         size = shifts.shape[1]
         g = problem.differentiable(lambda u: residuals(at, shifts + u, delay)[0], 0.03)
         by_state = jax.vmap(lambda d: jax.jvp(g, (jnp.zeros(size),), (d,))[1])(jnp.eye(size))
@@ -118,9 +118,9 @@ def _programs(
     return Program(curves), Program(slopes)
 
 
-def _shifts(x: np.ndarray, own: np.ndarray, states: int, pick: np.ndarray) -> Any:
+def _shifts(x: np.ndarray, moved: np.ndarray, states: int, pick: np.ndarray) -> jax.Array:
     """Return the initial states' shifts ``(E, 2 * channels)``; without any where they are not fitted."""
-    return jnp.asarray(x[len(own) :].reshape(len(pick), -1), jnp.float32) if states else jnp.zeros((len(pick), 1))
+    return jnp.asarray(x[len(moved) :].reshape(len(pick), -1), jnp.float32) if states else jnp.zeros((len(pick), 1))
 
 
 def _apart(problem: Problem) -> np.ndarray:

@@ -13,29 +13,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.identify.delays.likelihood import FLOOR, Likelihood, Seen, along, covariance, maximise
+from sim2real.identify.delays.likelihood import FLOOR, DelayEvidence, Likelihood, along, covariance, maximise
 
 _FIRST_S = 0.005
-"""What delays may deviate by, as long as nothing is known of them [s]."""
+"""Assumed deviation of delays before the first estimate [s]."""
 _LEAST, _MOST = 40, 100
 """Points of the final grid."""
-Linearise = Callable[[np.ndarray, float], Seen]
-"""From the unknowns ``(P,)`` and a delay [s] to what is seen there."""
+Linearise = Callable[[np.ndarray, float], DelayEvidence]
+"""From the unknowns ``(P,)`` and a delay [s] to the linearised measurements."""
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """What was found.
+    """The estimated distribution of delays.
 
     Attributes:
         x: Shape ``(P,)``: the unknowns.
-        drift: How much faster the measurements' clock runs [s/s].
+        drift: Rate of the measurements' clock minus 1 [s/s].
         noise: Shape ``(F,)``: deviation of the noise, in deviations of the measurement.
         delays: Shape ``(K,)``: a grid of delays, in the middle of the recording [s].
         share: Shape ``(K,)``: share of the measurements that have each delay.
         by_shape: Shape ``(K, M)``: d share / d weight of the splines.
         covariance: Of unknowns, logarithms of the noise and weights of the splines, in this order.
-        place: Where the likelihood is largest, in the same order; 0 for unknowns, as they are counted from ``x``.
+        place: The point of the largest likelihood, in the same order; 0 for unknowns, as offsets from ``x``.
     """
 
     x: np.ndarray
@@ -63,8 +63,8 @@ class Hidden:
     def quantile(self, q: float, deviations: float) -> tuple[float, float, float]:
         """Return the delay that a share ``q`` of the messages does not exceed, and the ends of its interval [s].
 
-        The ends are where the distribution passes ``q`` less and more its error: a quantile within a gap of the
-        distribution has no standard error of its own.
+        The ends are the quantiles at ``q`` minus and plus the error of the distribution there: a quantile within a gap
+        of the distribution has no standard error.
         """
         below = np.cumsum(self.share) - 0.5 * self.share
         error = self._error(np.array(_at(self._below(), below, q)))
@@ -75,8 +75,8 @@ class Hidden:
         return np.cumsum(self.by_shape, axis=0) - 0.5 * self.by_shape
 
     def _error(self, slope: np.ndarray) -> float:
-        own = self.covariance[-len(slope) :, -len(slope) :]
-        return float(np.sqrt(max(slope @ own @ slope, 0.0)))
+        block = self.covariance[-len(slope) :, -len(slope) :]
+        return float(np.sqrt(max(slope @ block @ slope, 0.0)))
 
 
 def _at(rows: np.ndarray, where: np.ndarray, q: float) -> list[float]:
@@ -85,7 +85,7 @@ def _at(rows: np.ndarray, where: np.ndarray, q: float) -> list[float]:
 
 @dataclass(frozen=True)
 class _At:
-    """Where the search is: unknowns, drift [s/s], noise, and shares of the delays."""
+    """The present point of the search: unknowns, drift [s/s], noise, and shares of the delays."""
 
     x: np.ndarray
     drift: float
@@ -103,24 +103,29 @@ class _At:
 
 
 def hidden(linearise: Linearise, x: np.ndarray, delay_s: float) -> Hidden:
-    """Find delays, drift, noise and the unknowns of a model together.
+    """Estimate delays, drift, noise and the unknowns of a model together.
 
     Args:
-        linearise: The model: called with the unknowns and about the mean delay, in every round.
-        x: Shape ``(P,)``: about the unknowns.
-        delay_s: About the mean delay [s].
+        linearise: The model; called in every round with the unknowns and the mean delay.
+        x: Shape ``(P,)``: a first estimate of the unknowns.
+        delay_s: A first estimate of the mean delay [s].
     """
+    # First estimates by least squares, then by expectation and maximisation.
     size, drift = len(x), 0.0
     for _ in range(3):
-        seen = linearise(x, delay_s)
-        move, _ = straight(seen, drift, delay_s, _FIRST_S, np.ones(seen.errors.shape[1]))
+        evidence = linearise(x, delay_s)
+        move, _ = straight(evidence, drift, delay_s, _FIRST_S, np.ones(evidence.errors.shape[1]))
         x, drift = x + move[:size], drift + float(move[-1])
-        delay_s = float(np.clip(delay_s + move[size], seen.delays[0], seen.delays[-1]))
-    seen = linearise(x, delay_s)
-    at = rough(seen, x)
-    at, _, _ = _climb(linearise, at, _support(seen, at.share, at.noise))
+        delay_s = float(np.clip(delay_s + move[size], evidence.delays[0], evidence.delays[-1]))
+    evidence = linearise(x, delay_s)
+    at = rough(evidence, x)
+
+    # Maximise the likelihood, twice: the second time on the grid of the first.
+    at, _, _ = _climb(linearise, at, _support(evidence, at.share, at.noise))
     at, likelihood, p = _climb(linearise, at)
-    _, error = straight(likelihood.seen, at.drift, at.mean_s, at.deviation_s, at.noise)
+
+    # Errors of the estimate.
+    _, error = straight(likelihood.evidence, at.drift, at.mean_s, at.deviation_s, at.noise)
     by_shape = at.share[:, None] * (likelihood.bumps - at.share @ likelihood.bumps)
     spread = covariance(likelihood, likelihood(p)[1])
     place = np.where(np.arange(p.size) < size, 0.0, p)
@@ -133,10 +138,10 @@ def _climb(linearise: Linearise, at: _At, grid: np.ndarray | None = None) -> tup
     Returns:
         The end, the likelihood, and its parameters there.
     """
-    seen = linearise(at.x, at.mean_s)
-    drift = at.drift + float(straight(seen, at.drift, at.mean_s, at.deviation_s, at.noise)[0][-1])
+    evidence = linearise(at.x, at.mean_s)
+    drift = at.drift + float(straight(evidence, at.drift, at.mean_s, at.deviation_s, at.noise)[0][-1])
     share = at.share if grid is None else np.full(len(grid), 1.0 / len(grid))
-    likelihood = Likelihood(seen, at.delays if grid is None else grid, drift)
+    likelihood = Likelihood(evidence, at.delays if grid is None else grid, drift)
     p = maximise(likelihood, likelihood.start(at.noise, share))
     noise = np.exp(p[likelihood.unknowns : likelihood.unknowns + likelihood.fields])
     x = at.x + p[: likelihood.unknowns]
@@ -144,25 +149,28 @@ def _climb(linearise: Linearise, at: _At, grid: np.ndarray | None = None) -> tup
 
 
 def straight(
-    seen: Seen, drift: float, delay_s: float, deviation_s: float, noise: np.ndarray
+    evidence: DelayEvidence, drift: float, delay_s: float, deviation_s: float, noise: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return how far unknowns, mean delay and drift are off ``(P + 2,)`` by least squares, and the drift's error [s/s].
+    """Return corrections ``(P + 2,)`` of unknowns, mean delay and drift by least squares, and the drift's error [s/s].
 
-    The drift is found by this alone, not by the likelihood: that gives most weight to the few messages at the edges of
-    a distribution, and climbs to one of many maxima of nearly the same height.
+    The drift is estimated here and not by the likelihood, which gives most weight to the few messages at the edges of
+    a distribution and has many maxima of nearly the same height.
 
     Args:
-        drift: About the drift [s/s].
+        drift: A first estimate of the drift [s/s].
         delay_s: The mean delay [s].
         deviation_s: The deviation of delays [s].
         noise: Shape ``(F,)``: deviation of the noise, in deviations of the measurement.
     """
-    errors, slopes = seen.at((delay_s + drift * seen.stamps)[:, None])
+    errors, slopes = evidence.at((delay_s + drift * evidence.stamps)[:, None])
     weight = 1.0 / np.sqrt(noise**2 + (slopes[:, :, 0] * deviation_s) ** 2)
-    columns = np.concatenate([seen.jacobian, slopes, slopes * seen.stamps[:, None, None]], axis=2) * weight[:, :, None]
+    columns = (
+        np.concatenate([evidence.jacobian, slopes, slopes * evidence.stamps[:, None, None]], axis=2)
+        * weight[:, :, None]
+    )
     size = columns.shape[2]
     prior = np.zeros((size, size))
-    prior[:-2, :-2] = seen.prior
+    prior[:-2, :-2] = evidence.prior
     rest = errors[:, :, 0] * weight
     inverse = np.linalg.inv(np.einsum("nfp,nfq->pq", columns, columns) + prior)
     move = -inverse @ np.einsum("nfp,nf->p", columns, rest)
@@ -170,34 +178,37 @@ def straight(
     return move, float(np.sqrt((inverse @ along(gradient) @ inverse)[-1, -1]))
 
 
-def rough(seen: Seen, x: np.ndarray, steps: int = 40) -> _At:
-    """Return roughly where the likelihood is largest, by expectation and maximisation with a share for every delay.
+def rough(evidence: DelayEvidence, x: np.ndarray, steps: int = 40) -> _At:
+    """Return an approximate maximum of the likelihood, by expectation and maximisation with a share for every delay.
 
     Args:
         x: Shape ``(P,)``: the unknowns there.
     """
-    count, fields, size = seen.errors.shape
-    move, share = np.zeros(seen.jacobian.shape[2]), np.full(size, 1.0 / size)
+    count, fields, size = evidence.errors.shape
+    move, share = np.zeros(evidence.jacobian.shape[2]), np.full(size, 1.0 / size)
     noise = np.ones(fields)
     for _ in range(steps):
-        off = (seen.errors + (seen.jacobian @ move)[:, :, None]) / noise[None, :, None]
+        # Expectation: the probability of each delay for each measurement.
+        off = (evidence.errors + (evidence.jacobian @ move)[:, :, None]) / noise[None, :, None]
         height = -0.5 * (off**2).sum(axis=1) + np.log(share + FLOOR)
         likely = np.exp(height - height.max(axis=1, keepdims=True))
         likely /= likely.sum(axis=1, keepdims=True)
+
+        # Maximisation: shares, unknowns and noise.
         share = likely.sum(axis=0) / count
-        J = (seen.jacobian / noise[None, :, None]).reshape(-1, len(move))
-        error = (np.einsum("nk,nfk->nf", likely, seen.errors) / noise).reshape(-1)
-        move = -np.linalg.solve(J.T @ J + seen.prior + 1e-12 * np.eye(len(move)), J.T @ error)
-        off = seen.errors + (seen.jacobian @ move)[:, :, None]
+        J = (evidence.jacobian / noise[None, :, None]).reshape(-1, len(move))
+        error = (np.einsum("nk,nfk->nf", likely, evidence.errors) / noise).reshape(-1)
+        move = -np.linalg.solve(J.T @ J + evidence.prior + 1e-12 * np.eye(len(move)), J.T @ error)
+        off = evidence.errors + (evidence.jacobian @ move)[:, :, None]
         noise = np.sqrt(np.einsum("nk,nfk->f", likely, off**2) / count)
-    return _At(x + move, 0.0, noise, seen.delays, share)
+    return _At(x + move, 0.0, noise, evidence.delays, share)
 
 
-def _support(seen: Seen, share: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def _support(evidence: DelayEvidence, share: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Return a grid of delays that covers those of all messages, finer than the resolution of a measurement."""
-    below, few = np.cumsum(share), 0.3 / len(seen.stamps)
-    step = seen.delays[1] - seen.delays[0]
-    low, high = np.interp([few, 1 - few], below, seen.delays) + np.array([-step, step])
-    slopes = np.abs(np.diff(seen.errors, axis=2)).mean(axis=2) / step / noise
+    below, few = np.cumsum(share), 0.3 / len(evidence.stamps)
+    step = evidence.delays[1] - evidence.delays[0]
+    low, high = np.interp([few, 1 - few], below, evidence.delays) + np.array([-step, step])
+    slopes = np.abs(np.diff(evidence.errors, axis=2)).mean(axis=2) / step / noise
     fine = 0.7 / max(float(np.quantile(np.sqrt((slopes**2).sum(axis=1)), 0.95)), 1e-9)
     return np.linspace(low, high, int(np.clip((high - low) / fine, _LEAST, _MOST)))

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 _BUMPS = 20
-"""Splines that the logarithm of the shares is made of: the more, the sharper an edge may be."""
+"""Number of splines that form the logarithm of the shares: more of them allow sharper edges."""
 _RIDGE = 1e-3
 """Precision of a weak prior on the splines' weights, without which the share of a delay that never occurs is -inf."""
 _SMOOTH = 0.5
@@ -18,15 +18,15 @@ FLOOR = 1e-12
 
 
 @dataclass(frozen=True)
-class Seen:
-    """How well measurements agree with a model's predictions, for every delay that they may have had.
+class DelayEvidence:
+    """Agreement of measurements with a model's predictions, for every possible delay.
 
     Attributes:
         stamps: Shape ``(N,)``, in the order of time: the measurements' stamps [s], 0 in the middle of a recording.
         delays: Shape ``(G,)``: delays at equal distances [s].
         errors: Shape ``(N, F, G)``: prediction minus measurement at each delay, in deviations of the measurement.
-        jacobian: Shape ``(N, F, P)``: d error / d unknown, at about the mean delay.
-        prior: Shape ``(P, P)``: what is known of the unknowns beforehand, as a precision.
+        jacobian: Shape ``(N, F, P)``: d error / d unknown, near the mean delay.
+        prior: Shape ``(P, P)``: precision of the unknowns before the log.
     """
 
     stamps: np.ndarray
@@ -35,7 +35,7 @@ class Seen:
     jacobian: np.ndarray
     prior: np.ndarray
 
-    def rows(self, which: np.ndarray) -> Seen:
+    def rows(self, which: np.ndarray) -> DelayEvidence:
         """Return some of the measurements, ``(N,)`` bool."""
         return replace(self, stamps=self.stamps[which], errors=self.errors[which], jacobian=self.jacobian[which])
 
@@ -50,28 +50,28 @@ class Seen:
 
 
 class Likelihood:
-    """The likelihood of all measurements, and each one's part in its gradient.
+    """The likelihood of all measurements, and the part of each in its gradient.
 
     Args:
-        grid: Shape ``(K,)``: delays at equal distances that messages may have [s].
+        grid: Shape ``(K,)``: possible delays of messages, at equal distances [s].
         drift: The drift of the clock [s/s].
     """
 
-    def __init__(self, seen: Seen, grid: np.ndarray, drift: float) -> None:
-        self.seen, self.grid = seen, grid
-        self.fields, self.unknowns = seen.jacobian.shape[1:]
+    def __init__(self, evidence: DelayEvidence, grid: np.ndarray, drift: float) -> None:
+        self.evidence, self.grid = evidence, grid
+        self.fields, self.unknowns = evidence.jacobian.shape[1:]
         self.bumps = _bumps(grid)
         self.size = self.unknowns + self.fields + self.bumps.shape[1]
         bend = np.diff(np.eye(self.bumps.shape[1]), 3, axis=0)
         self.prior = np.zeros((self.size, self.size))
-        self.prior[: self.unknowns, : self.unknowns] = seen.prior
+        self.prior[: self.unknowns, : self.unknowns] = evidence.prior
         self.prior[-bend.shape[1] :, -bend.shape[1] :] = _SMOOTH * bend.T @ bend + _RIDGE * np.eye(bend.shape[1])
-        self._errors, slopes = seen.at(grid[None] + drift * seen.stamps[:, None])
-        # A delay lies anywhere between points of the grid: that is noise of this variance.
+        self._errors, slopes = evidence.at(grid[None] + drift * evidence.stamps[:, None])
+        # A delay may lie between points of the grid: that adds noise of this variance.
         self._blur = slopes.mean(axis=2) ** 2 * (grid[1] - grid[0]) ** 2 / 12.0
 
     def start(self, noise: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Return where a search begins, ``(size,)``, from the noise ``(F,)`` and the shares ``(K,)``."""
+        """Return the start of a search, ``(size,)``, from the noise ``(F,)`` and the shares ``(K,)``."""
         p = np.zeros(self.size)
         p[self.unknowns : self.unknowns + self.fields] = np.log(noise)
         p[-self.bumps.shape[1] :] = np.linalg.lstsq(self.bumps, np.log(np.maximum(share, 1e-9)), rcond=None)[0]
@@ -88,22 +88,27 @@ class Likelihood:
 
         The gradients are those of the likelihood alone.
         """
-        unknowns, seen = self.unknowns, self.seen
+        # The log likelihood of each measurement at each delay.
+        unknowns, evidence = self.unknowns, self.evidence
         variance = np.exp(2 * p[unknowns : unknowns + self.fields])[None]
         total = variance + self._blur
-        move = (seen.jacobian @ p[:unknowns])[:, :, None]
+        move = (evidence.jacobian @ p[:unknowns])[:, :, None]
         off = (self._errors + move) / np.sqrt(total)[:, :, None]
         share = self.shares(p)
         height = -0.5 * (off**2).sum(axis=1) - 0.5 * np.log(total).sum(axis=1)[:, None] + np.log(share + FLOOR)
+
+        # The sum over delays, and the probability of each delay.
         top = height.max(axis=1, keepdims=True)
         likely = np.exp(height - top)
         whole = likely.sum(axis=1, keepdims=True)
         likely /= whole
         rows = (np.log(whole) + top)[:, 0]
+
+        # The gradient by unknowns, noise and splines.
         weighed = off / np.sqrt(total)[:, :, None]
         expected = np.einsum("nk,nfk->nf", likely, weighed)
-        gradient = np.empty((len(seen.stamps), self.size))
-        gradient[:, :unknowns] = -np.einsum("nf,nfp->np", expected, seen.jacobian)
+        gradient = np.empty((len(evidence.stamps), self.size))
+        gradient[:, :unknowns] = -np.einsum("nf,nfp->np", expected, evidence.jacobian)
         squares = np.einsum("nk,nfk->nf", likely, off**2)
         gradient[:, unknowns : unknowns + self.fields] = (squares - 1) * variance / total
         gradient[:, unknowns + self.fields :] = (likely - share) @ self.bumps
@@ -111,15 +116,12 @@ class Likelihood:
 
 
 def maximise(likelihood: Likelihood, p: np.ndarray, steps: int = 40) -> np.ndarray:
-    """Climb to the largest likelihood, with the information that the rows' gradients hold; damped as by Levenberg.
+    """Maximise the likelihood by damped steps with the information matrix of the rows' gradients.
 
-    No library's: the rows' gradients come with the value, which a least-squares solver has no use for, as the rows are
-    no squares. On four likelihoods of two emulated links this takes 161 evaluations and 3.3 s, scipy's ``trust-exact``
-    with the same information for a Hessian 217 and 4.8 s, L-BFGS 970 and 36 s. The logarithms at which this and
-    ``trust-exact`` end differ by less than 0.01, L-BFGS stops up to 7.5 below.
+    docs/reference/choices.md compares it with solvers of scipy, which do not use these gradients.
 
     Args:
-        p: Shape ``(size,)``: where to begin.
+        p: Shape ``(size,)``: the start.
     """
     value, gradient, _ = likelihood(p)
     damping = 1e-3
@@ -145,12 +147,11 @@ def maximise(likelihood: Likelihood, p: np.ndarray, steps: int = 40) -> np.ndarr
 def covariance(likelihood: Likelihood, gradient: np.ndarray) -> np.ndarray:
     """Return the covariance of the estimate, ``(size, size)``.
 
-    Delays of successive messages are not independent: those of a timer go up and down like a saw, those of a busy bus
-    stay long for a while. So the rows' gradients are added up with their products with those of a few messages later
-    (Newey and West, Econometrica 55, 1987).
+    Delays of successive messages depend on each other: a timer's rise and fall periodically, a busy bus's stay long.
+    So products of gradients of messages up to a few steps apart are added (Newey and West, Econometrica 55, 1987).
 
     Args:
-        gradient: Shape ``(N, size)``: its rows' gradients at the largest one.
+        gradient: Shape ``(N, size)``: its rows' gradients at the maximum.
     """
     count = len(gradient)
     inverse = np.linalg.inv(gradient.T @ gradient + likelihood.prior)

@@ -32,7 +32,7 @@ def losses(again: np.ndarray, chance: np.ndarray, rounds: int = 10) -> Losses:
 
     Losses come in bursts: whether a message is lost depends on whether the one before was (Gilbert, Bell System
     Technical Journal 39, 1960). A robot at rest repeats values without any loss; that is what ``chance`` is for: it is
-    1 where a repeated value says nothing.
+    1 if a repeated value is no evidence.
 
     Args:
         again: Shape ``(N,)``, bool: whether a measurement has the value of the one before it.
@@ -40,10 +40,10 @@ def losses(again: np.ndarray, chance: np.ndarray, rounds: int = 10) -> Losses:
     """
     # Transitions from a message that came or was lost (row) to one that came or was lost (column).
     move = np.array([[0.95, 0.05], [0.5, 0.5]])
-    seen = np.stack([np.where(again, chance, 1.0), again.astype(float)], axis=1)
+    chances = np.stack([np.where(again, chance, 1.0), again.astype(float)], axis=1)
     counts, each = np.zeros((2, 2)), np.zeros(len(again))
     for _ in range(rounds):
-        counts, each = _expected(seen, move)
+        counts, each = _expected(chances, move)
         move = counts + 0.5
         move /= move.sum(axis=1, keepdims=True)
     rng = np.random.default_rng(0)
@@ -60,24 +60,24 @@ def losses(again: np.ndarray, chance: np.ndarray, rounds: int = 10) -> Losses:
     return Losses(share, Ranged(length, float(min(short, length)), float(max(long, length))), each)
 
 
-def _expected(seen: np.ndarray, move: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _expected(chances: np.ndarray, move: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the expected number of each transition ``(2, 2)``, and the probability of each loss ``(N,)``.
 
     Args:
-        seen: Shape ``(N, 2)``: how probable what was seen is for a message that came, and for one that was lost.
+        chances: Shape ``(N, 2)``: probability of the measured value, for a message that arrived and for a lost one.
         move: Shape ``(2, 2)``: probabilities of transitions.
     """
-    count = len(seen)
+    count = len(chances)
     ahead, back = np.empty((count, 2)), np.ones((count, 2))
-    ahead[0] = seen[0] * [0.5, 0.5]
+    ahead[0] = chances[0] * [0.5, 0.5]
     ahead[0] /= ahead[0].sum()
     for i in range(1, count):
-        now = (ahead[i - 1] @ move) * seen[i]
+        now = (ahead[i - 1] @ move) * chances[i]
         ahead[i] = now / now.sum()
     for i in range(count - 2, -1, -1):
-        now = move @ (seen[i + 1] * back[i + 1])
+        now = move @ (chances[i + 1] * back[i + 1])
         back[i] = now / now.sum()
-    both = ahead[:-1, :, None] * move * (seen[1:] * back[1:])[:, None, :]
+    both = ahead[:-1, :, None] * move * (chances[1:] * back[1:])[:, None, :]
     both /= both.sum(axis=(1, 2), keepdims=True)
     state = ahead * back
     return both.sum(axis=0), state[:, 1] / state.sum(axis=1)

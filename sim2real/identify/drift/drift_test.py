@@ -35,7 +35,7 @@ Causes = Mapping[str, Mapping[str, float]]
 
 @dataclass(frozen=True)
 class Way:
-    """A change that may come alone: its name, and a direction ``(P,)`` on the parameters' scales."""
+    """A change to test: its name, and a direction ``(P,)`` on the parameters' scales."""
 
     name: str
     along: np.ndarray
@@ -47,16 +47,16 @@ class Fitted:
 
     Attributes:
         size: Distance along the change.
-        own: Variance of ``size`` by the log's residuals.
-        before: Variance of ``size`` by the posterior.
+        by_log: Variance of ``size`` by the log's residuals.
+        by_posterior: Variance of ``size`` by the posterior.
         segments: Effective number of segments that inform the size.
         loss: Loss of the log with this change, the other parameters within the posterior.
     """
 
     way: Way
     size: float
-    own: float
-    before: float
+    by_log: float
+    by_posterior: float
     segments: float
     loss: float
 
@@ -64,71 +64,68 @@ class Fitted:
     def freedom(self) -> float:
         """Degrees of freedom of the whole variance (Satterthwaite, Biometrics Bulletin 2, 1946).
 
-        The log's part is known as well as segments that say something are many: a pendulum that is held upright says
-        nothing. The identification's part counts as known.
+        The freedom of the log's part is the effective number of informative segments minus 1: those of a pendulum that
+        is held upright do not count. The posterior's part counts as exact.
         """
-        return max(self.segments - 1.0, 1.0) * ((self.own + self.before) / max(self.own, 1e-300)) ** 2
+        return max(self.segments - 1.0, 1.0) * ((self.by_log + self.by_posterior) / max(self.by_log, 1e-300)) ** 2
 
 
 def ways(table: ParameterTable, causes: Causes) -> list[Way]:
-    """Return the changes that may come alone: of each parameter, and of causes.
+    """Return the changes to test: of each parameter, and of causes.
 
     A log determines only the sum of the delays on either side of the world: both move by half. A cause that moves
     unidentified parameters is not tested.
     """
     delays = [i for i, c in enumerate(table.columns) if c.parameter.kind == "delay"]
-    found = [Way(n, np.eye(len(table))[i]) for i, n in enumerate(table.names) if len(delays) < 2 or i not in delays]
+    changes = [Way(n, np.eye(len(table))[i]) for i, n in enumerate(table.names) if len(delays) < 2 or i not in delays]
     if len(delays) > 1:
-        found.append(Way(ROUND_TRIP, np.isin(np.arange(len(table)), delays) / len(delays)))
+        changes.append(Way(ROUND_TRIP, np.isin(np.arange(len(table)), delays) / len(delays)))
     for cause, shares in causes.items():
         if set(shares) <= set(table.names):
-            found.append(Way(cause, np.array([shares.get(n, 0.0) for n in table.names])))
-    return found
+            changes.append(Way(cause, np.array([shares.get(n, 0.0) for n in table.names])))
+    return changes
 
 
 def drift(problem: Problem, posterior: Posterior, widening: float, causes: Causes) -> tuple[Drift, np.ndarray]:
-    """Test whether a log is still of the robot that was identified.
+    """Test whether a log agrees with the identified robot.
 
-    Each change is fitted to the log alone: one that comes alone leaves all else as it was, and a short log of a
-    policy that soon holds still says too little to fit all parameters. A linear step from what was identified does not
-    do: where friction has doubled a joint stands still that should move, and there derivatives are those of another
-    motion.
+    Each change is fitted alone, because a short log of a policy that soon stands still cannot determine all parameters.
+    The fit is not a linear step from the estimate: with twice the friction a joint stands still that should move, and
+    derivatives at the estimate are those of another motion.
 
     Args:
-        problem: The log, all of its segments fitted.
-        posterior: What was identified; other parameters of the problem are known to have had their nominal values.
-        widening: Factor on the posterior's deviations that covers the errors of the model: a robot that is not of its
-            form acts, from motion to motion, like one with other parameters, and a policy moves otherwise than an
-            excitation.
+        posterior: The identification; other parameters of the problem had their nominal values.
+        widening: Factor on the posterior's deviations that covers the errors of the model: they act like other
+            parameters in each motion, and a policy moves differently than an excitation.
         causes: Known causes that move several parameters.
 
     Returns:
         The tests, and the point ``(P,)`` on the parameters' scales that explains the log best: that of the change that
-        explains most, or what was identified.
+        explains most, or the estimate.
 
     Raises:
         UsageError: When parameters of the posterior are not tested.
-        Sim2RealError: When the log says nothing about any of them.
+        Sim2RealError: The log informs none of them.
     """
     table = problem.table
     posterior = _with_known(posterior, table)
     values, axes = np.linalg.eigh(posterior.covariance)
     root = widening * axes * np.sqrt(np.maximum(values, 0.0))
     tried = [_alone(problem, posterior.mean, root, way) for way in ways(table, causes)]
-    found = [one for one in tried if one is not None]
-    if not found:
+    fitted = [one for one in tried if one is not None]
+    if not fitted:
         raise Sim2RealError("this log determines no parameter", hint="deploy a policy that moves the robot")
     at = _finite(linearise(problem, table.at_scale(posterior.mean)))
     now = _with_the_rest(at, root, loss_variance(problem, at))
-    found.sort(key=lambda one: one.loss)
+    fitted.sort(key=lambda one: one.loss)
     seconds = problem.segment_s * len(problem.train)
-    ends = (posterior.mean + found[0].size * found[0].way.along, posterior.mean)
+    ends = (posterior.mean + fitted[0].size * fitted[0].way.along, posterior.mean)
     losses = [problem.loss(table.at_scale(x)) for x in ends]
-    return weigh(found, now, table, posterior, seconds), ends[int(losses[1] < losses[0] or not np.isfinite(losses[0]))]
+    return weigh(fitted, now, table, posterior, seconds), ends[int(losses[1] < losses[0] or not np.isfinite(losses[0]))]
 
 
 def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
-    """Return the posterior of all parameters of a table: those that were not identified are sure to be nominal."""
+    """Return the posterior of all parameters of a table; those that were not identified are nominal, without error."""
     if lacking := [name for name in posterior.names if name not in table.names]:
         raise UsageError(
             f"the log is tested for {', '.join(table.names)}, but {', '.join(lacking)} were identified, too"
@@ -143,14 +140,14 @@ def _with_known(posterior: Posterior, table: ParameterTable) -> Posterior:
 
 
 def _alone(problem: Problem, mean: np.ndarray, root: np.ndarray, way: Way) -> Fitted | None:
-    """Fit one change to a log, and say how sure its size is for a robot that did not change.
+    """Fit one change to a log, and return the variance of its size for an unchanged robot.
 
     Args:
-        mean: Shape ``(P,)``: what was identified, on the parameters' scales.
-        root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
+        mean: Shape ``(P,)``: the estimate, on the parameters' scales.
+        root: Shape ``(P, P)``: a root of the posterior's covariance.
 
     Returns:
-        The change; None where this log does not feel it, as a torque limit that no motion of it reached.
+        The change; None if the log does not depend on it, such as a torque limit that its motion does not reach.
     """
     table = problem.table
 
@@ -161,103 +158,102 @@ def _alone(problem: Problem, mean: np.ndarray, root: np.ndarray, way: Way) -> Fi
     unit = float(np.min(table.span[moving] / np.abs(way.along[moving])))
     size = _best(problem, point, unit)
     at = _finite(linearise(problem, point(size)))
-    variance, said = loss_variance(problem, at), float(np.sum((at.jacobian @ way.along) ** 2))
-    if said * unit**2 <= _FELT * variance:
+    variance, informed = loss_variance(problem, at), float(np.sum((at.jacobian @ way.along) ** 2))
+    if informed * unit**2 <= _FELT * variance:
         return None
-    step, own, before, segments = _beside_the_rest(at, way, root, variance)
-    return Fitted(way, size + step, own, before, segments, _with_the_rest(at, root, variance))
+    step, by_log, by_posterior, segments = _beside_the_rest(at, way, root, variance)
+    return Fitted(way, size + step, by_log, by_posterior, segments, _with_the_rest(at, root, variance))
 
 
 def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float) -> float:
-    """Return how far along a change the log is fitted best.
+    """Return the size of a change that fits the log best.
 
     Args:
         point: Size of the change -> the unbounded vector ``(P,)``.
-        unit: The size that goes from bound to bound.
+        unit: The size between the bounds.
     """
     size, sizes = 0.0, unit * np.array(sorted([0.0, *_SIZES]))
     for _ in range(_TURNS):
         tried = np.array([point(s) for s in sizes])
-        found = problem.losses(tried, point(size))
-        best = int(np.argmin(np.where(np.isfinite(found), found, np.inf)))
+        trials = problem.losses(tried, point(size))
+        best = int(np.argmin(np.where(np.isfinite(trials), trials, np.inf)))
         size = float(sizes[best])
         sizes = np.linspace(sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)], len(sizes))
     return size
 
 
 def _beside_the_rest(at: Linearised, way: Way, root: np.ndarray, variance: float) -> tuple[float, float, float, float]:
-    """Return how far a change goes if all else may be as far off as the identification leaves open.
+    """Return a change's step with all other parameters free within the posterior, and its variances.
 
-    By generalised least squares, so that what the change alone could have done counts most: where a hand moves slowly a
-    weaker motor looks like a longer delay, in the first moments of a quick step it does not.
+    Generalised least squares gives most weight to the effects of this change alone: in slow motion a weaker motor looks
+    like a longer delay, at the start of a quick step it does not.
 
-    The log's own variance is the larger one of two: each segment's residuals with their correlation in time, and the
-    sum of squares of how far each segment moves the size (a sandwich estimate).
+    The log's variance is the larger of two: from each segment's residuals with their correlation in time, and from the
+    sum of squares of the segments' effects on the size (a sandwich estimate).
 
     Args:
-        at: The log, with the change that fits it best.
-        root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
+        root: Shape ``(P, P)``: a root of the posterior's covariance.
 
     Returns:
-        How much further it goes; the variance of its size by the log's residuals, and by what is open; how many
-        segments of the log say something about it.
+        The step; the variance of the size by the log's residuals, and by the posterior; the effective number of
+        segments that inform it.
     """
     along, residuals = at.jacobian @ way.along, at.residuals.reshape(len(at.residuals), -1)
     unit = 1.0 / float(np.linalg.norm(along))
-    # In units of what is open: a delay that is known to 1 us would make the sum ill-conditioned.
+    # In units of the posterior's deviations: a delay with a deviation of 1 us would make the sum ill-conditioned.
     columns = np.concatenate([unit * along[..., None], at.jacobian @ root], axis=-1)
     columns = columns.reshape(len(residuals), -1, 1 + len(root))
-    known = np.diag([0.0] + [1.0] * len(root))
-    inverse = np.linalg.inv(np.einsum("sna,snb->ab", columns, columns) / variance + known)
+    precision = np.diag([0.0] + [1.0] * len(root))
+    inverse = np.linalg.inv(np.einsum("sna,snb->ab", columns, columns) / variance + precision)
     moved = -inverse @ np.einsum("sna,sn->a", columns, residuals) / variance
     weights = columns @ inverse[0]  # of each residual in the size
     pulls = np.sum(weights * (residuals + columns @ moved), axis=1) / variance
-    said = np.sum(weights**2, axis=1)
-    segments = float(said.sum() ** 2 / np.sum(said**2))
-    # Residuals are large where much moves, and there the log says most: each segment counts with its own.
+    informed = np.sum(weights**2, axis=1)
+    segments = float(informed.sum() ** 2 / np.sum(informed**2))
+    # Fast motion has large residuals and informs most: each segment counts with its own residuals.
     squares, counted = np.sum(residuals**2, axis=1), np.count_nonzero(residuals, axis=1)
     uneven = squares / np.maximum(counted, 1) * counted.sum() / max(float(squares.sum()), 1e-300)
     spread = float(np.sum(pulls**2)) * segments / max(segments - 1.0, 0.5)
-    own = unit**2 * max(float(said @ uneven) / variance, spread)
-    return unit * float(moved[0]), own, unit**2 * float(np.sum(inverse[0, 1:] ** 2)), segments
+    by_log = unit**2 * max(float(informed @ uneven) / variance, spread)
+    return unit * float(moved[0]), by_log, unit**2 * float(np.sum(inverse[0, 1:] ** 2)), segments
 
 
 def _with_the_rest(at: Linearised, root: np.ndarray, variance: float) -> float:
-    """Return the loss at a point once all parameters moved as far as the identification leaves open.
+    """Return the loss at a point after all parameters moved within the posterior.
 
-    The right change needs little more; another one that imitates it needs much, and that costs.
+    The right change needs small moves of the others; an imitation needs large ones, which the posterior penalises.
 
     Args:
-        root: Shape ``(P, P)``: a root of the covariance that the identification leaves open.
+        root: Shape ``(P, P)``: a root of the posterior's covariance.
     """
     flat, rest = at.jacobian.reshape(-1, len(at.x)), at.residuals.reshape(-1)
-    # In units of what is open: a delay that is known to 1 us would make the sum ill-conditioned.
+    # In units of the posterior's deviations: a delay with a deviation of 1 us would make the sum ill-conditioned.
     pulled, informed = root.T @ (flat.T @ rest), root.T @ (flat.T @ flat) @ root
     gain = pulled @ np.linalg.solve(informed + variance * np.eye(len(root)), pulled)
     return float(rest @ rest - gain) / max(int(np.count_nonzero(rest)), 1)
 
 
 def _finite(at: Linearised) -> Linearised:
-    """Return the same without segments that cannot be simulated: of an unstable motion, say, that runs away."""
+    """Return the linearisation without segments that cannot be simulated, such as of an unstable motion."""
     whole = np.isfinite(at.residuals).all(axis=(1, 2)) & np.isfinite(at.jacobian).all(axis=(1, 2, 3))
     gone = lambda a: np.where(whole.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
     return replace(at, residuals=gone(at.residuals), jacobian=gone(at.jacobian), raw=gone(at.raw))
 
 
-def weigh(found: Sequence[Fitted], loss: float, table: ParameterTable, posterior: Posterior, seconds: float) -> Drift:
-    """Say which changes are significant: all tests together raise an alarm for 5 % of the robots that did not change.
+def weigh(fitted: Sequence[Fitted], loss: float, table: ParameterTable, posterior: Posterior, seconds: float) -> Drift:
+    """Return the significant changes: all tests together raise an alarm for 5 % of unchanged robots.
 
-    By Holm's correction (Scandinavian Journal of Statistics 6, 1979), with Student's distribution. Of factors it is
-    tested whether they are larger than a small one.
+    Tests use Holm's correction (Scandinavian Journal of Statistics 6, 1979) and Student's distribution. A factor is
+    compared with a small one instead of with 1.
 
     Args:
-        found: What the log says about each change, the one that explains most first.
+        fitted: The fit of each change, the one that explains most first.
         loss: Of the log, without any change.
         seconds: Length of the log [s].
     """
     rows = []
-    for one in found:
-        error = (one.own + one.before) ** 0.5
+    for one in fitted:
+        error = (one.by_log + one.by_posterior) ** 0.5
         reach = error * float(stdtrit(one.freedom, 0.975))
         small = 0.0 if _absolute(one.way.name, table) else _SMALL
         p = sum(float(stdtr(one.freedom, (sign * small - abs(one.size)) / error)) for sign in (1, -1))
@@ -268,7 +264,7 @@ def weigh(found: Sequence[Fitted], loss: float, table: ParameterTable, posterior
 
 
 def _holm(rows: Sequence[Changed]) -> list[str]:
-    """Return the names of what is significant, all tests together."""
+    """Return the names of the significant changes, over all tests together."""
     alarms: list[str] = []
     for i, row in enumerate(sorted(rows, key=lambda row: row.p)):
         if row.p > LEVEL / (len(rows) - i):

@@ -8,8 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from sim2real.types import PyTree
 
-def finite_differences(f: Callable[[Any], Any], step: float = 3e-3) -> Callable[[Any], Any]:
+
+def finite_differences(f: Callable[[PyTree], PyTree], step: float = 3e-3) -> Callable[[PyTree], PyTree]:
     """Return ``f`` with a forward-mode derivative by central differences along every entry.
 
     One batched evaluation returns the value and all ``2 P`` neighbours, so a program contains ``f`` once: a rollout of
@@ -21,7 +23,7 @@ def finite_differences(f: Callable[[Any], Any], step: float = 3e-3) -> Callable[
     """
     wrapped = jax.custom_jvp(f)
 
-    def rule(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+    def rule(primals: tuple[Any], tangents: tuple[Any]) -> tuple[PyTree, PyTree]:
         (x,), (t,) = primals, tangents
         n = x.size
         moves = step * jnp.concatenate(

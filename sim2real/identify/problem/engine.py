@@ -15,6 +15,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph, Tables
+from sim2real.types import MjModel, PyTree
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
 
@@ -25,7 +26,6 @@ class Choice:
 
     Attributes:
         why: The reason, as text.
-        model: The ``MjModel``, on C.
     """
 
     name: Literal["c", "compiled"]
@@ -37,7 +37,9 @@ class Choice:
         return f"{'C MuJoCo' if self.name == 'c' else 'compiled'}: {self.why}"
 
 
-def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any], jacobian: str = "auto") -> Choice:
+def choose(
+    wanted: str, nodes: Mapping[str, BaseNode], messages: Mapping[str, PyTree], jacobian: str = "auto"
+) -> Choice:
     """Choose an engine, and take the physics out of the world if it is C.
 
     Args:
@@ -52,7 +54,7 @@ def choose(wanted: str, nodes: Mapping[str, BaseNode], given: Mapping[str, Any],
     try:
         if jacobian == "forward":
             raise UsageError("derivatives are taken in forward mode, which C MuJoCo does not have")
-        world = _world(nodes, given)
+        world = _world(nodes, messages)
         model = world.open_loop()
     except UsageError as error:
         if wanted == "c":
@@ -82,12 +84,12 @@ def check_devices(count: int, engine: Choice) -> None:
         )
 
 
-def _world(nodes: Mapping[str, BaseNode], given: Mapping[str, Any]) -> Any:
+def _world(nodes: Mapping[str, BaseNode], messages: Mapping[str, PyTree]) -> PyTree:
     worlds = [n for n in nodes.values() if isinstance(n, BaseWorld)]
     if len(worlds) != 1 or not all(hasattr(worlds[0], n) for n in _NEEDED):
         names = ", ".join(f"{n.name!r} ({type(n).__name__})" for n in worlds) or "there is none"
         raise UsageError(f"the world is not one of MuJoCo's: {names}")
-    live = [c.output_node.name for c in worlds[0].inputs.values() if c.output_node.name not in given]
+    live = [c.output_node.name for c in worlds[0].inputs.values() if c.output_node.name not in messages]
     if live:
         raise UsageError(f"the world {worlds[0].name!r} has the input {live[0]!r}, which is not recorded")
     return worlds[0]
@@ -103,10 +105,10 @@ class Outside(NamedTuple):
         law: Parameters of the law.
     """
 
-    fields: Mapping[str, Any]
+    fields: Mapping[str, PyTree]
     start: Start
-    controls: Any
-    law: Mapping[str, Any]
+    controls: PyTree
+    law: Mapping[str, PyTree]
 
 
 class CRollouts:
@@ -114,31 +116,22 @@ class CRollouts:
 
     One program computes the world's inputs in each tick, with their delays and averages. C steps all copies, each with
     its own parameters. A second program computes the sensor's outputs from the world's messages.
-
-    Args:
-        graph: The graph, without the physics of its world.
-        model: The ``MjModel``.
     """
 
-    def __init__(self, graph: OpenLoopGraph, model: Any) -> None:
+    def __init__(self, graph: OpenLoopGraph, model: MjModel) -> None:
         self._graph, self._model = graph, model
         self._world: OpenLoop = graph.nodes[graph.world or ""]  # pyright: ignore[reportAttributeAccessIssue]
         self._law: StepLaw | None = getattr(self._world, "law", None)
         self._rollouts: dict[tuple[str, ...], Rollouts] = {}
 
-    def inputs(self, gs: GraphState, params: Mapping[str, Any], tables: Tables, given: Mapping[str, Any]) -> Outside:
-        """Return the inputs of C for an episode; traceable.
-
-        Args:
-            gs: Result of the graph's ``begin``.
-            params: The nodes' parameters, as in ``begin``.
-            tables: As in the graph's ``run``.
-            given: As in the graph's ``run``.
-        """
+    def inputs(
+        self, gs: GraphState, params: Mapping[str, PyTree], tables: Tables, messages: Mapping[str, PyTree]
+    ) -> Outside:
+        """Return the inputs of C for an episode; traceable."""
         world = self._world
         state, world_params = gs.state[world.name], params[world.name]
         law = world.law_values(world_params) if self._law else {}  # pyright: ignore[reportAttributeAccessIssue]
-        controls = self._graph.drive(gs, tables, given, world.controls)
+        controls = self._graph.drive(gs, tables, messages, world.controls)
         return Outside(dict(world.fields(world_params, state)), world.start(world_params, state), controls, law)
 
     def step(self, inputs: Outside) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -149,27 +142,25 @@ class CRollouts:
             self._rollouts[names] = Rollouts(self._model, world.substeps, names, world.derives, self._law)
         return self._rollouts[names](inputs.fields, inputs.start, inputs.controls, inputs.law)
 
-    def outputs(self, gs: GraphState, moved: Any, tables: Tables, given: Mapping[str, Any], record: str) -> Any:
-        """Return a node's outputs in an episode, leaves ``(K, ...)``; traceable.
-
-        Args:
-            moved: Result of ``step`` for the episode.
-        """
+    def outputs(
+        self, gs: GraphState, moved: PyTree, tables: Tables, messages: Mapping[str, PyTree], record: str
+    ) -> PyTree:
+        """Return a node's outputs in an episode, leaves ``(K, ...)``; traceable."""
         world = self._world
-        messages = jax.vmap(lambda *at: world.message(gs.state[world.name], *at))(*moved)
-        return self._graph.run(gs, tables, given, record, {world.name: messages})
+        world_messages = jax.vmap(lambda *at: world.message(gs.state[world.name], *at))(*moved)
+        return self._graph.run(gs, tables, messages, record, {world.name: world_messages})
 
     def rollout(
-        self, gs: GraphState, params: Mapping[str, Any], tables: Tables, given: Mapping[str, Any], record: str
-    ) -> Any:
+        self, gs: GraphState, params: Mapping[str, PyTree], tables: Tables, messages: Mapping[str, PyTree], record: str
+    ) -> PyTree:
         """Return a node's outputs in an episode by a callback to C; no compilation cache holds such a program."""
-        inputs = self.inputs(gs, params, tables, given)
+        inputs = self.inputs(gs, params, tables, messages)
         dtype, count = jnp.result_type(float), inputs.controls.shape[0]
         widths = (self._model.nq, self._model.nv, self._model.nv)
         shapes = tuple(jax.ShapeDtypeStruct((1 + count, n), dtype) for n in widths)
 
-        def outside(given: Any) -> tuple[np.ndarray, ...]:
-            return tuple(a.astype(dtype) for a in self.step(jax.tree_util.tree_map(np.asarray, given)))
+        def outside(messages: PyTree) -> tuple[np.ndarray, ...]:
+            return tuple(a.astype(dtype) for a in self.step(jax.tree_util.tree_map(np.asarray, messages)))
 
         moved = jax.pure_callback(outside, shapes, inputs, vmap_method="expand_dims")
-        return self.outputs(gs, moved, tables, given, record)
+        return self.outputs(gs, moved, tables, messages, record)

@@ -13,6 +13,7 @@ from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.residuals import LinearisedSegments, SegmentResiduals
 from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
+from sim2real.types import Array, PyTree
 
 Stacked = Callable[[np.ndarray], np.ndarray]
 
@@ -54,7 +55,7 @@ class Evaluator(Protocol):
         """
         ...
 
-    def searched(self, data: Data) -> Any:
+    def searched(self, data: Data) -> PyTree:
         """Return the losses of a generation, in the form that ``search`` takes."""
         ...
 
@@ -108,7 +109,7 @@ class CompiledEvaluator:
         program = self._residuals.program("losses", self._residuals.losses)
         return np.asarray(program(_single(candidates), _single(around), data), np.float64)
 
-    def searched(self, data: Data) -> Any:
+    def searched(self, data: Data) -> PyTree:
         """See ``Evaluator``: traceable ``Losses``, whose data is an argument."""
         del data
         return self._residuals.losses
@@ -125,11 +126,11 @@ class CompiledEvaluator:
         program = self._residuals.program("with_values", self._with_values)
         return np.asarray(program(_single(z), _single(rows), data), np.float64)
 
-    def _with_values(self, z: Any, rows: Any, data: Data) -> Any:
+    def _with_values(self, z: Array, rows: Array, data: Data) -> PyTree:
         residuals = self._residuals
         states = residuals.initial_states(z, data, data.fitted)
 
-        def one(row: Any) -> Any:
+        def one(row: Array) -> PyTree:
             values = replaced(residuals, z, row)
             r = jax.vmap(lambda e, s: residuals.projected(values, e, s, data))(data.fitted, states)
             return tamed(r, residuals.config.loss, residuals.config.reach)
@@ -137,7 +138,7 @@ class CompiledEvaluator:
         return jax.vmap(one)(rows)
 
 
-def replaced(residuals: SegmentResiduals, z: Any, row: Any) -> dict[str, Any]:
+def replaced(residuals: SegmentResiduals, z: Array, row: Array) -> dict[str, PyTree]:
     """Return parameters by name at a point, with some of them set; traceable.
 
     Args:

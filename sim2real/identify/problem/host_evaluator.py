@@ -22,6 +22,7 @@ from sim2real.identify.problem.residuals import InitialState, LinearisedSegments
 from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.problem.sizes import padded
+from sim2real.types import PyTree
 
 _FEW, _COPIES = 24, 128
 """Copies in one call of the two programs: each size compiles once. A descent evaluates one point in a call."""
@@ -88,7 +89,7 @@ class OutsideEvaluator:
         """See ``Evaluator``."""
         return self.losses_with(candidates, self._states(around, data), data)
 
-    def searched(self, data: Data) -> Any:
+    def searched(self, data: Data) -> PyTree:
         """See ``Evaluator``: ``HostLosses`` on some segments; a block of generations keeps the states of its first."""
         states: list[InitialState | None] = [None]
         most_moved = self._few(data)
@@ -143,7 +144,7 @@ class OutsideEvaluator:
         arrays = {n: np.asarray(v, np.float32) for n, v in values.items()}
         if not self._free:
             return self._errors(arrays, eps, np.zeros((len(eps), self._n)), data)
-        return self._initial.best(arrays, np.asarray(eps), fit_s, data).residuals
+        return np.asarray(self._initial.best(arrays, np.asarray(eps), fit_s, data).residuals)
 
     def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
         """See ``Evaluator``."""
@@ -188,12 +189,12 @@ class OutsideEvaluator:
 
     def _moves(self, z: np.ndarray, data: Data) -> np.ndarray:
         """Return the steps of finite differences, one row for each parameter that is part of the model."""
-        return self._residuals.config.difference * np.eye(z.size)[np.asarray(data.kept)]
+        return self._residuals.config.difference * np.eye(z.size)[np.asarray(data.present)]
 
     def _by_parameter(self, changes: np.ndarray, data: Data, size: int) -> np.ndarray:
         """Return derivatives ``(S, K, F, P)`` from the changes of the residuals by each of ``_moves``."""
         J = np.zeros((*changes.shape[1:], size))
-        J[..., np.asarray(data.kept)] = np.moveaxis(changes, 0, -1) / self._residuals.config.difference
+        J[..., np.asarray(data.present)] = np.moveaxis(changes, 0, -1) / self._residuals.config.difference
         return J
 
     def _errors(self, values: Mapping[str, np.ndarray], eps: np.ndarray, shift: np.ndarray, data: Data) -> np.ndarray:
@@ -218,7 +219,7 @@ class OutsideEvaluator:
     def _decoded(self, z: np.ndarray, data: Data) -> dict[str, np.ndarray]:
         decode = self._residuals.program("decode", jax.vmap(self._residuals.table.decode, (0, None)))
         points = _single(padded(z, -(-len(z) // _COPIES) * _COPIES))
-        return {n: np.asarray(v)[: len(z)] for n, v in decode(points, data.kept).items()}
+        return {n: np.asarray(v)[: len(z)] for n, v in decode(points, data.present).items()}
 
     def _priors(self, z: np.ndarray) -> np.ndarray:
         """Return the residuals of the priors at points ``(N, P)``, ``(N, Q)``."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -17,10 +16,11 @@ from scipy.sparse.csgraph import connected_components
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.problem.residuals import STATE_DIFFERENCE, InitialState, SegmentResiduals
 from sim2real.identify.problem.segments import Data
+from sim2real.types import MjModel
 
 _STEPS = 2
 """Gauss-Newton steps of an initial state; they share the derivatives at the first point."""
-_KEPT = 3
+_CACHED = 3
 """Cached points: a descent evaluates its end, then begins its next round there."""
 _RESPONDS = 1e-9
 """Share of the largest derivative below which a residual is independent of a state; decoupled derivatives are exactly
@@ -30,13 +30,9 @@ Errors = Callable[[Mapping[str, np.ndarray], np.ndarray, np.ndarray, Data], np.n
 
 
 class InitialStates:
-    """Fits the initial states of segments.
+    """Fits the initial states of segments."""
 
-    Args:
-        model: The ``MjModel``.
-    """
-
-    def __init__(self, residuals: SegmentResiduals, errors: Errors, model: Any) -> None:
+    def __init__(self, residuals: SegmentResiduals, errors: Errors, model: MjModel) -> None:
         self._errors, self._n = errors, len(residuals.prior)
         self._groups: list[tuple[int, ...]] | None = None if _trees_are_apart(model) else _each(self._n)
         self._responds = np.ones((self._n, len(residuals.fields)), bool)
@@ -50,23 +46,26 @@ class InitialStates:
             values: The parameters by name, ``(1, ...)``.
             again: Whether the derivatives are computed at the fitted states.
         """
-        for point, cached_data, linearised_again, states in self._last:
-            if point == z.tobytes() and cached_data is data and linearised_again is again:
+        # Return the states of an earlier call at this point.
+        for point, cached_data, was_linearised, states in self._last:
+            if point == z.tobytes() and cached_data is data and was_linearised is again:
                 return states
+        # Fit the states of segments with weight, or only linearise them again.
         live = np.flatnonzero(np.asarray(data.weight) > 0.0)
         segments = np.asarray(data.fitted)[live]
         spread = {n: np.repeat(v, len(live), axis=0) for n, v in values.items()}
         if again:
             before = self.fitted(z, values, data)
             fitted = InitialState(*(leaf[live] for leaf in before))
-            fitted = fitted._replace(slope=self._slopes(spread, segments, fitted.shift, data)[0])
+            fitted = fitted._replace(slope=self._slopes(spread, segments, np.asarray(fitted.shift), data)[0])
         else:
             fitted = self.best(spread, segments, np.full(len(live), float(data.length_s)), data, 1)
+        # Fill up with zeros, and store the result.
         whole = [np.zeros((len(data.fitted), *leaf.shape[1:])) for leaf in fitted]
         for leaf, values_ in zip(whole, fitted, strict=True):
             leaf[live] = values_
         states = InitialState(*whole)
-        self._last = [(z.tobytes(), data, again, states), *self._last[: _KEPT - 1]]
+        self._last = [(z.tobytes(), data, again, states), *self._last[: _CACHED - 1]]
         return states
 
     def best(
@@ -177,7 +176,7 @@ def _each(n: int) -> list[tuple[int, ...]]:
     return [(i,) for i in range(n)]
 
 
-def _trees_are_apart(model: Any) -> bool:
+def _trees_are_apart(model: MjModel) -> bool:
     """Return whether only bodies couple joints: there is no contact, equality or tendon."""
     contacts = model.opt.disableflags & mj.mjtDisableBit.mjDSBL_CONTACT == 0
     touching = contacts and (model.npair > 0 or bool(np.any(model.geom_contype) and np.any(model.geom_conaffinity)))

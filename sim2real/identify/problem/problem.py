@@ -27,6 +27,7 @@ from sim2real.identify.problem.residuals import SegmentResiduals
 from sim2real.identify.problem.segments import Data, Retimed, Span, cut, data_of
 from sim2real.identify.problem.sizes import padded, rounded
 from sim2real.runtime.compilation.bursts import make_room
+from sim2real.types import Array, PyTree
 
 
 @dataclass(frozen=True)
@@ -55,14 +56,12 @@ class Problem:
 
     Args:
         length_s: Length of a segment [s].
-        table: Default: the model's parameters.
         moved: Changes the recorded timing of the segments before they are simulated.
         like: Another problem of the same model, table and configuration; both share programs.
 
     Attributes:
         data: The segments, as an argument of programs.
         spans: The segments, recording by recording.
-        segments: Number of segments.
         train: Numbers of the fitted segments.
 
     Raises:
@@ -87,7 +86,7 @@ class Problem:
         nodes = self.residuals.graph.nodes
         # Commands sent before a segment still act in it, up to the largest delay.
         cuts = cut(model, nodes, recordings, spans, length_s, 2 * config.max_delay_s)
-        self.spans, self.segment_s, self.given = cuts.spans, length_s, cuts.given
+        self.spans, self.segment_s, self.messages = cuts.spans, length_s, cuts.messages
         # Complete the recorded timing: draw the steps of the simulated nodes.
         self.timeline = draw(nodes, length_s + model.ahead_s, recorded=moved(cuts.timeline))
         make_room(nodes, self.timeline)  # after a hiccup commands leave in a burst
@@ -104,7 +103,7 @@ class Problem:
                 hint="make them longer, or max_delay_s or skip_s smaller",
             )
         # Make the arguments of the programs.
-        tables = self.residuals.graph.tables(self.timeline, cuts.given)
+        tables = self.residuals.graph.tables(self.timeline, cuts.messages)
         steps = cuts.ts.shape[1]
         tables[model.sensor] = padded(tables[model.sensor], rounded(steps), axis=1)
         self.data: Data = data_of(cuts, tables, from_s, len(self.fields), len(self.table))
@@ -122,17 +121,17 @@ class Problem:
         return SegmentResiduals(self.model, nodes, self.table, self.config, engine)
 
     @property
-    def engine(self) -> Any:
+    def engine(self) -> PyTree:
         """The engine of rollouts."""
         return self.residuals.engine
 
     @property
-    def channels(self) -> Any:
+    def channels(self) -> PyTree:
         """The measured channels."""
         return self.model.channels
 
     @property
-    def fields(self) -> Any:
+    def fields(self) -> PyTree:
         """The columns of the residuals: field, deviation, and a function that takes the channel's entry."""
         return self.residuals.fields
 
@@ -151,24 +150,20 @@ class Problem:
         field, _, entry = self.fields[column]
         return np.asarray(entry(self._measured[field]))
 
-    def part(self, without: Any = (), kept: Any = None) -> Data:
+    def part(self, without: Sequence[int] | np.ndarray = (), present: np.ndarray | None = None) -> Data:
         """Return the data without some segments, and with some of the parameters.
 
         Args:
             without: Numbers of the segments that get no weight.
-            kept: Shape ``(P,)``, bool: which free parameters are part of the model; default: all.
+            present: Shape ``(P,)``, bool: which free parameters are part of the model; default: all.
         """
         weight = np.asarray(self.data.weight).copy()
         weight[: len(self.train)][np.isin(self.train, np.asarray(without, int))] = 0.0
-        kept = self.data.kept if kept is None else jnp.asarray(np.asarray(kept, bool))
-        return self.data._replace(weight=jnp.asarray(weight), kept=kept)
+        among = self.data.present if present is None else jnp.asarray(np.asarray(present, bool))
+        return self.data._replace(weight=jnp.asarray(weight), present=among)
 
-    def at(self, z: Any, data: Data | None = None, on_compile: OnCompile | None = None) -> Evaluation:
-        """Return the residuals of the fitted segments at ``z (P,)``, and their derivatives.
-
-        Args:
-            data: Default: all fitted segments.
-        """
+    def at(self, z: Array, data: Data | None = None, on_compile: OnCompile | None = None) -> Evaluation:
+        """Return the residuals of the fitted segments at ``z (P,)``, and their derivatives."""
         evaluated = self.evaluator.linearised(np.asarray(z), self.data if data is None else data, on_compile)
         count = len(self.train)
         steps = self._ts.shape[1]
@@ -176,21 +171,16 @@ class Problem:
         prior, slope = (np.asarray(a, np.float64) for a in (evaluated.prior, evaluated.prior_jacobian))
         return Evaluation(r, J, raw, prior, slope, float(evaluated.loss))
 
-    def loss(self, z: Any, data: Data | None = None, on_compile: OnCompile | None = None) -> float:
-        """Return the loss at ``z (P,)``.
-
-        Args:
-            data: Default: all fitted segments.
-        """
+    def loss(self, z: Array, data: Data | None = None, on_compile: OnCompile | None = None) -> float:
+        """Return the loss at ``z (P,)``."""
         return self.evaluator.loss(np.asarray(z), self.data if data is None else data, on_compile)
 
-    def losses(self, candidates: Any, around: Any, data: Data | None = None) -> np.ndarray:
+    def losses(self, candidates: Array, around: Array, data: Data | None = None) -> np.ndarray:
         """Return the loss of each candidate ``(N,)``, with initial states linearised at one point.
 
         Args:
             candidates: Shape ``(N, P)``.
             around: Shape ``(P,)``.
-            data: Default: all fitted segments.
         """
         segments = self.data if data is None else data
         return self.evaluator.losses(np.asarray(candidates), np.asarray(around), segments)

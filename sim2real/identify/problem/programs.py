@@ -8,6 +8,8 @@ from typing import Any
 
 import jax
 
+from sim2real.types import PyTree
+
 OnCompile = Callable[[bool], None]
 """Called with True before a program is compiled, and with False afterwards."""
 
@@ -18,12 +20,12 @@ class Program:
     On a CPU, XLA's fusion emitters are off (jaxlib 0.10), as programs that run for seconds then need half the time.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., PyTree]) -> None:
         old = jax.default_backend() == "cpu" and jax.__version__.startswith("0.10.")
         self._jitted = jax.jit(function, compiler_options={"xla_cpu_use_fusion_emitters": False} if old else None)
         self._compiled: dict[Any, Any] = {}
 
-    def __call__(self, *args: Any, on_compile: OnCompile | None = None) -> Any:
+    def __call__(self, *args: Any, on_compile: OnCompile | None = None) -> PyTree:
         """Run the function, compiled at the first call with arguments of this form."""
         leaves, tree = jax.tree_util.tree_flatten(args)
         form = (tree, tuple((a.shape, a.dtype, a.weak_type) for a in map(jax.typeof, leaves)))

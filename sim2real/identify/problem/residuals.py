@@ -1,12 +1,12 @@
 """The residuals of a segment, prediction minus measurement, as a function of parameters and data.
 
-``Data`` is an argument and holds all that differs between logs, so compiled programs depend on shapes alone.
+``Data`` is an argument and holds everything that differs between logs, so compiled programs depend on shapes alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from sim2real.identify.problem.programs import Program
 from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph
+from sim2real.types import Array, PyTree, Scalar
 
 _STATE_STEPS = 2
 """Points at which a segment's initial state is linearised; see docs/reference/choices.md."""
@@ -39,20 +40,24 @@ class InitialState(NamedTuple):
         residuals: Shape ``(K, F)``: the residuals at the point.
     """
 
-    shift: Any
-    slope: Any
-    residuals: Any
+    shift: Array
+    slope: Array
+    residuals: Array
+
+
+_StateSearch = tuple[jax.Array, InitialState, jax.Array]
+"""The next candidate, the best point so far, and its cost."""
 
 
 class LinearisedSegments(NamedTuple):
     """The residuals of all fitted segments and their derivatives; leaves as in ``Evaluation``."""
 
-    residuals: Any
-    jacobian: Any
-    raw: Any
-    prior: Any
-    prior_jacobian: Any
-    loss: Any
+    residuals: Array
+    jacobian: Array
+    raw: Array
+    prior: Array
+    prior_jacobian: Array
+    loss: Array | float
 
 
 class SegmentResiduals:
@@ -82,7 +87,7 @@ class SegmentResiduals:
         self.prior = 30.0 * jnp.array(sigmas)
         self.forward = config.jacobian == "forward"
         self.programs: dict[str, Program] = {}
-        self.searches: dict[Any, Any] = {}
+        self.searches: dict[tuple[object, ...], Program] = {}
         self._late = [p.name for p in table if p.side == "measurement"]
         # Trace the rollout once for all programs that contain it: tracing MuJoCo takes 6 s.
         self._rollout = jax.jit(self._simulate)
@@ -95,73 +100,76 @@ class SegmentResiduals:
         return self._outside
 
     @property
-    def fields(self) -> list[tuple[str, float, Callable[[Any], Any]]]:
+    def fields(self) -> list[tuple[str, float, Callable[[PyTree], PyTree]]]:
         """The columns of the residuals: field, deviation, and a function that takes the channel's entry."""
         return [(field, sigma, c.of) for c in self.channels for field, sigma in c.fields]
 
-    def program(self, name: str, function: Callable[..., Any]) -> Program:
+    def program(self, name: str, function: Callable[..., PyTree]) -> Program:
         """Return the compiled program of a name; all problems of a model share it."""
         if name not in self.programs:
             self.programs[name] = Program(function)
         return self.programs[name]
 
-    def simulate(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> Any:
+    def simulate(self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data) -> PyTree:
         """Return the sensor's predictions of a segment, leaves ``(K, ...)``.
 
         Args:
             shift: Shape ``(2 * channels,)``: added to the initial state that was estimated from the log.
         """
         values_, start = self._started(values, eps, shift, data)
-        tables, given = jax.tree_util.tree_map(lambda rows: rows[eps], (data.tables, data.given))
-        return self._rollout(values_, start, tables, given, eps)
+        tables, messages = jax.tree_util.tree_map(lambda rows: rows[eps], (data.tables, data.messages))
+        return self._rollout(values_, start, tables, messages, eps)
 
-    def _simulate(self, own: Mapping[str, Any], start: Any, tables: Any, given: Any, eps: Any) -> Any:
+    def _simulate(
+        self, values: Mapping[str, PyTree], start: PyTree, tables: PyTree, messages: PyTree, eps: Array | int
+    ) -> PyTree:
         """Simulate a segment for one recording's parameters, from an initial state."""
-        params = self.model.params(own, start)
-        gs = self._first(params, given, eps)
+        params = self.model.params(values, start)
+        gs = self._first(params, messages, eps)
         if self.engine.name == "c":
-            return self.outside.rollout(gs, params, tables, given, self.model.sensor)
-        return self.graph.run(gs, tables, given, self.model.sensor)
+            return self.outside.rollout(gs, params, tables, messages, self.model.sensor)
+        return self.graph.run(gs, tables, messages, self.model.sensor)
 
-    def _started(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> tuple[dict[str, Any], Any]:
+    def _started(
+        self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data
+    ) -> tuple[dict[str, PyTree], jax.Array]:
         """Return the parameters of a segment's recording, and its initial state."""
         values_ = self.table.of_recording(values, data.recording[eps])
         return values_, self.start(eps, sum(values_[n] for n in self._late), data) + shift
 
-    def _first(self, params: Mapping[str, Any], given: Any, eps: Any) -> GraphState:
+    def _first(self, params: Mapping[str, PyTree], messages: PyTree, eps: Array | int) -> GraphState:
         # Assume that the first recorded command held before, too.
-        first = jax.tree_util.tree_map(lambda rows: rows[0], given)
+        first = jax.tree_util.tree_map(lambda rows: rows[0], messages)
         return self.graph.begin(params, first, jnp.asarray(eps, jnp.int32))
 
-    def _begun(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> tuple[Any, GraphState, Any, Any]:
+    def _begun(
+        self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data
+    ) -> tuple[dict[str, PyTree], GraphState, PyTree, PyTree]:
         """Return parameters of the nodes, first state, timing and commands of a segment."""
         params = self.model.params(*self._started(values, eps, shift, data))
-        tables, given = jax.tree_util.tree_map(lambda rows: rows[eps], (data.tables, data.given))
-        return params, self._first(params, given, eps), tables, given
+        tables, messages = jax.tree_util.tree_map(lambda rows: rows[eps], (data.tables, data.messages))
+        return params, self._first(params, messages, eps), tables, messages
 
-    def inputs(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> Outside:
+    def inputs(self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data) -> Outside:
         """Return the inputs with which C simulates a segment; ``shift`` as in ``simulate``."""
-        params, gs, tables, given = self._begun(values, eps, shift, data)
-        return self.outside.inputs(gs, params, tables, given)
+        params, gs, tables, messages = self._begun(values, eps, shift, data)
+        return self.outside.inputs(gs, params, tables, messages)
 
-    def errors(self, values: Mapping[str, Any], eps: Any, shift: Any, moved: Any, data: Data) -> Any:
-        """Return ``residuals`` of a segment that C simulated.
+    def errors(
+        self, values: Mapping[str, Array], eps: Array | int, shift: Array, moved: PyTree, data: Data
+    ) -> jax.Array:
+        """Return ``residuals`` of a segment that C simulated."""
+        _, gs, tables, messages = self._begun(values, eps, shift, data)
+        return self._compared(self.outside.outputs(gs, moved, tables, messages, self.model.sensor), eps, data)
 
-        Args:
-            shift: As in ``simulate``.
-            moved: Result of ``CRollouts.step`` for the segment.
-        """
-        _, gs, tables, given = self._begun(values, eps, shift, data)
-        return self._compared(self.outside.outputs(gs, moved, tables, given, self.model.sensor), eps, data)
-
-    def residuals(self, values: Mapping[str, Any], eps: Any, shift: Any, data: Data) -> Any:
+    def residuals(self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data) -> jax.Array:
         """Return prediction minus measurement of a segment, ``(K, F)``, in deviations of the measurement.
 
         It is 0 where ``data.ts`` is -1; ``shift`` as in ``simulate``.
         """
         return self._compared(self.simulate(values, eps, shift, data), eps, data)
 
-    def _compared(self, predicted: Any, eps: Any, data: Data) -> Any:
+    def _compared(self, predicted: Array, eps: Array | int, data: Data) -> jax.Array:
         counts, columns = data.ts[eps] >= 0.0, []
         for field, sigma, entry in self.fields:
             error = entry(getattr(predicted, field)) - entry(data.measured[field][eps])
@@ -169,7 +177,12 @@ class SegmentResiduals:
         return jnp.stack(columns, axis=1)
 
     def initial_state(
-        self, values: Mapping[str, Any], eps: Any, data: Data, fit_s: Any = None, points: int = _STATE_STEPS
+        self,
+        values: Mapping[str, Array],
+        eps: Array | int,
+        data: Data,
+        fit_s: Array | None = None,
+        points: int = _STATE_STEPS,
     ) -> InitialState:
         """Fit a segment's initial state by Gauss-Newton steps; return the best point.
 
@@ -180,7 +193,7 @@ class SegmentResiduals:
         like = jax.eval_shape(lambda: self.residuals(values, eps, zero, data))
         counts = self._fitted(eps, data, fit_s)
 
-        def step(i: Any, at: tuple[Any, InitialState, Any]) -> tuple[Any, InitialState, Any]:
+        def step(i: jax.Array, at: _StateSearch) -> _StateSearch:
             candidate, best, least = at
             of_shift = self.differentiable(
                 lambda u: self.residuals(values, eps, (candidate + u) * self.prior, data), STATE_DIFFERENCE
@@ -197,7 +210,9 @@ class SegmentResiduals:
         blank = InitialState(zero, jnp.zeros((len(zero), *like.shape)), jnp.zeros(like.shape))
         return jax.lax.fori_loop(0, points, step, (zero, blank, jnp.float32(0.0)))[1]
 
-    def projected(self, values: Mapping[str, Any], eps: Any, state: InitialState | None, data: Data) -> Any:
+    def projected(
+        self, values: Mapping[str, Array], eps: Array | int, state: InitialState | None, data: Data
+    ) -> jax.Array:
         """Return a segment's residuals ``(K, F)`` at the best initial state near its estimate.
 
         Args:
@@ -209,7 +224,7 @@ class SegmentResiduals:
         step = self._solve(state._replace(residuals=error), self._fitted(eps, data, None))
         return error + jnp.tensordot(step, state.slope, axes=1)
 
-    def predict(self, values: Mapping[str, Any], eps: Any, fit_s: Any, data: Data) -> Any:
+    def predict(self, values: Mapping[str, Array], eps: Array | int, fit_s: Array, data: Data) -> Array:
         """Return the residuals ``(K, F)`` of a segment whose initial state is fitted to its first part.
 
         Args:
@@ -219,7 +234,7 @@ class SegmentResiduals:
             return self.residuals(values, eps, jnp.zeros(len(self.prior)), data)
         return self.initial_state(values, eps, data, fit_s, _STATE_STEPS + 1).residuals
 
-    def initial_states(self, z: Any, data: Data, pick: Any) -> InitialState | None:
+    def initial_states(self, z: Array, data: Data, pick: Array) -> InitialState | None:
         """Return ``initial_state`` of several segments, leaves ``(B, ...)``; None if states are not fitted.
 
         Args:
@@ -228,10 +243,10 @@ class SegmentResiduals:
         """
         if self.config.initial_state != "free":
             return None
-        values = self.table.decode(z, data.kept)
+        values = self.table.decode(z, data.present)
         return jax.vmap(lambda e: self.initial_state(values, e, data))(pick)
 
-    def losses(self, candidates: Any, around: Any, data: Data, pick: Any = None) -> Any:
+    def losses(self, candidates: Array, around: Array, data: Data, pick: Array | None = None) -> jax.Array:
         """Return the loss of each candidate, ``(N,)``: half the mean square of its robust residuals, plus the priors.
 
         The initial states of all candidates are linearised at ``around``; the result is exact for a candidate at that
@@ -245,13 +260,13 @@ class SegmentResiduals:
         pick = jnp.arange(len(data.fitted)) if pick is None else pick
         states = self.initial_states(around, data, data.fitted[pick])
 
-        def loss(z: Any) -> Any:
+        def loss(z: Array) -> PyTree:
             raw = self._weighed(z, states, data, pick)
             return self._loss(self._tamed(raw), z, data, pick)
 
         return jax.vmap(loss)(candidates)
 
-    def linearised(self, z: Any, data: Data) -> LinearisedSegments:
+    def linearised(self, z: Array, data: Data) -> LinearisedSegments:
         """Return the residuals of all fitted segments and their derivatives at ``z (P,)``.
 
         Initial states are linearised at ``z``; the derivative neglects the change of their slopes (Kaufman, BIT 15,
@@ -268,7 +283,7 @@ class SegmentResiduals:
         prior = of_prior(z), jax.jacfwd(of_prior)(z)
         return LinearisedSegments(r, slope[..., None] * J, raw, *prior, self._loss(r, z, data, pick))
 
-    def start(self, eps: Any, delay_s: Any, data: Data) -> Any:
+    def start(self, eps: Array | int, delay_s: Scalar, data: Data) -> jax.Array:
         """Return the initial state ``(2 * channels,)`` as measured around the start.
 
         Args:
@@ -282,7 +297,7 @@ class SegmentResiduals:
         velocity = c[:, 1] + t * (2 * c[:, 2] + t * 3 * c[:, 3])
         return jnp.concatenate([position, velocity])
 
-    def differentiable(self, f: Callable[[Any], Any], step: float | None = None) -> Callable[[Any], Any]:
+    def differentiable(self, f: Callable[[PyTree], PyTree], step: float | None = None) -> Callable[[PyTree], PyTree]:
         """Return a function of one array with a derivative: its own, or finite differences; default: as configured."""
         return f if self.forward else finite_differences(f, step or self.config.difference)
 
@@ -298,26 +313,26 @@ class SegmentResiduals:
             return
         self.forward = True
 
-    def _weighed(self, z: Any, states: InitialState | None, data: Data, pick: Any) -> Any:
+    def _weighed(self, z: Array, states: InitialState | None, data: Data, pick: Array | None) -> jax.Array:
         """Return the residuals of some fitted segments without the robust loss; 0 in segments without weight."""
-        values = self.table.decode(z, data.kept)
+        values = self.table.decode(z, data.present)
         raw = jax.vmap(lambda e, s: self.projected(values, e, s, data))(data.fitted[pick], states)
         return jnp.where(data.weight[pick, None, None] > 0.0, raw, 0.0)
 
-    def _loss(self, r: Any, z: Any, data: Data, pick: Any) -> Any:
+    def _loss(self, r: jax.Array, z: Array, data: Data, pick: Array | None) -> jax.Array:
         compared = (data.ts[data.fitted[pick]] >= 0.0) & (data.weight[pick, None] > 0.0)
         prior = jnp.sum(self.table.prior_residuals(z) ** 2) / data.count
         return 0.5 * (jnp.sum(r**2) / jnp.maximum(jnp.sum(compared) * r.shape[-1], 1) + prior)
 
-    def _tamed(self, residuals: Any) -> Any:
+    def _tamed(self, residuals: jax.Array) -> jax.Array:
         return tamed(residuals, self.config.loss, self.config.reach)
 
-    def _fitted(self, eps: Any, data: Data, fit_s: Any) -> Any:
+    def _fitted(self, eps: Array | int, data: Data, fit_s: Array | None) -> jax.Array:
         """Return which measurements a segment's initial state is fitted to, ``(K, 1)``, bool."""
         ts = data.ts[eps]
         return ((ts >= 0.0) & (ts <= (data.length_s if fit_s is None else fit_s)))[:, None]
 
-    def _solve(self, at: InitialState, counts: Any) -> Any:
+    def _solve(self, at: InitialState, counts: jax.Array) -> jax.Array:
         """Return the Gauss-Newton step of an initial state ``(2 * channels,)``, in deviations of the prior."""
         n = len(self.prior)
         J = jnp.where(counts[None], at.slope, 0.0).reshape(n, -1)

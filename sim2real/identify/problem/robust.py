@@ -7,18 +7,18 @@ from typing import Any
 import jax.numpy as jnp
 
 from sim2real.identify.config import Loss
+from sim2real.types import Array, PyTree
 
 
-def tamed(residual: Any, loss: Loss, reach: float, xp: Any = jnp) -> Any:
+def tamed(residual: Array, loss: Loss, reach: float, xp: Any = jnp) -> PyTree:
     """Return a residual whose half square is the robust loss of the given one, so that least squares minimises it.
 
     ``huber`` is the pseudo-Huber loss: squared below ``reach``, linear far above it. ``cauchy`` grows
     with the logarithm.
 
     Args:
-        residual: Any shape, in deviations.
+        residual: Array shape, in deviations.
         reach: Above this the loss grows more slowly than the square, in deviations.
-        xp: ``jax.numpy`` or ``numpy``.
     """
     if loss == "squared":
         return residual

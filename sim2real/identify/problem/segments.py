@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.sizes import padded, rounded
+from sim2real.types import Array, PyTree
 
 Retimed = Callable[[Timeline], Timeline]
 """Recorded timing of segments -> changed timing."""
@@ -37,7 +38,7 @@ class Segments:
 
     Attributes:
         timeline: The recorded timing of sensor and given nodes, E episodes; the sensor's is ``ahead_s`` later.
-        given: Node -> its recorded messages, leaves ``(E, N, ...)``.
+        messages: Node -> its recorded messages, leaves ``(E, N, ...)``.
         measured: Field -> ``(E, N, ...)``.
         ts: Shape ``(E, N)``: time of each measurement [s from the segment's start]; 0 after the last.
         starts: Shape ``(E, channels, 4)``: a cubic in time through each channel's measurements around the start.
@@ -46,7 +47,7 @@ class Segments:
     spans: tuple[Span, ...]
     length_s: float
     timeline: Timeline
-    given: Mapping[str, Any]
+    messages: Mapping[str, PyTree]
     measured: Mapping[str, np.ndarray]
     ts: np.ndarray
     starts: np.ndarray
@@ -60,7 +61,7 @@ class Data(NamedTuple):
 
     Attributes:
         tables: Timing of the simulated steps, from ``OpenLoopGraph.tables``.
-        given: Node -> its recorded messages, leaves ``(E, N, ...)``.
+        messages: Node -> its recorded messages, leaves ``(E, N, ...)``.
         measured: Field -> ``(E, K, ...)``: the measurement that each of the sensor's steps predicts.
         ts: Shape ``(E, K)``: its time [s from the segment's start]; -1 without a comparison.
         starts: Shape ``(E, channels, 4)``, as in ``Segments``.
@@ -68,24 +69,24 @@ class Data(NamedTuple):
         length_s: Length of a segment [s].
         fitted: Shape ``(S,)``: numbers of the fitted segments.
         weight: Shape ``(S,)``: 1 for a fitted segment that counts, 0 for another.
-        kept: Shape ``(P,)``, bool: which free parameters are part of the model.
+        present: Shape ``(P,)``, bool: which free parameters are part of the model.
         count: Number of measured numbers in the fitted segments.
     """
 
-    tables: Any
-    given: Mapping[str, Any]
-    measured: Mapping[str, Any]
-    ts: Any
-    starts: Any
-    recording: Any
-    length_s: Any
-    fitted: Any
-    weight: Any
-    kept: Any
-    count: Any
+    tables: PyTree
+    messages: Mapping[str, PyTree]
+    measured: Mapping[str, Array]
+    ts: Array
+    starts: Array
+    recording: Array
+    length_s: Array | np.float32
+    fitted: Array
+    weight: Array
+    present: Array
+    count: Array | np.float32  # pyright: ignore[reportIncompatibleMethodOverride] - a tuple's count() is not used
 
 
-def data_of(cuts: Segments, tables: Any, from_s: float, fields: int, parameters: int) -> Data:
+def data_of(cuts: Segments, tables: PyTree, from_s: float, fields: int, parameters: int) -> Data:
     """Return segments as an argument of compiled programs.
 
     Args:
@@ -97,13 +98,15 @@ def data_of(cuts: Segments, tables: Any, from_s: float, fields: int, parameters:
     ts = np.where(cuts.ts >= from_s, cuts.ts, -1.0)
     steps, size = rounded(ts.shape[1]), rounded(segments)
     ts = np.pad(ts, ((0, 0), (0, steps - ts.shape[1])), constant_values=-1.0)
+    # Pad measurements and messages.
     measured = {f: np.asarray(padded(rows, steps, 1), np.float32) for f, rows in cuts.measured.items()}
-    given = {
+    messages = {
         n: jax.tree_util.tree_map(lambda leaf: padded(leaf, rounded(leaf.shape[1]), 1), tree)
-        for n, tree in cuts.given.items()
+        for n, tree in cuts.messages.items()
     }
-    rows = (tables, given, measured, ts.astype(np.float32), np.asarray(cuts.starts, np.float32),
+    rows = (tables, messages, measured, ts.astype(np.float32), np.asarray(cuts.starts, np.float32),
             np.array([s.recording for s in cuts.spans], np.int32))  # fmt: skip
+    # Weights of the fitted segments.
     counts = rounded(max(len(fitted), 1))
     return jax.tree_util.tree_map(
         jnp.asarray,
@@ -112,7 +115,7 @@ def data_of(cuts: Segments, tables: Any, from_s: float, fields: int, parameters:
             length_s=np.float32(cuts.length_s),
             fitted=np.pad(fitted, (0, counts - len(fitted))).astype(np.int32),
             weight=(np.arange(counts) < len(fitted)).astype(np.float32),
-            kept=np.ones(parameters, bool),
+            present=np.ones(parameters, bool),
             count=np.float32(max(int((ts[fitted] >= 0.0).sum()) * fields, 1)),
         ),
     )
@@ -165,7 +168,7 @@ def cut(
         spans=tuple(ordered),
         length_s=length_s,
         timeline=_later(timeline, model.sensor, to_ticks(model.ahead_s)),
-        given={n: jax.tree_util.tree_map(lambda f, n=n: rows(n, f), tree) for n, tree in model.given.items()},
+        messages={n: jax.tree_util.tree_map(lambda f, n=n: rows(n, f), tree) for n, tree in model.given.items()},
         measured={f: rows(model.sensor, f) for f in sorted(fields)},
         ts=np.where(start < length_s, start, 0.0),
         starts=np.stack([_local_fit(recordings[s.recording], model, s.begin_s) for s in ordered]),
@@ -194,6 +197,7 @@ def require_moved(episode: Episode, name: str = "the log") -> None:
 
 def check_log(episode: Episode, model: IdentifiableModel) -> None:
     """Raise an error unless the log holds the sensor's channels and the commands, as numbers and not of a dry run."""
+    # Steps of all nodes, then their fields, which must be finite.
     require_moved(episode)
     hint = "identify from a log of this pipeline's record stage, or one imported with its mapping"
     for name in (model.sensor, *model.given):
@@ -256,7 +260,7 @@ def beyond(
     """
     fields = [(n, f) for n, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
     fields += [(model.sensor, f) for f in dict.fromkeys(c.position for c in model.channels)]
-    messages = []
+    lines = []
     for node, field in fields:
         ends: dict[bool, list[np.ndarray]] = {True: [], False: []}
         # Collect the range of each segment.
@@ -275,8 +279,8 @@ def beyond(
         room = share * (high - low) + 1e-9 * np.abs(high)
         for i in np.flatnonzero((lowest < low - room) | (highest > high + room))[:3]:
             name = field if low.size == 1 else f"{field}[{i}]"
-            messages.append(
+            lines.append(
                 f"held-out data extrapolates: {name!r} of {node!r} reaches [{lowest[i]:.3g}, {highest[i]:.3g}], "
                 f"fitted was [{low[i]:.3g}, {high[i]:.3g}]"
             )
-    return messages
+    return lines

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import numpy as np
+
+from sim2real.types import PyTree
 
 _EXACT = 4
 """Largest count that is not rounded."""
@@ -25,7 +25,7 @@ def rounded(count: int, steps: int = 4) -> int:
     return -(-count // unit) * unit
 
 
-def padded(tree: Any, size: int, axis: int = 0) -> Any:
+def padded(tree: PyTree, size: int, axis: int = 0) -> PyTree:
     """Return arrays that repeat their last entry along an axis up to a size.
 
     Args:

@@ -14,6 +14,7 @@ from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
 from sim2real.identify.search.search import search
+from sim2real.types import Array, PyTree
 
 _DECADE = 10.0
 """Positive bounds with at least this ratio are searched on a logarithmic scale."""
@@ -23,7 +24,7 @@ _INSIDE = 1e-3
 
 @dataclass(frozen=True, repr=False)
 class Minimum(Shown):
-    """What minimising a loss found.
+    """Result of a minimisation.
 
     Attributes:
         parameters: Name -> value, as ``loss`` takes them.
@@ -39,7 +40,7 @@ class Minimum(Shown):
     history: np.ndarray
     evaluations: int
 
-    def about(self) -> dict[str, Any]:
+    def about(self) -> dict[str, PyTree]:
         """Return what to say about it: name -> value."""
         return {"loss": self.loss, "start": self.start, "evaluations": self.evaluations}
 
@@ -66,39 +67,39 @@ class _Scale:
         share = np.clip((value - low) / (high - low), _INSIDE, 1.0 - _INSIDE)
         return np.log(share / (1.0 - share))
 
-    def parameters(self, z: Any, np_: Any = jnp) -> dict[str, Any]:
+    def parameters(self, z: Array, np_: Any = jnp) -> dict[str, PyTree]:
         """Return the parameters at ``z (P,)``, in numpy or JAX."""
         share = 1.0 / (1.0 + np_.exp(-z))
         low = np.where(self.log, self.low, 1.0)
         scaled = low * np_.exp(share * np.log(np.where(self.log, self.high / low, 1.0)))
         flat = np_.where(self.log, scaled, self.low + (self.high - self.low) * share)
-        found, at = {}, 0
+        tree, at = {}, 0
         for name, like in self.start.items():
-            found[name] = flat[at : at + like.size].reshape(like.shape)
+            tree[name] = flat[at : at + like.size].reshape(like.shape)
             at += like.size
-        return found
+        return tree
 
     def _ends(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.low, self.high, self.value
 
 
 def minimise(
-    loss: Callable[[dict[str, Any]], Any],
+    loss: Callable[[dict[str, PyTree]], Array | float],
     parameters: Mapping[str, Any],
     bounds: Mapping[str, Any],
     config: FitConfig | Mapping[str, Any] | None = None,
     compiled: bool = True,
 ) -> Minimum:
-    """Return the parameters within bounds at which a loss of one's own is least.
+    """Return the parameters within bounds that minimise a user's loss.
 
     Args:
-        loss: Parameters -> a number; a rollout of a graph, say. JAX compiles it for a whole generation of candidates.
-        parameters: Name -> where to begin, a number or an array.
+        loss: Parameters -> a number, such as a rollout's error. JAX compiles it for a whole generation of candidates.
+        parameters: Name -> start, a number or an array.
         bounds: Name -> (lowest, highest), numbers or arrays. Positive bounds of a decade or more are searched on a
             logarithmic scale.
-        config: Strategy, population, generations, restarts, spread and seed of the search; a dict has what is different
-            from the default.
-        compiled: False: the loss is plain Python, and called for one candidate after the other.
+        config: Strategy, population, generations, restarts, spread and seed of the search; a dict has the settings that
+            differ from the default.
+        compiled: False: the loss is plain Python, and is called for each candidate in turn.
 
     Raises:
         UsageError: When parameters and bounds do not fit each other, or the loss is not one number.
@@ -110,7 +111,7 @@ def minimise(
         raise UsageError("there is no parameter to search for")
     config, scale = replace(_configured(config), batch=0), _Scale(parameters, bounds)
 
-    def one(z: Any) -> Any:
+    def one(z: Array) -> PyTree:
         value = jnp.asarray(loss(scale.parameters(z)))
         if value.shape:
             raise UsageError(f"the loss must be one number, got an array of shape {value.shape}", hint="sum it up")
@@ -119,23 +120,26 @@ def minimise(
     def number(z: np.ndarray) -> float:
         return float(np.asarray(loss(scale.parameters(np.asarray(z, np.float64), np))))
 
+    # Search, in one compiled program or candidate by candidate.
     begin, size = scale.first(), scale.value.size
     if compiled:
         alone = jax.jit(one)
         at = lambda z: float(alone(jnp.asarray(z, jnp.float32)))  # noqa: E731
-        found = search(lambda c, around, data, pick: jax.vmap(one)(c), begin, config, alone=at)
+        result = search(lambda c, around, data, pick: jax.vmap(one)(c), begin, config, alone=at)
     else:
         at = number
-        found = search(lambda c, *rest: np.array([number(z) for z in c]), begin, config, alone=at, host=True)
+        result = search(lambda c, *rest: np.array([number(z) for z in c]), begin, config, alone=at, host=True)
+
+    # Keep the start if the search finds nothing better.
     first = at(begin)
-    better = found.loss < first or not np.isfinite(first)
-    values = scale.parameters(np.asarray(found.z if better else begin, np.float64).reshape(size), np)
+    better = result.loss < first or not np.isfinite(first)
+    values = scale.parameters(np.asarray(result.z if better else begin, np.float64).reshape(size), np)
     return Minimum(
         {n: np.asarray(v) for n, v in values.items()},
-        found.loss if better else first,
+        result.loss if better else first,
         first,
-        found.record.history,
-        found.record.evaluations + 1,
+        result.record.history,
+        result.record.evaluations + 1,
     )
 
 

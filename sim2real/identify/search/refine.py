@@ -42,7 +42,7 @@ _LEFT = 0.1
 """A descent has converged if the next Gauss-Newton step is shorter [standard errors]."""
 _POLLED, _REACH, _BETTER = 12, 0.5, 1e-3
 """Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
-their loss must be lower. Where friction sticks, the derivative at a point says little about the points around it."""
+their loss must be lower. Where friction sticks, the derivative at a point does not describe the points around it."""
 _TRIES = 3
 OnStep = Callable[[float, np.ndarray], None]
 """Called with the best loss and point ``(P,)`` so far, after every evaluation."""
@@ -83,7 +83,6 @@ def refine(
 
     Args:
         starts: Shape ``(K, P)``.
-        data: Default: all fitted segments.
         coarse: Whether the first descents suffice, to compare with a model by percents.
         settle: Whether the end is tested, and points around it are tried if it is no minimum.
 
@@ -129,11 +128,11 @@ def remaining(problem: Problem, z: np.ndarray, data: Data | None = None) -> floa
 
     Args:
         z: Shape ``(P,)``: the point.
-        data: What is fitted; default: all fitted segments.
+        data: Segments to fit; default: all fitted ones.
     """
     at, rest = linearise(problem, z, data), determined(problem)
     if data is not None:
-        rest = rest[np.asarray(data.kept)[rest]]
+        rest = rest[np.asarray(data.present)[rest]]
     J, variance = at.jacobian.reshape(-1, len(at.x))[:, rest], loss_variance(problem, at)
     root = root_of_inverse(J.T @ J / variance + at.prior[np.ix_(rest, rest)])
     covariance = root @ root.T
@@ -178,6 +177,7 @@ class _Descent:
         if pin and self.shift.any():
             z = centred(self._problem.table, z)
         loss = self.at(z)
+        # Rounds of Levenberg-Marquardt; a round that ends worse goes half way back.
         for _ in range(1 if self._problem.evaluator.fresh else _ROUNDS):
             end = self._round(z, gain, pin)
             after = self.at(end)
@@ -209,10 +209,12 @@ class _Descent:
         """Return where least squares ends from a point."""
         from scipy.optimize import least_squares  # 0.2 s
 
+        # Linearise the initial states at the start of the round.
         value, slope = self._problem.evaluator.around(z, self._data)
         first = value(z)
         if not (np.isfinite(first).all() and np.isfinite(slope(z)).all()):
             return z
+        # Pin directions that the data does not determine, so that steps stay finite.
         pin *= float(np.linalg.norm(first))
 
         def pinned(y: np.ndarray) -> np.ndarray:
@@ -222,11 +224,12 @@ class _Descent:
         def pinned_slope(y: np.ndarray) -> np.ndarray:
             return np.concatenate([slope(y), pin * self._pinned(y)[1]])
 
+        # Descend with scipy.
         most = max(1, self._problem.config.refine_steps)
         near = max(_NEAR, self._problem.evaluator.precision)
         options: Any = {"jac": pinned_slope, "gtol": None}  # scipy's stubs have neither functions nor None
-        found = least_squares(pinned, z, ftol=gain, xtol=near, max_nfev=most, **options)
-        return np.asarray(found.x, np.float64)
+        solution = least_squares(pinned, z, ftol=gain, xtol=near, max_nfev=most, **options)
+        return np.asarray(solution.x, np.float64)
 
     def _report(self, loss: float, z: np.ndarray) -> None:
         self.steps += 1

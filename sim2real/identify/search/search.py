@@ -17,6 +17,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.programs import OnCompile, Program
 from sim2real.identify.search.pytrees import strong
+from sim2real.types import Array, Key, PyTree
 
 Losses = Callable[[Any, Any, Any, Any], Any]
 """``candidates (N, P), around (P,), data, pick (B,) or None -> losses (N,)``, traceable; ``data`` is any pytree."""
@@ -60,7 +61,7 @@ def search(
     losses: Losses | HostLosses,
     start: np.ndarray,
     config: FitConfig,
-    data: Any = None,
+    data: PyTree = None,
     weight: np.ndarray | None = None,
     on_generations: Callable[[int, float, np.ndarray], None] | None = None,
     programs: dict[Any, Any] | None = None,
@@ -134,7 +135,7 @@ def _restarts(start: np.ndarray, config: FitConfig) -> Iterator[tuple[jax.Array,
             yield k_run, start, config.std, config.population
 
 
-def _ranked(finalists: np.ndarray, alone: Callable[[Any], Any]) -> tuple[np.ndarray, float]:
+def _ranked(finalists: np.ndarray, alone: Callable[[PyTree], PyTree]) -> tuple[np.ndarray, float]:
     """Return the finalists ``(K, P)``, best first, and the loss of the best."""
     losses = np.array([float(alone(z)) for z in finalists])
     order = np.argsort(np.where(np.isfinite(losses), losses, _INFINITE))
@@ -156,19 +157,20 @@ class _Run:
         self.by_population = "mean" not in inspect.signature(type(self.strategy).init).parameters
         self.batched, self.batch = batched, config.batch
         self.devices = jax.local_devices()[: config.devices]
-        self.advance: Callable[..., Any] = Program(self._advance)
+        self.advance: Callable[..., PyTree] = Program(self._advance)
 
     def __call__(
         self,
-        key: Any,
+        key: Key,
         middle: np.ndarray,
         std: float,
         generations: int,
-        data: Any,
+        data: PyTree,
         report: Callable[[int, float, np.ndarray], None] | None,
         on_compile: OnCompile | None,
     ) -> tuple[np.ndarray, np.ndarray, int]:
         """Return the best candidate ``(P,)``, the best loss up to each generation, and the number of evaluations."""
+        # Start around the middle of the bounds.
         params = self.strategy.default_params
         if hasattr(params, "std_init"):
             params = params.replace(std_init=std)
@@ -178,6 +180,7 @@ class _Run:
         state = strong(first)  # else it compiles twice
         history: list[np.ndarray] = []
         median = np.inf
+        # Advance by several generations in one program, until the spread or the progress is small.
         for k_generations in keys:
             state, (best, medians, width) = self.advance(state, params, k_generations, data, on_compile=on_compile)
             history.append(np.asarray(best))
@@ -197,7 +200,7 @@ class _Run:
         losses = np.minimum.accumulate(np.concatenate(history))
         return np.asarray(self._best(state)), losses, self.population * losses.size
 
-    def _first(self, key: Any, middle: Any, std: float, params: Any, data: Any) -> Any:
+    def _first(self, key: Key, middle: Array, std: float, params: PyTree, data: PyTree) -> PyTree:
         if not self.by_population:
             return self.strategy.init(key, middle, params)
         k_spread, k_pick, k_init = jax.random.split(key, 3)
@@ -205,40 +208,40 @@ class _Run:
         candidates = middle + spread.at[0].set(0.0)
         return self.strategy.init(k_init, candidates, self._fitness(candidates, middle, k_pick, data), params)
 
-    def _best(self, state: Any) -> Any:
+    def _best(self, state: PyTree) -> PyTree:
         return self._middle(state) if self.batched else state.best_solution
 
-    def _middle(self, state: Any) -> Any:
+    def _middle(self, state: PyTree) -> PyTree:
         return state.best_solution if self.by_population else self.strategy.get_mean(state)
 
-    def _fitness(self, candidates: Any, around: Any, key: Any, data: Any) -> Any:
+    def _fitness(self, candidates: Array, around: Array, key: Key, data: PyTree) -> PyTree:
         fitness = self.losses(candidates, around, data[0], self._pick(key, data[1]))
         return jnp.where(jnp.isfinite(fitness), fitness, _INFINITE)
 
-    def _pick(self, key: Any, weight: Any) -> Any:
+    def _pick(self, key: Key, weight: Array) -> PyTree:
         """Return the segments with the largest of random numbers ``(B,)``; None without batches."""
         if not self.batched:
             return None
         return jax.lax.top_k(jnp.where(weight > 0.0, jax.random.uniform(key, weight.shape), -1.0), self.batch)[1]
 
-    def _divided(self, candidates: Any) -> Any:
+    def _divided(self, candidates: Array) -> PyTree:
         """Return candidates that are divided among the devices."""
         return self._spread(candidates, PartitionSpec("candidates"))
 
-    def _on_all(self, values: Any) -> Any:
+    def _on_all(self, values: Any) -> PyTree:
         """Return values that all devices hold, so that each makes the same next generation."""
         return self._spread(values, PartitionSpec())
 
-    def _spread(self, values: Any, how: PartitionSpec) -> Any:
+    def _spread(self, values: Any, how: PartitionSpec) -> PyTree:
         if len(self.devices) == 1:
             return values
         where = NamedSharding(Mesh(np.array(self.devices), ("candidates",), (AxisType.Auto,)), how)
         return jax.tree.map(lambda leaf: jax.lax.with_sharding_constraint(leaf, where), values)
 
-    def _advance(self, state: Any, params: Any, key: Any, data: Any) -> tuple[Any, Any]:
+    def _advance(self, state: PyTree, params: PyTree, key: Key, data: PyTree) -> tuple[PyTree, PyTree]:
         """Make a block of generations; return the state, and best loss, median loss and width of each generation."""
 
-        def generation(state: Any, key: Any) -> tuple[Any, Any]:
+        def generation(state: PyTree, key: Key) -> tuple[PyTree, PyTree]:
             k_ask, k_tell, pick = jax.random.split(key, 3)
             candidates, state = self.strategy.ask(k_ask, state, params)
             fitness = self._on_all(self._fitness(self._divided(candidates), self._middle(state), pick, data))
@@ -257,19 +260,21 @@ class _HostRun(_Run):
         self.advance = self._generations
         self._fresh = True
 
-    def _generations(self, state: Any, params: Any, key: Any, data: Any, on_compile: OnCompile | None) -> Any:
+    def _generations(
+        self, state: PyTree, params: PyTree, key: Key, data: PyTree, on_compile: OnCompile | None
+    ) -> PyTree:
         """Make a block of generations; as ``_advance``."""
         rows = []
         self._fresh = True
-        for own in jax.random.split(key, self.count):
-            k_ask, k_tell, pick = jax.random.split(own, 3)
+        for key_of_generation in jax.random.split(key, self.count):
+            k_ask, k_tell, pick = jax.random.split(key_of_generation, 3)
             candidates, state = self._ask(k_ask, state, params, on_compile=on_compile)
             fitness = self._fitness(candidates, self._middle(state), pick, data)
             state = strong(self._tell(k_tell, candidates, fitness, state, params, on_compile=on_compile)[0])
             rows.append((np.min(fitness), np.median(fitness), np.max(np.std(candidates, axis=0))))
         return state, tuple(np.array(column) for column in zip(*rows, strict=True))
 
-    def _fitness(self, candidates: Any, around: Any, key: Any, data: Any) -> Any:
+    def _fitness(self, candidates: Array, around: Array, key: Key, data: PyTree) -> PyTree:
         pick = self._pick(key, data[1])
         points = np.asarray(candidates, np.float64), np.asarray(around, np.float64)
         fitness = self.losses(*points, None if pick is None else np.asarray(pick), self._fresh)
@@ -277,20 +282,22 @@ class _HostRun(_Run):
         return jnp.asarray(np.where(np.isfinite(fitness), fitness, _INFINITE), jnp.float32)
 
 
-def _strategy(config: FitConfig, population: int, size: int) -> Any:
+def _strategy(config: FitConfig, population: int, size: int) -> PyTree:
     import evosax.algorithms
     import optax
 
+    # Find the algorithm, and the arguments that it needs.
     if config.strategy not in strategies():
         raise UsageError(f"unknown strategy {config.strategy!r}. Available: {', '.join(strategies())}")
     algorithm = getattr(evosax.algorithms, config.strategy)
-    arguments: dict[str, Any] = {"population_size": population, "solution": jnp.zeros(size)}
+    arguments: dict[str, PyTree] = {"population_size": population, "solution": jnp.zeros(size)}
     wanted = inspect.signature(algorithm).parameters
     missing = [n for n, p in wanted.items() if p.default is p.empty and n not in arguments]
     if missing:
         raise UsageError(
             f"the strategy {config.strategy!r} needs {', '.join(missing)}, which no search here has", hint="try CMA_ES"
         )
+    # Shrink the deviation of strategies that do not adapt it.
     if "std_schedule" in wanted:
         arguments["std_schedule"] = optax.exponential_decay(config.std, config.generations, 0.03)
     try:

@@ -101,19 +101,19 @@ def _models(widest: Fit, estimate: Fit, spread: Uncertainty, selection: Selectio
     whole = statistics(problem, at, np.ones((1, len(problem.train)), bool))
     precision = whole.information[0] / loss_variance(problem, at) + at.prior
     models = []
-    for kept, weight in zip(selection.near[1:], selection.weight[1:], strict=True):
-        columns = table.of_terms(kept)
-        start = table.at_scale(at.x + whole.step(table, kept))
+    for present, weight in zip(selection.near[1:], selection.weight[1:], strict=True):
+        columns = table.of_terms(present)
+        start = table.at_scale(at.x + whole.step(table, present))
         # Refine each other model from the minimum of that function, and keep those with a similar loss.
-        ended = refine(problem, start[None], problem.part(kept=columns), settle=False)
+        ended = refine(problem, start[None], problem.part(present=columns), settle=False)
         if ended.loss > (1.0 + _WORSE) * estimate.loss:
             continue
         # Compute its covariance from the quadratic function, widened like the estimate's.
         z, rest = ended.z, np.flatnonzero(columns)
-        fewer = ParameterTable([p for p in table if p.free], table.recordings).with_terms(_named(table, kept))
+        fewer = ParameterTable([p for p in table if p.free], table.recordings).with_terms(_named(table, present))
         covariance = _widened(np.linalg.inv(precision[np.ix_(rest, rest)]), fewer, estimate.problem.table, spread)
         drawn = _possible(fewer.posterior(z[rest], covariance), estimate.problem.table, spread)
-        models.append(Alternative(_about(table, kept), float(weight), drawn))
+        models.append(Alternative(_about(table, present), float(weight), drawn))
     return models
 
 
@@ -127,7 +127,7 @@ def _possible(posterior: Posterior, table: ParameterTable, spread: Uncertainty) 
     return replace(posterior, low=low)
 
 
-def _widened(covariance: np.ndarray, table: ParameterTable, known: ParameterTable, spread: Uncertainty) -> np.ndarray:
+def _widened(covariance: np.ndarray, table: ParameterTable, fewer: ParameterTable, spread: Uncertainty) -> np.ndarray:
     """Return a covariance that is wider than its linearisation by the factor of the estimate's covariance.
 
     Args:
@@ -136,8 +136,8 @@ def _widened(covariance: np.ndarray, table: ParameterTable, known: ParameterTabl
     deviation, usual = np.sqrt(np.diag(covariance)), float(np.median(spread.widening))
     factor = np.full(len(deviation), usual)
     for i, name in enumerate(table.names):
-        if name in known.names:
-            j = known.names.index(name)
+        if name in fewer.names:
+            j = fewer.names.index(name)
             ratio = float(np.sqrt(spread.scale_covariance[j, j]) / deviation[i])
             factor[i] = min(ratio, usual) if spread.verdict[j] in ABSENT else spread.widening[j]
     factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / deviation))
@@ -150,9 +150,9 @@ def _by_segment(residuals: np.ndarray) -> np.ndarray:
     return np.sum(rows**2, axis=1) / np.maximum(np.count_nonzero(rows, axis=1), 1)
 
 
-def _named(table: ParameterTable, kept: np.ndarray) -> list[str]:
-    return [name for name, there in zip(table.terms, kept, strict=True) if there]
+def _named(table: ParameterTable, present: np.ndarray) -> list[str]:
+    return [name for name, there in zip(table.terms, present, strict=True) if there]
 
 
-def _about(table: ParameterTable, kept: np.ndarray) -> str:
-    return f"with {', '.join(_named(table, kept))}" if kept.any() else "without optional terms"
+def _about(table: ParameterTable, present: np.ndarray) -> str:
+    return f"with {', '.join(_named(table, present))}" if present.any() else "without optional terms"

@@ -58,6 +58,7 @@ def negligible(
     ]
     if not suspects:
         return spread, check
+    # Compute bounds of the suspects, and test them together.
     bounds = _bounded(problem, z, at, spread, suspects)
     bounds = _apart(bounds, problem, at, check)
     if not bounds:
@@ -113,9 +114,11 @@ def _judged(problem: Problem, at: Linearised, spread: Uncertainty, bounds: Bound
 
 def _bounded(problem: Problem, z: np.ndarray, at: Linearised, spread: Uncertainty, suspects: Sequence[int]) -> Bounds:
     """Return the bounds of the suspects that may be absent, together with all suspects before them."""
+    # Profile each suspect: the loss at its bound, with the other parameters free.
     table, size = problem.table, len(at.x)
     profiles = {i: profile(problem, z, at, spread, i) for i in suspects}
     bounds: Bounds = {}
+    # Keep those that the log allows at their bound.
     for i, curve in profiles.items():
         bound, p = curve.bound(), table.columns[i].parameter
         if (

@@ -81,7 +81,7 @@ def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> floa
 
 
 def _quantum(readings: Sequence[float] | np.ndarray) -> float:
-    """Return the step of which nearly all differences between readings are multiples; 0 if there is none."""
+    """Return the step that divides nearly all differences between readings; 0 without such a step."""
     levels = np.unique(np.asarray(readings, np.float64))
     steps = np.diff(levels)
     steps = steps[steps > 1e-6 * max(1e-12, float(np.ptp(levels)))] if levels.size > 1 else np.zeros(0)

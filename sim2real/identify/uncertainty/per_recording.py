@@ -54,7 +54,7 @@ def identify_each(estimate: Fit) -> list[tuple[Mapping[str, Value], Uncertainty]
 
 
 def _quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
-    """Return the quantities to compare: name, unit, and the parameters of which each is the sum."""
+    """Return the quantities to compare: name, unit, and the parameters whose sum each is."""
     free = [p for p in parameters if p.free and not p.per_recording]
     delays = [p.name for p in free if p.kind == "delay"]
     rows = [(p.name, p.unit, [p.name]) for p in free if p.kind != "delay" or len(delays) == 1]

@@ -18,8 +18,6 @@ class RoundTrip:
     """Time from a command to the first measurement of its effect; times in [s].
 
     Attributes:
-        parts: Identified delays.
-        held: Fixed delays.
         apart: Whether the log separates the parts.
         estimate: The sum.
         low: Lower end of the 95 % interval.
@@ -60,6 +58,7 @@ def round_trip(table: ParameterTable, x: np.ndarray, spread: Uncertainty) -> Rou
     Args:
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
     """
+    # Sum free and fixed delays, and their bounds.
     free = [i for i, c in enumerate(table.columns) if c.parameter.kind == "delay"]
     if not free:
         return None

@@ -1,4 +1,4 @@
-"""How well the recordings determine the parameters: covariance, intervals, and what is not determined at all."""
+"""Covariance and intervals of the parameters by the recordings, and parameters that they do not determine."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _INSIDE = 5e-3
 """Share of the bounds' width from a bound within which derivatives are taken further inside: a servo's by a delay of up
 to 20 ms were mostly rounding at 1e-4 of it."""
 _RESOLVED = 1e-13
-"""Least eigenvalue of a precision with a diagonal of ones: what is below is rounding of doubles."""
+"""Least eigenvalue of a precision with a diagonal of ones: smaller ones are rounding errors of doubles."""
 _LEAST_FREEDOM = 2.0
 """With fewer degrees of freedom Satterthwaite's approximation fails: Tipton, Psychological Methods 20 (2015)."""
 _ALONE = 0.5
-"""Share of the information about a parameter above which one part stands alone with what it says."""
+"""Share of the information about a parameter above which a single part determines it."""
 _BY_CHANCE = (0.2, 0.05)
 """Intervals begin to widen where chance alone would make blocks differ as much in this share of recordings, and widen
 in full in this one: a sharp limit doubled an interval, or did not, by the last digits of a fit."""
@@ -106,18 +106,18 @@ def linearise(problem: Problem, z: np.ndarray, data: Data | None = None) -> Line
 
     Args:
         z: Shape ``(P,)``: the point.
-        data: What is fitted; default: all fitted segments.
+        data: Segments to fit; default: all fitted ones.
     """
     table = problem.table
     most = np.log((1.0 - _INSIDE) / _INSIDE)
     inside = np.clip(z, -most, most)
-    found = problem.at(inside, data)
+    evaluation = problem.at(inside, data)
     at, stretch = table.scale(inside)
-    x, J = table.scale(z)[0], found.jacobian / stretch
+    x, J = table.scale(z)[0], evaluation.jacobian / stretch
     onward = J @ (x - at)
-    priors = found.prior_jacobian / stretch
+    priors = evaluation.prior_jacobian / stretch
     prior = priors.T @ priors + np.diag(12.0 / table.span**2)
-    return Linearised(found.residuals + onward, J, prior, x, found.raw + onward)
+    return Linearised(evaluation.residuals + onward, J, prior, x, evaluation.raw + onward)
 
 
 def uncertainty(problem: Problem, z: np.ndarray) -> Uncertainty:
@@ -140,6 +140,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     unknown within the bounds, and neither delay is ever accepted alone. Where initial states are free no other
     estimate depends on it, and it is held while the others are judged; where they are given, the others move with it.
     """
+    # Covariance of a linear model with white noise.
     table, size = problem.table, len(at.x)
     J, (count, free, inflation) = at.jacobian.reshape(-1, size), _freedom(problem, at)
     variance = loss_variance(problem, at)
@@ -148,6 +149,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     cov = np.zeros((size, size))
     root = root_of_inverse(precision)
     cov[np.ix_(rest, rest)] = root @ root.T
+    # Widen the errors to those between blocks of the log.
     quantile = float(stdtrit(max(count / inflation - free, 1.0), 0.975))
     linear, wider = np.sqrt(np.diag(cov)), np.ones(size)
     error, freedom = _by_blocks(*_blocks(problem, at, rest), (at.prior * variance)[np.ix_(rest, rest)])
@@ -155,12 +157,14 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     # No standard error grows beyond that of a uniform distribution within the bounds.
     wider = np.minimum(wider, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(linear, 1e-30)))
     cov *= np.outer(wider, wider)
+    # Directions that shift all delays are limited by the bounds alone.
     down, up = shift_range(table, at.x, shift)
     reach = quantile * np.sqrt(np.diag(cov))
     low = table.unscale(at.x - reach + np.minimum(down * shift, up * shift))
     high = table.unscale(at.x + reach + np.maximum(down * shift, up * shift))
     cov += np.outer(shift, shift) * (up - down) ** 2 / 12.0
     error = np.sqrt(np.diag(cov))
+    # Return to the parameters' own scales.
     slope = table.slope(at.x)
     margin = np.minimum(at.x - table.low, table.high - at.x) / table.span
     return Uncertainty(
@@ -200,24 +204,24 @@ def _freedom(problem: Problem, at: Linearised) -> tuple[int, int, float]:
 def between_parts(
     spread: Uncertainty, table: ParameterTable, x: np.ndarray, moved: np.ndarray, share: np.ndarray
 ) -> Uncertainty:
-    """Return wider intervals where estimates without a part of the recordings differ more than by chance.
+    """Return wider intervals if estimates without a part of the recordings differ more than by chance.
 
     The standard error is that of the jackknife over parts (Efron and Stein, Annals of Statistics 9, 1981). Parts are
-    recordings, or long blocks: it holds what differs from one to the next, which shorter blocks do not show. It says
-    nothing about a parameter of which a single part says more than all others together: such intervals stay.
+    recordings, or long blocks, and show differences that shorter blocks do not show. Intervals of a parameter stay
+    unchanged if one part has more information about it than all others together.
 
     Args:
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         moved: Shape ``(K, P)``: estimates without each part, on the scales.
-        share: Shape ``(K, P)``: which share of the information about each parameter a part holds.
+        share: Shape ``(K, P)``: share of each part in the information about each parameter.
     """
     parts = len(moved)
     error = np.sqrt((parts - 1) / parts * np.sum((moved - moved.mean(axis=0)) ** 2, axis=0))
-    own = np.sqrt(np.diag(spread.scale_covariance))
+    errors = np.sqrt(np.diag(spread.scale_covariance))
     shifts = time_shift(table) != 0.0
-    factor = _widening(error / np.maximum(own, 1e-30), np.full(len(x), parts - 1.0), float(stdtrit(1e3, 0.975)))
+    factor = _widening(error / np.maximum(errors, 1e-30), np.full(len(x), parts - 1.0), float(stdtrit(1e3, 0.975)))
     factor = np.where((share.max(axis=0) > _ALONE) | shifts, 1.0, factor)
-    factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(own, 1e-30)))
+    factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(errors, 1e-30)))
     return scaled(spread, table, x, factor)
 
 
@@ -228,6 +232,7 @@ def scaled(spread: Uncertainty, table: ParameterTable, x: np.ndarray, factor: np
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         factor: Shape ``(P,)``: on standard errors and on the reach of intervals.
     """
+    # Widen on the parameters' scales, then return to their units.
     shifts = time_shift(table) != 0.0
     cov = spread.scale_covariance * np.outer(factor, factor)
     middle = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, table.unscale(x), strict=True)])
@@ -313,26 +318,26 @@ def _blocks(problem: Problem, at: Linearised, columns: np.ndarray) -> tuple[np.n
 def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the standard errors ``(Q,)`` that blocks show, and their degrees of freedom ``(Q,)``.
 
-    The variance is the sum of squares of how far each block moves the estimate, whatever the residuals within a block
-    are like (a "sandwich" estimate). Blocks that weigh much have residuals that are too small, since the fit follows
-    them: they are scaled up so that the variance is unbiased for white noise (Bell and McCaffrey, Survey Methodology
+    The variance is the sum of squares of the blocks' effects on the estimate, for any correlation of residuals within
+    a block (a "sandwich" estimate). The fit follows blocks of large weight, so their residuals are too
+    small: they are scaled up so that the variance is unbiased for white noise (Bell and McCaffrey, Survey Methodology
     28, 2002). A bootstrap over blocks was 1.15 times too large with ten blocks that differ.
 
     Args:
         gradients: Shape ``(B, Q)``.
         informations: Shape ``(B, Q, Q)``.
-        prior: Shape ``(Q, Q)``: what the prior adds to the information.
+        prior: Shape ``(Q, Q)``: information of the prior.
     """
     root = root_of_inverse(informations.sum(axis=0) + prior)
-    shares = root.T @ informations @ root  # they sum to the identity, less the prior's
+    shares = root.T @ informations @ root  # their sum is the identity, minus the prior's share
     left, axes = np.linalg.eigh(np.eye(len(root)) - shares)
     scaled = (axes / np.sqrt(np.maximum(left, 1e-3))[:, None, :]) @ axes.transpose(0, 2, 1)
     moves = np.einsum("pq,bqr->pbr", root, scaled)
     variance = np.sum(np.einsum("pbr,br->pb", moves, gradients @ root) ** 2, axis=1)
     # Satterthwaite's degrees of freedom, from the covariance that white noise gives the moves of blocks.
-    seen = np.einsum("pbr,brs->pbs", moves, shares)
-    own = np.einsum("pbr,pbr->pb", seen, moves)[:, :, None] * np.eye(len(shares))
-    between = own - seen @ seen.transpose(0, 2, 1)
+    pulls = np.einsum("pbr,brs->pbs", moves, shares)
+    diagonal = np.einsum("pbr,pbr->pb", pulls, moves)[:, :, None] * np.eye(len(shares))
+    between = diagonal - pulls @ pulls.transpose(0, 2, 1)
     trace, square = np.trace(between, axis1=1, axis2=2), np.sum(between**2, axis=(1, 2))
     return np.sqrt(variance), trace**2 / np.maximum(square, 1e-300)
 
@@ -340,8 +345,8 @@ def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarra
 def root_of_inverse(precision: np.ndarray) -> np.ndarray:
     """Return ``R (Q, Q)`` with ``R R' = precision^-1``, for a matrix that rounding may have made indefinite.
 
-    What was measured a million times, and what only the bounds say, differ by more than doubles resolve: the inverse
-    had negative variances there.
+    A quantity with a million measurements and one with bounds alone differ by more than doubles resolve: a plain
+    inverse had negative variances there.
     """
     unit = 1.0 / np.sqrt(np.diag(precision))
     values, axes = np.linalg.eigh(precision * np.outer(unit, unit))

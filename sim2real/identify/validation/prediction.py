@@ -68,7 +68,7 @@ def _goals(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str,
             for n, tree in problem.model.given.items()
             if c.goal in (fields := jax.tree_util.tree_leaves(tree))
         )
-        rows = np.asarray(jax.tree_util.tree_leaves(problem.given[node])[place])
+        rows = np.asarray(jax.tree_util.tree_leaves(problem.messages[node])[place])
         sent_s = problem.timeline.vertices[node].end / TICKS_PER_S
         # Take the newest goal before each sample.
         goals = np.empty(len(into))

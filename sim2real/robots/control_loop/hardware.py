@@ -7,14 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
-from sim2real.graph.node import BaseNode
+from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.robots.roles import ROLES
+from sim2real.types import Key, PyTree
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
@@ -40,11 +41,11 @@ class Embedded:
     plant_args: Mapping[str, Any] = field(default_factory=dict)
 
     def mounted(self, joints: Sequence[Joint], zero_rad: float) -> Embedded:
-        """Return the same robot with its joints mounted; where all are plain, nothing is in between.
+        """Return the same robot with its joints mounted; plain joints change nothing.
 
         Args:
-            joints: One per servo, in the order of the plant's ``servo_ids``.
-            zero_rad: What an encoder reads, from count 0, where the device says 0 [rad].
+            joints: One for each servo, in the order of the plant's ``servo_ids``.
+            zero_rad: Reading of an encoder, from count 0, at the device's 0 [rad].
         """
         if all(joint.is_plain for joint in joints):
             return self
@@ -57,12 +58,11 @@ class ServoSession:
     """An open robot: the rig, and, for the port ``embedded``, the process of the emulated robot.
 
     Args:
-        port: What the device is connected to; may be ``embedded``.
         device: Returns the device on a port, not opened yet.
         embedded: The emulated robot; None: there is none.
         truth_path: File for the emulated robot's true states and latencies.
         seed: Seed of the emulated robot's jitter and faults.
-        joints: How each motor's joint is mounted; none: as the device measures and commands it.
+        joints: How each motor's joint is mounted; default: as the device measures and commands it.
 
     Raises:
         UsageError: The port is ``embedded``, but the robot has none.
@@ -79,7 +79,7 @@ class ServoSession:
         seed: int,
         joints: Sequence[Joint] = (),
     ) -> None:
-        # Training makes robots, too, and must not import what opens them.
+        # Imported here: training also makes robots, and must not import their drivers.
         from sim2real.hardware.emulation.embedded import EmbeddedRobot
         from sim2real.hardware.safety.rig import Rig
 
@@ -113,7 +113,6 @@ class ServoSensor(BaseNode):
 
     Args:
         rate: Steps per second [Hz].
-        message: Makes the node's message from a reading.
         rest: The message of a robot at rest, which is the default output.
         **options: Options of ``BaseNode``.
     """
@@ -126,18 +125,18 @@ class ServoSensor(BaseNode):
         rate: float,
         rig: Rig,
         message: Callable[[Reading], Any],
-        rest: Any,
-        **options: Any,
+        rest: PyTree,
+        **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
         self._rig, self._message, self._rest = rig, message, rest
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the message of a robot at rest."""
         del rng, graph_state
         return self._rest
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Read the servos."""
         reading = self._rig.measure()
         ts = max(self.at(reading.transaction.t_sent_ns), float(step_state.ts))
@@ -150,7 +149,6 @@ class ServoActuator(BaseNode):
     Args:
         rate: Steps per second [Hz].
         field: Field of the agent's message that is the command, shape ``(servos,)``.
-        message: Makes the node's message from the command that was sent.
         **options: Options of ``BaseNode``.
     """
 
@@ -164,12 +162,12 @@ class ServoActuator(BaseNode):
         field: str,
         message: Callable[[np.ndarray], Any],
         agent: str = ROLES.supervisor,
-        **options: Any,
+        **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
         self._rig, self._field, self._message, self._agent = rig, field, message, agent
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return a message with zeros."""
         del rng, graph_state
         return self._message(np.zeros(len(self._rig.device.motors)))
@@ -186,7 +184,7 @@ class ServoActuator(BaseNode):
         self._rig.stop()
         return True
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Send the newest command.
 
         Raises:
@@ -206,7 +204,6 @@ class Excitation(BaseNode):
     Args:
         rate: Steps per second [Hz].
         signal: Shape ``(N, servos)``: one command per step; after its end zeros are sent.
-        message: Makes the node's message from a command.
         **options: Options of ``BaseNode``.
 
     Raises:
@@ -216,19 +213,24 @@ class Excitation(BaseNode):
     jittable = False
 
     def __init__(
-        self, name: str, rate: float, signal: np.ndarray, message: Callable[[np.ndarray], Any], **options: Any
+        self,
+        name: str,
+        rate: float,
+        signal: np.ndarray,
+        message: Callable[[np.ndarray], Any],
+        **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
         if not np.isfinite(signal).all():
             raise UsageError("the excitation holds values that are no numbers")
         self._signal, self._message = signal, message
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return a message with zeros."""
         del rng, graph_state
         return self._message(np.zeros(self._signal.shape[1]))
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Return the next command."""
         seq = int(step_state.seq)
         over = seq >= len(self._signal)

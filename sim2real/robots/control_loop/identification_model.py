@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from sim2real.robots.control_loop.loop import DelayParams, delay_parameters, rec
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.control_loop.simulated_devices import SimSensor
 from sim2real.robots.robot_parts import ConnectedParts
-from sim2real.types import Array, PyTree
+from sim2real.types import Array, PyTree, Scalar
 
 
 class IdentifiableLoop:
@@ -39,7 +38,7 @@ class IdentifiableLoop:
         sensor = SimSensor(self.sensor, robot.rate_hz, world)
         return recorded_loop(sensor, robot.sim_actuator(), world, max_delay_s, self.ahead_s, robot.model.lead_s)
 
-    def params(self, values: Mapping[str, Any], start: Array) -> dict[str, PyTree]:
+    def params(self, values: Mapping[str, Scalar], start: Array) -> dict[str, PyTree]:
         """Return the nodes' parameters.
 
         Args:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
 
 import jax
 import numpy as np
@@ -16,13 +15,14 @@ from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, Scheduling
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.roles import ROLES, Roles
+from sim2real.types import PyTree, Scalar
 
 BURST = 3
 """Extra messages in the world's window of commands. After a hiccup, the actuator makes its missed steps one right after
 the other, so that commands come faster than its rate for a moment."""
 DELAYS = ("sensor_delay", "actuator_delay")
 """Names of the two delays: from the world to the sensor, and from the actuator to the world."""
-Draw = Callable[[jax.Array], dict[str, Any]]
+Draw = Callable[[jax.Array], dict[str, PyTree]]
 """Draws dynamics and delays of an episode: key -> values by name."""
 EMPTY: Mapping[str, np.ndarray] = MappingProxyType({})
 """No samples."""
@@ -37,12 +37,12 @@ class DelayParams(Base):
         noise: Factor on deviation and bias of a sensor's noise; None: 1.
     """
 
-    delay: Any = None
-    noise: Any = None
+    delay: Scalar | None = None
+    noise: Scalar | None = None
 
 
-def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, Any]:
-    """Return what ``init_delays`` returns: the delay in a node's ``DelayParams``, if it has one.
+def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict[str, PyTree]:
+    """Return the result of ``init_delays``: the delay in a node's ``DelayParams``, if it has one.
 
     Args:
         input_name: The input that it belongs to.
@@ -90,8 +90,8 @@ def delay_bounds(
     """
     bounds = {}
     for name, lead in zip(DELAYS, (0.0, lead_s), strict=True):
-        own = np.append(draws.get(name, []), values[name])
-        low, high = float(own.min()) - tick_s - spread_s, float(own.max()) + spread_s
+        delays = np.append(draws.get(name, []), values[name])
+        low, high = float(delays.min()) - tick_s - spread_s, float(delays.max()) + spread_s
         bounds[name] = (values[name] + lead, max(0.0, low), high + lead)
     return bounds
 
@@ -100,7 +100,7 @@ def in_a_loop(values: Mapping[str, float], tick_s: float, spread_s: float) -> di
     """Return parameters with part of the actuator's delay moved to the sensor, as far as a simulated loop needs it.
 
     The simulated sensor interpolates between ticks of the world, so its delay must be at least one tick: the next tick
-    is not simulated yet. Only the sum of both delays affects what a policy sees of the effect of its commands.
+    is not simulated yet. Only the sum of both delays affects a policy's observations of its commands.
 
     Args:
         values: Parameters by name, with both delays [s] or neither.
@@ -119,7 +119,7 @@ def drawn_in_a_loop(
 ) -> dict[str, np.ndarray]:
     """Return samples of parameters with the sensor's delay as ``in_a_loop`` has it, as far as the sum of both allows.
 
-    All that the sum varies by is then in the actuator's delay: a policy sees only the sum.
+    The variation of the sum is then in the actuator's delay: only the sum affects a policy.
 
     Args:
         values: Parameters by name, with both delays [s] or neither; a delay that is not drawn is as here.
@@ -162,7 +162,7 @@ def simulated_loop(
     """Connect the whole loop in simulation, for training and for comparison with hardware.
 
     Args:
-        delays: What ``delay_bounds`` returns; None: no delays.
+        delays: Result of ``delay_bounds``; None: no delays.
 
     Returns:
         The four nodes by name.
@@ -196,7 +196,7 @@ def recorded_loop(
     return {n.name: n for n in (sensor, actuator, world)}
 
 
-def draw_values(key: jax.Array, values: Mapping[str, float], draws: Mapping[str, jax.Array]) -> dict[str, Any]:
+def draw_values(key: jax.Array, values: Mapping[str, float], draws: Mapping[str, jax.Array]) -> dict[str, PyTree]:
     """Draw the parameters of one episode.
 
     Args:

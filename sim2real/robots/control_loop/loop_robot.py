@@ -6,24 +6,24 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState
-from sim2real.graph.node import BaseNode
+from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.hardware.joint import Joint
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
+from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask, Session
 from sim2real.robots.control_loop.hardware import Embedded, ServoSession
 from sim2real.robots.control_loop.loop import Draw, in_a_loop
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.probe import Probe
 from sim2real.robots.roles import Roles
 from sim2real.train.environment.tasks import Rewards
-from sim2real.types import Array, Key, PyTree
+from sim2real.types import Array, Key, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Reading
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 class _Params:
     """A start that is already the parameters of all nodes, or of the agent alone."""
 
-    params: Any
+    params: PyTree
     trial: int = 0
 
 
@@ -52,7 +52,7 @@ class LoopRobot(Robot):
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     lead_s: float = 0.0
 
-    def __init_subclass__(cls, **options: Any) -> None:
+    def __init_subclass__(cls, **options: object) -> None:
         """Warn of the next release."""
         super().__init_subclass__(**options)
         warnings.warn(
@@ -66,20 +66,20 @@ class LoopRobot(Robot):
         self.sensor, self.drive, self.agent = _Sensor(self), _Drive(self), _Agent(self)
         self.model, self.task = _Model(self), _Task(self)
 
-    def judged(self, graph_state: GraphState) -> Any:
+    def judged(self, graph_state: GraphState) -> PyTree:
         """Return the state that ``reward`` and ``success`` evaluate: the world's."""
         return graph_state.state[self.roles.world]
 
-    def terminated(self, state: Any) -> jax.Array:
+    def terminated(self, state: PyTree) -> jax.Array:
         """Return whether the episode ends, bool."""
         del state
         return jnp.bool_(False)
 
-    def true_state(self, state: Any) -> PyTree:
+    def true_state(self, state: PyTree) -> PyTree:
         """Return the part of the world's state that a value function may observe."""
         return state
 
-    def displaced(self, params: Mapping[str, Any], position: Array, velocity: Array) -> dict[str, Any]:
+    def displaced(self, params: Mapping[str, PyTree], position: Array, velocity: Array) -> dict[str, PyTree]:
         """Return an episode's parameters with another start: ``start`` of the world's parameters is changed."""
         world = params[self.roles.world]
         moved = jnp.asarray(world.start) + jnp.concatenate([jnp.asarray(position), jnp.asarray(velocity)])
@@ -99,14 +99,14 @@ class LoopRobot(Robot):
         )
 
     def simulation_params(
-        self, values: Mapping[str, float], policy: Any, trial: int = 0, measured: np.ndarray | None = None
+        self, values: Mapping[str, float], policy: PyTree, trial: int = 0, measured: np.ndarray | None = None
     ) -> dict[str, PyTree]:
-        """Return the nodes' parameters for an episode in simulation that starts at rest, as ``rest_params`` says."""
+        """Return the nodes' parameters for an episode in simulation that starts at rest."""
         del measured
         robot: Any = self
         return robot.rest_params(in_a_loop(values, self.model.tick_s, self.delay_spread_s), policy, trial)
 
-    def node_parameters(self, values: Mapping[str, Any], start: Any, policy: Any = None) -> dict[str, PyTree]:
+    def node_parameters(self, values: Mapping[str, Scalar], start: PyTree, policy: PyTree = None) -> dict[str, PyTree]:
         """Return the parameters of all nodes."""
         if isinstance(start, _Params):
             return dict(start.params)
@@ -134,13 +134,13 @@ class _Drive(RobotDrive):
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
         return self._robot.connect(port, limits, truth_path, seed)
 
-    def prepare(self, session: Any, settle_s: float) -> None:
+    def prepare(self, session: Session, settle_s: float) -> None:
         self._robot.prepare(session, settle_s)
 
     def around(self, signal: np.ndarray) -> np.ndarray:
         return self._robot.around(signal)
 
-    def measured_start(self, session: Any, start: Any) -> Any:
+    def measured_start(self, session: Session, start: PyTree) -> PyTree:
         return _Params(self._robot.agent_params(session, None, start.trial))
 
 
@@ -149,11 +149,11 @@ class _Agent(RobotAgent):
         self._robot, self.observation, self.action = robot, robot.observation, robot.action
         self.limits, self.tilt_rad = robot.limits, getattr(robot, "tilt_rad", None)
 
-    def make(self, rate_hz: float, **options: Any) -> BaseNode:
+    def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> BaseNode:
         del rate_hz
         return self._robot.make_agent(**options)
 
-    def params(self, start: Any, policy: Any) -> PyTree:
+    def params(self, start: PyTree, policy: PyTree) -> PyTree:
         del policy
         return start.params
 
@@ -170,10 +170,10 @@ class _Model(RobotModel):
     def make_world(self, resumed: bool = False) -> BaseNode:
         return self._robot.make_world(resumed)
 
-    def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PyTree:
+    def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> PyTree:
         return self._robot.node_parameters(values, start)[self._robot.roles.world]
 
-    def true_state(self, state: Any) -> PyTree:
+    def true_state(self, state: PyTree) -> PyTree:
         return self._robot.true_state(state)
 
 
@@ -181,26 +181,26 @@ class _Task(RobotTask):
     def __init__(self, robot: Any) -> None:
         self._robot = robot
 
-    def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], Any]:
+    def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], Any]:
         return {}, _Params(self._robot.random_params(key, draw))
 
-    def at_rest(self, trial: int) -> Any:
+    def at_rest(self, trial: int) -> PyTree:
         return _Params(None, trial)
 
-    def moved(self, start: Any, position: Array, velocity: Array) -> Any:
+    def moved(self, start: PyTree, position: Array, velocity: Array) -> PyTree:
         return _Params(self._robot.displaced(start.params, position, velocity))
 
-    def judged(self, graph_state: GraphState, roles: Roles) -> Any:
+    def judged(self, graph_state: GraphState, roles: Roles) -> PyTree:
         del roles
         return self._robot.judged(graph_state)
 
-    def reward(self, state: Any, action: jax.Array) -> Rewards:
+    def reward(self, state: PyTree, action: jax.Array) -> Rewards:
         return self._robot.reward(state, action)
 
-    def success(self, state: Any) -> jax.Array:
+    def success(self, state: PyTree) -> jax.Array:
         return self._robot.success(state)
 
-    def terminated(self, state: Any) -> jax.Array:
+    def terminated(self, state: PyTree) -> jax.Array:
         return self._robot.terminated(state)
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from flax import struct
 
 from sim2real.graph.base import Base
+from sim2real.types import Array
 
 
 @struct.dataclass
@@ -18,8 +17,8 @@ class JointReading(Base):
         velocity: Shape ``(joints,)`` [rad/s].
     """
 
-    position: Any
-    velocity: Any
+    position: Array
+    velocity: Array
 
 
 @struct.dataclass
@@ -30,32 +29,32 @@ class Goals(Base):
         goal: Shape ``(joints,)``: goal positions [rad].
     """
 
-    goal: Any
+    goal: Array
 
 
 @struct.dataclass
 class Decision(Base):
-    """The agent's message: a command, and what the task asks for.
+    """The agent's message: a command, and the aim of the task.
 
     Attributes:
         goal: Shape ``(joints,)``: goal positions [rad].
-        aim: Shape ``(k,)``: what the task asks for in this episode, e.g. a target's position ``(3,)`` [m].
+        aim: Shape ``(k,)``: the task's aim in this episode, e.g. a target's position ``(3,)`` [m].
     """
 
-    goal: Any
-    aim: Any
+    goal: Array
+    aim: Array
 
 
 @struct.dataclass
 class EpisodeStart(Base):
-    """Where an episode starts, and what it is about.
+    """The start and the aim of an episode.
 
     Attributes:
         position: Shape ``(channels,)``: positions of the joints [rad].
         velocity: Shape ``(channels,)`` [rad/s].
-        aim: Shape ``(k,)``: what the task asks for, e.g. a target's position ``(3,)`` [m].
+        aim: Shape ``(k,)``: the task's aim, e.g. a target's position ``(3,)`` [m].
     """
 
-    position: Any
-    velocity: Any
-    aim: Any
+    position: Array
+    velocity: Array
+    aim: Array

@@ -11,10 +11,11 @@ import numpy as np
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.policy.upright import Runner
+from sim2real.types import Key, PyTree
 
 
 class PolicyNode(BaseNode):
-    """Stands in for the agent on the wall clock: what is run is the bundle's runner, not a policy made again in JAX.
+    """The agent's node on the wall clock; it calls the bundle's runner instead of a policy in JAX.
 
     The agent makes observations and messages, from numpy arrays; its own ``step`` is not called.
 
@@ -28,15 +29,15 @@ class PolicyNode(BaseNode):
         super().__init__(agent.name, agent.rate, delay=agent.delay, delay_dist=agent.delay_dist)
         self._agent, self._runner = agent, runner
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the agent's parameters, in numpy."""
         return _in_numpy(self._agent.init_params, rng, graph_state)
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the agent's state, in numpy."""
         return _in_numpy(self._agent.init_state, rng, graph_state)
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the agent's default message, in numpy."""
         return _in_numpy(self._agent.init_output, rng, graph_state)
 
@@ -46,7 +47,7 @@ class PolicyNode(BaseNode):
         self._runner.reset()
         return True
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Make a step with the policy's action.
 
         Raises:
@@ -56,10 +57,10 @@ class PolicyNode(BaseNode):
         return self._agent.act(step_state, action)
 
 
-def in_numpy(tree: Any) -> Any:
-    """Return a pytree with numpy arrays for leaves: arrays of JAX would draw all that meets them into JAX."""
+def in_numpy(tree: PyTree) -> PyTree:
+    """Return a pytree with numpy arrays for leaves: an array of JAX turns every later computation into one of JAX."""
     return jax.tree_util.tree_map(np.asarray, tree)
 
 
-def _in_numpy(make: Callable[[Any, GraphState | None], Any], rng: Any, graph_state: GraphState | None) -> Any:
+def _in_numpy(make: Callable[[Any, GraphState | None], Any], rng: Any, graph_state: GraphState | None) -> PyTree:
     return in_numpy(make(rng, graph_state))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -13,19 +13,20 @@ from flax import struct
 
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.errors import UsageError
-from sim2real.graph.base import Base, GraphState, StepState
-from sim2real.graph.node import BaseNode
+from sim2real.graph.base import Base, GraphState, StepState, Value
+from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.robots.control_loop.loop import DelayParams, delay_of
 from sim2real.robots.control_loop.messages import Goals
 from sim2real.robots.roles import ROLES
+from sim2real.types import Array, Key, PyTree
 
 
 class NoiseSizes(NamedTuple):
     """Sizes of a sensor's noise, each of shape ``(noise,)`` in the units of ``Noise``."""
 
-    deviation: Any
-    quantum: Any
-    bias: Any
+    deviation: Array
+    quantum: Array
+    bias: Array
 
 
 class SimSensor(BaseNode):
@@ -33,14 +34,13 @@ class SimSensor(BaseNode):
 
     Args:
         rate: Steps per second [Hz].
-        world: The world that it reads.
         **options: Options of ``BaseNode``.
 
     Attributes:
-        noise: What readings have on top of the motion; empty: they are exact.
+        noise: Noise of the readings; empty: they are exact.
     """
 
-    def __init__(self, name: str, rate: float, world: BaseNode, **options: Any) -> None:
+    def __init__(self, name: str, rate: float, world: BaseNode, **options: Unpack[NodeOptions]) -> None:
         super().__init__(name, rate, **options)
         self._world = world
         self.noise: tuple[Noise, ...] = ()
@@ -60,21 +60,21 @@ class SimSensor(BaseNode):
         sensor._sizes = data
         return sensor
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> DelayParams:
         """Return parameters without a delay."""
         del rng, graph_state
         return DelayParams()
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the world's message at the start."""
         return self._world.init_output(rng, graph_state)
 
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+    def init_delays(self, rng: Key | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the sensing delay [s], if the parameters have one."""
         del rng
         return delay_of(self.name, self._world.name, graph_state)
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the biases of an episode, ``(noise,)``; without any noise there is no state."""
         if (sizes := self.data) is None:
             return super().init_state(rng, graph_state)
@@ -82,29 +82,29 @@ class SimSensor(BaseNode):
         params = (graph_state or GraphState()).params.get(self.name)
         return SensorBias(_scale(params) * drawn * sizes.bias)
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Return the world's message, with noise if there is any."""
         message = step_state.inputs[self._world.name][-1].data
         return step_state, message if (sizes := self.data) is None else self._noisy(message, step_state, sizes)
 
-    def _noisy(self, message: Any, step_state: StepState, sizes: NoiseSizes) -> Any:
+    def _noisy(self, message: PyTree, step_state: StepState, sizes: NoiseSizes) -> PyTree:
         if step_state.rng is None:
             raise UsageError(f"sensor {self.name!r} has noise and no random numbers to draw it from")
         # A key of its own for each step; the sensor has no other use for its random numbers.
         key = jax.random.fold_in(step_state.rng, step_state.seq)
         added = jax.random.normal(key, (len(self.noise),)) * sizes.deviation
         added = _scale(step_state.params) * added + step_state.state.bias
-        changed: dict[str, Any] = {}
+        changed: dict[str, PyTree] = {}
         for noise, error, quantum in zip(self.noise, added, sizes.quantum, strict=True):
             field, index = noise.place
             value = jnp.asarray(changed.get(field, getattr(message, field)))
-            own = (value if index is None else value[index]) + error
-            own = quantum * jnp.round(own / quantum) if noise.quantum else own
-            changed[field] = own if index is None else value.at[index].set(own)
+            entry = (value if index is None else value[index]) + error
+            entry = quantum * jnp.round(entry / quantum) if noise.quantum else entry
+            changed[field] = entry if index is None else value.at[index].set(entry)
         return message.replace(**changed)
 
 
-def _scale(params: Any) -> Any:
+def _scale(params: PyTree) -> PyTree:
     """Return the factor on the noise in a sensor's parameters."""
     noise = getattr(params, "noise", None)
     return 1.0 if noise is None else noise
@@ -112,13 +112,13 @@ def _scale(params: Any) -> Any:
 
 @struct.dataclass
 class SensorBias(Base):
-    """What a simulated sensor's readings are off by in an episode.
+    """The constant error of a simulated sensor's readings in an episode.
 
     Attributes:
         bias: Shape ``(noise,)``, each in the unit of its noise.
     """
 
-    bias: Any
+    bias: Array
 
 
 class SimActuator(BaseNode):
@@ -129,7 +129,6 @@ class SimActuator(BaseNode):
     Args:
         rate: Steps per second [Hz].
         field: Field of the agent's message that is the command, shape ``(joints,)``.
-        message: Makes the node's message from a command.
         **options: Options of ``BaseNode``.
     """
 
@@ -139,24 +138,24 @@ class SimActuator(BaseNode):
         rate: float,
         joints: int,
         field: str = "goal",
-        message: Callable[[Any], Any] = Goals,
+        message: Callable[[PyTree], PyTree] = Goals,
         agent: str = ROLES.supervisor,
-        **options: Any,
+        **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
         self._joints, self._field, self._message, self._agent = joints, field, message, agent
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> DelayParams:
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> DelayParams:
         """Return parameters without a delay."""
         del rng, graph_state
         return DelayParams()
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return a message with the agent's start, or with zeros."""
         del rng
         start = getattr((graph_state or GraphState()).params.get(self._agent), "start", None)
         return self._message(jnp.zeros(self._joints) if start is None else jnp.asarray(start, jnp.float32))
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Return the newest command."""
         return step_state, self._message(getattr(step_state.inputs[self._agent][-1].data, self._field))

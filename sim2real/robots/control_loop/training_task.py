@@ -1,4 +1,4 @@
-"""The training task of a robot in a loop: random dynamics, delays and starts, and what the robot says of its states."""
+"""The training task of a robot in a loop: random dynamics, delays and starts, and the robot's rewards."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from sim2real.graph.base import GraphState, StepState
 from sim2real.robots.control_loop.loop import draw_values
 from sim2real.robots.robot_parts import ConnectedParts
 from sim2real.train.environment.tasks import Rewards
+from sim2real.types import PyTree
 
 
 class LoopTask:
     """The training task of a robot in a loop; see ``sim2real.train.environment.graph_environment.TrainingTask``.
 
     Args:
-        agent: The agent's node in the graph.
         draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode
             in place of the values.
 
@@ -37,7 +37,7 @@ class LoopTask:
         draws: Mapping[str, np.ndarray],
     ) -> None:
         self.robot, self.agent = robot, agent
-        self.values: dict[str, Any] = dict(values)
+        self.values: dict[str, PyTree] = dict(values)
         self.supervisor = robot.roles.supervisor
         self.draws = {n: jnp.asarray(d, jnp.float32) for n, d in draws.items()}
         self.observation_size = robot.agent.observation_size
@@ -45,21 +45,21 @@ class LoopTask:
         self.action_low, self.action_high = np.array([(t.low, t.high) for t in robot.agent.action], np.float32).T
 
     @property
-    def data(self) -> Any:
+    def data(self) -> PyTree:
         """The values and samples of the parameters; see ``HoldsData``."""
         return {n: jnp.asarray(v, jnp.float32) for n, v in self.values.items()}, self.draws
 
-    def with_data(self, data: Any) -> LoopTask:
+    def with_data(self, data: PyTree) -> LoopTask:
         """Return a copy with other values and samples, which may be traced."""
         task = copy.copy(self)
         task.values, task.draws = data
         return task
 
-    def params(self, key: jax.Array) -> dict[str, Any]:
+    def params(self, key: jax.Array) -> dict[str, PyTree]:
         """Draw the parameters of an episode."""
         return self.params_at(key, None)
 
-    def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, Any]:
+    def params_at(self, key: jax.Array, width: jax.Array | None) -> dict[str, PyTree]:
         """Draw the parameters of an episode that has a share of all differences; None: all of them."""
         draw = partial(self._draw, width=width)
         task = self.robot.task
@@ -76,7 +76,7 @@ class LoopTask:
         return params
 
     def offsets(self, key: jax.Array, width: jax.Array | None) -> tuple[jax.Array, jax.Array]:
-        """Draw how far from the robot's own start an episode starts: positions and velocities, ``(joints,)`` each.
+        """Draw the offsets of an episode's start: positions [rad] and velocities [rad/s], ``(joints,)`` each.
 
         Args:
             width: Share of the differences; None: all of them.
@@ -89,7 +89,7 @@ class LoopTask:
         """Return the policy's observation, made by the agent's node."""
         return self.agent.observe(step_state)
 
-    def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, Any]:
+    def act(self, step_state: StepState, action: jax.Array) -> tuple[StepState, PyTree]:
         """Return the agent's new step state and its message for an action."""
         return self.agent.act(step_state, action)
 
@@ -112,11 +112,11 @@ class LoopTask:
         numbers = [x for x in numbers if jnp.issubdtype(x.dtype, jnp.inexact)]
         return jnp.concatenate([x.astype(jnp.float32).ravel() for x in numbers])
 
-    def _judged(self, graph_state: GraphState) -> Any:
+    def _judged(self, graph_state: GraphState) -> PyTree:
         return self.robot.task.judged(graph_state, self.robot.roles)
 
-    def _draw(self, key: jax.Array, width: jax.Array | None) -> dict[str, Any]:
+    def _draw(self, key: jax.Array, width: jax.Array | None) -> dict[str, PyTree]:
         drawn = draw_values(key, self.values, self.draws)
         if width is None:
             return drawn
-        return {n: own + width * (drawn[n] - own) if n in self.draws else own for n, own in self.values.items()}
+        return {n: value + width * (drawn[n] - value) if n in self.draws else value for n, value in self.values.items()}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
+from sim2real.types import MjModel
 
 
 @dataclass(frozen=True)
@@ -30,56 +31,56 @@ class Coupling:
     acts: bool = True
 
 
-def couplings_of(model: Any) -> list[Coupling]:
+def couplings_of(model: MjModel) -> list[Coupling]:
     """Return the couplings of a compiled model: its active equalities, and its tendons."""
-    found: list[Coupling] = []
+    couplings: list[Coupling] = []
     if not int(model.opt.disableflags) & int(mj.mjtDisableBit.mjDSBL_EQUALITY):
         active = map(int, np.flatnonzero(model.eq_active0))
-        found = [Coupling(_named("equality", model.equality(i)), _of_equality(model, i), i) for i in active]
+        couplings = [Coupling(_named("equality", model.equality(i)), _of_equality(model, i), i) for i in active]
     pulling = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_armature)
-    pulled = {c.tendon for c in found} | _tendons_in_equalities(model)
+    pulled = {c.tendon for c in couplings} | _tendons_in_equalities(model)
     for t in range(model.ntendon):
         acts = bool(model.tendon_limited[t]) or t in pulled or any(np.any(values[t]) for values in pulling)
-        found.append(Coupling(_named("tendon", model.tendon(t)), joints_of_tendon(model, t), tendon=t, acts=acts))
-    return found
+        couplings.append(Coupling(_named("tendon", model.tendon(t)), joints_of_tendon(model, t), tendon=t, acts=acts))
+    return couplings
 
 
 def groups(couplings: Iterable[Coupling]) -> list[frozenset[int]]:
     """Return the sets of joints that couplings which act join, directly or through other joints."""
-    found: list[frozenset[int]] = []
+    merged: list[frozenset[int]] = []
     for coupling in couplings:
         if coupling.acts and coupling.joints:
-            joined = [g for g in found if g & coupling.joints]
-            found = [g for g in found if g not in joined] + [coupling.joints.union(*joined)]
-    return found
+            joined = [g for g in merged if g & coupling.joints]
+            merged = [g for g in merged if g not in joined] + [coupling.joints.union(*joined)]
+    return merged
 
 
-def joints_of_tendon(model: Any, tendon: int) -> frozenset[int]:
+def joints_of_tendon(model: MjModel, tendon: int) -> frozenset[int]:
     """Return the numbers of the joints that change a tendon's length."""
-    found: set[int] = set()
+    joints: set[int] = set()
     bodies: list[int] = []
     begin = int(model.tendon_adr[tendon])
     for i in range(begin, begin + int(model.tendon_num[tendon])):
         kind, number = int(model.wrap_type[i]), int(model.wrap_objid[i])
         if kind == int(mj.mjtWrap.mjWRAP_JOINT):
-            found.add(number)
+            joints.add(number)
         elif kind == int(mj.mjtWrap.mjWRAP_SITE):
             bodies.append(int(model.site_bodyid[number]))
         elif kind == int(mj.mjtWrap.mjWRAP_PULLEY):
-            found |= _between(model, bodies)
+            joints |= _between(model, bodies)
             bodies = []
         else:
             bodies.append(int(model.geom_bodyid[number]))
-    return frozenset(found | _between(model, bodies))
+    return frozenset(joints | _between(model, bodies))
 
 
-def below(model: Any, joint: int) -> set[int]:
+def below(model: MjModel, joint: int) -> set[int]:
     """Return the numbers of the joints of a joint's body and of the bodies that hang on it."""
     top = int(model.jnt_bodyid[joint])
     return {i for i in range(model.njnt) if top in upwards(model, int(model.jnt_bodyid[i]))}
 
 
-def _of_equality(model: Any, equality: int) -> frozenset[int]:
+def _of_equality(model: MjModel, equality: int) -> frozenset[int]:
     kind = int(model.eq_type[equality])
     ends = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
     eq = mj.mjtEq
@@ -94,12 +95,12 @@ def _of_equality(model: Any, equality: int) -> frozenset[int]:
     return frozenset()
 
 
-def _tendons_in_equalities(model: Any) -> set[int]:
+def _tendons_in_equalities(model: MjModel) -> set[int]:
     rows = np.flatnonzero((model.eq_type == int(mj.mjtEq.mjEQ_TENDON)) & (model.eq_active0 != 0))
     return {int(ends[i]) for i in rows for ends in (model.eq_obj1id, model.eq_obj2id) if ends[i] >= 0}
 
 
-def _between(model: Any, bodies: Sequence[int]) -> set[int]:
+def _between(model: MjModel, bodies: Sequence[int]) -> set[int]:
     """Return the joints that move some of the bodies, but not all of them."""
     if not bodies:
         return set()
@@ -108,13 +109,13 @@ def _between(model: Any, bodies: Sequence[int]) -> set[int]:
     return {i for i in range(model.njnt) if int(model.jnt_bodyid[i]) in moved}
 
 
-def upwards(model: Any, body: int) -> set[int]:
+def upwards(model: MjModel, body: int) -> set[int]:
     """Return a body and its ancestors without the world."""
-    found: set[int] = set()
+    bodies: set[int] = set()
     while body > 0:
-        found.add(body)
+        bodies.add(body)
         body = int(model.body_parentid[body])
-    return found
+    return bodies
 
 
 def _named(kind: str, element: Any) -> str:

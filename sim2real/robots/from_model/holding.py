@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.robots.from_model.couplings import Coupling, below, couplings_of, groups, upwards
+from sim2real.types import MjModel, MjSpec
 
 _HOME = "home"
 """The keyframe that is taken where a model has several."""
@@ -63,26 +65,26 @@ class Holding:
     key: int = -1
 
 
-def plan(model: Any, recorded: Sequence[str], hold: Sequence[str], fix_base: bool, path: Any) -> Holding:
+def plan(model: MjModel, recorded: Sequence[str], hold: Sequence[str], fix_base: bool, path: Path) -> Holding:
     """Return which joints are held and where.
 
     A joint that a loop, an equality or a tendon moves together with a recorded one stays free. Others are held at a
     named value, else at the keyframe, else at the model's zero.
 
     Args:
-        recorded: The joints that were recorded.
         hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
-        path: The file, for messages.
 
     Raises:
         UsageError: A joint would be held outside its range, a value is named for a joint that moves, the base floats,
             or only an actuator of a tendon moves a joint together with a recorded one.
     """
+    # Find the joints that move together with recorded ones.
     couplings = couplings_of(model)
     numbers = {model.joint(name).id for name in recorded}
     moved = _moved(model, couplings, numbers, fix_base)
     key, named = _named(model, hold, numbers, moved, path)
     _refuse_tendons(model, couplings, numbers, {*moved, *named}, path)
+    # Hold every other joint; only joints that carry a free one matter for the dynamics.
     held = []
     free = {int(model.jnt_bodyid[i]) for i in numbers | moved.keys()}
     carrying = set().union(*(upwards(model, body) for body in free))
@@ -97,19 +99,20 @@ def plan(model: Any, recorded: Sequence[str], hold: Sequence[str], fix_base: boo
         body = int(model.jnt_bodyid[i])
         matters = body in carrying or bool(upwards(model, body) & free)
         held.append(_held(model, i, named.get(i), key, matters))
+    # Couplings between held joints have no effect any more.
     _refuse_outside(model, held, path)
     at = {h.joint for h in held}
     dropped = tuple(c for c in couplings if not c.acts or not c.joints or c.joints <= at)
     return Holding(tuple(held), moved, dropped, key)
 
 
-def apply(spec: Any, model: Any, holding: Holding) -> None:
+def apply(spec: MjSpec, model: MjModel, holding: Holding) -> None:
     """Hold joints of a model: their bodies stand as they do at the values, and the joints are gone.
 
     Args:
         spec: ``mujoco.MjSpec`` whose elements have the compiled model's numbers; it is changed.
-        holding: What ``plan`` returned.
     """
+    # Delete elements that refer to held joints.
     held, dropped = {h.joint: h for h in holding.held}, holding.dropped
     joints = {int(j.id): j for j in spec.joints}
     equalities = {c.equality for c in dropped} | {i for i in range(model.neq) if not model.eq_active0[i]}
@@ -120,8 +123,10 @@ def apply(spec: Any, model: Any, holding: Holding) -> None:
     gone += [t for t in spec.tendons if int(t.id) in tendons]
     for element in (*spec.sensors, *spec.actuators, *spec.keys, *spec.tuples, *gone):
         spec.delete(element)
+    # Move each body to the pose of its held joints.
     for body in sorted({int(model.jnt_bodyid[i]) for i in held}):
         _pose(model, body, held, joints)
+    # Keep the start of the joints that still move.
     if holding.moved and holding.key >= 0:
         left = [i for i in range(model.njnt) if i not in held]
         start = np.concatenate([model.key_qpos[holding.key, _address(model, i)] for i in left])
@@ -133,22 +138,23 @@ def apply(spec: Any, model: Any, holding: Holding) -> None:
         spec.add_key(name="start", qpos=start)
 
 
-def _moved(model: Any, couplings: Sequence[Coupling], recorded: set[int], fix_base: bool) -> dict[int, str]:
+def _moved(model: MjModel, couplings: Sequence[Coupling], recorded: set[int], fix_base: bool) -> dict[int, str]:
     """Return the joints that stay free, and what moves each."""
     together = [group for group in groups(couplings) if group & recorded]
-    found: dict[int, str] = {}
+    causes: dict[int, str] = {}
     for c in couplings:
         alone = c.equality >= 0 and int(model.eq_type[c.equality]) == int(mj.mjtEq.mjEQ_JOINT) and len(c.joints) == 1
         if c.acts and (alone or any(c.joints <= group for group in together)):
-            found |= {i: c.name for i in sorted(c.joints - recorded) if i not in found}
-    bases = [i for i in found if int(model.jnt_type[i]) == _FREE and below(model, i) & recorded]
-    return {i: name for i, name in found.items() if not (fix_base and i in bases)}
+            causes |= {i: c.name for i in sorted(c.joints - recorded) if i not in causes}
+    bases = [i for i in causes if int(model.jnt_type[i]) == _FREE and below(model, i) & recorded]
+    return {i: name for i, name in causes.items() if not (fix_base and i in bases)}
 
 
 def _named(
-    model: Any, hold: Sequence[str], recorded: set[int], moved: Mapping[int, str], path: Any
+    model: MjModel, hold: Sequence[str], recorded: set[int], moved: Mapping[int, str], path: Path
 ) -> tuple[int, dict[int, float]]:
     """Return the number of the keyframe, -1 for none, and the named values by joint."""
+    # An entry is a keyframe, or JOINT=VALUE.
     keys = [model.key(i).name for i in range(model.nkey)]
     names = {model.joint(i).name: i for i in range(model.njnt)}
     chosen, values = None, {}
@@ -176,7 +182,9 @@ def _named(
     return _key(model, keys, chosen, recorded, {*moved, *values}, path), values
 
 
-def _key(model: Any, keys: Sequence[str], chosen: int | None, recorded: set[int], others: set[int], path: Any) -> int:
+def _key(
+    model: MjModel, keys: Sequence[str], chosen: int | None, recorded: set[int], others: set[int], path: Path
+) -> int:
     """Return the number of the keyframe at which joints are held; -1: none."""
     if chosen is not None or len(keys) < 2:
         return len(keys) - 1 if chosen is None else chosen
@@ -193,7 +201,7 @@ def _key(model: Any, keys: Sequence[str], chosen: int | None, recorded: set[int]
 
 
 def _refuse_tendons(
-    model: Any, couplings: Sequence[Coupling], recorded: set[int], settled: set[int], path: Any
+    model: MjModel, couplings: Sequence[Coupling], recorded: set[int], settled: set[int], path: Path
 ) -> None:
     """Refuse a joint that only the actuator of a tendon moves together with a recorded one."""
     of_tendon = model.actuator_trntype == int(mj.mjtTrn.mjTRN_TENDON)
@@ -209,7 +217,7 @@ def _refuse_tendons(
             )
 
 
-def _refuse_outside(model: Any, held: Sequence[Held], path: Any) -> None:
+def _refuse_outside(model: MjModel, held: Sequence[Held], path: Path) -> None:
     """Refuse joints that would be held outside their ranges: they change the inertia of the others."""
     outside = []
     for h in held:
@@ -225,8 +233,9 @@ def _refuse_outside(model: Any, held: Sequence[Held], path: Any) -> None:
         )
 
 
-def _held(model: Any, number: int, named: float | None, key: int, matters: bool) -> Held:
+def _held(model: MjModel, number: int, named: float | None, key: int, matters: bool) -> Held:
     """Return where a joint is held; one that no free joint carries, or is carried by, is moved into its range."""
+    # A joint without an actuator is passive.
     kind, name = int(model.jnt_type[number]), model.joint(number).name
     at, low_high = _address(model, number), model.jnt_range[number]
     shown = name or f"a joint of body {model.body(int(model.jnt_bodyid[number])).name!r}"
@@ -234,12 +243,14 @@ def _held(model: Any, number: int, named: float | None, key: int, matters: bool)
     passive = model.nu > 0 and kind != _FREE and not driven.any()
     if kind == _FREE:
         return Held(number, shown, (), "", "where the model has it", passive)
+    # The position: by name, by the keyframe, or the model's zero.
     source = "named" if named is not None else "the model's zero"
     value = np.array([named]) if named is not None else np.array(model.qpos0[at])
     if named is None and key >= 0:
         value, source = np.array(model.key_qpos[key, at]), f"keyframe {model.key(key).name!r}"
     if kind == _BALL:
         return Held(number, shown, tuple(map(float, value)), "", source, passive)
+    # Move a position that is rounded, or without effect, into the joint's range.
     unit = "m" if kind == _SLIDE else "rad"
     nearest = np.clip(value, *low_high) if model.jnt_limited[number] else value
     if abs(nearest - value)[0] <= _ROUNDED or not (matters or named is not None):
@@ -248,13 +259,14 @@ def _held(model: Any, number: int, named: float | None, key: int, matters: bool)
     return Held(number, shown, (float(value[0]),), unit, source, passive)
 
 
-def _address(model: Any, number: int) -> slice:
+def _address(model: MjModel, number: int) -> slice:
     begin = int(model.jnt_qposadr[number])
     return slice(begin, begin + {_FREE: 7, _BALL: 4}.get(int(model.jnt_type[number]), 1))
 
 
-def _pose(model: Any, body: int, held: Mapping[int, Held], joints: Mapping[int, Any]) -> None:
+def _pose(model: MjModel, body: int, held: Mapping[int, Held], joints: Mapping[int, Any]) -> None:
     """Set the pose of a body with held joints, and the joints of it that are left, which stand before held ones."""
+    # Apply the held joints of the body in their order.
     pos, quat = np.array(model.body_pos[body]), np.array(model.body_quat[body])
     first = int(model.body_jntadr[body])
     left: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -267,6 +279,7 @@ def _pose(model: Any, body: int, held: Mapping[int, Held], joints: Mapping[int, 
         pos, quat = pos + _turned(quat, step), _product(quat, turn)
         back = turn * np.array([1, -1, -1, -1])
         left = {k: (_turned(back, a - step), _turned(back, x)) for k, (a, x) in left.items()}
+    # Put a frame with the new pose around the body.
     element = joints[first].parent
     element.set_frame(element.parent.add_frame(pos=pos, quat=quat))
     element.pos, element.quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
@@ -276,7 +289,7 @@ def _pose(model: Any, body: int, held: Mapping[int, Held], joints: Mapping[int, 
 
 
 def _step(
-    model: Any, number: int, value: Sequence[float], anchor: np.ndarray, axis: np.ndarray
+    model: MjModel, number: int, value: Sequence[float], anchor: np.ndarray, axis: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return how a joint at a value moves its body, seen from the body: a translation [m], and a quaternion."""
     turn = np.array([1.0, 0.0, 0.0, 0.0])
@@ -294,12 +307,12 @@ def _step(
 
 
 def _turned(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    found = np.zeros(3)
-    mj.mju_rotVecQuat(found, vector, quat)
-    return found
+    turned = np.zeros(3)
+    mj.mju_rotVecQuat(turned, vector, quat)
+    return turned
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    found = np.zeros(4)
-    mj.mju_mulQuat(found, a, b)
-    return found
+    product = np.zeros(4)
+    mj.mju_mulQuat(product, a, b)
+    return product

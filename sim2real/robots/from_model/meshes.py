@@ -6,12 +6,14 @@ import os
 from pathlib import Path
 from typing import Any
 
+from sim2real.types import MjSpec
+
 _PACKAGE = "package://"
 _FROM_GEOMS = 1
 """Value of the compiler's option inertiafromgeom with which geoms give every inertia."""
 
 
-def find_packages(spec: Any, path: Path) -> list[str]:
+def find_packages(spec: MjSpec, path: Path) -> list[str]:
     """Name the files of ROS packages by their places, where they are found; return where else was looked.
 
     Args:
@@ -23,15 +25,15 @@ def find_packages(spec: Any, path: Path) -> list[str]:
             continue
         package, _, rest = mesh.file.removeprefix(_PACKAGE).partition("/")
         places = _places(path, package)
-        found = next((place / rest for place in places if (place / rest).is_file()), None)
-        if found is not None:
-            mesh.file = str(found.resolve())
+        file = next((place / rest for place in places if (place / rest).is_file()), None)
+        if file is not None:
+            mesh.file = str(file.resolve())
         elif not looked:
             looked = [f"{_PACKAGE}{package} was looked for in {', '.join(dict.fromkeys(map(str, places)))}"]
     return looked
 
 
-def leave_out(spec: Any) -> list[str]:
+def leave_out(spec: MjSpec) -> list[str]:
     """Take out files that only contacts and pictures need; return their names.
 
     These are meshes and height fields of bodies whose inertia the file has, or which cannot move, and textures.
@@ -49,20 +51,20 @@ def leave_out(spec: Any) -> list[str]:
     for material in spec.materials:
         material.textures = [""] * len(material.textures)
     files += [*spec.textures, *spec.skins]
-    found = [element.file for element in files if getattr(element, "file", "")]
+    removed = [element.file for element in files if getattr(element, "file", "")]
     for element in files:
         spec.delete(element)
-    return found
+    return removed
 
 
-def needed_by(spec: Any) -> list[str]:
+def needed_by(spec: MjSpec) -> list[str]:
     """Return the bodies whose inertia their meshes give."""
     return sorted(
         {g.parent.name or "one without a name" for g in spec.geoms if g.meshname and not _spare(spec, g.parent)}
     )
 
 
-def _spare(spec: Any, body: Any) -> bool:
+def _spare(spec: MjSpec, body: Any) -> bool:
     """Return whether a body's motion does not depend on its geoms."""
     if body.explicitinertial and int(spec.compiler.inertiafromgeom) != _FROM_GEOMS:
         return True
@@ -79,5 +81,6 @@ def _places(path: Path, package: str) -> list[Path]:
     above += [folder for folder in path.resolve().parents if folder.name == package]
     configured = [Path(p) / package for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p]
     configured += [Path(p) / "share" / package for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    own = [Path(p) for p in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if p and Path(p).name == package]
-    return [*configured, *own, *above]
+    entries = map(Path, filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)))
+    from_path = [p for p in entries if p.name == package]
+    return [*configured, *from_path, *above]

@@ -13,6 +13,7 @@ from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.robots.from_model import model_file
 from sim2real.robots.from_model.holding import Holding, apply, plan
+from sim2real.types import MjModel, MjSpec
 
 NO_LIMIT = 1e6
 _LEAST_FRICTION = 1e-9
@@ -21,23 +22,23 @@ _OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/r
 """Units of hinges -> units of slides."""
 
 
-def read_spec(path: Path, contacts: bool = False) -> Any:
-    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file; see ``model_file.read``, and what that raises."""
+def read_spec(path: Path, contacts: bool = False) -> MjSpec:
+    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file; see ``model_file.read``."""
     return model_file.read(path, contacts)[0]
 
 
-def read_model(path: Path) -> Any:
+def read_model(path: Path) -> MjModel:
     """Return the compiled model of an MJCF or URDF file; see ``read_spec``."""
     return read_spec(path).compile()
 
 
-def joints_of(model: Any) -> tuple[str, ...]:
+def joints_of(model: MjModel) -> tuple[str, ...]:
     """Return the names of a model's hinges and slides, in its order."""
     kinds = {int(mj.mjtJoint.mjJNT_HINGE), int(mj.mjtJoint.mjJNT_SLIDE)}
     return tuple(model.joint(i).name for i in range(model.njnt) if int(model.jnt_type[i]) in kinds)
 
 
-def slides_of(model: Any, joints: Sequence[str]) -> tuple[str, ...]:
+def slides_of(model: MjModel, joints: Sequence[str]) -> tuple[str, ...]:
     """Return those of a model's joints that are slides: their units have m for rad, and N for N m."""
     return tuple(j for j in joints if int(model.joint(j).type[0]) == int(mj.mjtJoint.mjJNT_SLIDE))
 
@@ -55,30 +56,31 @@ def driven(
     contacts: bool,
     rubbing: bool = True,
     hold: Sequence[str] = (),
-) -> Any:
+) -> MjModel:
     """Return the model with a drive on each recorded joint: actuators of force, of stiffness and of damping.
 
-    First stand those of force, in the order of the joints, then those of stiffness, whose force is ``-ctrl * angle``,
-    then those of damping, ``-ctrl * velocity``. Their sum stays within the torque limits of the file's own actuators.
-    Joints that were not recorded are held, but for those that something moves together with recorded ones: see
-    ``holding.plan``. Where some are moved, the keyframe that the others are held at is the model's only one.
+    The actuators of force come first, in the order of the joints, then those of stiffness, whose force is
+    ``-ctrl * angle``, then those of damping, ``-ctrl * velocity``. Their sum stays within the torque limits of the
+    file's own actuators. Joints that were not recorded are held, except joints that move together with recorded ones;
+    see ``holding.plan``. If some move, the keyframe of the held joints is the model's only keyframe.
 
     Args:
-        path: MJCF or URDF.
-        joints: The joints that were recorded.
         step_s: Time step [s].
-        fix_base: Whether a floating base is held where the model has it.
-        rubbing: Whether joints have dry friction, be it little: MJX leaves it out for good where the model has none.
-        hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+        fix_base: Whether a floating base is held at its position in the model.
+        rubbing: Whether joints have at least a little dry friction: MJX compiles no friction for a model without any.
+        hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
 
     Raises:
         UsageError: When a joint is missing or is no hinge or slide, the base floats, or a joint cannot be held.
     """
+    # Hold the joints that were not recorded.
     spec = read_spec(path, contacts)
     model = spec.compile()
     holding = held_in(path, model, joints, fix_base, hold)
     limits = {j: limit_of(model, j) for j in joints}
     apply(spec, model, holding)
+
+    # Add the actuators, and give each joint its torque limit.
     for what, gain in (("force", (1.0, 0.0, 0.0)), ("kp", (0.0, -1.0, 0.0)), ("kd", (0.0, 0.0, -1.0))):
         for joint in joints:
             part: Any = spec.add_actuator(name=f"{joint}_{what}", target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
@@ -89,6 +91,8 @@ def driven(
         spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-most, most]
         if rubbing:
             spec.joint(joint).frictionloss = max(float(np.ravel(spec.joint(joint).frictionloss)[0]), _LEAST_FRICTION)
+
+    # Set the options that identification needs, and compile.
     option = spec.option
     option.timestep, option.integrator = step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone, option.noslip_iterations = mj.mjtCone.mjCONE_PYRAMIDAL, 0
@@ -99,24 +103,22 @@ def driven(
     except ValueError as error:
         raise UsageError(
             f"{path} does not compile with joints held: {model_file.one_line(error)}",
-            hint="take what needs them out of the model",
+            hint="remove the elements that need them from the model",
         ) from None
 
 
-def held_in(path: Path, model: Any, joints: Sequence[str], fix_base: bool, hold: Sequence[str]) -> Holding:
+def held_in(path: Path, model: MjModel, joints: Sequence[str], fix_base: bool, hold: Sequence[str]) -> Holding:
     """Return which joints of a file's compiled model are held, as ``driven`` holds them.
 
     Args:
-        path: The file, for messages.
-        joints: The joints that were recorded.
         hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
 
     Raises:
         UsageError: When a joint is missing, the base floats, or a joint cannot be held.
     """
-    own = joints_of(model)
-    if unknown := [j for j in joints if j not in own]:
-        raise UsageError(f"{path} has no joint {unknown[0]!r}. Available: {', '.join(own)}")
+    available = joints_of(model)
+    if unknown := [j for j in joints if j not in available]:
+        raise UsageError(f"{path} has no joint {unknown[0]!r}. Available: {', '.join(available)}")
     return plan(model, joints, hold, fix_base, path)
 
 
@@ -126,8 +128,8 @@ class JointDrive:
 
     Attributes:
         control: Quantity of its control.
-        stiffness: With a position as control [N m/rad].
-        damping: Of its own [N m s/rad]; with a velocity as control also its gain.
+        stiffness: Gain of a position control [N m/rad].
+        damping: Damping [N m s/rad]; also the gain of a velocity control.
         gain: Torque for each unit of a torque control [N m].
         most: Largest torque [N m]; None: no limit.
     """
@@ -139,34 +141,37 @@ class JointDrive:
     most: float | None
 
 
-def set_drives(spec: Any, drives: Mapping[str, JointDrive]) -> None:
-    """Give joints of a model one actuator each: the file's own where it has just one, else a new one.
+def set_drives(spec: MjSpec, drives: Mapping[str, JointDrive]) -> None:
+    """Give joints of a model one actuator each: the file's actuator if it has exactly one, otherwise a new one.
 
     Args:
         spec: ``mujoco.MjSpec`` of the model; it is changed.
     """
+    # Leave one actuator on each joint, and set its gains.
     fixed, affine = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
     for joint, drive in drives.items():
-        own = [a for a in spec.actuators if a.trntype == mj.mjtTrn.mjTRN_JOINT and a.target == joint]
-        for element in own[1:]:
+        actuators = [a for a in spec.actuators if a.trntype == mj.mjtTrn.mjTRN_JOINT and a.target == joint]
+        for element in actuators[1:]:
             spec.delete(element)
-        part: Any = own[0] if own else spec.add_actuator(name=joint, target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
+        part: Any = (
+            actuators[0] if actuators else spec.add_actuator(name=joint, target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
+        )
         gain = {"position": drive.stiffness, "velocity": drive.damping, "torque": drive.gain}[drive.control]
         stiffness = drive.stiffness if drive.control == "position" else 0.0
         part.gaintype, part.biastype, part.dyntype = fixed, affine, mj.mjtDyn.mjDYN_NONE
         part.gear[:] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
         part.gainprm[:3], part.biasprm[:3] = [gain, 0.0, 0.0], [0.0, -stiffness, -drive.damping]
-        part.ctrllimited = False  # what the file allowed may have been a torque
+        part.ctrllimited = False  # the file's range may be a torque
         part.forcelimited = False
-        if drive.most is not None:  # the joint's, as in identification: MuJoCo then still takes damping implicitly
+        if drive.most is not None:  # at the joint, as in identification: MuJoCo then integrates damping implicitly
             spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-drive.most, drive.most]
 
 
-def limit_of(model: Any, joint: str) -> float | None:
+def limit_of(model: MjModel, joint: str) -> float | None:
     """Return the largest torque that the file's own actuator or joint allows [N m or N]; None: no limit."""
     number = model.joint(joint).id
     ranges = [model.actuator_forcerange[i] for i in _actuators(model, number) if model.actuator_forcelimited[i]]
-    # A motor's torque is its control, so a limit of that is one, too.
+    # The control of a motor is its torque, so a range of the control is a limit, too.
     ranges += [
         model.actuator_ctrlrange[i] * model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0]
         for i in _actuators(model, number)
@@ -177,7 +182,7 @@ def limit_of(model: Any, joint: str) -> float | None:
     return min(limits, default=None)
 
 
-def gains_of(model: Any, joint: str) -> tuple[float, float] | None:
+def gains_of(model: MjModel, joint: str) -> tuple[float, float] | None:
     """Return stiffness and damping of the file's own position or velocity servo; None: the joint has none."""
     for i in _actuators(model, model.joint(joint).id):
         if model.actuator_biastype[i] == int(mj.mjtBias.mjBIAS_AFFINE):
@@ -185,6 +190,6 @@ def gains_of(model: Any, joint: str) -> tuple[float, float] | None:
     return None
 
 
-def _actuators(model: Any, joint: int) -> list[int]:
+def _actuators(model: MjModel, joint: int) -> list[int]:
     of_joint = model.actuator_trntype == int(mj.mjtTrn.mjTRN_JOINT)
     return [int(i) for i in np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == joint))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, Transform
 from sim2real.robots.from_model.mjcf import gains_of, limit_of, slides_of, unit_for
+from sim2real.types import Array, MjModel, PyTree, Scalar
 
 What = Literal[
     "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
@@ -22,7 +23,7 @@ What = Literal[
 ALL = ".*"
 _WIDE = {"kp": (10, 10), "kd": (30, 30), "gain": (20, 20), "torque": (5, 5), "speed": (5, 5), "damping": (30, 30),
          "armature": (30, 30), "frictionloss": (50, 20), "stribeck_rad_s": (10, 20)}  # fmt: skip
-"""By which factors bounds lie below and above the nominal value."""
+"""Factors of the lower bound below, and of the upper bound above the nominal value."""
 FALLBACK = {"kp": 20.0, "kd": 0.5, "gain": 1.0, "torque": 10.0, "speed": 20.0, "damping": 0.1, "armature": 0.01,
              "frictionloss": 0.1, "stribeck_rad_s": 0.1}  # fmt: skip
 """Nominal values where the model has none."""
@@ -82,7 +83,7 @@ _EXCITE = {
 }
 """Motion that determines each quantity."""
 _VANISHING = ("kd", "damping", "armature", "frictionloss")
-"""Quantities that a joint may be without."""
+"""Quantities that may be 0."""
 _FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0),
           "load": (0.0, 0.0, 1.0), "play": (0.0, 0.0, 0.1), "tilt_x": (0.0, -0.3, 0.3), "tilt_y": (0.0, -0.3, 0.3),
           "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
@@ -95,9 +96,9 @@ _OF_MODEL = {
     "cogging_cos": ("frictionloss", 5.0),
     "cogging_sin": ("frictionloss", 5.0),
 }
-"""Terms without a usual size: up to a factor of what the model has of another quantity."""
+"""Terms without a usual size: their bound is a factor times another quantity of the model."""
 _BOTH_WAYS = ("bias", "cogging_cos", "cogging_sin")
-"""Those of them that may be negative."""
+"""Those that may be negative."""
 OPTIONAL = {
     "load": ("load",),
     "stribeck": ("static", "stribeck_rad_s"),
@@ -111,9 +112,9 @@ OPTIONAL = {
 }
 """Optional terms, and the quantities that each has."""
 TILT = OPTIONAL["tilt"]
-ASKED = ("tilt", "eccentricity", "cogging")
+ONLY_NAMED = ("tilt", "eccentricity", "cogging")
 """Terms that ``auto`` omits unless a parameter names them: in few robots they differ from a zero or a stiffness."""
-LAWS = (*(q for own in OPTIONAL.values() if own != TILT for q in own), "cogging_per_turn")
+LAWS = (*(q for term in OPTIONAL.values() if term != TILT for q in term), "cogging_per_turn")
 """Quantities that are set before every step."""
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
 ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
@@ -124,15 +125,15 @@ class ParameterPattern:
     """One quantity of some joints, identified as one value or as one for each.
 
     Attributes:
-        what: The quantity; of a body, where it is ``payload``.
+        what: The quantity; ``payload`` is of a body.
         joints: Regular expression that a whole name must match.
         each: Whether each joint has a value of its own.
         nominal: The value to start from; None: the model's own, or a usual one.
         low: Lower bound; None: a factor below the nominal value.
         high: Upper bound; None: a factor above.
-        name: Name of the parameter; default: the quantity, with the pattern's letters where it is for a group.
-        free: Whether it is identified; else it is held at ``nominal``.
-        term: Optional term of the model that it belongs to; "": of none.
+        name: Name of the parameter; default: the quantity, for a group with the letters of its pattern.
+        free: Whether it is identified; otherwise it is held at ``nominal``.
+        term: Optional term of the model that it belongs to; "": none.
     """
 
     what: What
@@ -168,14 +169,14 @@ class ParameterPattern:
         """Return the term of ``WHAT[:each][@PATTERN][=VALUE]``, such as ``frictionloss:each`` or ``kp@.*_calf_joint``.
 
         Raises:
-            UsageError: When it is none.
+            UsageError: The text has another form.
         """
-        found = re.fullmatch(r"(\w+)(:each)?(?:@([^=]+))?(?:=([-+.\deE]+))?", text)
-        if not found:
+        match = re.fullmatch(r"(\w+)(:each)?(?:@([^=]+))?(?:=([-+.\deE]+))?", text)
+        if not match:
             raise UsageError(f"{text!r} is no parameter", hint="write WHAT, WHAT:each, WHAT@PATTERN or WHAT=VALUE")
-        what: Any = found[1]
-        value = float(found[4]) if found[4] else None
-        return ParameterPattern(what, found[3] or ALL, bool(found[2]), value, free=value is None)
+        what = cast(What, match[1])
+        value = float(match[4]) if match[4] else None
+        return ParameterPattern(what, match[3] or ALL, bool(match[2]), value, free=value is None)
 
     def label(self) -> str:
         """Return the name of a value that several joints share."""
@@ -197,18 +198,17 @@ class Placed:
     at: tuple[int, ...]
 
 
-def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any, own: Any) -> list[Placed]:
+def expand(
+    terms: Sequence[ParameterPattern], joints: Sequence[str], model: MjModel, file_model: MjModel
+) -> list[Placed]:
     """Return the parameters of a model.
-
-    Args:
-        joints: The joints that were recorded.
-        own: The model as it is in the file, for nominal values.
 
     Raises:
         UsageError: When a pattern matches nothing, or two parameters have one name.
     """
-    found: list[Placed] = []
+    placed: list[Placed] = []
     for term in terms:
+        # The joints or bodies that match the pattern.
         names = [model.body(i).name for i in range(1, model.nbody)] if term.what == "payload" else list(joints)
         offset = 1 if term.what == "payload" else 0
         at = [i for i, name in enumerate(names) if re.fullmatch(term.joints, name, re.DOTALL)]
@@ -217,21 +217,22 @@ def expand(terms: Sequence[ParameterPattern], joints: Sequence[str], model: Any,
                 f"{term.what!r}: {term.joints!r} matches none of {', '.join(names)}",
                 hint="a pattern matches whole names: .*_hip_joint",
             )
-        sliding = set() if term.what == "payload" else set(slides_of(own, names))
+        # Joints with one value form a group.
+        sliding = set() if term.what == "payload" else set(slides_of(file_model, names))
         if term.each:
             groups = [([i], f"{term.name or term.what}_{_letters(names[i])}") for i in at]
         else:
             groups = [(part, term.label() + suffix) for part, suffix in _by_unit(term.what, at, names, sliding)]
         for group, name in groups:
-            nominal = _nominal(term, [names[i] for i in group], own)
+            nominal = _nominal(term, [names[i] for i in group], file_model)
             unit = unit_for(_ABOUT[term.what][0], term.what not in TILT and names[group[0]] in sliding)
-            p = replace(_parameter(term, name, nominal, _size(term, [names[i] for i in group], own)), unit=unit)
-            found.append(Placed(p, term.what, tuple(i + offset for i in group)))
-    return found
+            p = replace(_parameter(term, name, nominal, _size(term, [names[i] for i in group], file_model)), unit=unit)
+            placed.append(Placed(p, term.what, tuple(i + offset for i in group)))
+    return placed
 
 
 def _by_unit(what: str, at: list[int], names: Sequence[str], sliding: set[str]) -> list[tuple[list[int], str]]:
-    """Return the groups of joints that may share a value, and what is added to its name: slides are in other units."""
+    """Return the groups of joints that may share a value, and the suffix of its name: slides have other units."""
     slides = [i for i in at if names[i] in sliding]
     hinges = [i for i in at if names[i] not in sliding]
     if what in TILT or unit_for(_ABOUT[what][0], True) == _ABOUT[what][0] or not (slides and hinges):
@@ -240,31 +241,31 @@ def _by_unit(what: str, at: list[int], names: Sequence[str], sliding: set[str]) 
 
 
 def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[ParameterPattern, ...]:
-    """Return patterns with optional terms added that none of them is of: one value for all joints, not identified.
+    """Return the patterns, and one for all joints for each further quantity of the optional terms.
 
-    Terms are chosen with ``--terms``; without, they are 0.
+    These quantities are 0 unless ``--terms`` chooses their terms.
 
     Args:
-        wanted: ``auto``, ``all``, or names with commas between, which are offered beside those of ``auto``. Of a term
-            that ``auto`` leaves out, parameters that were named are offered without its others.
+        wanted: ``auto``, ``all``, or names separated by commas, in addition to those of ``auto``. A quantity that a
+            pattern names is available without the others of its term.
 
     Raises:
         UsageError: Cogging is requested without its number of repeats a turn.
     """
-    said, names = {term.what for term in terms}, {n.strip() for n in wanted.split(",")}
-    if "cogging" in names and "cogging_per_turn" not in said:
-        raise UsageError("how often does cogging repeat in a turn?", hint="add --parameter cogging_per_turn=N")
-    there = {name for name in OPTIONAL if name not in ASKED or name in names}
+    quantities_named, names = {term.what for term in terms}, {n.strip() for n in wanted.split(",")}
+    if "cogging" in names and "cogging_per_turn" not in quantities_named:
+        raise UsageError("cogging needs its number of repeats in a turn", hint="add --parameter cogging_per_turn=N")
+    available = {name for name in OPTIONAL if name not in ONLY_NAMED or name in names}
     if wanted == "all":
-        there |= set(ASKED) - (set() if "cogging_per_turn" in said else {"cogging"})
+        available |= set(ONLY_NAMED) - (set() if "cogging_per_turn" in quantities_named else {"cogging"})
     return (
-        *(replace(term, term=own) if (own := _term_of(term.what)) else term for term in terms),
+        *(replace(term, term=name) if (name := _term_of(term.what)) else term for term in terms),
         *(
             ParameterPattern(what, free=False, term=name)
             for name, quantities in OPTIONAL.items()
-            if name in there
+            if name in available
             for what in quantities
-            if what not in said
+            if what not in quantities_named
         ),
     )
 
@@ -273,19 +274,21 @@ def _term_of(what: str) -> str:
     return next((name for name, quantities in OPTIONAL.items() if what in quantities), "")
 
 
-def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints: np.ndarray, dofs: np.ndarray) -> Any:
+def place(
+    placed: Sequence[Placed], values: Mapping[str, Scalar], base: PyTree, joints: np.ndarray, dofs: np.ndarray
+) -> PyTree:
     """Return the world's parameters with values in their places.
 
     Args:
-        placed: What ``expand`` returned.
         base: ``DriveParams`` with nominal values.
         joints: Shape ``(joints,)``: their numbers in the model.
-        dofs: Shape ``(joints,)``: where the model's arrays have each joint.
+        dofs: Shape ``(joints,)``: index of each joint in the model's arrays.
     """
-    drive: dict[str, Any] = {}
-    model: dict[str, Any] = {}
-    terms: Any = base.terms
-    # A speed without load makes a damping of the torque limit, so that comes first.
+    # Collect the new values of each field.
+    drive: dict[str, PyTree] = {}
+    model: dict[str, PyTree] = {}
+    terms: PyTree = base.terms
+    # A speed without load is the torque limit divided by the damping, so set the limit first.
     for p in sorted(placed, key=lambda p: p.what == "speed"):
         if p.what in TILT:
             continue
@@ -306,16 +309,17 @@ def place(placed: Sequence[Placed], values: Mapping[str, Any], base: Any, joints
         else:
             field = ON_DOF[p.what]
             model[field] = model.get(field, getattr(base.model, field)).at[dofs[at]].set(value)
+
+    # Replace the fields.
     if any(p.what in TILT for p in placed):
         model["opt.gravity"] = tilted(placed, values, base.model.opt.gravity)
     return base.replace(model=base.model.tree_replace(model), terms=terms, **drive)
 
 
-def tilted(placed: Sequence[Placed], values: Mapping[str, Any], gravity: Any) -> Any:
+def tilted(placed: Sequence[Placed], values: Mapping[str, Scalar], gravity: Array) -> PyTree:
     """Return gravity ``(3,)`` [m/s^2] turned about the model's x axis, then about its y axis.
 
     Args:
-        placed: What ``expand`` returned.
         gravity: As the model has it, ``(3,)`` [m/s^2].
     """
     angle = {p.what: values[p.parameter.name] for p in placed if p.what in TILT}
@@ -330,7 +334,7 @@ def tilted(placed: Sequence[Placed], values: Mapping[str, Any], gravity: Any) ->
 def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: float) -> Parameter:
     unit, about = _ABOUT[term.what]
     transform: Transform = "log"
-    kind: Any = "measurement" if term.what == "zero" else "dynamics"
+    kind = "measurement" if term.what == "zero" else "dynamics"
     if term.what in _FIXED:
         _, low, high = _FIXED[term.what]
         transform = "linear"
@@ -339,15 +343,15 @@ def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: floa
     else:
         below, above = _WIDE[term.what]
         low, high = nominal / below, nominal * above
-    low, high = (own if own is not None else usual for own, usual in ((term.low, low), (term.high, high)))
+    low, high = (bound if bound is not None else usual for bound, usual in ((term.low, low), (term.high, high)))
     return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=_EXCITE[term.what],
         vanishes=term.what in _VANISHING, limits=term.what == "torque", term=term.term,
         off=nominal if term.term and not term.free else None,
     )  # fmt: skip
 
 
-def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
-    """Return the value that joints start from: the median of the model's own."""
+def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel) -> float:
+    """Return the nominal value: the median of the joints' values in the file."""
     if term.nominal is not None:
         return term.nominal
     if term.what in _FIXED:
@@ -357,21 +361,21 @@ def _nominal(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
     values: list[float] = []
     for name in names:
         if term.what in ON_DOF:
-            values.append(float(getattr(own, ON_DOF[term.what])[own.joint(name).dofadr[0]]))
-        elif term.what in ("kp", "kd") and (gains := gains_of(own, name)):
+            values.append(float(getattr(file_model, ON_DOF[term.what])[file_model.joint(name).dofadr[0]]))
+        elif term.what in ("kp", "kd") and (gains := gains_of(file_model, name)):
             values.append(gains[term.what == "kd"])
-        elif term.what == "torque" and (limit := limit_of(own, name)):
+        elif term.what == "torque" and (limit := limit_of(file_model, name)):
             values.append(limit)
-    known = [v for v in values if v > 0]
-    return float(np.median(known)) if known else FALLBACK[term.what]
+    positive = [v for v in values if v > 0]
+    return float(np.median(positive)) if positive else FALLBACK[term.what]
 
 
-def _size(term: ParameterPattern, names: Sequence[str], own: Any) -> float:
-    """Return how large a term can be that has no usual size of its own; 0 for others."""
+def _size(term: ParameterPattern, names: Sequence[str], file_model: MjModel) -> float:
+    """Return the bound of a term without a usual size; 0 for other terms."""
     if term.what not in _OF_MODEL:
         return 0.0
     quantity, factor = _OF_MODEL[term.what]
-    return factor * _nominal(replace(term, what=quantity, nominal=None), names, own)
+    return factor * _nominal(replace(term, what=quantity, nominal=None), names, file_model)
 
 
 def _letters(pattern: str) -> str:

@@ -1,4 +1,4 @@
-"""A robot of which there is a model and a recording: no Python of its own."""
+"""A robot that consists of a model file and recordings, without Python code."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import msgspec
@@ -27,7 +26,6 @@ from sim2real.robots.from_model.mjcf import (
     JointDrive,
     driven,
     held_in,
-    joints_of,
     limit_of,
     read_model,
     read_spec,
@@ -47,6 +45,7 @@ from sim2real.robots.from_model.mjcf_parameters import (
     tilted,
 )
 from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
+from sim2real.types import Array, Key, PyTree, Scalar
 from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
@@ -54,7 +53,7 @@ from sim2real.worlds.recorded import RecordedActuator
 ROBOT_FILE = "robot.toml"
 COMMANDS = tuple(f.name for f in fields(DriveCommand))
 DRIVING = ("goal", "goal_velocity", "torque", "duty")
-"""Commands of which there must be one."""
+"""Fields of commands; a robot has at least one of them."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +73,7 @@ class RobotConfig:
         kp_unit: What 1 stands for in the log's own stiffness.
         kd_unit: What 1 stands for in the log's own damping.
         fix_base: Whether a floating base is held.
-        contacts: Whether bodies touch.
         hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
-        terms: What is identified.
     """
 
     model: Path
@@ -95,7 +92,7 @@ class RobotConfig:
     hold: tuple[str, ...] = ()
     terms: tuple[ParameterPattern, ...] = ()
 
-    def driven(self, rubbing: bool = True) -> Any:
+    def driven(self, rubbing: bool = True) -> PyTree:
         """Return the model with a drive on each recorded joint, see ``mjcf.driven``."""
         return driven(self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold)
 
@@ -105,45 +102,43 @@ class RobotConfig:
 
     def to_toml(self, model: str) -> str:
         """Return the text of a ``robot.toml`` that names the model's file."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "terms"}
+        keys = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "terms"}
         plain = {f.name: f.default for f in fields(self)}
-        lines = [
-            "# A robot that was recorded: sim2real.robots.from_model.mjcf_robot.RobotConfig says what each key is."
-        ]
-        own["model"] = model
-        lines += [f"{k} = {toml_value(v)}" for k, v in own.items() if v != plain[k]]
+        lines = ["# A robot that was recorded: sim2real.robots.from_model.mjcf_robot.RobotConfig describes each key."]
+        keys["model"] = model
+        lines += [f"{k} = {toml_value(v)}" for k, v in keys.items() if v != plain[k]]
         for term in self.terms:
             usual = asdict(ParameterPattern(term.what))
-            said = {"what": term.what, **{k: v for k, v in asdict(term).items() if v != usual[k]}}
-            lines += ["", "[[terms]]", *(f"{k} = {toml_value(v)}" for k, v in said.items())]
+            entries = {"what": term.what, **{k: v for k, v in asdict(term).items() if v != usual[k]}}
+            lines += ["", "[[terms]]", *(f"{k} = {toml_value(v)}" for k, v in entries.items())]
         return "\n".join(lines) + "\n"
 
     @staticmethod
     def load(path: Path) -> RobotConfig:
-        """Read a ``robot.toml``; its model lies where that says, seen from it.
+        """Read a ``robot.toml``; the path of its model is relative to it.
 
         Raises:
             UsageError: When a key is unknown, missing or of the wrong kind.
         """
-        known = [f.name for f in fields(RobotConfig)]
+        keys = [f.name for f in fields(RobotConfig)]
         try:
             table = tomllib.loads(path.read_text(encoding="utf-8"))
             terms = tuple(ParameterPattern(**row) for row in table.pop("terms", []))
-            check(table.keys() <= set(known), f"unknown key {min(table.keys() - set(known), default='')!r}")
-            found = msgspec.convert(table, RobotConfig, dec_hook=lambda _, text: Path(text))
-            return replace(found, model=path.parent / found.model, terms=terms)
+            check(table.keys() <= set(keys), f"unknown key {min(table.keys() - set(keys), default='')!r}")
+            config = msgspec.convert(table, RobotConfig, dec_hook=lambda _, text: Path(text))
+            return replace(config, model=path.parent / config.model, terms=terms)
         except UsageError:
             raise
         except (ValueError, TypeError, OSError) as error:
-            raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {', '.join(known)}") from None
+            raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {', '.join(keys)}") from None
 
 
 @struct.dataclass
 class Measured(Base):
-    """What the encoders say, each of shape ``(joints,)`` [rad, rad/s]; no velocity where there is none."""
+    """Readings of the encoders, each of shape ``(joints,)`` [rad, rad/s]; None without a velocity."""
 
-    position: Any
-    velocity: Any = None
+    position: Array
+    velocity: Array | None = None
 
 
 class Encoders(BaseNode):
@@ -157,12 +152,12 @@ class Encoders(BaseNode):
         super().__init__(name, rate)
         self._world, self._velocity = world, velocity
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> EncoderParams:
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> EncoderParams:
         """Return encoders that read 0 at the model's zero."""
-        own = self._world.init_params(rng, graph_state)
-        return EncoderParams(jnp.zeros(len(self._world.qpos_at)), own.terms)
+        world = self._world.init_params(rng, graph_state)
+        return EncoderParams(jnp.zeros(len(self._world.qpos_at)), world.terms)
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Measured:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Measured:
         """Return zeros."""
         del rng, graph_state
         still = jnp.zeros(len(self._world.qpos_at))
@@ -170,11 +165,11 @@ class Encoders(BaseNode):
 
     def step(self, step_state: StepState) -> tuple[StepState, Measured]:
         """Read."""
-        seen, own = step_state.inputs[self._world.name][-1].data, step_state.params
-        angle, speed = seen.qpos[self._world.qpos_at], seen.qvel[self._world.qvel_at]
-        if own.terms is not None:
-            angle, speed = own.terms.read(angle), own.terms.rate(angle, speed)
-        return step_state, Measured(angle + own.zero, speed if self._velocity else None)
+        message, params = step_state.inputs[self._world.name][-1].data, step_state.params
+        angle, speed = message.qpos[self._world.qpos_at], message.qvel[self._world.qvel_at]
+        if params.terms is not None:
+            angle, speed = params.terms.read(angle), params.terms.rate(angle, speed)
+        return step_state, Measured(angle + params.zero, speed if self._velocity else None)
 
 
 @struct.dataclass
@@ -182,19 +177,16 @@ class EncoderParams(Base):
     """Parameters of the encoders.
 
     Attributes:
-        zero: What they read at the model's zero, ``(joints,)`` [rad].
+        zero: Readings at the model's zero, ``(joints,)`` [rad].
         terms: The drives' own, which say how far each is off its axis; None: not at all.
     """
 
-    zero: Any
+    zero: Array
     terms: DriveTerms | None = None
 
 
 class MjcfRobot(LoggedRobot):
-    """A robot that is known from its model and from recordings.
-
-    Args:
-        config: What there is to know about it.
+    """A robot that consists of a model and recordings.
 
     Raises:
         UsageError: When the model does not fit.
@@ -210,16 +202,16 @@ class MjcfRobot(LoggedRobot):
                 hint=f"fields of the actuator may be {', '.join(COMMANDS)}",
             )
         self.config, self.tick_s = config, config.step_s
-        own = read_model(config.model)
+        file_model = read_model(config.model)
         self.lawful = any(term.what in LAWS for term in config.terms)
         rubbing = self.lawful or any(term.what == "frictionloss" for term in config.terms)
         self.model = config.driven(rubbing)
-        self.placed = tuple(expand(config.terms, config.joints, self.model, own))
-        self._limits = [limit_of(own, joint) for joint in config.joints]
+        self.placed = tuple(expand(config.terms, config.joints, self.model, file_model))
+        self._limits = [limit_of(file_model, joint) for joint in config.joints]
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """What was measured of each joint."""
+        """The measured quantities of each joint."""
         c = self.config
         velocity, goal = ("velocity" if c.velocity else None), ("goal" if "goal" in c.commands else None)
         rows = enumerate(c.joints)
@@ -228,13 +220,13 @@ class MjcfRobot(LoggedRobot):
     @property
     def units(self) -> Mapping[str, str]:
         """Field -> unit; entry of a field, such as ``position[0]``, where some joints are slides and others hinges."""
-        known = {"position": "rad", "velocity": "rad/s", "goal": "rad", "goal_velocity": "rad/s", "torque": "N m"}
+        units = {"position": "rad", "velocity": "rad/s", "goal": "rad", "goal_velocity": "rad/s", "torque": "N m"}
         there = {"position", *self.config.commands, *(["velocity"] if self.config.velocity else [])}
-        known = {field: unit for field, unit in known.items() if field in there}
+        units = {field: unit for field, unit in units.items() if field in there}
         slides = [joint in slides_of(self.model, self.config.joints) for joint in self.config.joints]
         if len(set(slides)) == 1:
-            return {field: unit_for(unit, slides[0]) for field, unit in known.items()}
-        return {f"{field}[{i}]": unit_for(unit, s) for field, unit in known.items() for i, s in enumerate(slides)}
+            return {field: unit_for(unit, slides[0]) for field, unit in units.items()}
+        return {f"{field}[{i}]": unit_for(unit, s) for field, unit in units.items() for i, s in enumerate(slides)}
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified."""
@@ -281,8 +273,8 @@ class MjcfRobot(LoggedRobot):
         """
         return 0.5 * self.config.step_s
 
-    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
-        """Return the file's model with what was identified: friction, inertia, payload, tilt, and each joint's drive.
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
+        """Return the file's model with the identified values: friction, inertia, payload, tilt, and each joint's drive.
 
         Where the log has gains of its own in N m/rad they are the command's, and the file's own actuators stay.
         """
@@ -309,18 +301,17 @@ class MjcfRobot(LoggedRobot):
         spec.copy_back(model)
         return spec.to_xml()
 
-    def _drives(self, values: Mapping[str, Any]) -> list[JointDrive]:
+    def _drives(self, values: Mapping[str, Scalar]) -> list[JointDrive]:
         """Return the joints' drives with identified values."""
-        control: Any = next(
-            (t for n, t in (("goal", "position"), ("goal_velocity", "velocity")) if n in self.config.commands), "torque"
-        )
-        usual: dict[str, Any] = {"stiffness": FALLBACK["kp"], "damping": 0.0, "gain": FALLBACK["gain"]}
-        found = [{**usual, "most": most} for most in self._limits]
+        commands = self.config.commands
+        control = "position" if "goal" in commands else "velocity" if "goal_velocity" in commands else "torque"
+        usual: dict[str, float] = {"stiffness": FALLBACK["kp"], "damping": 0.0, "gain": FALLBACK["gain"]}
+        drives = [{**usual, "most": most} for most in self._limits]
         names = {"kp": "stiffness", "kd": "damping", "gain": "gain", "torque": "most"}
         for p in self.placed:
             for i in p.at if p.what in names else ():
-                found[i][names[p.what]] = float(values[p.parameter.name])
-        return [JointDrive(control, **one) for one in found]
+                drives[i][names[p.what]] = float(values[p.parameter.name])
+        return [JointDrive(control, **drive) for drive in drives]
 
 
 class IdentifiableMjcf(IdentifiableRecording):
@@ -341,7 +332,7 @@ class IdentifiableMjcf(IdentifiableRecording):
         self._joints, self._dofs = world.joints, world.qvel_at
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
 
-    def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
+    def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.
 
         Args:
@@ -363,7 +354,7 @@ class IdentifiableMjcf(IdentifiableRecording):
 
 
 def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[ParameterPattern, ...]:
-    """Return what is identified unless somebody says otherwise.
+    """Return the default parameters to identify.
 
     Stiffness or gain, damping and inertia are one value for all joints, dry friction is each joint's own. The drive's
     damping and the joint's can be separated only where torque is switched off or the log has gains of its own: else
@@ -374,7 +365,7 @@ def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[Parame
         physical: Whether the log's own gains are in N m/rad and N m s/rad: then factors of them are identified.
     """
     if "goal" in commands:
-        factor: dict[str, Any] = {"nominal": 1.0, "low": 0.3, "high": 3.0} if physical else {}
+        factor: dict[str, PyTree] = {"nominal": 1.0, "low": 0.3, "high": 3.0} if physical else {}
         first: tuple[ParameterPattern, ...] = (
             ParameterPattern("kp", **factor),
             *([ParameterPattern("kd", **factor)] if physical else []),
@@ -384,8 +375,3 @@ def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[Parame
         first = (ParameterPattern("kd"),) if "goal_velocity" in commands else (ParameterPattern("gain"),)
     rest = () if "goal_velocity" in commands and "goal" not in commands else (ParameterPattern("damping"),)
     return (*first, *rest, ParameterPattern("armature"), ParameterPattern("frictionloss", each=True))
-
-
-def all_joints(model: Path) -> tuple[str, ...]:
-    """Return the joints of a model file."""
-    return joints_of(read_model(model))

@@ -43,6 +43,7 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
     Raises:
         UsageError: When the file is missing, beyond the budget, or MuJoCo cannot read or compile it.
     """
+    # Count the file's memory before MuJoCo reads it.
     if not path.is_file():
         raise UsageError(f"there is no model {path}", hint="name an MJCF or URDF file with --mjcf")
     _Budget(path).check(path)
@@ -50,6 +51,7 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
     notes: list[str] = []
     packaged = False
     try:
+        # Read it; if it does not compile, omit files that only contacts and pictures need.
         spec = mj.MjSpec.from_file(str(path))
         notes = meshes.find_packages(spec, path)
         packaged = bool(notes)
@@ -66,7 +68,7 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
             f"MuJoCo cannot read {path}: {'; '.join([one_line(error), *notes])}",
             hint=_PACKAGES
             if packaged
-            else "correct the file; files that it names must lie where it says, or be taken out",
+            else "correct the file; put the files that it names where it names them, or remove them from it",
         ) from None
     return spec, omitted
 
@@ -83,7 +85,7 @@ class _Budget:
         self._path = path
         self._bytes = self._file_bytes = 0
         self._elements = 0
-        self._seen: set[Path] = set()
+        self._visited: set[Path] = set()
         self._names: set[str] = set()
 
     def check(self, path: Path) -> None:
@@ -92,12 +94,14 @@ class _Budget:
         Raises:
             UsageError: When it is beyond the budget, or no text in UTF-8.
         """
-        if path.resolve() in self._seen or not path.is_file():
-            return  # MuJoCo says what is wrong with it
-        self._seen.add(path.resolve())
+        if path.resolve() in self._visited or not path.is_file():
+            return  # MuJoCo reports the defect
+        # Limit the total size of all included files.
+        self._visited.add(path.resolve())
         self._bytes += path.stat().st_size
         if self._bytes > _MOST_BYTES:
             self._refuse("has more than", _MOST_BYTES // 2**20, "MiB of text")
+        # Read the text; MuJoCo reads UTF-8 without entities.
         try:
             text = path.read_bytes().decode("utf-8-sig")
         except UnicodeDecodeError as error:
@@ -113,7 +117,8 @@ class _Budget:
         self._count(text)
 
     def _count(self, text: str) -> None:
-        """Count the elements of a text, and what they ask for."""
+        """Count the elements of a text, and the memory that they need."""
+        # Parse in parts, and stop as soon as a limit is exceeded.
         parser: Any = ET.XMLPullParser(("start", "end"))
         copies = [1]
         try:
@@ -132,14 +137,16 @@ class _Budget:
                         self._refuse("has more than", _MOST_ELEMENTS, f"elements after <{element.tag}>")
                     self._element(element)
         except ET.ParseError:
-            return  # MuJoCo says what is wrong with it
+            return  # MuJoCo reports the defect
 
     def _element(self, element: ET.Element) -> None:
+        # Refuse numbers that are not finite.
         tag, get = element.tag, element.attrib
         self._names.add(get.get("name", ""))
         for name, value in get.items():
             if value not in self._names and any(_strange(word, name) for word in value.split()):
                 raise UsageError(f"{self._path}: {name} = {value!r} of a <{tag}> is not finite", hint="correct it")
+        # Limit included files, sizes and the memory of files.
         if tag == "include":
             self.check(self._path.parent / get.get("file", ""))
         elif tag == "size":
@@ -148,22 +155,22 @@ class _Budget:
                 if _number(value) > most:
                     self._refuse(f"asks for {name} = {value} in <size>, more than", most, "")
         elif tag in ("hfield", "texture", "mesh"):
-            own = _number(get.get("nrow")) * _number(get.get("ncol"))
-            own = max(own, _number(get.get("width")) * _number(get.get("height")))
-            if own > _MOST_CELLS:
+            cells = _number(get.get("nrow")) * _number(get.get("ncol"))
+            cells = max(cells, _number(get.get("width")) * _number(get.get("height")))
+            if cells > _MOST_CELLS:
                 self._refuse(f"has a <{tag}> of more than", _MOST_CELLS, "cells")
             self._file(tag, get)
 
     def _file(self, tag: str, get: Mapping[str, str]) -> None:
         """Count files that an element names and that lie beside the model or in a folder of it."""
         for name in (get.get("file"), get.get("filename")):
-            found = next(iter(self._places(name)), None) if name else None
-            if found is None:
+            file = next(iter(self._places(name)), None) if name else None
+            if file is None:
                 continue
-            self._file_bytes += found.stat().st_size
+            self._file_bytes += file.stat().st_size
             if self._file_bytes > _MOST_FILE_BYTES:
                 self._refuse("names files with more than", _MOST_FILE_BYTES // 2**20, "MiB")
-            if math.prod(_png_size(found)) > _MOST_CELLS:
+            if math.prod(_png_size(file)) > _MOST_CELLS:
                 self._refuse(f"has a <{tag}> of more than", _MOST_CELLS, "pixels")
 
     def _places(self, name: str) -> Iterable[Path]:
@@ -181,7 +188,7 @@ class _Budget:
 
 
 def _copies(element: ET.Element) -> int:
-    """Return how many copies MuJoCo makes of what is in an element."""
+    """Return the number of copies that MuJoCo makes of an element's content."""
     if element.tag not in ("replicate", "flexcomp", "composite"):
         return 1
     return max(1, math.prod(int(_number(n)) for n in element.attrib.get("count", "1").split()))
@@ -198,10 +205,10 @@ def _number(text: str | None) -> float:
     text = (text or "").strip()
     factor = _UNITS.get(text[-1:].upper(), 1)
     try:
-        found = factor * float(text[:-1] if factor > 1 else text)
+        number = factor * float(text[:-1] if factor > 1 else text)
     except ValueError:
         return 0.0
-    return 0.0 if math.isnan(found) else min(max(found, 0.0), 1e18)
+    return 0.0 if math.isnan(number) else min(max(number, 0.0), 1e18)
 
 
 def _png_size(path: Path) -> tuple[int, int]:

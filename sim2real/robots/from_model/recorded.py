@@ -1,4 +1,4 @@
-"""Robots that are known from recordings: a world that recorded commands drive, and a sensor that reads it."""
+"""Robots of recordings: recorded commands drive a world, and a sensor reads it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import jax
 
@@ -18,6 +18,7 @@ from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.robots.completeness import complete, tuple_of
 from sim2real.robots.roles import ROLES, Roles
+from sim2real.types import PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
 
 
@@ -44,19 +45,19 @@ class LoggedRobot(ABC):
 
     _DATA: ClassVar = {"channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel))}
 
-    def __new__(cls, *args: Any, **options: Any) -> Self:
+    def __new__(cls, *args: object, **options: object) -> Self:
         """Make the robot, if its class has all methods."""
         return complete(cls, *args, **options)
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
-        """Return the parameters that may be identified, but for the delays."""
+        """Return the parameters that can be identified, without the delays."""
 
     @abstractmethod
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
         """Return sensor, actuator and world, not connected yet; their names are those of the roles."""
 
-    def started(self, params: Mapping[str, Any], start: Any) -> dict[str, Any]:
+    def started(self, params: Mapping[str, PyTree], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters with an initial state; default: ``start`` of the world's parameters.
 
         Args:
@@ -78,7 +79,7 @@ class LoggedRobot(ABC):
         del wanted
         return self
 
-    def identified_mjcf(self, values: Mapping[str, Any]) -> str | None:
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""
         del values
         return None
@@ -105,7 +106,7 @@ class IdentifiableRecording:
         nodes = robot.make_nodes()
         message = nodes[1].init_output()
         fields = jax.tree_util.tree_structure(message).unflatten(list(named_leaves(message)))
-        self.given: Mapping[str, Any] = {actuator: fields}
+        self.given: Mapping[str, PyTree] = {actuator: fields}
         self._params = {node.name: node.init_params() for node in nodes}
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
@@ -117,7 +118,7 @@ class IdentifiableRecording:
         sensor.connect(world, delay_dist=TrainableDist.create(tick_s, 0.0, 2 * tick_s, "linear") if tick_s else None)
         return {n.name: n for n in (sensor, actuator, world)}
 
-    def params(self, values: Mapping[str, Any], start: Any) -> dict[str, Any]:
+    def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.
 
         Args:

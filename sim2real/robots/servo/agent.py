@@ -1,26 +1,27 @@
 """The policy's node: reads measurements, keeps a short history, and sends goals of joints, or actions as they are.
 
-``observe`` and ``act`` compute with what they get: JAX in a compiled graph, numpy on the wall clock, where a call of
-JAX for each small array would take longer than the policy.
+``observe`` and ``act`` compute with the type of their arguments: JAX in a compiled graph, numpy on the wall
+clock, where a call of JAX for each small array would take longer than the policy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Unpack
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
 from sim2real.arrays import namespace
-from sim2real.graph.base import Array, Base, GraphState, StepState
-from sim2real.graph.node import BaseNode
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.robots.control_loop.messages import Decision, JointReading
 from sim2real.robots.roles import ROLES
+from sim2real.types import Array, Key, PyTree
 
-Features = Callable[[JointReading, Any, Any], Array]
-"""Returns the part of the observation that depends on the present: (reading, goals, aim) -> ``(features,)``."""
+Features = Callable[[JointReading, Array, Array], Array]
+"""Returns the present part of the observation: (reading, goals, aim) -> ``(features,)``."""
 
 
 @struct.dataclass
@@ -30,13 +31,13 @@ class AgentParams(Base):
     Attributes:
         policy: A pytree with ``get_action(observation)``, or, if it remembers, with ``initial_carry()`` and
             ``step(carry, observation)``; None: the goals stay constant.
-        aim: Shape ``(k,)``: what the task asks for in this episode, e.g. a target [the task's units].
+        aim: Shape ``(k,)``: the task's aim in this episode, e.g. a target [the task's units].
         start: Shape ``(joints,)``: goals at the start [rad].
     """
 
-    policy: Any = None
-    aim: Any = None
-    start: Any = None
+    policy: PyTree = None
+    aim: Array | None = None
+    start: Array | None = None
 
 
 @struct.dataclass
@@ -47,24 +48,23 @@ class AgentState(Base):
         goal: Shape ``(joints,)``: the goals [rad].
         past: Shape ``(history, 3 * joints)``: positions [rad], velocities [rad/s] and goals [rad] of the last steps,
             newest first.
-        carry: What a policy that remembers carries from step to step.
+        carry: State of a policy with memory.
     """
 
-    goal: Any
-    past: Any
-    carry: Any = ()
+    goal: Array
+    past: PyTree
+    carry: PyTree = ()
 
 
-def first_carry(policy: Any) -> Any:
-    """Return what a policy carries into an episode's first step; ``()`` where it remembers nothing."""
+def first_carry(policy: PyTree) -> PyTree:
+    """Return a policy's state before the first step; ``()`` without memory."""
     return policy.initial_carry() if hasattr(policy, "initial_carry") else ()
 
 
-def decide(policy: Any, carry: Any, observation: Array) -> tuple[Any, Array]:
-    """Return what a policy carries on, and its action.
+def decide(policy: PyTree, carry: PyTree, observation: Array) -> tuple[PyTree, Array]:
+    """Return a policy's next state, and its action.
 
     Args:
-        policy: See ``AgentParams``.
         observation: Shape ``(O,)``.
     """
     return policy.step(carry, observation) if hasattr(policy, "step") else (carry, policy.get_action(observation))
@@ -73,14 +73,13 @@ def decide(policy: Any, carry: Any, observation: Array) -> tuple[Any, Array]:
 class GoalAgent(BaseNode):
     """Sends goals to position-controlled servos; a policy's action is the speed of the goals.
 
-    So the goals are continuous and of limited speed whatever the policy does, and exploration noise averages out.
+    So the goals are continuous and of limited speed for every policy, and exploration noise averages out.
 
     Args:
         rate: Steps per second [Hz].
         low: Shape ``(joints,)``: lowest goals [rad].
         high: Shape ``(joints,)``: highest goals [rad].
-        features: Part of the observation that depends on the present: (reading, goals, aim) -> ``(features,)``.
-        history: Number of past steps in the observation.
+        features: Present part of the observation: (reading, goals, aim) -> ``(features,)``.
         **options: Options of ``BaseNode``.
     """
 
@@ -94,25 +93,25 @@ class GoalAgent(BaseNode):
         history: int,
         aims: int,
         sensor: str = ROLES.sensor,
-        **options: Any,
+        **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
         self._low, self._high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         self._features, self._history, self._aims, self._sensor = features, history, aims, sensor
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentParams:
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
         """Return parameters without a policy, and zeros for aim and start."""
         del rng, graph_state
         return AgentParams(aim=jnp.zeros(self._aims), start=jnp.zeros_like(self._low))
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentState:
+    def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentState:
         """Return the goals at the start, and a history of zeros."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         start = jnp.asarray(params.start, jnp.float32)
         past = jnp.zeros((self._history, 3 * start.size))
         return AgentState(goal=start, past=past, carry=first_carry(params.policy))
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Decision:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Decision:
         """Return a message with the goals at the start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         return Decision(jnp.asarray(params.start, jnp.float32), jnp.asarray(params.aim, jnp.float32))
@@ -123,7 +122,7 @@ class GoalAgent(BaseNode):
         now = self._features(reading, state.goal, step_state.params.aim)
         return namespace(now, state.past).concatenate([now, state.past.ravel()]).astype(np.float32)
 
-    def act(self, step_state: StepState, action: Any) -> tuple[StepState, Decision]:
+    def act(self, step_state: StepState, action: Array) -> tuple[StepState, Decision]:
         """Return the new step state and the message for an action ``(joints,)``: speeds of the goals [rad/s]."""
         reading, state = step_state.inputs[self._sensor][-1].data, step_state.state
         xp = namespace(action, state.goal, reading.position)
@@ -149,24 +148,22 @@ class Past(Base):
     Attributes:
         observations: Shape ``(history, features)``.
         actions: Shape ``(history, actions)``.
-        carry: What a policy that remembers carries from step to step.
+        carry: State of a policy with memory.
     """
 
-    observations: Any
-    actions: Any
-    carry: Any = ()
+    observations: Array
+    actions: Array
+    carry: PyTree = ()
 
 
 class DirectAgent(BaseNode):
-    """Sends a policy's actions as they are, e.g. voltages.
+    """Sends a policy's actions unchanged, e.g. voltages.
 
-    The policy sees features of the newest measurement, and the features and actions of the last steps.
+    Its observation has features of the newest measurement, and the features and actions of the last steps.
 
     Args:
         rate: Steps per second [Hz].
-        features: What the policy sees of a measurement: message of the sensor -> ``(features,)``.
-        history: Number of past steps in the observation.
-        message: Makes the node's message from an action.
+        features: The policy's features of a measurement: message of the sensor -> ``(features,)``.
         **options: Options of ``BaseNode``.
     """
 
@@ -174,28 +171,28 @@ class DirectAgent(BaseNode):
         self,
         name: str,
         rate: float,
-        features: Callable[[Any], Array],
+        features: Callable[[PyTree], Array],
         sizes: tuple[int, int],
         history: int,
-        message: Callable[[Any], Any],
+        message: Callable[[PyTree], PyTree],
         sensor: str = ROLES.sensor,
-        **options: Any,
+        **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
         self._features, self._sizes, self._history = features, sizes, history
         self._message, self._sensor = message, sensor
 
-    def init_params(self, rng: Any = None, graph_state: GraphState | None = None) -> AgentParams:
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
         """Return no policy."""
         del rng, graph_state
         return AgentParams()
 
-    def init_state(self, rng: Any = None, graph_state: GraphState | None = None) -> Past:
+    def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Past:
         """Return an empty history."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
         return Past(*(jnp.zeros((self._history, size)) for size in self._sizes), carry=first_carry(params.policy))
 
-    def init_output(self, rng: Any = None, graph_state: GraphState | None = None) -> Any:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return a message with zeros."""
         del rng, graph_state
         return self._message(jnp.zeros(self._sizes[1]))
@@ -206,7 +203,7 @@ class DirectAgent(BaseNode):
         xp = namespace(now, past.observations)
         return xp.concatenate([now, past.observations.ravel(), past.actions.ravel()])
 
-    def act(self, step_state: StepState, action: Any) -> tuple[StepState, Any]:
+    def act(self, step_state: StepState, action: Array) -> tuple[StepState, PyTree]:
         """Return the new step state and the message for an action ``(actions,)``."""
         past, now = step_state.state, self._now(step_state)
         xp = namespace(action, now, past.observations)
@@ -216,7 +213,7 @@ class DirectAgent(BaseNode):
         )
         return step_state.replace(state=new), self._message(action)
 
-    def step(self, step_state: StepState) -> tuple[StepState, Any]:
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Make a step with the policy's action."""
         policy, past = step_state.params.policy, step_state.state
         if policy is None:

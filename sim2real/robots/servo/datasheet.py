@@ -12,18 +12,18 @@ if TYPE_CHECKING:
 
 _PWM_FULL_SCALE, _P_GAIN_UNIT, _RAD_PER_COUNT = 885, 256, 2.0 * math.pi / 4096
 _STS_P_GAIN_UNIT_PER_RAD = 0.166
-"""As in the registers of ``sim2real.hardware``, which a model for training does not import; a test compares them."""
+"""Equal to the registers of ``sim2real.hardware``, which training does not import; a test compares them."""
 
 
 @dataclass(frozen=True)
 class DataSheet:
-    """Data of a position-controlled servo, and its settings; of a DYNAMIXEL, where no subclass says otherwise.
+    """Data of a position-controlled servo, and its settings; the defaults are a DYNAMIXEL's.
 
     Attributes:
         stall: Torque at full duty and standstill [N m].
         damping: Back-EMF and viscous friction together, about ``stall`` divided by the no-load speed [N m s/rad].
         armature: Inertia of the rotor, as seen at the gear's output [kg m^2].
-        friction: Dry friction [N m]; where it wears off with speed, that at standstill.
+        friction: Dry friction [N m], at standstill if it decreases with speed.
         p_gain: Position P Gain [counts].
         profile_rad_s: Profile Velocity [rad/s].
         model_number: Model number of the servos; a twin of the robot emulates that model's firmware.

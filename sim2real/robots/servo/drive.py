@@ -1,4 +1,4 @@
-"""Position-controlled servos on a bus: what they measure, how they are commanded, and how their port is opened."""
+"""Position-controlled servos on a bus: their measurements, commands and port."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim2real.identify.model import Channel
-from sim2real.robots.contract import RobotDrive, RobotSensor
+from sim2real.robots.contract import RobotDrive, RobotSensor, Session
 from sim2real.robots.control_loop.hardware import Embedded, ServoSession
 from sim2real.robots.control_loop.messages import EpisodeStart, Goals, JointReading
 from sim2real.robots.probe import Probe
@@ -59,7 +59,6 @@ class ServoDrive(RobotDrive):
     Args:
         embedded: Returns the emulated robot; None: there is none.
         settings: Returns the settings of the device on a port; default: those of the data sheet.
-        actuator: Name of the actuator's node.
     """
 
     command, units, message = "goal", MappingProxyType({"goal": "rad"}), Goals
@@ -108,7 +107,7 @@ class ServoDrive(RobotDrive):
         low, high = np.maximum(s.low, -limits.limit), np.minimum(s.high, limits.limit)
         return limits.gate((tuple(low), tuple(high)), stale="hold", node=self._actuator, joints=s.names)
 
-    def prepare(self, session: ServoSession, settle_s: float) -> None:
+    def prepare(self, session: Session, settle_s: float) -> None:
         """Bring the joints to rest, slowly; torque is off before and afterwards.
 
         Raises:
@@ -121,7 +120,7 @@ class ServoDrive(RobotDrive):
         """Return goals ``(N, joints)`` [rad] of an excitation around the middle positions."""
         return signal + np.asarray(self.servos.middle or 0.0)
 
-    def approach(self, session: ServoSession, signal: np.ndarray) -> np.ndarray:
+    def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
         """Return goals ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s instead of in a leap."""
         # After its end an excitation would be 0, which may be outside of the limits: repeat the last goals.
         signal = self.around(np.vstack([signal, np.repeat(signal[-1:], round(_HOLD_S * self.rate_hz), axis=0)]))
@@ -129,6 +128,6 @@ class ServoDrive(RobotDrive):
         covered = np.arange(len(signal))[:, None] * HOME_RAD_S / self.rate_hz
         return signal + np.sign(offset) * np.maximum(np.abs(offset) - covered, 0.0)
 
-    def measured_start(self, session: ServoSession, start: EpisodeStart) -> EpisodeStart:
+    def measured_start(self, session: Session, start: EpisodeStart) -> EpisodeStart:
         """Return a start at the measured positions: goals start there."""
         return start.replace(position=np.asarray(session.rig.measure().position_rad, np.float32))

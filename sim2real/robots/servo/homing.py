@@ -1,4 +1,4 @@
-"""A robot of servos on its way to where it rests: slowly, and torque is off before and afterwards."""
+"""The slow motion of a robot of servos to its rest pose; torque is off before and afterwards."""
 
 from __future__ import annotations
 
@@ -7,32 +7,32 @@ import time
 import numpy as np
 
 from sim2real.errors import SafetyStop
-from sim2real.robots.control_loop.hardware import ServoSession
+from sim2real.robots.robot_parts import Session
 from sim2real.robots.servo.servos import Servos
 
 HOME_RAD_S = 1.0
-"""How fast joints are brought to where they rest."""
+"""Speed of joints on the way to the rest pose."""
 _AT_HOME_RAD, _HOLD_S = 0.1, 0.5
 
 
-def bring_home(session: ServoSession, servos: Servos, rate_hz: float, settle_s: float) -> None:
-    """Bring the joints to where they rest.
+def bring_home(session: Session, servos: Servos, rate_hz: float, settle_s: float) -> None:
+    """Bring the joints to their rest pose.
 
     Args:
-        settle_s: How long it may take to come to rest, a try [s].
+        settle_s: Longest time to come to rest, for each try [s].
 
     Raises:
-        HardwareLost: It does not come to rest.
-        SafetyStop: It rests somewhere else, or what the gate stopped.
+        HardwareLost: The robot does not come to rest.
+        SafetyStop: It rests in another pose, or the gate stopped it.
     """
     rest = np.asarray(servos.at_rest)
     position = session.rig.wait_until_still(settle_s).position_rad
     if np.max(np.abs(position - rest)) > _AT_HOME_RAD:
         _move(session, position, rest, rate_hz)  # a joint without weight stays where it was left
         position = session.rig.wait_until_still(settle_s).position_rad
-    off = np.abs(position - rest)
-    worst = int(np.argmax(off))
-    if off[worst] > servos.rest_tolerance:
+    error = np.abs(position - rest)
+    worst = int(np.argmax(error))
+    if error[worst] > servos.rest_tolerance:
         raise SafetyStop(
             f"joint {servos.names[worst]!r} rests at {position[worst]:.2f} rad, "
             f"not within {servos.rest_tolerance:g} rad of {rest[worst]:g} rad",
@@ -40,7 +40,7 @@ def bring_home(session: ServoSession, servos: Servos, rate_hz: float, settle_s: 
         )
 
 
-def _move(session: ServoSession, position: np.ndarray, rest: np.ndarray, rate_hz: float) -> None:
+def _move(session: Session, position: np.ndarray, rest: np.ndarray, rate_hz: float) -> None:
     rig, way = session.rig, rest - position
     steps = int(np.ceil(np.max(np.abs(way)) / HOME_RAD_S * rate_hz))
     rig.start()
@@ -50,6 +50,6 @@ def _move(session: ServoSession, position: np.ndarray, rest: np.ndarray, rate_hz
             rig.command(position + min(1.0, step / steps) * way, 0.0, time.monotonic())
             time.sleep(1 / rate_hz)
     except BaseException:
-        rig.stop_quietly()  # the reason must not be lost to what else fails
+        rig.stop_quietly()  # a failure here must not replace the reason
         raise
     rig.stop()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from sim2real.robots.servo.payload import PAYLOAD, Hand
 from sim2real.robots.servo.servos import Servos
 from sim2real.robots.servo.simulated_world import ServoWorld
 from sim2real.robots.servo.task import NO_AIM, Aim
-from sim2real.types import PyTree
+from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.composer.world import WorldParams
@@ -34,10 +34,7 @@ class ComposedModel(RobotModel):
     """A composed task on MJX, whose control step is the world's tick.
 
     Args:
-        make_task: Returns a new task.
-        hand: Where the robot holds things; its payload is an optional term.
         dynamics: Returns the parameters; default: those of the servos, and the payload.
-        causes: See ``RecordedRobot``.
     """
 
     def __init__(
@@ -66,7 +63,7 @@ class ComposedModel(RobotModel):
         if (built := [s.gear for s in task.robot.servos]) != mounted:
             raise UsageError(
                 f"the model's servos have the gears {built}, the joints {mounted}",
-                hint="make each part of its joint: `Servo(joint, axis, sheet)`, not of the joint's name",
+                hint="pass the joint to each part, not its name: `Servo(joint, axis, sheet)`",
             )
         return task
 
@@ -84,9 +81,9 @@ class ComposedModel(RobotModel):
     def export_lead_s(self) -> float:
         """Time that C MuJoCo adds to the actuator's delay [s].
 
-        Half a step for the leapfrog, as in the graph, and half a step as MuJoCo's setpoints are those of a step's end.
-        Less a quarter of a tick: in the graph a goal acts as its mean over a tick, so a profile starts up to a tick
-        early. docs/guides/export.md has the remaining error.
+        It is half a step for the leapfrog, as in the graph, plus half a step because MuJoCo uses setpoints of a step's
+        end, minus a quarter of a tick: in the graph a goal acts as its mean over a tick, so a profile starts up to a
+        tick early. docs/guides/export.md has the remaining error.
         """
         return 2 * self.lead_s - 0.25 * self.tick_s
 
@@ -102,28 +99,28 @@ class ComposedModel(RobotModel):
         fields, worn, roles = self.fields(self.task), self.servos.sheet.worn, self._roles
         return ServoWorld(roles.world, self.task, fields, resumed, roles.actuator, worn)
 
-    def params(self, values: Mapping[str, Any], start: EpisodeStart) -> WorldParams:
+    def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
         """Return the world's parameters for an episode."""
         position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
         return self._world_params.replace(values=self.place(values, start.aim), qpos=position, qvel=velocity)
 
-    def true_state(self, state: Any) -> PyTree:
+    def true_state(self, state: PyTree) -> PyTree:
         """Return positions and velocities of all bodies' joints, and the servos' setpoints."""
         return state.data.qpos, state.data.qvel, state.variables[REFERENCE]
 
-    def fields(self, task: GoalTask) -> Mapping[str, tuple[Any, str]]:
+    def fields(self, task: GoalTask) -> Mapping[str, tuple[PyTree, str]]:
         """Return the parts of the model that differ between copies: name -> (elements, attribute)."""
         in_hand = self.hand.fields(task) if self.hand else {}
         return {**parameters.fields(task.robot), **in_hand, **self.aim.elements(task)}
 
-    def place(self, values: Mapping[str, Any], aim: Any) -> dict[str, Any]:
+    def place(self, values: Mapping[str, Scalar], aim: Array) -> dict[str, PyTree]:
         """Return the arrays of ``fields`` for parameters by name and an aim ``(k,)``."""
         s = self.servos
         of_servos = parameters.place(values, s.sheet, s.joints, self.task.physics_timestep)
         in_hand = self.hand.place(values, self._world_params.values) if self.hand else {}
         return {**of_servos, **in_hand, **self.aim.place(aim)}
 
-    def identified_mjcf(self, values: Mapping[str, Any]) -> str:
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str:
         """Return the robot's model with identified values, as MJCF."""
         s, task = self.servos, self.task
         mjcf = parameters.identified_mjcf(self._mjcf, task.robot, values, s.sheet, s.joints)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Unpack
 
 import jax.numpy as jnp
 
 from sim2real.arrays import namespace
+from sim2real.graph.node import NodeOptions
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.contract import RobotAgent
 from sim2real.robots.control_loop.messages import EpisodeStart, JointReading
@@ -16,7 +17,7 @@ from sim2real.robots.roles import ROLES, Roles
 from sim2real.robots.servo.agent import AgentParams, GoalAgent
 from sim2real.robots.servo.servos import Servos
 from sim2real.robots.servo.task import NO_AIM, Aim
-from sim2real.types import Array
+from sim2real.types import Array, PyTree
 
 Feature = tuple[str, tuple[str, ...]] | tuple[str, tuple[str, ...], float]
 """Name and units of a term of the observation, and its largest magnitude [the units] where there is one."""
@@ -38,7 +39,6 @@ class ServoAgent(RobotAgent):
         features: Names, units and largest magnitudes of the present part of the observation; None: positions,
             velocities, goals and aim.
         observe: Makes that part; see ``Observe``.
-        history: Number of past steps in the observation.
     """
 
     def __init__(
@@ -59,14 +59,14 @@ class ServoAgent(RobotAgent):
         self.limits = {f"{end} goal of {n}": v for end, vs in ends.items() for n, v in zip(names, vs, strict=True)}
         self.units = {f"aim[{i}]": unit for i, (_, unit) in enumerate(aim.entries)}
 
-    def make(self, rate_hz: float, **options: Any) -> GoalAgent:
+    def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> GoalAgent:
         """Return the policy's node."""
         s, roles, aims = self._servos, self._roles, len(self._aim.entries)
         return GoalAgent(
             roles.supervisor, rate_hz, s.low, s.high, self.observe, self.history, aims, roles.sensor, **options
         )
 
-    def params(self, start: EpisodeStart, policy: Any) -> AgentParams:
+    def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
         """Return the node's parameters: goals start at the joints' positions."""
         return AgentParams(policy=policy, aim=start.aim, start=jnp.asarray(start.position, jnp.float32))
 
@@ -84,8 +84,8 @@ def servo_terms(
     Args:
         aim: Names and units of the aim's entries.
         features: Terms of the present; None: positions, velocities, goals and aim.
-        history: Number of past steps.
     """
+    # Bounds of the measurements: the goals' range with a margin, and the servos' largest speed.
     n, sheet = len(servos.joints), servos.sheet
     free = _SPEED_FACTOR * sheet.stall / sheet.damping if sheet.damping else _FASTEST_RAD_S
     fast = tuple(free / gear for gear in servos.gears)
@@ -94,6 +94,7 @@ def servo_terms(
         (tuple(-v for v in fast), fast),
         (servos.low, servos.high),
     )
+    # The present part of the observation.
     if features is None:
         measured = (("position", "rad", position), ("velocity", "rad/s", velocity), ("goal", "rad", goal))
         present = [ObservationTerm(name, (unit,) * n, 1, *bounds) for name, unit, bounds in measured]
@@ -101,6 +102,7 @@ def servo_terms(
             present.append(ObservationTerm("aim", tuple(unit for _, unit in aim)))
     else:
         present = [ObservationTerm.within(f[0], f[1], f[2] if len(f) > 2 else math.inf) for f in features if f[1]]
+    # The history.
     if history:
         units = ("rad",) * n + ("rad/s",) * n + ("rad",) * n
         low, high = (position[i] + velocity[i] + goal[i] for i in (0, 1))

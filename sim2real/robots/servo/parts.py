@@ -14,6 +14,7 @@ from sim2real.composer.robot import Robot
 from sim2real.composer.task import Task
 from sim2real.robots.servo.datasheet import DataSheet
 from sim2real.robots.servo.servos import gear_of, name_of
+from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from sim2real.hardware.joint import Joint
@@ -29,9 +30,6 @@ class Servo(Robot):
     The joint's damping is back-EMF and viscous friction together. The driven part is attached to the site ``horn``.
     A gear between servo and joint makes the joint slower and its torque larger; gain, damping and inertia grow by its
     square.
-
-    Args:
-        name: Name of the model, or the joint with its gear.
     """
 
     def _build(self, name: Joint | str, axis: tuple[float, float, float], sheet: DataSheet) -> None:
@@ -54,7 +52,7 @@ class Servo(Robot):
         self.profile_rad_s = sheet.profile_rad_s / gear
 
     @property
-    def mjcf_model(self) -> Any:
+    def mjcf_model(self) -> PyTree:
         """The servo's model."""
         return self._model
 
@@ -90,17 +88,17 @@ class ServoDriven(Robot):
         return [s.actuator for s in self.servos]
 
     def _build_observables(self) -> composer.Observables:
-        found = super()._build_observables()
-        found.disable_all()  # what is enabled is computed in every step, and the graph's sensor needs none of it
-        return found
+        observables = super()._build_observables()
+        observables.disable_all()  # each would be computed in every step, and the graph's sensor needs none
+        return observables
 
     @composer.observable
-    def joint_positions(self, physics: Any) -> Any:
+    def joint_positions(self, physics: Any) -> PyTree:
         """Return the joints' angles ``(joints,)`` [rad]."""
         return physics.bind(self.joints).qpos
 
     @composer.observable
-    def joint_velocities(self, physics: Any) -> Any:
+    def joint_velocities(self, physics: Any) -> PyTree:
         """Return the joints' speeds ``(joints,)`` [rad/s]."""
         return physics.bind(self.joints).qvel
 

@@ -1,4 +1,4 @@
-"""What a robot of servos holds in its hand: an optional term of its model, and tested for after each deployment."""
+"""The payload of a robot of servos: an optional term of its model, and part of each drift test."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.servo.parts import GoalTask
+from sim2real.types import MjSpec, PyTree, Scalar
 
 PAYLOAD = "payload"
 """Name of the parameter, and of its term."""
@@ -20,15 +21,14 @@ _MASS, _CENTRE = "mass of the hand", "centre of the hand"
 
 @dataclass(frozen=True)
 class Hand:
-    """Where a robot holds things.
+    """The hand of a robot.
 
-    Its inertia about its own centre is omitted: behind gears the rotors' is larger by far.
+    The payload's inertia about its centre is neglected: the rotors' inertia behind gears is far larger.
 
     Attributes:
-        joint: The joint that moves the hand.
-        at_m: Where a payload is in the frame of the link that this joint moves [m].
-        most_kg: What it can bear.
-        least_kg: What it may hold less than when the robot was identified, as a negative number; the link that the
+        at_m: Position of a payload in the frame of the link that this joint moves [m].
+        most_kg: Largest mass that it can bear [kg].
+        least_kg: Smallest change since the identification [kg], a negative number; the link that the
             joint moves weighs more.
     """
 
@@ -44,8 +44,8 @@ class Hand:
             PAYLOAD, "kg", 0.0, self.least_kg, self.most_kg, "linear", about=about, free=False, term=PAYLOAD, off=0.0
         )
 
-    def body(self, task: GoalTask) -> Any:
-        """Return the link in a composed task that holds things."""
+    def body(self, task: GoalTask) -> PyTree:
+        """Return the hand's link in a composed task."""
         return next(servo for servo in task.robot.servos if servo.mjcf_model.model == self.joint).horn.parent
 
     def fields(self, task: GoalTask) -> dict[str, tuple[Any, str]]:
@@ -53,30 +53,26 @@ class Hand:
         link = [self.body(task)]
         return {_MASS: (link, "mass"), _CENTRE: (link, "ipos")}
 
-    def loaded(self, mjcf: str, task: GoalTask, values: Mapping[str, Any]) -> str:
-        """Return a model's MJCF with what the hand holds.
-
-        Args:
-            task: Of which it is the model.
-        """
-        spec: Any = mj.MjSpec.from_string(mjcf)
+    def loaded(self, mjcf: str, task: GoalTask, values: Mapping[str, Scalar]) -> str:
+        """Return a model's MJCF with the payload."""
+        spec: MjSpec = mj.MjSpec.from_string(mjcf)
         model, body = spec.compile(), spec.body(self.body(task).full_identifier)
-        own = model.body(body.name)
-        placed = self.place(values, {_MASS: own.mass, _CENTRE: own.ipos[None]})
+        link = model.body(body.name)
+        placed = self.place(values, {_MASS: link.mass, _CENTRE: link.ipos[None]})
         body.explicitinertial, body.mass, body.ipos = True, float(placed[_MASS][0]), np.asarray(placed[_CENTRE][0])
-        body.iquat, body.inertia = own.iquat, own.inertia
+        body.iquat, body.inertia = link.iquat, link.inertia
         body.fullinertia = np.full(6, np.nan)
         spec.compile()
         return spec.to_xml()
 
-    def place(self, values: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    def place(self, values: Mapping[str, Scalar], empty: Mapping[str, PyTree]) -> dict[str, PyTree]:
         """Return the arrays of ``fields``.
 
         Args:
-            values: Parameters by name; without a payload among them there is none.
-            own: The arrays of ``fields`` of a hand that holds nothing.
+            values: Parameters by name; without a payload, it is 0.
+            empty: The arrays of ``fields`` of an empty hand.
         """
-        carried = jnp.asarray(values.get(PAYLOAD, 0.0), jnp.float32)
-        mass, centre = own[_MASS], own[_CENTRE]
-        total = mass + carried
-        return {_MASS: total, _CENTRE: (mass * centre + carried * jnp.asarray(self.at_m)) / total}
+        payload = jnp.asarray(values.get(PAYLOAD, 0.0), jnp.float32)
+        mass, centre = empty[_MASS], empty[_CENTRE]
+        total = mass + payload
+        return {_MASS: total, _CENTRE: (mass * centre + payload * jnp.asarray(self.at_m)) / total}

@@ -1,4 +1,4 @@
-"""Robots of servos as the last release described them, for one release."""
+"""The class of robots of servos of the last release, kept for one release."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sim2real.robots.servo.payload import Hand
 from sim2real.robots.servo.servos import Servos as Servos
 from sim2real.robots.servo.task import Aim, AimTask
 from sim2real.train.environment.tasks import Rewards
-from sim2real.types import Array, Key
+from sim2real.types import Array, Key, PyTree
 
 
 class ServoRobot(Robot):
@@ -44,7 +44,7 @@ class ServoRobot(Robot):
     position_sigma_rad: float = 0.002
     velocity_sigma_rad_s: float = 0.05
 
-    def __init_subclass__(cls, **options: Any) -> None:
+    def __init_subclass__(cls, **options: object) -> None:
         """Warn of the next release."""
         super().__init_subclass__(**options)
         warnings.warn(
@@ -72,7 +72,7 @@ class ServoRobot(Robot):
         """Return the aim of an episode, ``(k,)``."""
         raise NotImplementedError
 
-    def success(self, state: Any) -> jax.Array:
+    def success(self, state: PyTree) -> jax.Array:
         """Return whether the task is fulfilled, bool."""
         raise NotImplementedError
 
@@ -80,12 +80,12 @@ class ServoRobot(Robot):
         """Return figures of how well a deployment went."""
         raise NotImplementedError
 
-    def aim_fields(self, task: Any) -> Mapping[str, tuple[Any, str]]:
-        """Return where an aim stands in the model: name -> (elements, attribute)."""
+    def aim_fields(self, task: GoalTask) -> Mapping[str, tuple[PyTree, str]]:
+        """Return the parts of the model that an aim sets: name -> (elements, attribute)."""
         del task
         return {}
 
-    def place_aim(self, aim: Any) -> dict[str, Any]:
+    def place_aim(self, aim: Array) -> dict[str, PyTree]:
         """Return the arrays of ``aim_fields`` for an aim ``(k,)``."""
         del aim
         return {}
@@ -95,8 +95,8 @@ class ServoRobot(Robot):
         of_servos = parameters.parameters(self.servos.sheet, self.servos.joints)
         return [*of_servos, self.hand.parameter()] if self.hand else of_servos
 
-    def reward(self, state: Any, action: jax.Array) -> Rewards:
-        """Return the reward of a policy step: the task's, less a little for speed of the goals."""
+    def reward(self, state: PyTree, action: jax.Array) -> Rewards:
+        """Return the reward of a policy step: the task's, minus a small penalty on the speed of the goals."""
         return {"task": state.reward, "speed": -0.01 * jnp.mean((action / self.servos.speed) ** 2)}
 
     def observe(self, reading: JointReading, goal: Array, aim: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What a robot's position servos are: their numbers on the bus, their limits, and the joints that they drive."""
+"""A robot's position servos: their numbers on the bus, their limits, and their joints."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ class Servos:
     """The servos on the bus, in the order of the joints.
 
     Attributes:
-        joints: Their names, or the joints with zero, direction and gear; a zero is what the device reads there.
+        joints: Their names, or the joints with zero, direction and gear; a zero is the device's reading there.
         ids: Numbers on the bus.
         low: Lowest goals [rad].
         high: Highest goals [rad].
-        sheet: What their data sheet says, and how they are set up.
-        speed: The fastest that a policy moves goals [rad/s].
-        rest: Where the joints hang without torque [rad]; default: 0.
-        rest_tolerance: How far from there an episode may start [rad].
-        middle: What excitations are around [rad]; default: 0.
-        baud_rate: Of the bus.
-        device: Name of the device that they are; see `sim2real.hardware.registry`.
+        sheet: Their data sheet and settings.
+        speed: Largest speed of a policy's goals [rad/s].
+        rest: Positions of the joints without torque [rad]; default: 0.
+        rest_tolerance: Largest distance of an episode's start from ``rest`` [rad].
+        middle: Centre of excitations [rad]; default: 0.
+        baud_rate: Baud rate of the bus.
+        device: Name of the device; see `sim2real.hardware.registry`.
     """
 
     joints: tuple[Joint | str, ...]
@@ -56,7 +56,7 @@ class Servos:
     @property
     def mounting(self) -> tuple[Joint, ...]:
         """The joints."""
-        from sim2real.hardware.joint import Joint  # for the rig: training needs names and gears alone
+        from sim2real.hardware.joint import Joint  # imported here: training needs names and gears only
 
         return tuple(Joint.of(joint) for joint in self.joints)
 
@@ -72,5 +72,5 @@ class Servos:
 
     @property
     def at_rest(self) -> np.ndarray:
-        """Where the joints hang without torque, ``(joints,)`` [rad]."""
+        """Positions of the joints without torque, ``(joints,)`` [rad]."""
         return np.asarray(self.rest or np.zeros(len(self.joints)), np.float64)

@@ -1,7 +1,8 @@
-"""The world of a servo robot in simulation; sensor and actuator are those of ``devices.py``."""
+"""The world of a servo robot in simulation; sensor and actuator are in ``simulated_devices.py``."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -9,12 +10,13 @@ import jax.numpy as jnp
 
 from sim2real.composer.world import ComposedWorld, WorldParams
 from sim2real.errors import UsageError
-from sim2real.graph.base import GraphState
+from sim2real.graph.base import GraphState, Value
 from sim2real.robots.control_loop.loop import delay_of
 from sim2real.robots.control_loop.messages import JointReading
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.robots.roles import ROLES
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
+from sim2real.types import Array, Key, PyTree
 from sim2real.worlds.worn import WornFriction
 
 __all__ = ["ServoWorld", "SimActuator", "SimSensor"]
@@ -30,7 +32,8 @@ class ServoWorld(ComposedWorld):
         parameters: Parts of the model that differ between copies: name -> (elements, attribute).
         resumed: Whether episodes begin in the middle of a recording. The servos' setpoints, which are not recorded,
             then start at the goals of that time; otherwise they start at the joints' positions, as when torque goes on.
-        worn: Whether dry friction wears off with speed; ``stribeck_rad_s`` of the parameters' values says where.
+        worn: Whether dry friction decreases with speed; the parameter ``stribeck_rad_s`` is the speed at which 1/e of
+            it is left.
         **options: Options of ``ComposedWorld``.
     """
 
@@ -38,14 +41,14 @@ class ServoWorld(ComposedWorld):
         self,
         name: str,
         task: GoalTask,
-        parameters: Any,
+        parameters: Mapping[str, tuple[PyTree, str]],
         resumed: bool = False,
         actuator: str = ROLES.actuator,
         worn: bool = False,
         **options: Any,
     ) -> None:
         if worn and options.get("impl", "jax") != "jax":
-            raise UsageError("friction that wears off with speed is set between MJX's steps", hint='take impl="jax"')
+            raise UsageError("friction that decreases with speed is set between MJX's steps", hint='set impl="jax"')
         super().__init__(name, task, actuator, "goal", parameters, **options)
         self._resumed = resumed
         self.law = WornFriction() if worn else None
@@ -63,26 +66,26 @@ class ServoWorld(ComposedWorld):
         return params.replace(values={**params.values, STRIBECK: jnp.full(len(self._qvel), jnp.inf)})
 
     def law_values(self, params: WorldParams) -> dict[str, jax.Array]:
-        """Return friction at standstill [N m], and at which speed [rad/s] 1/e of it is left, of all that moves."""
+        """Return friction at standstill [N m], and the speed [rad/s] at which 1/e of it is left, of each joint."""
         friction = self._model(params).dof_frictionloss
         widths = jnp.full(friction.shape, jnp.inf).at[self._qvel].set(jnp.asarray(params.values[STRIBECK]))
         return {"frictionloss": friction, STRIBECK: widths}
 
-    def output(self, state: Any) -> JointReading:
+    def output(self, state: PyTree) -> JointReading:
         """Return positions and velocities of the joints."""
         # In a leapfrog scheme velocities belong to half a step earlier: extrapolated by the acceleration.
         speed = state.data.qvel + self.lead_s * state.data.qacc
         return JointReading(state.data.qpos[self._qpos], speed[self._qvel])
 
-    def velocity(self, state: Any) -> jax.Array:
+    def velocity(self, state: PyTree) -> jax.Array:
         """Return the joints' velocities ``(joints,)`` [rad/s]."""
         return state.data.qvel[self._qvel]
 
-    def with_velocity(self, state: Any, velocity: jax.Array) -> Any:
+    def with_velocity(self, state: PyTree, velocity: jax.Array) -> PyTree:
         """Return the state with other velocities of the joints ``(joints,)`` [rad/s]."""
         return state.replace(data=state.data.replace(qvel=state.data.qvel.at[self._qvel].set(velocity)))
 
-    def entered(self, state: Any, action: Any) -> Any:
+    def entered(self, state: PyTree, action: Array) -> PyTree:
         """Return the state with which a control step begins; a resumed episode's setpoints start at the goals.
 
         Args:
@@ -93,12 +96,12 @@ class ServoWorld(ComposedWorld):
         reference = jnp.where(state.steps == 0, action, state.variables[REFERENCE])
         return state.replace(variables={**state.variables, REFERENCE: reference})
 
-    def init_delays(self, rng: Any = None, graph_state: GraphState | None = None) -> dict[str, Any]:
+    def init_delays(self, rng: Key | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of the goals, if the actuator's parameters have one.
 
         MuJoCo's integrator (a leapfrog scheme) moves a joint as if a force had acted half a time step earlier. Half a
         step is therefore added to the delay, so that an identified delay is that of the real robot.
         """
         del rng
-        found = delay_of(self.input_name, self.input_name, graph_state)
-        return {name: delay + self.lead_s for name, delay in found.items()}
+        delays = delay_of(self.input_name, self.input_name, graph_state)
+        return {name: delay + self.lead_s for name, delay in delays.items()}

@@ -1,10 +1,9 @@
-"""The task of a robot of servos: each episode has an aim, and starts at rest or anywhere."""
+"""The task of a robot of servos: each episode has an aim, and starts at rest or at a random position."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,23 +14,23 @@ from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.servo.servos import Servos
 from sim2real.train.environment.tasks import Rewards
-from sim2real.types import Array, Key
+from sim2real.types import Array, Key, PyTree
 
 
 @dataclass(frozen=True)
 class Aim:
-    """What the task asks for in an episode, such as a target's position.
+    """The aim of an episode, such as a target's position.
 
     Attributes:
         entries: Name and unit of each of the k entries.
         draw: Returns the aim of an episode ``(k,)``.
-        elements: Returns where an aim stands in the composed task: name -> (elements, attribute).
+        elements: Returns the parts of the composed task that an aim sets: name -> (elements, attribute).
         place: Returns the arrays of ``elements`` for an aim ``(k,)``.
     """
 
     entries: tuple[tuple[str, str], ...]
     draw: Callable[[Key], Array]
-    elements: Callable[[Any], Mapping[str, tuple[Any, str]]] = lambda task: {}
+    elements: Callable[[PyTree], Mapping[str, tuple[PyTree, str]]] = lambda task: {}
     place: Callable[[Array], dict[str, Array]] = lambda aim: {}
 
 
@@ -45,21 +44,21 @@ class AimTask(RobotTask):
     Args:
         success: Returns whether a state of the world fulfils the task, bool.
         score: Returns figures of a deployment; see ``RobotTask.score``.
-        reward: Returns the reward of a state and an action; default: the composed task's, less a little for speed.
+        reward: Returns the reward of a state and an action; default: the composed task's, minus a penalty on speed.
     """
 
     def __init__(
         self,
         servos: Servos,
         aim: Aim,
-        success: Callable[[Any], jax.Array],
+        success: Callable[[PyTree], jax.Array],
         score: Callable[[np.ndarray, Mapping[str, np.ndarray]], dict[str, float]],
-        reward: Callable[[Any, jax.Array], Rewards] | None = None,
+        reward: Callable[[PyTree, jax.Array], Rewards] | None = None,
     ) -> None:
         self._servos, self.aim, self.aim_size = servos, aim, len(aim.entries)
         self._success, self._score, self._reward = success, score, reward
 
-    def random(self, key: Key, draw: Draw) -> tuple[dict[str, Any], EpisodeStart]:
+    def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], EpisodeStart]:
         """Return values and a start: half of the starts are at rest, half at any position."""
         k_values, k_aim, k_where, k_start = jax.random.split(key, 4)
         values, s = draw(k_values), self._servos
@@ -79,13 +78,13 @@ class AimTask(RobotTask):
         position = jnp.clip(start.position + position, low, high)
         return start.replace(position=position, velocity=start.velocity + velocity)
 
-    def reward(self, state: Any, action: jax.Array) -> Rewards:
+    def reward(self, state: PyTree, action: jax.Array) -> Rewards:
         """Return the reward of a policy step."""
         if self._reward is not None:
             return self._reward(state, action)
         return {"task": state.reward, "speed": -0.01 * jnp.mean((action / self._servos.speed) ** 2)}
 
-    def success(self, state: Any) -> jax.Array:
+    def success(self, state: PyTree) -> jax.Array:
         """Return whether the task is fulfilled, bool."""
         return self._success(state)
 

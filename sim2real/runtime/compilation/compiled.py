@@ -78,9 +78,9 @@ class CompiledGraph:
         self.nodes = nodes_of(nodes, timeline)
         self.supervisor = supervisor_of(supervisor, self.nodes)
         self.timeline = timeline
-        self.given = tuple(given or ())
+        self.replayed = tuple(given or ())
         check_fit(self.nodes, timeline, given or {})
-        self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.given), reusable)
+        self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.replayed), reusable)
         self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes, reusable=reusable)
         self.walk = Walk(self.program, self.supervisor)
         # Unrolling halves a GPU's copies of the carried state (docs/reference/choices.md); on a CPU it costs time to
@@ -90,7 +90,7 @@ class CompiledGraph:
     @cached_property
     def repetition(self) -> Repetition | None:
         """The program of whole episodes in a pattern that all repeat; None without a pattern, or with ``given``."""
-        pattern = None if self.given else wire_pattern(self.nodes, self.supervisor, self.timeline)
+        pattern = None if self.replayed else wire_pattern(self.nodes, self.supervisor, self.timeline)
         if pattern is not None and np.diff(pattern.full) < 2:
             return None
         with jax.ensure_compile_time_eval():  # the first rollout may be traced
@@ -145,7 +145,6 @@ class CompiledGraph:
         Args:
             params: Parameters of some nodes; the other nodes' come from ``init_params``.
             order: Names of nodes that are initialised first.
-            eps: Index of the episode, int or traced.
 
         Raises:
             UsageError: When there is no such episode, or a name is unknown. A traced ``eps`` cannot be checked: in an
@@ -156,7 +155,7 @@ class CompiledGraph:
         outputs = gs.aux[OUTPUTS]
         buffer = {name: (outputs[name],) * length for name, length in self.wiring.rings.items() if length}
         self.program.check_given(outputs)
-        buffer |= {name: outputs[name] for name in self.given}
+        buffer |= {name: outputs[name] for name in self.replayed}
         aux = {k: v for k, v in gs.aux.items() if k != OUTPUTS}
         # A numpy number, not a traced one: code later in the same program can see that this is the first row.
         return gs.replace(eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
@@ -176,7 +175,6 @@ class CompiledGraph:
         """Make the supervisor's step, and run from there to its next one.
 
         Args:
-            gs: The state that ``reset`` or ``step`` returned.
             step_state: The supervisor's step state after the step; None: unchanged.
             output: The step's output; None: the supervisor's ``step`` is called with ``step_state``.
 
@@ -224,7 +222,6 @@ class CompiledGraph:
         """Run the rows of an episode, the supervisor making its own steps.
 
         Args:
-            gs: The state that ``init`` or another rollout returned.
             rows: Number of rows; default: all remaining rows, or the whole episode if ``gs.step`` is traced. A whole
                 episode runs in a pattern if there is one, see ``repetition``: to the world's last tick, in another
                 order of the records' places.
@@ -263,8 +260,8 @@ class CompiledGraph:
 
     def _check_record(self, record: Sequence[str]) -> None:
         for name in record:
-            if name not in self.nodes or name in self.given:
-                running = [n for n in self.nodes if n not in self.given]
+            if name not in self.nodes or name in self.replayed:
+                running = [n for n in self.nodes if n not in self.replayed]
                 raise UsageError(f"no node {name!r} runs that could be recorded. Nodes: {', '.join(running)}")
 
     def observe(self, gs: GraphState, inside: bool = False) -> tuple[GraphState, StepState, Number]:
@@ -292,7 +289,6 @@ class CompiledGraph:
 
         Args:
             output: The step's output; ignored in a row without a step.
-            inside: As in ``observe``.
 
         Returns:
             The state at the start of the next row.

@@ -41,31 +41,30 @@ def supervisor_of(supervisor: BaseNode | str, nodes: Mapping[str, BaseNode]) -> 
     return supervisor if isinstance(supervisor, str) else supervisor.name
 
 
-def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[str, PyTree]) -> None:
+def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, replayed: Mapping[str, PyTree]) -> None:
     """Check that nodes, connections and timeline fit each other, and that the nodes can be compiled.
 
     Args:
-        nodes: The nodes of the timeline, by name.
-        given: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
+        replayed: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
 
     Raises:
         UsageError: A node or connection does not fit; the message names the first one.
     """
     # Nodes, and recorded outputs.
     for name, node in nodes.items():
-        if not node.jittable and name not in given:
+        if not node.jittable and name not in replayed:
             raise UsageError(
                 f"node {name!r} steps in plain Python (jittable = False) and cannot be compiled",
                 hint="give its recorded outputs, or put a simulated node in its place",
             )
     check_senders(nodes, among=nodes)
-    unknown = [n for n in given if n not in nodes]
+    unknown = [n for n in replayed if n not in nodes]
     if unknown:
         raise UsageError(
             f"the outputs of {unknown[0]!r} are given, which is not in the graph. Nodes: {', '.join(nodes)}"
         )
-    for name, recorded in given.items():
-        _check_given(name, recorded, timeline)
+    for name, recorded in replayed.items():
+        _check_replayed(name, recorded, timeline)
 
     # Every input of a node has messages in the timeline, and the reverse.
     wanted = {(n, i) for n, node in nodes.items() for i, c in node.inputs.items() if c.output_node.name in nodes}
@@ -93,7 +92,7 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, given: Mapping[
             )
 
 
-def _check_given(name: str, recorded: PyTree, timeline: Timeline) -> None:
+def _check_replayed(name: str, recorded: PyTree, timeline: Timeline) -> None:
     """Check that there is a recorded output for every step of every episode."""
     steps = int(timeline.vertices[name].count.max(initial=0))
     for path, leaf in jax.tree_util.tree_flatten_with_path(recorded)[0]:

@@ -35,8 +35,7 @@ class OpenLoopGraph:
     """A graph whose computed nodes can run one after the other.
 
     Args:
-        supervisor: Name of the node that ``init_graph_state`` initialises first.
-        given: Nodes that do not run, as their outputs are recorded.
+        replayed: Nodes that do not run, as their outputs are recorded.
 
     Attributes:
         order: The computed nodes, senders before readers.
@@ -46,12 +45,12 @@ class OpenLoopGraph:
         UsageError: Computed nodes form a loop.
     """
 
-    def __init__(self, nodes: Mapping[str, BaseNode], supervisor: str, given: Collection[str]) -> None:
-        self.nodes, self.supervisor, self.given = dict(nodes), supervisor, frozenset(given)
+    def __init__(self, nodes: Mapping[str, BaseNode], supervisor: str, replayed: Collection[str]) -> None:
+        self.nodes, self.supervisor, self.replayed = dict(nodes), supervisor, frozenset(replayed)
         senders = {
-            n: {c.output_node.name for c in node.inputs.values()} - self.given
+            n: {c.output_node.name for c in node.inputs.values()} - self.replayed
             for n, node in self.nodes.items()
-            if n not in self.given
+            if n not in self.replayed
         }
         try:
             self.order = tuple(graphlib.TopologicalSorter(senders).static_order())
@@ -63,16 +62,16 @@ class OpenLoopGraph:
         worlds = [self.nodes[n] for n in self.order if isinstance(self.nodes[n], BaseWorld)]
         self.world = max(worlds, key=lambda n: n.rate).name if worlds else None
 
-    def tables(self, timeline: Timeline, given: Mapping[str, PyTree]) -> Tables:
+    def tables(self, timeline: Timeline, replayed: Mapping[str, PyTree]) -> Tables:
         """Return the timing of all computed steps.
 
         Args:
-            given: Node -> recorded outputs, leaves ``(E, N, ...)``.
+            replayed: Node -> recorded outputs, leaves ``(E, N, ...)``.
 
         Raises:
             UsageError: Nodes and timeline do not fit, or a window is too short for a burst of messages.
         """
-        check_fit(self.nodes, timeline, given)
+        check_fit(self.nodes, timeline, replayed)
         check_bursts(self.nodes, timeline)
         tables: Tables = {}
         for name in self.order:
@@ -102,19 +101,18 @@ class OpenLoopGraph:
         self,
         gs: GraphState,
         tables: Tables,
-        given: Mapping[str, PyTree],
+        replayed: Mapping[str, PyTree],
         record: str,
         known: Mapping[str, PyTree] | None = None,
     ) -> PyTree:
         """Run an episode and return a node's outputs, leaves ``(K, ...)``.
 
         Args:
-            gs: The state that ``begin`` returned.
             tables: Those of this episode: leaves ``(K, ...)``.
-            given: Node -> its recorded messages, leaves ``(N, ...)``.
+            replayed: Node -> its recorded messages, leaves ``(N, ...)``.
             known: Outputs of nodes that were computed elsewhere: node -> leaves ``(1 + K, ...)``, the default first.
         """
-        sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in given.items()} | dict(known or {})
+        sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in replayed.items()} | dict(known or {})
         for name in self.order:
             if name not in sent:
                 outputs = self._scan(name, gs, tables[name], sent, self._step_of(name, gs))
@@ -123,30 +121,27 @@ class OpenLoopGraph:
                 sent[name] = _with_default(gs.aux[OUTPUTS][name], outputs)
         raise UsageError(f"no node {record!r} runs that could be recorded. Nodes: {', '.join(self.order)}")
 
-    def drive(self, gs: GraphState, tables: Tables, given: Mapping[str, PyTree], step: Step) -> PyTree:
+    def drive(self, gs: GraphState, tables: Tables, replayed: Mapping[str, PyTree], step: Step) -> PyTree:
         """Run the world's ticks with another function in place of its step, for physics outside of the program.
 
         Args:
-            gs: The state that ``begin`` returned.
-            tables: As in ``run``.
-            given: As in ``run``, for all senders of the world.
             step: Maps the world's step state to the next one and to a result.
 
         Returns:
             The results, leaves ``(ticks, ...)``.
 
         Raises:
-            UsageError: There is no world, or one of its senders is not in ``given``.
+            UsageError: There is no world, or one of its senders is not in ``replayed``.
         """
         if self.world is None:
             raise UsageError("drive() is for graphs with a world, this one has none")
         world, senders = self.world, [c.output_node.name for c in self.nodes[self.world].inputs.values()]
-        if live := [n for n in senders if n not in given]:
+        if live := [n for n in senders if n not in replayed]:
             raise UsageError(
                 f"drive() needs all messages that the world {world!r} hears, and {live[0]!r} is not given",
                 hint="give its recorded outputs",
             )
-        sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in given.items()}
+        sent = {n: _with_default(gs.aux[OUTPUTS][n], rows) for n, rows in replayed.items()}
         return self._scan(world, gs, tables[world], sent, step, ahead=True)
 
     def _scan(

@@ -39,6 +39,7 @@ def _ticks(placer: Placer, ticks: int, counts: dict[str, int]) -> Steps | None:
 
     Steps that depend on ticks after the last one are not computed.
     """
+    # The range of ticks of each step, and the first tick of each repetition.
     lowest, highest = placer.slack(2 * ticks)
     base = {n: placer.steps(n) // counts[n] * ticks for n in placer.others}
 
@@ -48,6 +49,7 @@ def _ticks(placer: Placer, ticks: int, counts: dict[str, int]) -> Steps | None:
         ahead = np.where(placer.valid(name), tick - base[name], 0).max(axis=0, initial=0)
         return base[name] + np.array([ahead[i::count].max(initial=0) for i in range(count)])[placer.steps(name) % count]
 
+    # Move readers behind their senders until nothing changes; give up if one leaves its range.
     tick = {n: repeated(n, lowest[n]) for n in placer.others}
     changed = True
     while changed:
@@ -60,6 +62,7 @@ def _ticks(placer: Placer, ticks: int, counts: dict[str, int]) -> Steps | None:
             tick[reader] = new
             if (new > highest[reader])[placer.valid(reader)].any():
                 return None
+    # Steps that start after the last tick stay there.
     fits = all((tick[n] <= highest[n])[placer.valid(n)].all() and (np.diff(tick[n]) >= 0).all() for n in placer.others)
     count = int(placer.timeline.vertices[placer.world or ""].count.min())
     return {n: np.where(lowest[n] > count, count + 2 * ticks, t) for n, t in tick.items()} if fits else None

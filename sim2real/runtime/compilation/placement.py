@@ -31,7 +31,6 @@ class Placement:
 
     Attributes:
         ticks: Number of world ticks in a row; 1 without a world.
-        rows: Number of rows in an episode.
         row: Row of each step; steps with a row after the last one are not computed.
         slot: Slot of each step in its row.
         slots: Node of each slot, in the order in which slots run.
@@ -53,7 +52,7 @@ class Placer:
 
     Args:
         supervisor: The supervisor's name; a row is at most as long as its period.
-        given: Nodes with recorded outputs, which are not computed.
+        replayed: Nodes with recorded outputs, which are not computed.
 
     Attributes:
         nodes: The nodes of the timeline, senders before readers.
@@ -64,13 +63,13 @@ class Placer:
     """
 
     def __init__(
-        self, nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, given: frozenset[str]
+        self, nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, replayed: frozenset[str]
     ) -> None:
-        self.timeline, self.supervisor, self.given = timeline, supervisor, given
+        self.timeline, self.supervisor, self.replayed = timeline, supervisor, replayed
         self.nodes = {n: nodes[n] for n in topological(nodes) if n in timeline.vertices}
-        worlds = [n for n in self.nodes.values() if isinstance(n, BaseWorld) and n.name not in given]
+        worlds = [n for n in self.nodes.values() if isinstance(n, BaseWorld) and n.name not in replayed]
         self.world = max(worlds, key=lambda n: n.rate).name if worlds else None
-        self.others = [n for n in self.nodes if n != self.world and n not in given]
+        self.others = [n for n in self.nodes if n != self.world and n not in replayed]
         self.edges = {k: e for k, e in timeline.edges.items() if k[0] in self.nodes and e.sender in self.nodes}
         self.newest = {k: newest_message(e, timeline.vertices[k[0]]) for k, e in self.edges.items()}
 
@@ -101,7 +100,7 @@ class Placer:
     def live(self) -> Iterator[tuple[str, Edge, np.ndarray]]:
         """Yield (reader, edge, newest) of each connection between nodes that are computed, ordered by reader."""
         order = list(self.nodes)
-        keys = [k for k, e in self.edges.items() if e.sender not in self.given and k[0] not in self.given]
+        keys = [k for k, e in self.edges.items() if e.sender not in self.replayed and k[0] not in self.replayed]
         for key in sorted(keys, key=lambda k: order.index(k[0])):
             yield key[0], self.edges[key], self.newest[key]
 
@@ -164,11 +163,13 @@ class Placer:
         Through other nodes' messages as well as directly. Limited to ``slack`` ticks after the step's start: the
         program must keep a step's inputs until it is computed, and some outputs reach the world late or never.
         """
+        # Start from the latest tick at which each step could run.
         ticks = self.timeline.vertices[self.world or ""].start
         latest = {}
         for n in self.others:
             natural = search_rows(ticks, self.timeline.vertices[n].start)
             latest[n] = np.maximum(lowest[n], natural) + slack
+        # Move senders before their readers until nothing changes.
         changed = True
         while changed:
             changed = False

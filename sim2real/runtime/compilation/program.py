@@ -42,7 +42,7 @@ class RowProgram:
     """Traces rows; its tables, constants or those of ``with_data``, are looked up at the state's ``eps`` and ``step``.
 
     Args:
-        given: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
+        replayed: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
         ages: For each slot: input -> smallest and largest age in the table. Without an entry, all ages of the sender's
             ring are possible.
         reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
@@ -52,14 +52,14 @@ class RowProgram:
         self,
         nodes: Mapping[str, BaseNode],
         wiring: Wiring,
-        given: Mapping[str, PyTree],
+        replayed: Mapping[str, PyTree],
         episodes: int,
         ages: Sequence[Mapping[str, Ages]] | None = None,
         reusable: bool = False,
     ) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
         self.bounds: DelayBounds = bounds_of(nodes)
-        self._given = jax.tree_util.tree_map(jnp.asarray, dict(given))
+        self._replayed = jax.tree_util.tree_map(jnp.asarray, dict(replayed))
         # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
         by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
@@ -80,7 +80,7 @@ class RowProgram:
 
     def check_given(self, outputs: Mapping[str, PyTree]) -> None:
         """Check that recorded outputs have the form of their nodes' default outputs."""
-        for name, recorded in self._given.items():
+        for name, recorded in self._replayed.items():
             one = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), recorded)
             check_match(name, "an output that is given for it", one, "that of init_output", outputs[name])
 
@@ -118,7 +118,6 @@ class RowProgram:
 
         Args:
             outputs: Node -> its steps; the world's ticks are appended.
-            inside: As in ``run_slots``.
         """
         name, before, here = self.wiring.world, gs, None if inside else self.within(gs)
         if name is not None:
@@ -212,7 +211,7 @@ class RowProgram:
             width, age = connection.total_window, t["age"]
             sender = connection.output_node.name
             # Messages: recorded ones by seq, computed ones by their age in the sender's ring.
-            if sender in self._given:
+            if sender in self._replayed:
                 data = self._look_up(gs, sender, t["seq"])
             else:
                 ring = gs.buffer[sender]
@@ -237,7 +236,7 @@ class RowProgram:
             filled = seq.reshape(-1, *[1] * default.ndim) >= 0
             return jnp.where(filled, recorded[gs.eps, jnp.maximum(seq, 0)], default)
 
-        return jax.tree_util.tree_map(one, self._given[sender], gs.buffer[sender])
+        return jax.tree_util.tree_map(one, self._replayed[sender], gs.buffer[sender])
 
 
 def _window(ring: tuple[T, ...], age: jax.Array, width: int, min_age: int, max_age: int) -> T:

@@ -22,7 +22,6 @@ class Walk:
     The supervisor may have several slots in a row; its i-th one is called turn i.
 
     Attributes:
-        turns: The supervisor's slots.
         places: Shape ``(E, K)``: place of each of its steps, ``row * number of turns + turn``.
         end: The place after the last row, also used for steps that an episode does not have.
     """
@@ -89,7 +88,6 @@ class Walk:
         """Run to the supervisor's next step.
 
         Args:
-            gs: The graph's state, with the supervisor's step done.
             turn: The turn of that step.
             ended: Bool scalar: the episode has no further step, and the state stays unchanged.
         """

@@ -65,7 +65,6 @@ class Wiring:
     Attributes:
         world: Name of the world that ticks in every row; None without a world.
         ticks: Number of world ticks in a row.
-        rows: Number of rows.
         slots: Node of each slot, in the order in which slots run.
         tables: One for each slot.
         world_table: The world's; arrays ``(E, R, ticks, ...)``.
@@ -108,14 +107,14 @@ def wire(
     nodes: Mapping[str, BaseNode],
     supervisor: str,
     timeline: Timeline,
-    given: frozenset[str] = frozenset(),
+    replayed: frozenset[str] = frozenset(),
     reusable: bool = False,
 ) -> Wiring:
     """Turn timelines into index tables.
 
     Args:
         supervisor: The supervisor's name; a row is at most as long as its period.
-        given: Nodes with recorded outputs: they get no slot; readers look up their messages by ``seq``.
+        replayed: Nodes with recorded outputs: they get no slot; readers look up their messages by ``seq``.
         reusable: Whether rings are longer than these timelines need, so that most timelines of a robot have rings of
             the same lengths.
 
@@ -126,7 +125,7 @@ def wire(
     if supervisor not in timeline.vertices:
         raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")
     check_bursts(nodes, timeline)
-    placer = Placer(nodes, supervisor, timeline, given)
+    placer = Placer(nodes, supervisor, timeline, replayed)
     return _Tables(placer, placer.place(), reusable).wiring()
 
 
@@ -145,7 +144,6 @@ def messages_read(
     Args:
         newest: Shape ``(E, C)``: the newest message that each step has consumed; -1: none, or no step.
         ts: Shape ``(E, C)``: starts of the steps [ticks].
-        sender: The steps that sent them.
     """
     window = np.maximum(newest[..., None] - np.arange(width - 1, -1, -1), -1)
     flat = window.reshape(len(window), -1).clip(0)
@@ -229,7 +227,7 @@ class _Tables:
         for key, edge in self.placer.edges.items():
             if key[0] != name:
                 continue
-            if edge.sender in self.placer.given:
+            if edge.sender in self.placer.replayed:
                 count = None
             elif edge.sender == self.world:
                 count = np.broadcast_to(ticks, seq.shape)
@@ -271,7 +269,7 @@ class _Tables:
             for input_name, t in table.inputs.items():
                 connection = self.nodes[reader].inputs[input_name]
                 sender = connection.output_node.name
-                if sender in self.placer.given:
+                if sender in self.placer.replayed:
                     continue
                 room = int(t.age.max(initial=0))
                 # 2, 4, 8 ...; a recording with a late step reads older messages than another recording of the robot.

@@ -54,9 +54,7 @@ class MessageChannel:
         """Deliver a message, which arrives now; called by the sender.
 
         Args:
-            seq: Number of the sender's step.
             sent: Time at which it was sent [ticks].
-            leaves: The message, as ``Format.pack`` returns it.
         """
         with self._condition:
             received = max(self._clock.now(), sent, self._last_arrival)

@@ -26,7 +26,6 @@ class Shared:
 
     Args:
         recorder: Receives all steps and messages, or None.
-        graph_state: The state at the episode's start.
         wake: Called when the graph stops: wakes threads that wait for messages or for the caller.
         spin: Time before each step in which a thread polls the clock instead of sleeping [ticks].
         answer_timeout_s: Longest wait of the supervisor for its caller [s].
@@ -85,7 +84,6 @@ class NodeThread(threading.Thread):
     calls ``stop`` again, as that call may have switched something on.
 
     Args:
-        inputs: The node's channels by input name.
         handover: Synchronises the supervisor with its caller; None for the other nodes.
 
     Attributes:
@@ -168,6 +166,7 @@ class NodeThread(threading.Thread):
         drift = end = 0
         for k in count():
             self.during = f"step {k}"
+            # Wait for blocking inputs, then for the start by the timing rules.
             scheduled = slots[k]
             blocked = max((channel.wait_group(k) for channel in self.inputs.values()), default=0)
             begin = start(scheduled, drift, end, blocked, waits)
@@ -176,6 +175,7 @@ class NodeThread(threading.Thread):
             if not clock.sleep_past(begin, shared.stopping, shared.spin):
                 return
             woken = clock.now()
+            # Consume messages and make the step.
             for name, channel in self.inputs.items():
                 taken = channel.take(k, begin)
                 self.data.windows[name].push(taken)
@@ -183,6 +183,7 @@ class NodeThread(threading.Thread):
             result = self._step(k, begin)
             end = clock.now()
             moved = overwritten(result.ts, begin, end, node.name)
+            # Send the output, then write the log.
             for channel in self.outputs:
                 channel.put(k, end, result.leaves)
             self.data.keep(result.changed)
@@ -194,11 +195,11 @@ class NodeThread(threading.Thread):
             drift = later
 
     def _step(self, k: int, begin: int) -> Result:
-        given = self.data.step_state(k, begin)
-        reply = self.handover.meet(given, self.shared.answer_timeout_s) if self.handover else Reply()
-        self.stepper.show(self.shared.recorder, given, {}, reply)
+        offered = self.data.step_state(k, begin)
+        reply = self.handover.meet(offered, self.shared.answer_timeout_s) if self.handover else Reply()
+        self.stepper.show(self.shared.recorder, offered, {}, reply)
         self.since_s = time.monotonic()  # only now: the caller's time does not count
-        return self.stepper.answer(self.data, given, {}, reply)
+        return self.stepper.answer(self.data, offered, {}, reply)
 
     def _record(self, record: StepRecord, result: Result) -> None:
         recorder = self.shared.recorder

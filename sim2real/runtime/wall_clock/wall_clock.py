@@ -30,9 +30,7 @@ class WallClockRun:
     """One episode on the wall clock.
 
     Args:
-        graph_state: The state at the episode's start.
         recorder: Receives all steps and messages, or None.
-        autonomous: Whether the supervisor makes its own steps.
         spin_s: Time before each step in which a thread polls the clock instead of sleeping [s].
         timeout_s: Longest wait of the supervisor for its caller [s].
         step_timeout_s: Longest time of a step, see ``step_limits``.

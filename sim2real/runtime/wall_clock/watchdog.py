@@ -69,9 +69,11 @@ class Watchdog(threading.Thread):
             return limit
         if during == "startup" and not stopped_s:
             return limit  # startups have their own timeout, in WallClockRun.begin
+        # Time until the step, or the startup of a stopped graph, has taken too long.
         rest = stopped_s + _GRACE_S - now if during == "startup" else since + limit - now
         if rest > 0 or thread.since_s != since:
             return rest
+        # Stop the graph, and make the node safe from outside of its thread.
         if not stopped_s:
             thread.failed = True
             self._shared.fail(

@@ -36,6 +36,7 @@ def _joints(
     episode: Episode, model: IdentifiableModel, units: Mapping[str, str], begun_s: np.ndarray
 ) -> list[dict[str, Json]]:
     """Return a row for each joint: the distributions of position and velocity, and the time in motion."""
+    # Positions and velocities of each channel, and their distribution.
     outputs, rows = episode.outputs[model.sensor], []
     for channel in model.channels:
         position = np.asarray(channel.of(outputs[channel.position]), np.float64)

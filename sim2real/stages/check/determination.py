@@ -125,6 +125,7 @@ def _round_trip_row(problem: Problem, linearised: uncertainty.Linearised) -> dic
     free = np.flatnonzero(~(shift > 0))
     jacobian = linearised.jacobian.reshape(-1, len(linearised.x))[:, free]
     delays = [int(np.flatnonzero(free == i)[0]) for i in np.flatnonzero(shift < 0)]
+    # A longer recording has information in proportion to its duration.
     duration_s = problem.segment_s * len(problem.train)
 
     def standard_error(seconds: float) -> float:

@@ -15,15 +15,10 @@ class Checked(Shown):
     Attributes:
         source: ``log``, or ``planned excitation``.
         recordings: Sampling, joints and commands of each recording.
-        segments: Number of simulated segments.
         segment_s: Length of a segment [s].
-        condition: Condition number of the Jacobian.
         determined: Whether every parameter is determined; of the delays the sum suffices.
         undetermined: Groups of parameters; only combinations of the parameters in a group are determined.
         only_sum_of_delays: Whether only the sum of the delays is determined.
-        messages: Sentences about the undetermined groups.
-        parameters: A row for each parameter.
-        recommendation: Sentences about the next step.
     """
 
     pipeline: str

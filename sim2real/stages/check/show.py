@@ -19,6 +19,7 @@ def show_json(checked: Checked) -> None:
 
 def show(checked: Mapping[str, Json]) -> None:
     """Print the fields of a result as tables, then the messages and recommendations."""
+    # The recordings, then a row for each parameter.
     for recording in checked["recordings"]:
         _show_recording(recording)
     rows = [
@@ -33,6 +34,7 @@ def show(checked: Mapping[str, Json]) -> None:
         for p in checked["parameters"]
     ]
     print(table(rows, ["parameter", "nominal", "s.e. from a minute", "unit", "of nominal", "determined"]))
+    # Figures and sentences on all of them.
     about = {"condition number": f"{checked['condition']:.2g}", "directions left open": len(checked["undetermined"])}
     print(f"\n{pairs(about)}")
     for message in [*checked["messages"], *checked["recommendation"]]:

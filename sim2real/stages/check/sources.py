@@ -47,6 +47,7 @@ def find_source(
     Raises:
         UsageError: There is neither a recording nor an excitation to plan one with.
     """
+    # Take the named logs, or the newest recording.
     paths, robot = [Path(p) for p in config.log], pipeline.load()
     if not paths and not config.plan:
         try:
@@ -59,6 +60,7 @@ def find_source(
                     hint=f"name a log with --log FILE, or `sim2real import FILE --pipeline {pipeline.name}`",
                 ) from error
             note(f"no recording of {pipeline.name} in {shown(config.runs)}: the planned excitation is simulated")
+    # Open them.
     if paths:
         return JudgedLogs([shown(p) for p in paths], [open_recording(p, pipeline, robot).episode for p in paths], False)
     if not isinstance(robot, Robot):

@@ -37,6 +37,7 @@ def simulate(
         signal: Shape ``(N, actions)``: one command a step, as ``RobotDrive.around`` returns them.
         config: Largest delay of the model, and the engine.
     """
+    # Draw a timeline, and play the signal on it.
     nodes = model.nodes(config.max_delay_s)
     engine = choose(config.engine, nodes, model.given, config.jacobian)
     timeline = draw(nodes, len(signal) / robot.rate_hz, rng=seed)
@@ -53,6 +54,7 @@ def simulate(
             [jnp.asarray(r[None], jnp.asarray(v).dtype) for r, v in zip(rows.values(), leaves, strict=True)]
         )
         outputs[name] = rows
+    # Start at rest, driven joints at their first goal.
     graph = OpenLoopGraph(nodes, model.sensor, model.given)
     tables = jax.tree_util.tree_map(lambda rows: jnp.asarray(rows[0]), graph.tables(timeline, commands))
     messages = jax.tree_util.tree_map(lambda rows: rows[0], commands)
@@ -63,11 +65,13 @@ def simulate(
     params = model.params(values, jnp.asarray(np.concatenate([start, np.zeros_like(start)]), jnp.float32))
     # The first command is taken to have held before, as where a log is cut into segments.
     gs = graph.begin(params, jax.tree_util.tree_map(lambda rows: rows[0], messages), 0)
+    # Simulate by the configured engine.
     if engine.name == "c":
         outside = CRollouts(graph, engine.model)
         records = jax.jit(lambda state: outside.rollout(state, params, tables, messages, model.sensor))(gs)
     else:
         records = jax.jit(lambda state: graph.run(state, tables, messages, model.sensor))(gs)
+    # Return the simulation as an episode.
     count = int(timeline.vertices[model.sensor].count[0])
     outputs[model.sensor] = {n: np.asarray(v)[:count] for n, v in named_leaves(records).items()}
     early = {model.sensor: to_ticks(model.ahead_s)}  # where it is put back when the log is cut into segments

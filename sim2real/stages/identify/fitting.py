@@ -43,7 +43,7 @@ class Fits:
 
 
 def fit_model(inputs: Inputs, best: Best) -> Fits:
-    """Fit the model, and select its optional terms if the configuration says ``auto``.
+    """Fit the model, and select its optional terms if the configuration is ``auto``.
 
     Args:
         best: Updated with the best values so far.

@@ -29,7 +29,6 @@ class Inputs:
         robot: The robot, with the optional terms that the configuration names.
         table: The parameters, with the bounds and fixed values of the configuration.
         logs: The fitted recordings, then those that are held out whole.
-        fitted: Number of fitted recordings.
         windows: Segments to fit, and segments to predict.
     """
 

@@ -91,6 +91,7 @@ def left_behind(stage: OpenStage, pipeline: str, logs: Sequence[Path], again: Ca
 
 def _unfinished(pipeline: str, logs: Sequence[Path], run_dir: Path, best: Best, again: str) -> Identification:
     """Return the best values as an identification with the verdict ``interrupted``."""
+    # The best values so far, without intervals.
     table = best.table or ParameterTable([])
     values = as_numbers(table, np.asarray(best.z))
     done = ", ".join(f"{share:.0%} of {what}" for what, share in best.done.items())

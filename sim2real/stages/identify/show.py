@@ -30,10 +30,12 @@ def show(identification: Identification) -> None:
 
 def summary(identification: Identification) -> dict[str, str]:
     """Return the lines that the console shows at the end: name -> text. Of several positions it is the worst one."""
+    # The logs and the sum of the delays.
     logs, search = identification.logs, identification.search
     lines = {"log": logs[0].path if len(logs) == 1 else f"{len(logs)} logs, the first {logs[0].path}"}
     if total := next((p for p in identification.parameters if p.name == ROUND_TRIP), None):
         lines["round trip delay"] = f"{1e3 * total.estimate:.1f} ms"
+    # The worst error on held-out data.
     if identification.held_out:
         worst = identification.held_out[0]
         count, unit = len(identification.held_out), f" {worst.unit}".rstrip()

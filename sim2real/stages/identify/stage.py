@@ -38,15 +38,15 @@ def identify(
 
     Args:
         robot: The robot, its pipeline, or the pipeline's name.
-        recording: What is fitted: one recording, or several; or the paths of their logs.
-        config: How; default: that of the pipeline that loaded the robot. A dict has what is different from it. The
+        recording: The recordings to fit: one or several, or the paths of their logs.
+        config: Settings; default: the pipeline's. A dict has the settings that differ from these. The
             files that it may name are not read.
         hold_out: Recordings that are only predicted.
         best: Updated with the best values so far while the search runs.
         begin: Values at which the search begins; default: the pipeline's.
 
     Returns:
-        Estimates, their uncertainty, what they predict, and a verdict.
+        Estimates, their uncertainty, their predictions, and a verdict.
 
     Raises:
         UsageError: When the recordings are too short, or the model does not fit them.
@@ -124,13 +124,13 @@ def _write(identification: Identification, stage: OpenStage, pipeline: Pipeline,
 
 def _begin(path: str, pipeline: Pipeline) -> dict[str, float]:
     """Return the values at which a search begins, from an earlier identification of the same robot."""
-    found = Identification.load(Path(path))
-    if found.pipeline != pipeline.name:
+    earlier = Identification.load(Path(path))
+    if earlier.pipeline != pipeline.name:
         raise UsageError(
-            f"{path} is of pipeline {found.pipeline!r}, not of {pipeline.name!r}",
+            f"{path} is of pipeline {earlier.pipeline!r}, not of {pipeline.name!r}",
             hint="begin at an identification of the same robot, or leave --begin out",
         )
-    return {p.name: p.estimate for p in found.parameters if p.kind != "derived" and p.verdict != "fixed"}
+    return {p.name: p.estimate for p in earlier.parameters if p.kind != "derived" and p.verdict != "fixed"}
 
 
 def find_logs(
@@ -140,7 +140,7 @@ def find_logs(
 
     Args:
         config: Names logs, or none: then the newest finished recording is taken.
-        run_dir: Run folder that is asked first.
+        run_dir: Run folder that is searched first.
     """
     held_out = [Path(p) for p in config.hold_out]
     if config.log:

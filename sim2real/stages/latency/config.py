@@ -18,6 +18,6 @@ class LatencyConfig(RecordConfig):
     @staticmethod
     def of(record: RecordConfig, identify: IdentifyConfig) -> LatencyConfig:
         """Return the defaults for a robot: 30 s of steps, and no more of an identification than the delay needs."""
-        own = {f.name: getattr(record, f.name) for f in fields(record)}
+        settings = {f.name: getattr(record, f.name) for f in fields(record)}
         steps = {"duration_s": 30.0, "excitation": "steps"}
-        return LatencyConfig(**own | steps, identify=replace(identify, folds=0, free_run_s=0.0))
+        return LatencyConfig(**settings | steps, identify=replace(identify, folds=0, free_run_s=0.0))

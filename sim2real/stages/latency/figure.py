@@ -24,7 +24,6 @@ def picture(
     """Draw a bar of the medians, and how each part that the clocks saw, or the motion, scatters, into a PNG file.
 
     Args:
-        chain: The nodes, as in `Latency.of`.
         links: Distributions of the device's delays, estimated from the motion.
     """
     parts = list(measured(recording, chain))

@@ -1,4 +1,4 @@
-"""Where the milliseconds between motion and motion go: what a test of latency leaves."""
+"""The parts of the delay between a motion and the motion that answers it."""
 
 from __future__ import annotations
 
@@ -28,10 +28,9 @@ class Part:
     """One part of the way from a motion to the motion that answers it.
 
     Attributes:
-        name: What happens, in words.
         where: ``host`` (this computer), ``bus`` (the wire, the adapter and its driver).
-        took: How long it took [s].
-        counted: Whether it is on the way; the sensor's question on the bus comes before the sample.
+        took: Distribution of its duration [s].
+        counted: Whether it is part of the sum; the sensor's request on the bus comes before the sample.
     """
 
     name: str
@@ -42,14 +41,14 @@ class Part:
 
 @dataclass(frozen=True)
 class DeviceShare:
-    """What no clock of this computer sees: from a motion to its sample, and from a command to the motion.
+    """Delays that no clock of this computer measures: from a motion to its sample, and from a command to the motion.
 
     Attributes:
         estimate: The sum of both [s], from the motion.
         low95: Lower end of its 95 % interval [s].
         high95: Upper end [s].
         verdict: ``accepted``, ``not identifiable`` or ``at a bound``.
-        about: Names of the delays that it is the sum of.
+        about: Names of the delays in this sum.
     """
 
     estimate: float
@@ -61,15 +60,11 @@ class DeviceShare:
 
 @dataclass(frozen=True)
 class Latency:
-    """Where the milliseconds go.
+    """The parts of the delay.
 
     Attributes:
-        parts: In their order.
-        hidden: The device's share; None where nothing moved.
-        transactions: Questions asked on the bus; None without a bus.
-        lost: Answers that never came.
-        late: Answers that came late.
-        format: Version of the file.
+        hidden: The device's share; None without motion.
+        transactions: Number of transactions on the bus; None without a bus.
     """
 
     parts: tuple[Part, ...]
@@ -85,19 +80,18 @@ class Latency:
         return sum(p.took.p50 or 0.0 for p in self.parts if p.counted) + (self.hidden.estimate if self.hidden else 0.0)
 
     @staticmethod
-    def of(recording: Recording, chain: Sequence[str], found: Identification | None) -> Latency:
+    def of(recording: Recording, chain: Sequence[str], identification: Identification | None) -> Latency:
         """Return the parts of a session.
 
         Args:
-            recording: The session, with what its clocks saw.
             chain: The nodes from the sensor to the actuator, in the order of the messages.
-            found: What was identified from its log; None where nothing moved.
+            identification: From the session's log; None without motion.
         """
         parts = tuple(Part(name, where, Spread.of(s), on) for name, where, s, on in measured(recording, chain))
         timing = recording.timing
         bus = timing.bus
         counted = (bus.transactions, bus.lost, bus.late) if bus else (None, 0, 0)
-        return Latency(parts, None if found is None else _hidden(found.parameters), *counted)
+        return Latency(parts, None if identification is None else _hidden(identification.parameters), *counted)
 
     def save(self, folder: Path) -> dict[str, str]:
         """Write it into a folder; return output -> name of the file in the folder."""
@@ -106,24 +100,24 @@ class Latency:
 
     @staticmethod
     def load(path: Path) -> Latency:
-        """Read what ``save`` wrote, from the file or its folder.
+        """Read a latency from its file or folder.
 
         Raises:
-            Sim2RealError: When it is missing, of another format, or not as it should be.
+            Sim2RealError: The file is missing, malformed, or of another format.
         """
         file = path / LATENCY if path.is_dir() else path
         with malformed(file, _AGAIN):
-            found = read_json(file, Latency)
-            if found.format != FORMAT:
-                raise Sim2RealError(f"{file} has format {found.format}, this version reads {FORMAT}", hint=_AGAIN)
-        return found
+            latency = read_json(file, Latency)
+            if latency.format != FORMAT:
+                raise Sim2RealError(f"{file} has format {latency.format}, this version reads {FORMAT}", hint=_AGAIN)
+        return latency
 
 
 def measured(recording: Recording, chain: Sequence[str]) -> Iterator[tuple[str, Where, np.ndarray, bool]]:
-    """Yield the parts of the way through a chain of nodes, and what each node spends on the bus.
+    """Yield the parts of the way through a chain of nodes, and the time of each node on the bus.
 
     Yields:
-        Its name, where it is, its times ``(N,)`` [s], and whether it is counted, as in `Part`.
+        Name, place, times ``(N,)`` [s], and whether it is part of the sum, as in `Part`.
     """
     timing, sensor = recording.timing, chain[0]
     steps = recording.episode.steps[sensor]

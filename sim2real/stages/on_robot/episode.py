@@ -74,12 +74,11 @@ def run_episode(
     label: str,
     hold: bool = False,
 ) -> dict[str, Any]:
-    """Run the graph for a while and log it; whatever happens, the motors end without torque and the log readable.
+    """Run the graph and log it; after every failure the motors have no torque and the log is readable.
 
     Args:
         duration_s: How long to run [s].
-        config: The stage's configuration, for the log's metadata.
-        hold: Whether the motors hold the robot where it ends, until somebody says that it can do without them.
+        hold: Whether the motors hold the robot at its last position until the user confirms.
 
     Returns:
         The summary that also stands in the log's ``session_end``: timing by node, losses, the gate's counts.
@@ -90,6 +89,7 @@ def run_episode(
     graph = AsyncGraph(nodes, nodes[robot.roles.supervisor])
     state = graph.init(jax.random.key(0), params)
     graph.warmup(state)  # every program is compiled before torque goes on
+    # Start the log, and run; an interrupted episode comes to rest before torque goes off.
     recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig.torque_withheld)
     watch = Watch(recorder)
     graph.recorder = watch
@@ -107,6 +107,7 @@ def run_episode(
         session.rig.stop_quietly()
         _end(error, graph, recorder, lambda: _summary(robot, graph, session, watch))
         raise
+    # A failure ends without torque, and the log holds it.
     summary = _summary(robot, graph, session, watch)
     recorder.close("finished", OK, summary, note)
     return summary
@@ -171,7 +172,8 @@ def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str, 
 def _recorder(
     pipeline: Pipeline, robot: Robot, graph: AsyncGraph, state: GraphState, log: Path, config: Any, dry: bool
 ) -> McapRecorder:
-    """Return the log's writer, whose metadata says what the session is, and, first of all, whether it is a dry run."""
+    """Return the log's writer, whose metadata describes the session; a dry run comes first."""
+    # The graph as the log's metadata describes it.
     topology = {
         name: {
             "rate_hz": node.rate,
@@ -196,15 +198,17 @@ def _recorder(
         "seed": config.seed,
         "port": config.port,
     }
+    # The writer, which starts with a mark if the run is dry.
     inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
     joints, units = {robot.roles.sensor: robot.sensor.joints}, dict.fromkeys(graph.nodes, robot.units)
     recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
     if dry:
-        recorder.write_event("dry run", "torque was withheld: no command in this log was sent, and nothing was moved")
+        recorder.write_event("dry run", "torque was withheld: no command in this log was sent, and no joint was moved")
     return recorder
 
 
 def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
+    # Times of the nodes, in the order of the loop.
     rig, command, counters = session.rig, robot.drive.command, session.rig.device.counters
     timing = {
         n: {
@@ -216,6 +220,7 @@ def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) ->
         }
         for n, s in sorted(graph.statistics().items(), key=lambda item: _place(graph.nodes[item[0]]))
     }
+    # Counters of bus, gate and commands.
     return {
         "monotonic_ns": watch.monotonic_ns,
         "timing": timing,

@@ -1,4 +1,4 @@
-"""Opening the robot for a stage that moves it, and what that stage says about its rig."""
+"""Opening the robot for a stage that moves it, and the printed state of its rig."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def rig_summary(rig: Rig) -> dict[str, Any]:
     Returns:
         ``late_replies``: answers whose sample's time is not sure, or that came after they had been asked for again;
         ``late_s``: by how much answers took longer than their bytes, median, 99 % and largest [s];
-        ``suspects``: what was odd about the measurements.
+        ``suspects``: warnings about the measurements.
     """
     counters = rig.device.counters
     quantiles = np.quantile(counters.late_s, [0.5, 0.99, 1.0]).tolist() if counters.late_s.size else [None] * 3
@@ -87,7 +87,7 @@ def answer_rows(summary: Mapping[str, Any]) -> list[list[Any]]:
 
 
 def warn(summary: Mapping[str, Any]) -> None:
-    """Say what was odd, but no reason to stop."""
+    """Print the warnings of a session that did not stop it."""
     share = summary["late_replies"] / max(1, summary["transactions"])
     if share > LATE_SHARE:
         note(
@@ -105,7 +105,8 @@ def sent_rows(gate: SafetyGate, field: str, unit: str) -> list[dict[str, Any]]:
         field: Field of the command, the name of what has none.
 
     Returns:
-        ``name``, ``unit``, ``commands``, ``low``, ``mean`` and ``high`` of what was sent, or would have been; and
+        ``name``, ``unit``, ``commands``, ``low``, ``mean`` and ``high`` of the sent
+        commands, or of those that a dry run withheld; and
         ``cut``: commands that a limit of the gate had changed.
     """
     counts, names = gate.counts, gate.config.joints
@@ -131,8 +132,8 @@ def show_withheld(summaries: Sequence[Mapping[str, Any]]) -> None:
     for number, summary in enumerate(summaries):
         for s in summary["sent"]:
             share = f"{s['cut'] / max(1, s['commands']):.1%}"
-            own = [s["unit"], s["commands"], s["low"], s["mean"], s["high"], s["cut"], share]
-            rows.append([*([number] if several else []), s["name"], *own])
+            figures = [s["unit"], s["commands"], s["low"], s["mean"], s["high"], s["cut"], share]
+            rows.append([*([number] if several else []), s["name"], *figures])
     heads = ["would have been sent to", "unit", "commands", "min", "mean", "max", "cut by the gate", "share"]
     print(table(rows, [*(["episode"] if several else []), *heads]))
-    note("dry run: nothing was moved; no later stage takes this for a recording")
+    note("dry run: no joint was moved; no later stage uses this as a recording")

@@ -34,27 +34,27 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
             raise UsageError(f"{folder} is a run of {', '.join(sorted(owners))}, not of {pipeline}")
         if owners:
             return folder
-    if pipeline is None and (known := run_folders(root, str(target))):
-        return next((f for f in reversed(known) if any(finished(f, stage) for stage in STAGES)), known[-1])
+    if pipeline is None and (folders := run_folders(root, str(target))):
+        return next((f for f in reversed(folders) if any(finished(f, stage) for stage in STAGES)), folders[-1])
     raise _nothing_there(root, str(target))
 
 
-def warn_of_stale(found: StageFolder) -> StageFolder:
+def warn_of_stale(folder: StageFolder) -> StageFolder:
     """Return a finished stage that is taken up; print a warning where its run has a newer input of it."""
-    if why := why_stale(found, stage_status(found.run_dir)):
-        note(f"warning: {why}; `sim2real run {found.manifest['pipeline']} --resume {found.run_dir}` makes it again")
-    return found
+    if why := why_stale(folder, stage_status(folder.run_dir)):
+        note(f"warning: {why}; `sim2real run {folder.manifest['pipeline']} --resume {folder.run_dir}` makes it again")
+    return folder
 
 
 def _nothing_there(root: Path, target: str) -> UsageError:
-    """Return the error for a name that is none: it says what there is."""
+    """Return the error for an unknown name, with the available names."""
     pipelines = sorted(available())
     names = [f"{f.parent.name}/{f.name}" for p in sorted(Path(root).glob("*")) for f in run_folders(root, p.name)]
-    said = f"Pipelines: {', '.join(pipelines) or 'none'}. Runs in {root}: {', '.join(names[-5:]) or 'none'}"
+    listed = f"Pipelines: {', '.join(pipelines) or 'none'}. Runs in {root}: {', '.join(names[-5:]) or 'none'}"
     if target in pipelines:
         hint = f"make a run with `sim2real run {target}`, or name another folder with --runs DIR"
     elif close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
         hint = f"did you mean {close[0]}?"
     else:
         hint = "make a run with `sim2real run PIPELINE`, or name another folder with --runs DIR"
-    return UsageError(f"there is no file, pipeline or run {target!r}. {said}", hint=hint)
+    return UsageError(f"there is no file, pipeline or run {target!r}. {listed}", hint=hint)

@@ -99,6 +99,7 @@ def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
             "a robot without a pipeline is described by its model and by a log",
             hint="sim2real identify --mjcf robot.xml --log run.csv",
         )
+    # A log of this package needs no mapping; any other file has one, or one is proposed.
     model, first = read_model(flags.mjcf), Path(logs[0])
     name = pipeline_name(flags.mjcf)
     if first.suffix == ".mcap" and bags.is_ours(first):
@@ -111,6 +112,7 @@ def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
             mapping, _ = import_logs_stage.proposed(open_foreign(first), replace(description, as_told=flags.as_told))
         episode = importer.import_file(first, mapping)
         import_logs_stage.refuse_contradictions(first, episode, flags.as_told)
+    # Describe the robot by the first log.
     description = _description(flags, model, episode)
     note_held(description)
     summary = f"{len(description.joints)} joints of {flags.mjcf.name}"
@@ -172,6 +174,7 @@ def files_of(description: RobotConfig) -> dict[str, str]:
 
 def _description(flags: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
     """Return the description of a robot, from its model and a log."""
+    # The commands that drive the joints.
     joints = flags.joints or joints_of(model)
     commands, sensed = episode.outputs.get("actuator", {}), episode.outputs.get("sensor", {})
     driving = tuple(n for n in COMMANDS if n in commands)
@@ -186,6 +189,7 @@ def _description(flags: RobotFlags, model: Any, episode: Episode) -> RobotConfig
             f"sensor {', '.join(sensed) or 'nothing'}, actuator {', '.join(commands) or 'nothing'}",
             hint=f"in the mapping, name the actuator's fields as they act: {', '.join(COMMANDS)}",
         )
+    # Each field has one number for each joint, or one for all.
     n, one = (len(joints),), {name: (1,) for name in driving}
     shapes = {name: values.shape[1:] for name, values in [("position", sensed["position"]), *commands.items()]}
     if wrong := [f"{name} {shapes[name]}" for name in ("position", *driving) if shapes[name] not in (n, one.get(name))]:
@@ -194,6 +198,7 @@ def _description(flags: RobotFlags, model: Any, episode: Episode) -> RobotConfig
             hint="name the joints that were recorded with --joints, in the order of the columns; in a mapping, "
             "shape = [1] makes a vector of a number",
         )
+    # Rate and step follow from the log and the model.
     fastest = min(float(np.quantile(np.diff(episode.steps[n].begun_s), _FASTEST)) for n in ("actuator", "sensor"))
     own_s = float(model.opt.timestep)
     description = RobotConfig(
@@ -210,6 +215,7 @@ def _description(flags: RobotFlags, model: Any, episode: Episode) -> RobotConfig
     )
     if flags.velocity and not description.velocity:
         raise UsageError("the log has no velocity", hint="run without --velocity: it is not needed")
+    # Parameters: gains in a firmware's unit, or those of a torque loop.
     units = {n: float(np.median(commands[n][commands[n] > 0])) for n in ("kp", "kd") if n in commands}
     if set(units) == {"kp"}:  # a firmware's own unit; both gains together are those of a motor's own torque loop
         description = replace(description, kp_unit=units["kp"])

@@ -26,19 +26,19 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
     Raises:
         Sim2RealError: When it is no log, of another pipeline, or of a dry run, in other units, or has holes.
     """
+    # A file of another recorder is read by the pipeline's mapping.
     if (mapping := pipeline.mapping_of(path)) is not None:
+        # A log of this package must be of this pipeline, and complete.
         recording = Recording(path, import_file(path, mapping))
         if robot is not None:
             require_units(recording, robot)
         return recording
     recording = Recording.load(path)
     for warning in recording.warnings:
-        note(f"warning: {warning}; what is there is used")
+        note(f"warning: {warning}; the readable part is used")
     owner = recording.pipeline
     if owner is None:
-        raise Sim2RealError(
-            f"{path} does not say which pipeline it is of: its metadata is damaged", hint="record again"
-        )
+        raise Sim2RealError(f"{path} has no name of its pipeline: its metadata is damaged", hint="record again")
     if owner != pipeline.name:
         raise Sim2RealError(
             f"{path} is a log of pipeline {owner!r}, not of {pipeline.name!r}", hint=f"run `sim2real identify {owner}`"
@@ -58,11 +58,13 @@ def require_units(recording: Recording, robot: RecordedRobot) -> None:
     Raises:
         Sim2RealError: When a log is in other ones.
     """
-    said = recording.episode.units or dict.fromkeys((robot.roles.sensor, robot.roles.actuator), recording.units)
+    recorded_units = recording.episode.units or dict.fromkeys(
+        (robot.roles.sensor, robot.roles.actuator), recording.units
+    )
     for node in (robot.roles.sensor, robot.roles.actuator):
-        for field, unit in said.get(node, {}).items():
-            if unit != (own := unit_of(field, robot.units) or unit):
+        for field, unit in recorded_units.get(node, {}).items():
+            if unit != (expected := unit_of(field, robot.units) or unit):
                 raise Sim2RealError(
-                    f"{field!r} of {node!r} is in {unit} in the log {recording.path}, the robot computes in {own}",
+                    f"{field!r} of {node!r} is in {unit} in the log {recording.path}, the robot computes in {expected}",
                     hint="convert it: `scale` in the mapping of an import, or the robot's `units`",
                 )

@@ -14,34 +14,35 @@ def open_identification(path: Path, pipeline: Pipeline) -> Identification:
     """Read what identify found for a pipeline.
 
     Args:
-        path: The stage's folder, or ``parameters.json``.
         pipeline: The robot that it must be of.
 
     Raises:
         Sim2RealError: When it is missing, damaged, of another pipeline, was interrupted, or did not converge.
     """
-    found = Identification.load(path)
-    check_parameters(found, pipeline)
-    return found
+    identification = Identification.load(path)
+    check_parameters(identification, pipeline)
+    return identification
 
 
-def check_parameters(found: Identification, pipeline: Pipeline) -> None:
-    """Check that a pipeline can be simulated with what was identified.
+def check_parameters(identification: Identification, pipeline: Pipeline) -> None:
+    """Check that a pipeline can be simulated with an identification.
 
     Raises:
         Sim2RealError: When it is of another pipeline, lacks parameters, was interrupted, or did not converge.
         UsageError: When the world that it was identified in is not installed.
     """
     hint = f"make them with `sim2real identify {pipeline.name}`"
-    if found.pipeline != pipeline.name:
-        raise Sim2RealError(f"these are parameters of pipeline {found.pipeline!r}, not of {pipeline.name!r}", hint=hint)
-    if found.posterior is None:
-        ended = UNFINISHED.get(found.verdict.status, "has no intervals")
+    if identification.pipeline != pipeline.name:
         raise Sim2RealError(
-            f"this identification {ended}: its estimates may be far off", hint=found.verdict.next or hint
+            f"these are parameters of pipeline {identification.pipeline!r}, not of {pipeline.name!r}", hint=hint
         )
-    robot = in_world(pipeline.load(), found.world)
+    if identification.posterior is None:
+        ended = UNFINISHED.get(identification.verdict.status, "has no intervals")
+        raise Sim2RealError(
+            f"this identification {ended}: its estimates may be far off", hint=identification.verdict.next or hint
+        )
+    robot = in_world(pipeline.load(), identification.world)
     expected = robot.identifiable(pipeline.identify.max_delay_s).parameters.names
-    there = {p.name for p in found.parameters if p.standard_error is not None}
+    there = {p.name for p in identification.parameters if p.standard_error is not None}
     if lacking := [n for n in expected if n not in there]:
         raise Sim2RealError(f"these parameters hold no finite estimate of {', '.join(lacking)}", hint=hint)

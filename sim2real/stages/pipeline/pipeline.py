@@ -1,4 +1,4 @@
-"""Pipelines: what a robot's folder under ``pipelines/`` defines, and how it is found."""
+"""Pipelines: the definition in a robot's folder under ``pipelines/``, and the search for it."""
 
 from __future__ import annotations
 
@@ -86,8 +86,8 @@ class Pipeline:
 
         if path.suffix == ".mcap" or not path.is_file():
             return None
-        own = self.folder / "import.toml"
-        return load_mapping(own) if own.is_file() else None
+        file = self.folder / "import.toml"
+        return load_mapping(file) if file.is_file() else None
 
     def texts(self) -> Mapping[str, str]:
         """Return files that an identification keeps beside its parameters: name -> text; none for a pipeline."""
@@ -103,14 +103,14 @@ class Pipeline:
         """Return the robot, checked; or a module of the pipeline's package.
 
         Raises:
-            UsageError: When the robot misses something, or something about it is of the wrong kind.
+            UsageError: The robot is incomplete, or an attribute has the wrong type.
         """
-        found = importlib.import_module(f"{self.package}.{module or self.robot}")
+        imported = importlib.import_module(f"{self.package}.{module or self.robot}")
         if module:
-            return found
+            return imported
         from sim2real.robots.loading import checked  # imports JAX
 
-        robot = checked(getattr(found, "ROBOT", None), f"pipeline {self.name!r} ({found.__file__})")
+        robot = checked(getattr(imported, "ROBOT", None), f"pipeline {self.name!r} ({imported.__file__})")
         _LOADED[robot] = self
         return robot
 
@@ -121,17 +121,17 @@ _LOADED: WeakKeyDictionary[RecordedRobot, Pipeline] = WeakKeyDictionary()
 
 @dataclass(frozen=True, repr=False)
 class _OfRobot(Pipeline):
-    """A robot that no pipeline has loaded, such as one made in a notebook, with the stages' own defaults."""
+    """A robot without a pipeline, such as one made in a notebook, with the stages' defaults."""
 
-    made: Any = None
+    bare_robot: Any = None
 
     @property
     def has_commands(self) -> bool:
-        """Whether a command finds it by its words: it does not."""
+        """False: no command finds it by name."""
         return False
 
     def load(self, module: str | None = None) -> Any:
-        return super().load(module) if module else self.made
+        return super().load(module) if module else self.bare_robot
 
 
 def pipeline_of(robot: RecordedRobot | Pipeline | str) -> Pipeline:
@@ -153,16 +153,18 @@ def pipeline_of(robot: RecordedRobot | Pipeline | str) -> Pipeline:
             hint="sim2real.load_pipeline(NAME), or NAME alone, is a pipeline, and its load() a robot",
         )
     kind = type(robot)
-    return _LOADED.get(robot) or _OfRobot(kind.__name__, "", kind.__module__, made=checked(robot, kind.__module__))
+    return _LOADED.get(robot) or _OfRobot(
+        kind.__name__, "", kind.__module__, bare_robot=checked(robot, kind.__module__)
+    )
 
 
 def available() -> dict[str, Any]:
     """Return name -> source of all pipelines: entry points, folders in ./pipelines, and those of the package."""
-    found: dict[str, Any] = {}
+    pipelines: dict[str, Any] = {}
     for folder in reversed(_folders()):
-        found.update({p.parent.name: p.parent for p in sorted(folder.glob("*/__init__.py"))})
-    found.update({entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINT_GROUP)})
-    return found
+        pipelines.update({p.parent.name: p.parent for p in sorted(folder.glob("*/__init__.py"))})
+    pipelines.update({entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINT_GROUP)})
+    return pipelines
 
 
 def load_pipeline(name: str) -> Pipeline:
@@ -171,18 +173,20 @@ def load_pipeline(name: str) -> Pipeline:
     Raises:
         UsageError: When there is no such pipeline, or it does not define a ``PIPELINE`` of this name.
     """
-    found = available()
-    if name not in found:
+    # Find the folder or the entry point of the name.
+    pipelines = available()
+    if name not in pipelines:
         raise UsageError(
-            f"unknown pipeline {name!r}. Available: {', '.join(sorted(found)) or 'none'}",
+            f"unknown pipeline {name!r}. Available: {', '.join(sorted(pipelines)) or 'none'}",
             hint=did_you_mean(
                 name,
-                found,
+                pipelines,
                 "run where ./pipelines/NAME/__init__.py exists, or install a package with the entry point "
                 f"group '{ENTRY_POINT_GROUP}'",
             ),
         )
-    source = found[name]
+    source = pipelines[name]
+    # Import it, and check its PIPELINE.
     pipeline = getattr(_import_folder(source), "PIPELINE", None) if isinstance(source, Path) else source.load()
     if not isinstance(pipeline, Pipeline):
         raise UsageError(
@@ -204,6 +208,7 @@ def _folders() -> list[Path]:
 
 def _import_folder(folder: Path) -> ModuleType:
     """Import a pipeline's package as ``sim2real_pipelines.NAME``, so that no top-level ``pipelines`` is needed."""
+    # Pipelines are modules below one parent, by the name of their folder.
     parent = "sim2real_pipelines"
     if parent not in sys.modules:
         sys.modules[parent] = ModuleType(parent)
@@ -216,6 +221,7 @@ def _import_folder(folder: Path) -> ModuleType:
         # A folder of the same name was imported from elsewhere, e.g. another working directory: forget it.
         for stale in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
             del sys.modules[stale]
+    # Import the folder; a failed import leaves no module behind.
     spec = importlib.util.spec_from_file_location(name, path, submodule_search_locations=[str(folder)])
     if spec is None or spec.loader is None:
         raise UsageError(f"{folder} is no Python package")

@@ -70,17 +70,17 @@ def recordings_of(value: Any, pipeline: Pipeline, name: str = "recording") -> li
         pipeline: The robot that files must be of.
     """
     several = isinstance(value, Iterable) and not isinstance(value, Recording | str | Mapping)
-    found = [recording_of(one, pipeline, name) for one in (value if several else [value])]
-    if not found:
+    recordings = [recording_of(one, pipeline, name) for one in (value if several else [value])]
+    if not recordings:
         raise UsageError(f"{name} is empty: at least one recording is needed")
-    return found
+    return recordings
 
 
 def identification_of(value: Any, name: str = "identification") -> Identification:
     """Return an identification, or that of a file or folder.
 
     Raises:
-        UsageError: It is something else, such as values alone: what they are worth is not in them.
+        UsageError: It is something else, such as values alone, which have no uncertainty.
     """
     hint = "sim2real.Identification.load(FOLDER) opens one; values alone have no intervals, timing and verdict"
     return _loaded(value, Identification, name, "an Identification, or its folder or file", hint)
@@ -107,12 +107,13 @@ def config_of(value: Any, default: T, name: str = "config") -> T:
     """Return a stage's configuration.
 
     Args:
-        value: A configuration, or what is different from the default, field by field; None: nothing.
+        value: A configuration, or the fields that differ from the default; None: the default.
         default: The default.
 
     Raises:
         UsageError: It is of another stage, or there is no such field.
     """
+    # A whole configuration, or fields of one.
     kind = type(default)
     if value is None:
         return default
@@ -122,13 +123,14 @@ def config_of(value: Any, default: T, name: str = "config") -> T:
         raise wrong(
             value, name, f"of type {kind.__name__}", f"replace(default, ...), or a dict of fields of {kind.__name__}"
         )
-    own: Any = default
-    if unknown := [f"{n}" for n in value if n not in {f.name for f in fields(own)}]:
-        known = ", ".join(f.name for f in fields(own))
-        raise UsageError(f"{name} has no {', '.join(unknown)}. Available: {known}")
-    new = {n: _inner(getattr(own, n), v, f"{name}.{n}") for n, v in value.items()}
+    base: Any = default
+    if unknown := [f"{n}" for n in value if n not in {f.name for f in fields(base)}]:
+        names = ", ".join(f.name for f in fields(base))
+        raise UsageError(f"{name} has no {', '.join(unknown)}. Available: {names}")
+    # Replace the fields; nested dicts replace fields of nested configurations.
+    new = {n: _inner(getattr(base, n), v, f"{name}.{n}") for n, v in value.items()}
     try:
-        return replace(own, **new)
+        return replace(base, **new)
     except TypeError as error:
         raise UsageError(f"{name}: {error}", hint=f"see help({kind.__module__}.{kind.__name__})") from error
 

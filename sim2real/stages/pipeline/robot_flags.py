@@ -21,7 +21,7 @@ class RobotFlags:
     """Joints that were recorded, in the order of the columns; default: all of the model's, in its order."""
     parameter: Annotated[tuple[str, ...], UseAppendAction] = ()
     """Identified quantity: WHAT[:each][@PATTERN][=VALUE], one flag a quantity, such as frictionloss:each or
-    kp@.*_calf_joint; with =VALUE it is held. An unknown WHAT is refused, with a list."""
+    kp@.*_calf_joint; with =VALUE it is held. An unknown WHAT is refused; the error lists the available ones."""
     mapping: Annotated[Path | None, arg(metavar="FILE")] = None
     """Mapping of the log, if it is of another recorder; default: one is proposed."""
     rate_hz: float | None = None

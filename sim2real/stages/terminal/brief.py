@@ -1,4 +1,4 @@
-"""A stage on one line: dots while it runs; what it prints is held back, and printed if it fails."""
+"""A stage on one line: dots while it runs; its output is held back, and printed if it fails."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ def brief() -> Iterator[None]:
             sys.stderr.write(".")
         sys.stderr.flush()
 
+    # Hold the stage's output back, and show the time or dots.
     sys.stderr.write("  ")
     sys.stderr.flush()
     console.hold(held)
@@ -40,6 +41,7 @@ def brief() -> Iterator[None]:
         raise
     finally:
         console.hold(None)
+    # Replace the display by the duration.
     end = f" {time.monotonic() - begun_s:.0f} s\n"
     sys.stderr.write(f"\r\033[K {end}" if held.terminal else end)
     sys.stderr.flush()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sim2real.artifacts.summary import ArtifactTable
 
 _TICK_S = 1.0
-"""How often a terminal's progress is drawn again, whatever is computed [s]."""
+"""Period of a terminal's progress display [s]."""
 _LINES_S = (1.0, 2.0, 4.0, 8.0, 15.0)
 """When a log file gets a line of progress [s after its start]; after the last one, a line each time as long again."""
 
@@ -33,7 +33,7 @@ class HeldOutput:
 
     Attributes:
         terminal: Whether stderr is a terminal.
-        activity: What is being done, as the latest progress display describes it.
+        activity: Text of the latest progress display.
     """
 
     text: io.StringIO
@@ -74,7 +74,7 @@ class _Silent:
 
 def clean(text: str) -> str:
     """Return a text with control sequences escaped: names in foreign files must not control the user's terminal."""
-    return _ACTS.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return _ACTS.sub(lambda match: match[0].encode("unicode_escape").decode(), text)
 
 
 def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -> str:
@@ -127,7 +127,7 @@ class Bar(Protocol):
         ...
 
     def set_description_str(self, desc: str) -> None:
-        """Set the description of what is being done."""
+        """Set the description of the activity."""
         ...
 
     def set_postfix_str(self, s: str) -> None:
@@ -146,6 +146,7 @@ def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar
         total: Number of steps; None if unknown.
         shown: False shows nothing: another process does.
     """
+    # Within a brief stage, only its activity changes.
     if _held is not None:
         yield _Silent(_held, total, desc)
         return
@@ -158,6 +159,7 @@ def progress(total: float | None, desc: str, shown: bool = True) -> Iterator[Bar
         with bar, ticking(bar.refresh):
             yield bar
         return
+    # Without a terminal, print lines.
     lines = _Lines(total, desc)
     try:
         with ticking(lines.refresh):
@@ -224,8 +226,8 @@ class _Lines:
         note(f"{desc}: started")
 
     def end(self, how: str) -> None:
-        said = f" ({self._postfix})" if self._postfix else ""
-        note(f"{self._desc}: {how} after {time.monotonic() - self._begun_s:.1f} s{said}")
+        suffix = f" ({self._postfix})" if self._postfix else ""
+        note(f"{self._desc}: {how} after {time.monotonic() - self._begun_s:.1f} s{suffix}")
 
 
 def note(text: str, urgent: bool = False) -> None:

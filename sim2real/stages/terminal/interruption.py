@@ -95,6 +95,7 @@ def patiently(work: Callable[[], Result], look: Callable[[], None] | None = None
     Returns:
         What ``work`` returned.
     """
+    # Work in a thread, so that the main thread receives signals at once.
     outcome: list[Result] = []
     failure: list[BaseException] = []
     done = threading.Event()

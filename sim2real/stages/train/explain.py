@@ -25,7 +25,6 @@ def explain(
 
     Args:
         identification: None: the nominal model.
-        inputs: Input files by name, for the manifest.
         run_dir: Run folder to add to; None: a new one.
     """
     with open_stage(root, pipeline.name, "explain", config, inputs, run_dir) as stage:

@@ -33,7 +33,6 @@ def learn_policy(
 
     Args:
         checkpoint: File that receives the whole training after each evaluation.
-        resume: A checkpoint to continue from.
     """
     master = None if teacher is None else teacher_policy(teacher, contract)
     ppo = replace(config.ppo, eval_steps=setup.env.length + 1)

@@ -46,11 +46,7 @@ class _Agent(Protocol):
 
 
 def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
-    """Return the observations ``(N, O)`` that a policy would get from a recording's measurements.
-
-    Args:
-        runner: The policy, whose actions are part of its later observations.
-    """
+    """Return the observations ``(N, O)`` that a policy would get from a recording's measurements."""
     agent, sensor = robot.agent.make(robot.rate_hz), robot.roles.sensor
     if not isinstance(agent, _Agent):
         raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")

@@ -169,7 +169,6 @@ def sensitivity(
 
     Args:
         env: With room for all models, see ``with_room``.
-        models: The result of ``models_of``.
     """
     parameters = _for_one_graph(robot, models)
     columns = {name: jnp.asarray([m[name] for m in parameters], jnp.float32) for name in parameters[0]}

@@ -82,11 +82,7 @@ def _history(result: TrainResult) -> History:
 def contract_of(
     robot: Robot, task: TrainingTask, values: Mapping[str, float], episodes: Episodes | None = None
 ) -> PolicyContract:
-    """Return the contract of a policy: observation, action, and the delays of its training.
-
-    Args:
-        values: Parameters by name.
-    """
+    """Return the contract of a policy: observation, action, and the delays of its training."""
     return PolicyContract(
         observation=robot.agent.observation,
         action=tuple(

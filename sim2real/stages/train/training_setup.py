@@ -31,8 +31,6 @@ class TrainingSetup:
 
     Attributes:
         robot: The robot, in the world of the training.
-        values: Parameters by name.
-        env: One copy.
         episodes: The distributions that episodes are drawn from.
     """
 

@@ -22,7 +22,6 @@ class TaskState(NamedTuple):
     """The state of a ``TaskEnvironment``.
 
     Attributes:
-        inner: The composed environment's state.
         terms: Sum of each named reward term so far.
     """
 

@@ -79,8 +79,6 @@ class EnvState(NamedTuple):
 
     Attributes:
         graph: The graph's state, run up to the supervisor's step of this row.
-        step_state: The supervisor's step state.
-        total: Sum of the rewards so far.
         terms: Sum of each named reward term so far.
         good: Number of rows in the second half of the episode in which the task was fulfilled.
         width: Share of the differences between episodes that this one has; None: all.
@@ -102,7 +100,6 @@ class GraphEnvironment:
     terminate it earlier: the value after it is 0, and the task counts as not fulfilled in the rest of the episode.
 
     Args:
-        graph: The compiled graph, with the task's supervisor.
         steps: Shape ``(E,)``: policy steps of each timeline; None: all of them.
         curriculum: Share of the differences between episodes at the first and at the last update; None: always all.
             ``reset`` takes the last.

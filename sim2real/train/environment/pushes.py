@@ -33,7 +33,6 @@ class Pushes:
     """Pushes of each joint, independent of the others, at the times of policy steps.
 
     Attributes:
-        node: Name of the world's node.
         size: Largest change of a velocity [rad/s, or m/s]; changes are uniform within it, in both directions.
         chance: Probability that a joint is pushed in a row.
     """

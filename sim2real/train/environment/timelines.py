@@ -34,7 +34,6 @@ class Stretches:
     A hiccup of the computer hits all nodes at once, so times that were measured together are drawn together.
 
     Attributes:
-        seed: Seed of the starts.
         pauses: Whether the long steps of the recording are used.
         calm_s: Shape ``(E,)``: time from which on an episode has no long steps [s]; None: never.
     """
@@ -198,6 +197,7 @@ def _draw_with_pauses(
     periods: float,
 ) -> TimelineDraw | None:
     """Return timelines that end before pauses longer than ``periods``; None if too many of them end early."""
+    # Draw again until enough timelines have room between pauses.
     accepted: list[Timeline] = []
     steps: list[np.ndarray] = []
     missing, redrawn = count, 0

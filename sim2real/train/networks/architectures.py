@@ -204,6 +204,7 @@ def make_network(
     Raises:
         UsageError: There is no such network, the factory makes no network, or it cannot be exported.
     """
+    # A network of this package.
     if kind in ("mlp", "gru"):
         if kind == "gru" and not hidden:
             raise UsageError("a GRU needs a width: hidden is empty", hint="--ppo.hidden 64 64")

@@ -41,9 +41,6 @@ _LOGICAL = {"not", "and", "or", "xor"}
 class Translation:
     """Nodes and constants of a traced function, with the given names of its inputs and outputs.
 
-    Args:
-        network: Name of the network, for errors.
-
     Attributes:
         nodes: The nodes, in order.
         constants: Name -> array.

@@ -27,7 +27,7 @@ def export_graph(policy: Policy) -> bytes | None:
         UsageError: The network has a primitive that is not exported.
         Sim2RealError: JAX and ONNX give different actions.
     """
-    if policy.spec.own:
+    if policy.spec.built_in:
         return None
     # Trace one step of a batch of 1; the leaves of the carry are inputs and outputs of the model.
     first, tree = jax.tree.flatten(policy.initial_carry())

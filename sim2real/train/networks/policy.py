@@ -16,7 +16,7 @@ from flax import struct
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import Base
-from sim2real.policy.network import OWN, NetworkSpec
+from sim2real.policy.network import BUILT_IN, NetworkSpec
 from sim2real.policy.runner import BESIDES, GRU_ARRAYS, OBSERVATION_CLIP, PARTS, gru_of, layers_of, require
 from sim2real.train.networks.architectures import GRU, MLP, Factory, Network, is_recurrent, make_network, name_of
 from sim2real.types import Array, PyTree
@@ -105,7 +105,6 @@ class Policy(Base):
         """Return the action, shape ``(A,)``, for an observation, shape ``(O,)``.
 
         Args:
-            observation: In the units of the training.
             rng: JAX key of the exploration noise; None: no noise.
 
         Raises:
@@ -157,7 +156,7 @@ class Policy(Base):
 
 def _to_arrays(name: str, params: PyTree) -> dict[str, Array]:
     """Return the parameters of a network by name."""
-    if name not in OWN:
+    if name not in BUILT_IN:
         return dict(_named(params))
     layers = params if name == "mlp" else params["layers"]
     arrays = {} if name == "mlp" else {f"gru.{part}": params[part] for part in GRU_ARRAYS}
@@ -166,13 +165,15 @@ def _to_arrays(name: str, params: PyTree) -> dict[str, Array]:
 
 def _from_arrays(kind: str | Factory, arrays: Mapping[str, jax.Array]) -> tuple[Network, PyTree]:
     """Return a network and its parameters; the inverse of ``_to_arrays``."""
-    if kind in OWN:
+    # Networks of this package: their widths are those of the arrays.
+    if kind in BUILT_IN:
         layers = tuple(layers_of(arrays))
         widths = tuple(bias.shape[0] for _, bias in layers)
         if kind == "mlp":
             return MLP(widths), layers
         gru = gru_of(arrays)
         return GRU((gru["recurrent"].shape[0], *widths)), {**gru, "layers": layers}
+    # A user's network: make it again, and compare its parameters with the arrays.
     require(arrays, BESIDES)
     inputs, outputs = arrays["mean"].size, arrays["log_std"].size
     network = make_network(kind, (), inputs, outputs)

@@ -63,8 +63,10 @@ def unroll(
     """
     apply = partial(network.apply, params)
     if not is_recurrent(network):
+        # Without memory, all rows are independent.
         rows = jax.vmap(jax.vmap(lambda x: apply(network.initial_carry(), x)[1]))
         return Unrolled(carry, rows(x), None if following is None else rows(following))
+    # With memory, scan over the rows.
     start = repeat(network.initial_carry(), x.shape[1])
 
     def row(

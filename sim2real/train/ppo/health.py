@@ -51,6 +51,7 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
                 f"no evaluation episode ended within eval_steps={config.eval_steps} rows",
                 hint="raise eval_steps above the longest episode, or let the environment truncate",
             )
+        # Metrics of episodes come last: they may follow from the causes above.
         metrics = sorted(name for name, value in values.items() if not np.isfinite(value[seed]).all())
         if metrics:
             raise Sim2RealError(f"metrics {', '.join(metrics)} of finished episodes are not finite {when}")
@@ -58,6 +59,7 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
 
 def check_target(env: TrainingEnvironment, config: PPOConfig) -> None:
     """Raise a ``UsageError`` if the configuration has a target and the environment reports no success."""
+    # The metrics are those of a step.
     if config.target is not None and "success" not in (names := metric_names(env)):
         raise UsageError(
             f"target={config.target} is a share of success, and the environment's metrics have none: {sorted(names)}",

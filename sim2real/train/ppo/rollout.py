@@ -110,7 +110,6 @@ def collect(
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
     Args:
-        env: One copy; vmapped here.
         copies: The copies after the last rollout; if ``update`` is 0 all of them are reset.
         update: Shape ``()``, int32: number of updates so far; in an evaluation, of rollouts.
         teacher: Its actions are recorded in every row, while the policy acts.
@@ -154,7 +153,6 @@ def _play_row(
     """Play one row of all copies.
 
     Args:
-        fresh: The copies at the start of an episode.
         cut: Shape ``(N,)``, int32: number of the row after which a copy's first episode ends.
         x: Exploration noise ``(N, A)``, keys ``(N,)``, and the row's number from 1 ``()``.
     """
@@ -224,9 +222,6 @@ def averages(evaluation: PolicyEvaluation) -> dict[str, jax.Array]:
 
 def evaluate(env: TrainingEnvironment, config: PPOConfig, policy: Policy, key: jax.Array) -> dict[str, jax.Array]:
     """Play one episode per copy without exploration noise, and average over the episodes that ended.
-
-    Args:
-        env: One copy; vmapped here.
 
     Returns:
         ``return`` (sum of the unscaled rewards, or the environment's metric of that name), the environment's metrics,

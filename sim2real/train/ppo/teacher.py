@@ -103,6 +103,7 @@ def check_teacher(env: TrainingEnvironment, config: PPOConfig, teacher: Policy) 
     Raises:
         UsageError: The teacher does not fit this student.
     """
+    # Refuse a teacher for a teacher, and one with memory.
     privileged = count_privileged(env) if teacher.spec.privileged else 0
     if config.teacher:
         raise UsageError(
@@ -115,6 +116,7 @@ def check_teacher(env: TrainingEnvironment, config: PPOConfig, teacher: Policy) 
             "has no memory of",
             hint="train the teacher with --ppo.network mlp: it observes the true state and need not remember",
         )
+    # Compare observations and bounds.
     sizes = (teacher.mean.size, teacher.spec.privileged), (env.observation_size + privileged, privileged)
     bounds = [np.asarray(a, np.float32) for a in (teacher.low, teacher.high, env.action_low, env.action_high)]
     if sizes[0] != sizes[1] or not np.array_equal(bounds[:2], bounds[2:]):

@@ -112,7 +112,6 @@ class _Session(NamedTuple):
         numbers: The settings that are swept.
         data: The environment's data: a training after another recording finds its program in the cache.
         layout: Where the arrays lie; None: on one device.
-        lowered: The traced program.
     """
 
     config: PPOConfig
@@ -132,6 +131,7 @@ class _Session(NamedTuple):
         makers: tuple[Factory | None, Factory | None, Policy | None],
     ) -> _Session:
         """Check the environment, make the networks and the first state, and trace the program."""
+        # Check the environment, and make networks and the first state.
         check_environment(env)
         env = TeacherEnvironment(env) if config.teacher else env
         check_target(env, config)
@@ -147,6 +147,7 @@ class _Session(NamedTuple):
         def of_member(state: TrainState, numbers: _Numbers, data: PyTree) -> tuple[TrainState, Policy, _Figures]:
             return _train_until_evaluation(with_data(env, data), with_numbers(members, numbers), networks, state)
 
+        # Trace one program for all members.
         where = layout and (layout.state, layout.whole, layout.whole)
         with small_random_numbers():
             program = jax.jit(jax.vmap(of_member, in_axes=(0, 0, None)), donate_argnums=0, out_shardings=where)
@@ -240,6 +241,7 @@ def _save(path: Path, identity: TrainingIdentity, training: Checkpoint, layout: 
 
 def _result(session: _Session, training: Checkpoint, first: int, compile_s: float, train_s: float) -> TrainResult:
     """Return the result; ``first`` is the number of evaluations that an earlier process made."""
+    # Figures of all evaluations, and the speed of this process alone.
     log, history = training.log, history_of(training.log)
     members = [point for point in session.sweep.grid for _ in range(session.config.num_seeds)]
     trained = log[-1].env_steps - (log[first - 1].env_steps if first else 0)

@@ -29,7 +29,6 @@ class TrainState(NamedTuple):
 
     Attributes:
         params: ``{"actor": ..., "log_std": (A,), "value": ...}``: the networks' parameters, and the noise.
-        normaliser: Statistics of the observations so far.
         privileged: Statistics of the value function's further inputs; None if it has none.
         update: Shape ``()``, int32: number of updates so far.
         key: The seed's key; it never changes. ``keys`` derives the keys of an update from it.
@@ -73,10 +72,6 @@ def prepare(
     state: TrainState, policy: Policy, rows: Rows, config: PPOConfig, networks: ActorCritic
 ) -> tuple[Batch, PyTree]:
     """Return the batch of a rollout: normalised observations, values, log densities and advantages.
-
-    Args:
-        state: The state before the rollout.
-        policy: The policy that played the rows.
 
     Returns:
         The batch, and the value function's carry after the last row.
@@ -143,10 +138,6 @@ def update(
     rows: Rows,
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """Update the networks and the normaliser after a rollout.
-
-    Args:
-        state: The state before the rollout; its policy played the rows.
-        copies: The copies after the rollout.
 
     Returns:
         The next state, and figures of the update: the parts of the loss and the mean ``reward`` and ``value`` per row,

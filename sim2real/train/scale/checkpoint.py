@@ -37,10 +37,8 @@ class Checkpoint(NamedTuple):
     """A training after an evaluation.
 
     Attributes:
-        state: The state of all seeds.
         policies: The policies of all seeds; None before the first evaluation.
         best: The best policy so far; None before the first evaluation.
-        log: The evaluations so far.
     """
 
     state: TrainState
@@ -54,7 +52,6 @@ class TrainingIdentity:
     """The properties in which a resumed training must equal the interrupted one.
 
     Attributes:
-        config: The settings by name.
         program: Digest of the program and the environment's data: they hold the timing, and depend on the versions of
             code and compiler.
     """
@@ -126,7 +123,6 @@ def load_checkpoint(path: Path, identity: TrainingIdentity, state: TrainState, p
     Args:
         identity: The training that the file must hold.
         state: A state of the same training, for its structure and the types of its keys.
-        policies: The same of the policies; shapes suffice.
 
     Raises:
         Sim2RealError: The file is missing or damaged.

@@ -44,6 +44,7 @@ def mesh_of(config: PPOConfig) -> Mesh | None:
             f"{by_copy} devices a seed do not divide its copies",
             hint=f"make num_envs a multiple of {by_copy}",
         )
+    # Devices of one host are neighbours in the mesh.
     by_process = [[d for d in jax.devices() if d.process_index == p] for p in range(jax.process_count())]
     devices = [device for devices in by_process for device in devices[: config.devices]]
     return Mesh(np.array(devices).reshape(by_seed, by_copy), (SEEDS, COPIES), (AxisType.Auto,) * 2)

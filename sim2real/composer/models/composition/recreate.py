@@ -69,6 +69,7 @@ def named(model: Tree[Handle], element: str, kind: str, target: Handle | str, to
     Raises:
         UsageError: When it is not there.
     """
+    # Find the element by its name.
     element_named: Any = target
     if isinstance(target, str):
         if not kind:

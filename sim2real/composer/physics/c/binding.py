@@ -43,7 +43,6 @@ class Place:
     """The place of an attribute of bound elements.
 
     Attributes:
-        array: MuJoCo's array.
         index: The rows in it.
         derived: Whether it is computed from other attributes, and out of date once those are written.
         shown: The array that readers get; None where they get a number.

@@ -37,9 +37,6 @@ class Physics(BoundPhysics):
     Args:
         legacy_step: After a step, also compute positions and velocities of the new state, as dm_control does.
         data: A ``mujoco.MjData`` as ``mj_resetData`` leaves it; default: a new one.
-
-    Attributes:
-        graphics: Draws the images.
     """
 
     np = np

@@ -45,11 +45,7 @@ class Start(NamedTuple):
 
 
 class StepLaw(Protocol):
-    """Sets controls, forces and fields before every physics step from the state, in MJX and around C.
-
-    Attributes:
-        fields: The model's fields that it sets.
-    """
+    """Sets controls, forces and fields before every physics step from the state, in MJX and around C."""
 
     fields: tuple[str, ...]
 
@@ -60,7 +56,6 @@ class StepLaw(Protocol):
 
         Args:
             values: Numbers of each copy, ``(..., n)``.
-            control: What the world's ``controls`` gave for this step.
             qpos: Positions ``(..., nq)`` [m or rad].
             qvel: Velocities ``(..., nv)`` [m/s or rad/s].
         """
@@ -71,7 +66,6 @@ class OpenLoop(Protocol):
     """A world on MuJoCo whose controls do not depend on its state: its physics can run outside of a graph's program.
 
     Attributes:
-        name: Its name in the graph.
         substeps: Physics steps in a tick.
         derives: Whether constants that MuJoCo derives from the model (``mj_setConst``) follow from ``fields``.
     """

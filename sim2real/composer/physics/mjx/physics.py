@@ -50,7 +50,6 @@ class MjxPhysics(Traced):
 
     Attributes:
         changed: Names of the model's fields that were set.
-        start: The ``mjx.Data`` that ``reset`` returns to.
         dry: Whether steps compute nothing: for finding out what hooks set and keep.
         failed: Whether no acceptable initial state was found, a boolean array.
     """

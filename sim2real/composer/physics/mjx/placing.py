@@ -37,7 +37,6 @@ def place(
     Args:
         physics: The physics; ``physics.fail`` is called where a prop found no place.
         pose: Position ``(3,)`` [m] and quaternion ``(4,)``, or variations.
-        attempts: Poses that are tried for each prop.
 
     Raises:
         UsageError: On Warp, which keeps the contacts of all copies together, unless collisions are ignored.

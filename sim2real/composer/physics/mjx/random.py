@@ -50,7 +50,6 @@ class JaxRandomState:
         memory: What variations keep from draw to draw: name -> array.
 
     Attributes:
-        key: The key that is left.
         memory: The same dictionary, with new values.
     """
 

@@ -30,7 +30,6 @@ class WarpEngine:
         UsageError: When the package or a device is missing, or MuJoCo Warp cannot run the model.
 
     Attributes:
-        model: The ``mjx.Model``.
         start: The ``mjx.Data`` of the model's initial state, nothing computed.
     """
 
