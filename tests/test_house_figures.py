@@ -8,14 +8,14 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 60_415,
-    "lines of composer": 12_165,
+    "lines without composer": 60_380,
+    "lines of composer": 12_153,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.3,
     "Any in 1,000 lines": 4.8,
     "words of the dialect": 14,
     "other words of the dialect": 260,
-    "largest number of project imports": 20,
+    "largest number of project imports": 18,
     "levels of robot classes": 2,
     "public members of SO101Robot": 18,
     "modules of hardware that train imports": 0,

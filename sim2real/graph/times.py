@@ -58,8 +58,6 @@ def search_rows(rows: np.ndarray, values: np.ndarray, side: Literal["left", "rig
     high = max(int(a.max(initial=0)) for a in real) + 2
     lift = (np.arange(len(rows), dtype=np.int64) * (high - low + 1))[:, None]
     flat = np.searchsorted(
-        (np.minimum(rows, high) + lift).ravel(),
-        (np.minimum(values, high) + lift).ravel(),
-        side=side,
+        (np.minimum(rows, high) + lift).ravel(), (np.minimum(values, high) + lift).ravel(), side=side
     )
     return flat.reshape(values.shape) - np.arange(len(rows))[:, None] * rows.shape[1]

@@ -52,10 +52,7 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
     """
 
     def __init__(
-        self,
-        pure: PureEnvironment[S],
-        num_envs: int,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        self, pure: PureEnvironment[S], num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
     ) -> None:
         if num_envs < 1:
             raise UsageError(f"num_envs must be at least 1, got {num_envs}")
@@ -201,10 +198,7 @@ class MjxVectorEnv(CopiesVectorEnv[State]):
     """Copies of a task; observations are dictionaries of observables. See ``CopiesVectorEnv`` for seeds and resets."""
 
     def __init__(
-        self,
-        environment: MjxEnvironment,
-        num_envs: int,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        self, environment: MjxEnvironment, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
     ) -> None:
         self.environment = environment
         super().__init__(PureTask(environment, flat=False), num_envs, autoreset_mode)
@@ -221,10 +215,7 @@ class RobotVectorEnv(CopiesVectorEnv[Copy]):
     """
 
     def __init__(
-        self,
-        robot: RobotEnvironment,
-        num_envs: int,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        self, robot: RobotEnvironment, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
     ) -> None:
         self.robot = robot
         super().__init__(robot, num_envs, autoreset_mode)

@@ -142,10 +142,7 @@ def input_topic(node: str, input_name: str) -> Topic:
 
 
 def joint_source(
-    node: str,
-    example: PyTree,
-    joints: Mapping[str, Mapping[str, str]],
-    units: Mapping[str, str] | None = None,
+    node: str, example: PyTree, joints: Mapping[str, Mapping[str, str]], units: Mapping[str, str] | None = None
 ) -> JointSource:
     """Return the source of the ``sensor_msgs/msg/JointState`` messages in a node's output.
 

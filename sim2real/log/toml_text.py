@@ -22,8 +22,7 @@ def toml_value(value: object) -> str:
             value.encode()
         except UnicodeEncodeError:
             raise UsageError(
-                f"{value!r} cannot be written: it has bytes that are no text",
-                hint="rename the file or joint",
+                f"{value!r} cannot be written: it has bytes that are no text", hint="rename the file or joint"
             ) from None
         # TOML has the escapes of JSON, and needs one for DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

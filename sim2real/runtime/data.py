@@ -156,12 +156,7 @@ class NodeData:
     def keep(self, changed: dict[str, PyTree]) -> None:
         """Store the fields that a step replaced, and count the step."""
         rng, params, state, steps = self.carried
-        self.carried = (
-            changed.get("rng", rng),
-            changed.get("params", params),
-            changed.get("state", state),
-            steps + 1,
-        )
+        self.carried = (changed.get("rng", rng), changed.get("params", params), changed.get("state", state), steps + 1)
 
 
 def snapshot(graph_state: GraphState, data: dict[str, NodeData], supervisor: str) -> GraphState:

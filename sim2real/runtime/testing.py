@@ -96,11 +96,7 @@ class _Player:
 
 
 def interpret_hashes(
-    nodes: Mapping[str, BaseNode],
-    wiring: Wiring,
-    episode: int,
-    states: Mapping[str, int],
-    outputs: Mapping[str, int],
+    nodes: Mapping[str, BaseNode], wiring: Wiring, episode: int, states: Mapping[str, int], outputs: Mapping[str, int]
 ) -> dict[str, np.ndarray]:
     """Play one episode of hash nodes.
 

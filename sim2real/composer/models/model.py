@@ -52,11 +52,7 @@ class Model(Tree[Element]):
 
     @classmethod
     def from_path(
-        cls,
-        path: str | os.PathLike[str],
-        assets: dict[str, bytes] | None = None,
-        *,
-        resolve_references: bool = True,
+        cls, path: str | os.PathLike[str], assets: dict[str, bytes] | None = None, *, resolve_references: bool = True
     ) -> Model:
         """Return a model from an MJCF file.
 

@@ -197,11 +197,7 @@ def contracting_node(name: str, rate: float, world: bool, **options: PyTree) -> 
 
 
 def random_graph(
-    seed: int,
-    size: int | None = None,
-    worlds: int | None = None,
-    make: MakeNode = hash_node,
-    trainable: bool = False,
+    seed: int, size: int | None = None, worlds: int | None = None, make: MakeNode = hash_node, trainable: bool = False
 ) -> dict[str, BaseNode]:
     """Return nodes by name with random rates, delays and connections; the first one can be the supervisor.
 

@@ -25,11 +25,7 @@ class MountedPlant:
     """
 
     def __init__(
-        self,
-        plant: str,
-        plant_args: Mapping[str, Any],
-        joints: Sequence[Mapping[str, Any]],
-        zero_rad: float,
+        self, plant: str, plant_args: Mapping[str, Any], joints: Sequence[Mapping[str, Any]], zero_rad: float
     ) -> None:
         self._plant, self._zero_rad = load_plant(plant, plant_args), zero_rad
         self.servo_ids = tuple(self._plant.servo_ids)

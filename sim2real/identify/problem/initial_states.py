@@ -69,12 +69,7 @@ class InitialStates:
         return states
 
     def best(
-        self,
-        values: Mapping[str, np.ndarray],
-        eps: np.ndarray,
-        fit_s: np.ndarray,
-        data: Data,
-        steps: int = _STEPS + 1,
+        self, values: Mapping[str, np.ndarray], eps: np.ndarray, fit_s: np.ndarray, data: Data, steps: int = _STEPS + 1
     ) -> InitialState:
         """Fit the initial states of segments; return shifts, derivatives at no shift, and residuals.
 

@@ -30,11 +30,7 @@ class LoopTask:
     """
 
     def __init__(
-        self,
-        robot: ConnectedParts,
-        agent: Any,
-        values: Mapping[str, float],
-        draws: Mapping[str, np.ndarray],
+        self, robot: ConnectedParts, agent: Any, values: Mapping[str, float], draws: Mapping[str, np.ndarray]
     ) -> None:
         self.robot, self.agent = robot, agent
         self.values: dict[str, PyTree] = dict(values)

@@ -258,11 +258,7 @@ class MjcfRobot(LoggedRobot):
         n, driving = len(self.config.joints), set(self.config.commands)
         zero, one = jnp.zeros(n), jnp.ones(n)
         return params.replace(
-            kp=FALLBACK["kp"] * one if "goal" in driving else zero,
-            kd=zero,
-            gain=one,
-            released=zero,
-            zero=zero,
+            kp=FALLBACK["kp"] * one if "goal" in driving else zero, kd=zero, gain=one, released=zero, zero=zero
         )
 
     @property

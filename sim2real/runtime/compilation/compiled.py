@@ -134,11 +134,7 @@ class CompiledGraph:
         return np.any([self.wiring.tables[turn].seq >= 0 for turn in self.walk.turns], axis=0)
 
     def init(
-        self,
-        rng: jax.Array,
-        params: Mapping[str, PyTree] | None = None,
-        order: Sequence[str] = (),
-        eps: Number = 0,
+        self, rng: jax.Array, params: Mapping[str, PyTree] | None = None, order: Sequence[str] = (), eps: Number = 0
     ) -> GraphState:
         """Return the state at the start of an episode.
 

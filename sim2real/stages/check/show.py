@@ -63,10 +63,7 @@ def _signal_rows(recording: Mapping[str, Json]) -> tuple[list[list[Json]], list[
     signals = [(c["name"], c["unit"], c) for c in recording["commands"]]
     for j in reversed(recording["joints"]):
         velocity_unit = f"{j['unit']}/s" if j["unit"] else ""
-        signals[:0] = [
-            (j["name"], j["unit"], j["position"]),
-            (f"speed of {j['name']}", velocity_unit, j["velocity"]),
-        ]
+        signals[:0] = [(j["name"], j["unit"], j["position"]), (f"speed of {j['name']}", velocity_unit, j["velocity"])]
     rows: list[list[Json]] = [
         [
             name,

@@ -65,8 +65,7 @@ def find_source(
         return JudgedLogs([shown(p) for p in paths], [open_recording(p, pipeline, robot).episode for p in paths], False)
     if not isinstance(robot, Robot):
         raise UsageError(
-            f"pipeline {pipeline.name!r} has no excitation to plan a recording with",
-            hint="name a log with --log FILE",
+            f"pipeline {pipeline.name!r} has no excitation to plan a recording with", hint="name a log with --log FILE"
         )
     # Simulate the planned commands with the nominal parameters.
     moving = moving_robot(pipeline)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,28 +14,16 @@ from sim2real.artifacts.identification import UNFINISHED, Identification
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identify.drift import drift_test
-from sim2real.identify.model import IdentifiableModel
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
 from sim2real.identify.search.refine import refine
 from sim2real.identify.validation import prediction
-from sim2real.identify.validation.folds import MOVES
 from sim2real.identify.validation.verdict import positions
-from sim2real.robots.contract import RecordedRobot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.segment_split import reach
-from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.estimation.later_logs import problem_of_logs
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 AS_HERE = "as in this log"
 """The model with the parameters fitted to the deployment's own log."""
-_SEGMENT_S = 0.4
-"""Shortest segment [s]. Errors of a balanced pendulum grow tenfold in 0.2 s, so long segments do not separate
-models."""
-_LEAST, _LEAST_S = 4, 5.0
-"""Fewest segments with motion for a test, and the shortest length of all logs [s]."""
 _NOISE = 2.0
 """Errors below this many deviations of the measurement count as noise."""
 
@@ -57,7 +45,7 @@ def tested(
     longest_s = max([pipeline.identify.max_delay_s, *delays_s])
     config = replace(pipeline.identify, settle_s=identification.settle_s, max_delay_s=longest_s)
     # Cut the logs into segments.
-    problem, ahead_s = segments(robot, identification, episodes, config)
+    problem, ahead_s = problem_of_logs(robot, identification, episodes, config)
     if identification.posterior is None:
         ended = UNFINISHED.get(identification.verdict.status, "has no intervals")
         raise Sim2RealError(
@@ -89,71 +77,6 @@ def tested(
         free = _free_run(identification, position.column)
         rows.append(Replay(position.name, position.unit, ahead_s, rmse, promise, position.column, free))
     return rows, drifted
-
-
-def segments(
-    robot: RecordedRobot, identification: Identification, episodes: Sequence[Episode], config: IdentifyConfig
-) -> tuple[Problem, float]:
-    """Return logs in short segments, with the identified parameters, and the horizon of the predictions [s].
-
-    Raises:
-        Sim2RealError: When the logs are too short, or parameters differ between recordings.
-    """
-    model = robot.watched(config.max_delay_s)
-    if own := [p.name for p in model.parameters if p.free and p.per_recording]:
-        raise Sim2RealError(f"{', '.join(own)} differ from recording to recording: a new log has no values for them")
-    horizons = sorted({p.horizon_s for p in identification.prediction})
-    length_s = max(_SEGMENT_S, config.settle_s + (horizons[0] if horizons else 0.0))
-    ahead_s = max([h for h in horizons if config.settle_s + h <= length_s + 1e-9], default=length_s - config.settle_s)
-    spans = []
-    for r, episode in enumerate(episodes):
-        begin, end = reach(episode, config)
-        begins = np.arange(begin, end - length_s + 1e-6, length_s)
-        spans += [Span(r, float(b)) for b in begins if _moves(model, episode, b, length_s)]
-    seconds = sum(e.duration_s for e in episodes)
-    if len(spans) < _LEAST or seconds < _LEAST_S:
-        moving = f", {length_s * len(spans):.1f} s of them in motion,"
-        raise Sim2RealError(f"{seconds:.1f} s of deployment{moving} are too little to test the model on")
-    own = {p.name for p in robot.identifiable(config.max_delay_s).parameters if p.free}
-    watched = {p.name for p in model.parameters if p.free} - own
-    table = known_table(model.parameters, identification, watched)
-    return Problem(model, list(episodes), spans, length_s, config, table), ahead_s
-
-
-def known_table(
-    parameters: ParameterTable, identification: Identification, watched: Container[str] = ()
-) -> ParameterTable:
-    """Return parameters with the identified terms, the values that were fixed, and bounds that include the search's.
-
-    Args:
-        watched: Names of parameters that are free although they were fixed, such as a payload.
-    """
-    terms = {p.term for p in parameters if p.term and (p.free or p.term in (identification.terms or ()))}
-    fixed = {p.name: p.estimate for p in identification.parameters if p.verdict == "fixed"}
-    fixed_here = {n: v for n, v in fixed.items() if n in {p.name for p in parameters}}
-    table = parameters.with_terms(terms).with_nominal(fixed_here)
-    table = table.with_fixed({n: v for n, v in fixed_here.items() if n not in watched})
-    free = {p.name for p in table if p.free}
-    wider = {
-        p.name: (min(p.lower, table[p.name].low), max(p.upper, table[p.name].high))
-        for p in identification.parameters
-        if p.name in free and p.kind != "delay" and p.lower is not None and p.upper is not None
-    }
-    return table.with_bounds(wider)
-
-
-def _moves(model: IdentifiableModel, episode: Episode, begin_s: float, length_s: float) -> bool:
-    """Return whether any joint moves in a part of a log [s].
-
-    Segments without motion do not count: all are alike, and a joint that sticks creeps in a model with smooth friction.
-    """
-    t = episode.steps[model.sensor].begun_s
-    inside = (t >= begin_s) & (t <= begin_s + length_s)
-    read = episode.outputs[model.sensor]
-    return any(
-        inside.any() and float(np.ptp(c.of(read[c.position][inside]))) > MOVES * c.position_sigma
-        for c in model.channels
-    )
 
 
 def _held_out(identification: Identification, model: str, ahead_s: float) -> Mapping[str, float]:

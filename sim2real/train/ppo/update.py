@@ -130,12 +130,7 @@ def keys(state: TrainState) -> jax.Array:
 
 
 def update(
-    env: TrainingEnvironment,
-    config: PPOConfig,
-    networks: ActorCritic,
-    state: TrainState,
-    copies: Copies,
-    rows: Rows,
+    env: TrainingEnvironment, config: PPOConfig, networks: ActorCritic, state: TrainState, copies: Copies, rows: Rows
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """Update the networks and the normaliser after a rollout.
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -13,20 +12,13 @@ from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.run_folder import StageFolder
 from sim2real.artifacts.summary import words_and_unit
-from sim2real.artifacts.timing import Timing
-from sim2real.graph.episode import Episode
-from sim2real.log.ages import oldest_input
-from sim2real.types import Json
-from sim2real.view import timing
 from sim2real.view.blocks import (
-    MISSING,
     Block,
     FigureBlock,
     NoteBlock,
     PageSection,
     TableBlock,
     Tile,
-    fixed,
     number,
 )
 from sim2real.view.identification.section import identify_section
@@ -34,6 +26,7 @@ from sim2real.view.page import deployment_verdict, figures
 from sim2real.view.page.episodes import episodes_svg
 from sim2real.view.page.sensitivity import sensitivity_blocks
 from sim2real.view.page.servos import DRY, servo_blocks
+from sim2real.view.page.timing_blocks import timing_blocks, timing_tiles
 from sim2real.view.provenance import about
 from sim2real.view.signals import Signals, signals_of, simulated_beside
 
@@ -50,9 +43,9 @@ def record_section(artifact: StageFolder) -> PageSection:
             f"Measurements, at the time of each sample, and {commanded}.{truth} Right: a part of the left plots.",
         )
     )
-    blocks += [*_timing_blocks(log.episode, "record"), *servo_blocks([log.episode])]
+    blocks += [*timing_blocks(log.episode, "record"), *servo_blocks([log.episode])]
     steps = max((len(s) for s in log.episode.steps.values()), default=0)
-    tiles = [Tile("length", f"{log.episode.duration_s:.1f} s", f"{steps} steps"), *_timing_tiles([log.episode])]
+    tiles = [Tile("length", f"{log.episode.duration_s:.1f} s", f"{steps} steps"), *timing_tiles([log.episode])]
     lead = "The robot under an excitation" + (", without torque." if log.dry else "; all later stages use this log.")
     return PageSection("record", "Record", lead, tiles, [*blocks, *about(artifact)], DRY if log.dry else None)
 
@@ -124,7 +117,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
         figure = figures.deployment(log, beside, deployed.units, index, f"deploy-{index}")
         blocks.append(FigureBlock(figure, caption))
     for index, log in enumerate(logs):
-        blocks += _timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
+        blocks += timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
     blocks += servo_blocks([log.episode for log in logs])
     # The tiles have the success on the robot and in simulation.
     real, simulated = (
@@ -136,7 +129,7 @@ def deploy_section(artifact: StageFolder) -> PageSection:
         note = f"in simulation {np.mean(simulated):.0%}" if simulated else ""
         tiles.append(Tile("success on the robot", f"{np.mean(real):.0%}", note))
     tiles += deployment_verdict.verdict_tile(deployed)
-    tiles += [Tile("episodes", str(len(deployed.episodes))), *_timing_tiles([log.episode for log in logs])]
+    tiles += [Tile("episodes", str(len(deployed.episodes))), *timing_tiles([log.episode for log in logs])]
     lead = "The policy on the robot, beside the same policy in simulation."
     return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)])
 
@@ -150,8 +143,8 @@ def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> PageSection:
         blocks.append(FigureBlock(figures.recording(log, f"deploy-{index}"), caption))
     episodes = [log.episode for log in logs]
     for index, episode in enumerate(episodes):
-        blocks += _timing_blocks(episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
-    tiles = [Tile("episodes", str(len(episodes)), "dry run"), *_timing_tiles(episodes)]
+        blocks += timing_blocks(episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
+    tiles = [Tile("episodes", str(len(episodes)), "dry run"), *timing_tiles(episodes)]
     lead = "The policy on the robot, without torque."
     return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], DRY)
 
@@ -167,67 +160,6 @@ SECTIONS = {
 def headline(sections: Sequence[PageSection]) -> list[Tile]:
     """Return the first tile of each stage, for the head of the page."""
     return [Tile(f"{s.title}: {s.tiles[0].label}", s.tiles[0].value, s.tiles[0].note) for s in sections if s.tiles]
-
-
-def _timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
-    late = {n: np.concatenate([timing.times(e.steps[n]).lateness for e in episodes]) for n in episodes[0].steps}
-    p99 = {n: float(np.quantile(values, 0.99)) for n, values in late.items() if len(values)}
-    worst = max(p99, key=lambda n: p99[n])
-    yield Tile("lateness, p99", f"{p99[worst]:.2f} ms", f"of {worst}, the worst node")
-    # Lateness does not show old messages, so show the oldest input, too.
-    old = {n: np.concatenate([oldest_input(e, n) for e in episodes]) for n in episodes[0].steps}
-    oldest = {n: 1e3 * float(ages.max()) for n, ages in old.items() if ages.size}
-    if oldest:
-        reader = max(oldest, key=lambda n: oldest[n])
-        yield Tile("oldest input of a step", f"{oldest[reader]:.1f} ms", f"of {reader}")
-    ends: list[Mapping[str, Json]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
-    overruns = [t.get("overruns", 0) for end in ends for t in end.get("timing", {}).values()]
-    if overruns:
-        lost = ends[-1].get("lost_replies")  # the count covers all episodes of a session
-        yield Tile("overruns", str(sum(overruns)), f"{lost} lost replies" if lost is not None else "")
-
-
-def _timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = False) -> list[Block]:
-    """Return figures and table about an episode's timing."""
-    end: Mapping[str, Json] = episode.metadata.get("log", {}).get("session_end") or {}
-    rows, measured = [], Timing.of(episode)
-    # Make a row for each node: quantiles of period, lateness, computation, bus and age.
-    for node in timing.in_order(episode):
-        steps = episode.steps[node]
-        if len(steps) < 2:
-            continue
-        row = [node, str(len(steps))]
-        taken = timing.times(steps)
-        for values in (taken.period, taken.lateness, taken.computation):
-            p50, p99 = np.quantile(values, [0.5, 0.99])
-            row += [fixed(float(v), 2) for v in (p50, p99, values.max())]
-        row += [MISSING if t is None else fixed(1e3 * t, 2) for t in astuple(measured.nodes[node].bus)]
-        ages = 1e3 * oldest_input(episode, node)
-        row += [fixed(float(q), 2) for q in np.quantile(ages, [0.5, 0.99, 1.0])] if ages.size else [MISSING] * 3
-        rows.append([*row, number(end.get("timing", {}).get(node, {}).get("overruns"))])
-    heads = [f"{q} {k}" for q in ("period", "late", "comp.", "bus", "age") for k in ("p50", "p99", "max")]
-    table = TableBlock(
-        f"Timing of each node [ms]{which and ',' + which.lower().rstrip('.')}",
-        ("node", "steps", *heads, "overruns"),
-        rows,
-        folded=folded,
-    )
-    # Draw figures only for the first episode.
-    if folded or not rows:
-        return [table]
-    return [
-        FigureBlock(
-            timing.schedule(episode, f"{name}-schedule"),
-            f"Computation of each node over time.{which} An arrow is a message, from the end of the sender's step to "
-            "the start of the reader's step.",
-        ),
-        FigureBlock(
-            timing.histograms(episode, f"{name}-timing"),
-            f"Times of the nodes, in ms.{which} Age: time from the sending of a message to the step that uses it, for "
-            "the oldest input. Dashed: the 99 % quantile. Counts are logarithmic.",
-        ),
-        table,
-    ]
 
 
 def _scores(score: Scores) -> str:

@@ -13,10 +13,7 @@ if TYPE_CHECKING:
     from sim2real.composer.models.tree import Handle, Tree
     from sim2real.composer.types import Native
 
-_OBJECTS = {
-    **{number: kind for kind, number in layout.OBJECT_TYPES.items()},
-    mj.mjtObj.mjOBJ_XBODY: "body",
-}
+_OBJECTS = {**{number: kind for kind, number in layout.OBJECT_TYPES.items()}, mj.mjtObj.mjOBJ_XBODY: "body"}
 _TRANSMISSIONS = {
     **{getattr(mj.mjtTrn, f"mjTRN_{name}"): "joint" for name in ("JOINT", "JOINTINPARENT")},
     **{getattr(mj.mjtTrn, f"mjTRN_{name}"): "site" for name in ("SITE", "SLIDERCRANK")},

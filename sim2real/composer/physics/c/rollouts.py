@@ -139,12 +139,7 @@ class Rollouts:
     """
 
     def __init__(
-        self,
-        model: MjModel,
-        substeps: int,
-        names: tuple[str, ...],
-        derives: bool = False,
-        law: StepLaw | None = None,
+        self, model: MjModel, substeps: int, names: tuple[str, ...], derives: bool = False, law: StepLaw | None = None
     ) -> None:
         from mujoco import batch  # 30 ms
 
