@@ -166,9 +166,6 @@ def split_pipeline(command: str, arguments: list[str]) -> tuple[Pipeline, list[s
     """Return the pipeline, which the first argument names, and the other arguments.
 
     ``--help`` without a pipeline shows the flags of the demo's pipeline.
-
-    Raises:
-        UsageError: The first argument is a flag, or there is none.
     """
     from sim2real.stages.pipeline.pipeline import available, load_pipeline
 

@@ -40,11 +40,7 @@ class RecoverConfig:
 
     @property
     def source(self) -> Path:
-        """The damaged file.
-
-        Raises:
-            UsageError: No file is given.
-        """
+        """The damaged file."""
         if self.log is None:
             raise UsageError("log recover needs a file", hint="sim2real log recover FILE")
         return self.log

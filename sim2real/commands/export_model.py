@@ -135,11 +135,7 @@ def write(
 
 
 def find_parameters(config: ExportConfig) -> Path:
-    """Return the file of the identification that the configuration names.
-
-    Raises:
-        UsageError: It names none, or there is no such file.
-    """
+    """Return the file of the identification that the configuration names."""
     source = config.source
     if source is None:
         raise UsageError(

@@ -46,11 +46,7 @@ def run(config: ShipConfig) -> Path:
 
 
 def find_bundle(config: ShipConfig) -> Path:
-    """Return the folder of the bundle that the configuration names.
-
-    Raises:
-        UsageError: It names none, or there is no such bundle.
-    """
+    """Return the folder of the bundle that the configuration names."""
     if (source := config.source) is None:
         raise UsageError(
             f"export needs a bundle, a run folder or a pipeline. Pipelines: {', '.join(sorted(available()))}",

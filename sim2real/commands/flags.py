@@ -86,11 +86,7 @@ class RunFlags(DemoFlags):
 
     @property
     def goal(self) -> tuple[str, float] | None:
-        """The quantity to reach, and its least value; None: no goal.
-
-        Raises:
-            UsageError: When ``until`` is neither.
-        """
+        """The quantity to reach, and its least value; None: no goal."""
         if self.until is None:
             return None
         name, _, value = self.until.partition("=")

@@ -130,11 +130,7 @@ def _run_stages(pipeline: Pipeline, flags: RunFlags) -> None:
 
 
 def _find_target(command: str, arguments: list[str], default: F, description: str) -> tuple[Path, F]:
-    """Return the run folder that the first argument names, and the flags after it.
-
-    Raises:
-        UsageError: The first argument is a flag, or there is none; or there is no such run.
-    """
+    """Return the run folder that the first argument names, and the flags after it."""
     from sim2real.commands import flags
     from sim2real.stages.pipeline.find_run import find_run
     from sim2real.stages.pipeline.pipeline import available

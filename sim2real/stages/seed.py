@@ -6,10 +6,6 @@ from sim2real.errors import UsageError
 
 
 def check_seed(seed: int) -> None:
-    """Refuse a value that is no seed.
-
-    Raises:
-        UsageError: When it is negative, or above 31 bits.
-    """
+    """Refuse a value that is no seed."""
     if not 0 <= seed < 2**31:
         raise UsageError(f"seed must lie in [0, 2**31), got {seed}")

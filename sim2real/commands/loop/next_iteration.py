@@ -22,11 +22,7 @@ ALL_STAGES = ", ".join(STAGES)
 
 
 def newest_deployment(run_dir: Path) -> StageFolder:
-    """Return the newest finished deployment of a run.
-
-    Raises:
-        UsageError: The run has none.
-    """
+    """Return the newest finished deployment of a run."""
     if (deployment := finished(run_dir, "deploy")) is None:
         raise UsageError(
             "this run has no deployment to judge", hint="run without --deploy.dry-run: a dry deployment moves nothing"
@@ -101,11 +97,7 @@ def _next_seed(flags: RunFlags, run_dir: Path) -> int:
 
 
 def _reached(deployment: Deployment, quantity: str, minimum: float) -> bool:
-    """Return whether a quantity of the gap report is at least ``minimum`` on the robot.
-
-    Raises:
-        UsageError: The gap report has no such quantity.
-    """
+    """Return whether a quantity of the gap report is at least ``minimum`` on the robot."""
     on_robot = {g.quantity: g.real for g in deployment.gap}
     if quantity not in on_robot:
         raise UsageError(f"there is no {quantity!r} in the gap report. Available: {', '.join(on_robot) or 'none'}")

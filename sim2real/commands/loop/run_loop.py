@@ -27,9 +27,6 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None
 
     Returns:
         The run folder; None if there is none.
-
-    Raises:
-        UsageError: The recording is a dry run, or the gap report has no quantity of the goal's name.
     """
     # Refuse a dry recording, and find an interrupted run.
     if flags.record.dry_run:

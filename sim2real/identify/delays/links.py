@@ -98,11 +98,7 @@ def _jitter(problem: Problem, z: np.ndarray, watched: Watched, estimate: StreamE
 
 
 def measured(table: ParameterTable) -> str:
-    """Return the name of the measurements' delay.
-
-    Raises:
-        UsageError: When none is identified, or several are.
-    """
+    """Return the name of the measurements' delay."""
     names = sorted({c.parameter.name for c in table.columns if c.parameter.side == "measurement"})
     if len(names) != 1:
         raise UsageError(

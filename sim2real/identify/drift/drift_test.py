@@ -105,7 +105,6 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
 
     Raises:
         UsageError: When parameters of the posterior are not tested.
-        Sim2RealError: The log informs none of them.
     """
     table = problem.table
     posterior = _with_known(posterior, table)

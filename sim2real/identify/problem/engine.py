@@ -45,9 +45,6 @@ def choose(
     Args:
         wanted: ``auto``, ``c`` or ``compiled``.
         jacobian: Kind of derivatives; only programs differentiate forward.
-
-    Raises:
-        UsageError: When C is requested and not possible.
     """
     if wanted == "compiled":
         return Choice("compiled", "requested")
@@ -65,11 +62,7 @@ def choose(
 
 
 def check_devices(count: int, engine: Choice) -> None:
-    """Raise an error if devices are missing, or the engine does not use them.
-
-    Raises:
-        UsageError: With the number of devices.
-    """
+    """Raise an error if devices are missing, or the engine does not use them."""
     if count == 1:
         return
     if engine.name == "c":

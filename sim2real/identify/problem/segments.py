@@ -138,7 +138,6 @@ def cut(
 
     Raises:
         Sim2RealError: When a log lacks a node or a field, or holds NaN.
-        UsageError: When there are too few measurements around the start of a segment.
     """
     if not spans:
         raise UsageError("there is no segment to identify from")
@@ -183,11 +182,7 @@ def _later(timeline: Timeline, node: str, ticks: int) -> Timeline:
 
 
 def require_moved(episode: Episode, name: str = "the log") -> None:
-    """Raise an error if a log is of a dry run, whose commands did not reach the motors.
-
-    Raises:
-        Sim2RealError: The log is of a dry run.
-    """
+    """Raise an error if a log is of a dry run, whose commands did not reach the motors."""
     if episode.metadata.get("dry_run") is True:
         raise Sim2RealError(
             f"{name} is of a dry run: torque was off, and none of its commands was sent",

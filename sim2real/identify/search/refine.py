@@ -85,9 +85,6 @@ def refine(
         starts: Shape ``(K, P)``.
         coarse: Whether the first descents suffice, to compare with a model by percents.
         settle: Whether the end is tested, and points around it are tried if it is no minimum.
-
-    Raises:
-        Sim2RealError: When no start has a finite loss.
     """
     descent = _Descent(problem, problem.data if data is None else data, on_step, on_compile)
     first = [descent.at(np.asarray(z, np.float64)) for z in starts]

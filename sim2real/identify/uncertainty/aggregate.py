@@ -18,9 +18,6 @@ def aggregate(estimates: np.ndarray, errors: np.ndarray, name: str = "", unit: s
     The standard error of one recording excludes the differences between recordings: temperature, wear, the errors of
     the model on other motions. The interval is the prediction interval for one further recording (Higgins, Thompson
     and Spiegelhalter, 2009), widened by the median standard error of a recording. Training randomises within it.
-
-    Raises:
-        UsageError: When there are fewer than two recordings.
     """
     x, s = np.asarray(estimates, np.float64), np.maximum(np.asarray(errors, np.float64), 1e-30)
     if len(x) < 2:

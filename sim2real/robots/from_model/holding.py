@@ -73,10 +73,6 @@ def plan(model: MjModel, recorded: Sequence[str], hold: Sequence[str], fix_base:
 
     Args:
         hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
-
-    Raises:
-        UsageError: A joint would be held outside its range, a value is named for a joint that moves, the base floats,
-            or only an actuator of a tendon moves a joint together with a recorded one.
     """
     # Find the joints that move together with recorded ones.
     couplings = couplings_of(model)

@@ -69,9 +69,6 @@ def driven(
         fix_base: Whether a floating base is held at its position in the model.
         rubbing: Whether joints have at least a little dry friction: MJX compiles no friction for a model without any.
         hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
-
-    Raises:
-        UsageError: When a joint is missing or is no hinge or slide, the base floats, or a joint cannot be held.
     """
     # Hold the joints that were not recorded.
     spec = read_spec(path, contacts)
@@ -112,9 +109,6 @@ def held_in(path: Path, model: MjModel, joints: Sequence[str], fix_base: bool, h
 
     Args:
         hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
-
-    Raises:
-        UsageError: When a joint is missing, the base floats, or a joint cannot be held.
     """
     available = joints_of(model)
     if unknown := [j for j in joints if j not in available]:

@@ -166,11 +166,7 @@ class ParameterPattern:
 
     @staticmethod
     def parse(text: str) -> ParameterPattern:
-        """Return the term of ``WHAT[:each][@PATTERN][=VALUE]``, such as ``frictionloss:each`` or ``kp@.*_calf_joint``.
-
-        Raises:
-            UsageError: The text has another form.
-        """
+        """Return the term of ``WHAT[:each][@PATTERN][=VALUE]``, e.g. ``frictionloss:each`` or ``kp@.*_calf_joint``."""
         match = re.fullmatch(r"(\w+)(:each)?(?:@([^=]+))?(?:=([-+.\deE]+))?", text)
         if not match:
             raise UsageError(f"{text!r} is no parameter", hint="write WHAT, WHAT:each, WHAT@PATTERN or WHAT=VALUE")
@@ -201,11 +197,7 @@ class Placed:
 def expand(
     terms: Sequence[ParameterPattern], joints: Sequence[str], model: MjModel, file_model: MjModel
 ) -> list[Placed]:
-    """Return the parameters of a model.
-
-    Raises:
-        UsageError: When a pattern matches nothing, or two parameters have one name.
-    """
+    """Return the parameters of a model."""
     placed: list[Placed] = []
     for term in terms:
         # The joints or bodies that match the pattern.
@@ -248,9 +240,6 @@ def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[Pa
     Args:
         wanted: ``auto``, ``all``, or names separated by commas, in addition to those of ``auto``. A quantity that a
             pattern names is available without the others of its term.
-
-    Raises:
-        UsageError: Cogging is requested without its number of repeats a turn.
     """
     quantities_named, names = {term.what for term in terms}, {n.strip() for n in wanted.split(",")}
     if "cogging" in names and "cogging_per_turn" not in quantities_named:

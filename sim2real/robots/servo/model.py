@@ -54,11 +54,7 @@ class ComposedModel(RobotModel):
 
     @cached_property
     def task(self) -> GoalTask:
-        """The composed task of this robot's world.
-
-        Raises:
-            UsageError: Its servos have other gears than the joints.
-        """
+        """The composed task of this robot's world."""
         task, mounted = self.make_task(), list(self.servos.gears)
         if (built := [s.gear for s in task.robot.servos]) != mounted:
             raise UsageError(

@@ -73,11 +73,7 @@ def judge(
 
 
 def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:
-    """Return segments side by side, all of them fitted, and their length [s].
-
-    Raises:
-        UsageError: The shortest recording is too short for a segment.
-    """
+    """Return segments side by side, all of them fitted, and their length [s]."""
     usable = [reach(e, config) for e in episodes]
     shortest_s = min(end - begin for begin, end in usable)
     length_s = min(config.settle_s + config.horizon_s, shortest_s)

@@ -43,9 +43,6 @@ def find_source(
 
     Args:
         parameters: Their nominal values are simulated.
-
-    Raises:
-        UsageError: There is neither a recording nor an excitation to plan one with.
     """
     # Take the named logs, or the newest recording.
     paths, robot = [Path(p) for p in config.log], pipeline.load()

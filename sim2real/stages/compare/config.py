@@ -26,11 +26,7 @@ class CompareConfig:
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """The runs, at least two.
-
-        Raises:
-            UsageError: Fewer than two runs are given.
-        """
+        """The runs, at least two."""
         if len(self.runs_to_compare) < 2:
             raise UsageError(
                 f"compare needs at least two runs, got {len(self.runs_to_compare)}",

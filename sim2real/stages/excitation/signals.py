@@ -19,9 +19,6 @@ def excitation(config: RecordConfig, rate_hz: float, commands: int = 1) -> np.nd
     Args:
         config: Kind of excitation, duration, amplitude, frequencies and seed.
         rate_hz: Commands per second [Hz].
-
-    Raises:
-        UsageError: When the highest frequency is above half the rate of steps.
     """
     if config.high_hz > rate_hz / 2:
         raise UsageError(

@@ -54,11 +54,7 @@ class ImportConfig:
 
     @property
     def sources(self) -> tuple[Path, ...]:
-        """The files, at least one.
-
-        Raises:
-            UsageError: When none was named.
-        """
+        """The files, at least one."""
         if not self.files:
             raise UsageError("import needs a file of another recorder", hint="sim2real import FILE... --pipeline NAME")
         return self.files

@@ -100,11 +100,7 @@ class Latency:
 
     @staticmethod
     def load(path: Path) -> Latency:
-        """Read a latency from its file or folder.
-
-        Raises:
-            Sim2RealError: The file is missing, malformed, or of another format.
-        """
+        """Read a latency from its file or folder."""
         file = path / LATENCY if path.is_dir() else path
         with malformed(file, _AGAIN):
             latency = read_json(file, Latency)

@@ -46,11 +46,7 @@ class Watch:
         self._recorder.start(epoch_ns, monotonic_ns)
 
     def step(self, record: StepRecord, output: Any) -> None:
-        """Pass a step on.
-
-        Raises:
-            SafetyStop: Its output holds a NaN; the log holds the step all the same.
-        """
+        """Pass a step on."""
         self._recorder.step(record, output)
         for name, leaf in named_leaves(output).items():
             values = np.asarray(leaf)
@@ -125,11 +121,7 @@ def _end(error: BaseException, graph: AsyncGraph, recorder: McapRecorder, summar
 
 
 def check_deadlines(summary: Mapping[str, Any]) -> None:
-    """Judge an episode for ``--strict-timing``, once everything about it is written.
-
-    Raises:
-        DeadlineExceeded: When more than ``LATE_SHARE`` of a node's steps were late.
-    """
+    """Judge an episode for ``--strict-timing``, once everything about it is written."""
     late = [
         f"{name} {node['overruns']} of {node['steps']}"
         for name, node in summary["timing"].items()

@@ -20,9 +20,6 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
 
     Args:
         pipeline: The pipeline that the run has to belong to; None allows any.
-
-    Raises:
-        UsageError: When there is no such run, or it belongs to another pipeline.
     """
     path = Path(target)
     # Only a stage folder stands for its parent: that of a pipeline's name would be the working directory.

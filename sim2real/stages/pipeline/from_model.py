@@ -90,9 +90,6 @@ def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
 
     Args:
         logs: The logs; the first one has the commands and their rate.
-
-    Raises:
-        UsageError: When there is no model or log, or they do not fit each other.
     """
     if flags.mjcf is None or not logs:
         raise UsageError(

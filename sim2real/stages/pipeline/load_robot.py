@@ -13,10 +13,6 @@ def moving_robot(pipeline: Pipeline, world: str | None = None) -> Robot:
 
     Args:
         world: World that it is simulated in; None: its own.
-
-    Raises:
-        UsageError: When the pipeline is for recordings only, and has just what identification needs; or there is no
-            such world.
     """
     robot = in_world(pipeline.load(), world)
     if not isinstance(robot, Robot):

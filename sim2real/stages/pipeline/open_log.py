@@ -22,9 +22,6 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
     Args:
         pipeline: The pipeline that it must be of.
         robot: Its robot, in whose units the log must be; None: any units.
-
-    Raises:
-        Sim2RealError: When it is no log, of another pipeline, or of a dry run, in other units, or has holes.
     """
     # A file of another recorder is read by the pipeline's mapping.
     if (mapping := pipeline.mapping_of(path)) is not None:
@@ -53,11 +50,7 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
 
 
 def require_units(recording: Recording, robot: RecordedRobot) -> None:
-    """Check that what the robot's sensor and actuator sent is in the units that the robot computes in.
-
-    Raises:
-        Sim2RealError: When a log is in other ones.
-    """
+    """Check that what the robot's sensor and actuator sent is in the units that the robot computes in."""
     recorded_units = recording.episode.units or dict.fromkeys(
         (robot.roles.sensor, robot.roles.actuator), recording.units
     )

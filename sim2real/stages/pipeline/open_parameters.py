@@ -28,7 +28,6 @@ def check_parameters(identification: Identification, pipeline: Pipeline) -> None
     """Check that a pipeline can be simulated with an identification.
 
     Raises:
-        Sim2RealError: When it is of another pipeline, lacks parameters, was interrupted, or did not converge.
         UsageError: When the world that it was identified in is not installed.
     """
     hint = f"make them with `sim2real identify {pipeline.name}`"

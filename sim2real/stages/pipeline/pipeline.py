@@ -135,11 +135,7 @@ class _OfRobot(Pipeline):
 
 
 def pipeline_of(robot: RecordedRobot | Pipeline | str) -> Pipeline:
-    """Return the pipeline of a name, or that has loaded a robot; else one with its class's name and stages' defaults.
-
-    Raises:
-        UsageError: It is neither a robot nor a pipeline, or not a complete robot.
-    """
+    """Return the pipeline of a name, or of a robot that it has loaded; else one with the stages' defaults."""
     if isinstance(robot, Pipeline):
         return robot
     if isinstance(robot, str):

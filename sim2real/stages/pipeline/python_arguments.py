@@ -109,9 +109,6 @@ def config_of(value: Any, default: T, name: str = "config") -> T:
     Args:
         value: A configuration, or the fields that differ from the default; None: the default.
         default: The default.
-
-    Raises:
-        UsageError: It is of another stage, or there is no such field.
     """
     # A whole configuration, or fields of one.
     kind = type(default)

@@ -147,11 +147,7 @@ def timing_of(identification: Identification) -> Timing:
 
 
 def world_of(config: TrainConfig, identification: Identification | None) -> str | None:
-    """Return the world to train in.
-
-    Raises:
-        UsageError: The identification is of another world than the configured one.
-    """
+    """Return the world to train in."""
     if identification is None:
         return config.world
     if config.world not in (None, identification.world):

@@ -24,12 +24,7 @@ path, and the program instead of the number of devices."""
 
 
 def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFolder | None:
-    """Return the interrupted training that ``config.resume`` names; None without ``config.resume``.
-
-    Raises:
-        UsageError: There is no such training, or it had other settings.
-        Sim2RealError: It was interrupted before its first evaluation.
-    """
+    """Return the interrupted training that ``config.resume`` names; None without ``config.resume``."""
     if config.resume is None:
         return None
     interrupted = _newest_unfinished(pipeline, config.resume, root)

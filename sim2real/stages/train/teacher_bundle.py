@@ -23,7 +23,6 @@ def find_teacher(pipeline: str, target: str, root: Path) -> tuple[Bundle, Path]:
         target: The folder of a bundle or of a training; or a run, by its path or name: its newest teacher.
 
     Raises:
-        UsageError: There is no such run, or no teacher was trained in it.
         Sim2RealError: The bundle cannot be read.
     """
     path = Path(target)
@@ -42,11 +41,7 @@ def find_teacher(pipeline: str, target: str, root: Path) -> tuple[Bundle, Path]:
 
 
 def teacher_policy(bundle: Bundle, student: PolicyContract) -> Policy:
-    """Return the policy of a teacher.
-
-    Raises:
-        UsageError: Its observation, without the privileged part, or its rate differs from the student's.
-    """
+    """Return the policy of a teacher."""
     terms = [(t.name, t.units, t.history) for t in bundle.contract.observation if t.name != _PRIVILEGED]
     student_terms = [(t.name, t.units, t.history) for t in student.observation]
     if terms != student_terms or bundle.contract.rate_hz != student.rate_hz:

@@ -56,8 +56,6 @@ def prepare(
         robot: The pipeline's robot in its world, changed by the caller; default: unchanged.
 
     Raises:
-        UsageError: The configuration names the identified model without an identification, or another world, or a
-            parameter is unknown.
         Sim2RealError: The identification is of another robot or was not accepted, or its timing is unusable.
     """
     identification = check_identification(pipeline, config, identification)
@@ -100,11 +98,7 @@ def prepare(
 
 
 def _replaced(values: Mapping[str, float], changed: Mapping[str, float]) -> dict[str, float]:
-    """Return the model's values with others in place of some.
-
-    Raises:
-        UsageError: One is unknown, or only one of two delays is given.
-    """
+    """Return the model's values with others in place of some."""
     available = dict.fromkeys([*values, *DELAYS])
     if unknown := sorted(set(changed) - set(available)):
         raise UsageError(f"there is no parameter {unknown[0]!r}. Available: {', '.join(available)}")
