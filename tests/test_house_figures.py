@@ -8,10 +8,10 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 60_380,
+    "lines without composer": 60_216,
     "lines of composer": 12_153,
     "files in the fullest folder": 15,
-    "docstring lines [%]": 20.3,
+    "docstring lines [%]": 20.2,
     "Any in 1,000 lines": 4.8,
     "words of the dialect": 14,
     "other words of the dialect": 260,
