@@ -315,7 +315,7 @@ class ParameterTable:
 
     def starts(self) -> np.ndarray:
         """Return starts of a descent without a search, ``(K, P)``: with short delays, and with long ones."""
-        delayed = any(c.parameter.kind == "delay" for c in self.columns)
+        delayed = any(c.parameter.kind == "delay" and c.parameter.begin is None for c in self.columns)
         return np.stack([self.start(share) for share in ((0.25, 0.75) if delayed else (0.25,))])
 
     def prior_residuals(self, z: Array) -> jax.Array:

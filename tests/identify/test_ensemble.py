@@ -1,6 +1,7 @@
 """Draws come of all models that explain the recordings as well, each as if it were the only one."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +28,7 @@ def test_draws_are_of_all_near_models_by_their_weights_and_a_term_that_one_lacks
     fewer = every.problem.table.with_terms(["bias"])
     found = fit(Model(), [episode], spans(0), LENGTH_S, CONFIG, fewer)
     near = np.array([[True, False], [True, True], [False, False]])
-    choice = Selection(near[0], (), np.zeros(1), np.zeros(1), near, np.array([0.5, 0.3, 0.2]))
+    choice = Selection(tuple(SimpleNamespace(present=k, z=every.z) for k in near), np.array([0.5, 0.3, 0.2]), ())
     posterior = of(found, every, choice)
     assert [(o.about, o.weight) for o in posterior.others] == [("with bias, square", 0.3)], "without bias it is worse"
     assert posterior.without == {"square": 0.0}

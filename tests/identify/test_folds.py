@@ -20,6 +20,8 @@ from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.search.refine import refine
 from sim2real.identify.validation.folds import Fold, folds_of, leave_out, moving
+from sim2real.identify.validation.optional_terms import select
+from sim2real.identify.validation.term_trials import Trials
 
 TICK_S, PERIOD_S, DURATION_S, LENGTH_S = 0.01, 0.02, 10.0, 1.0
 GAIN, TAU_S, BIAS, NOISE = 1.7, 0.13, 0.2, 0.002
@@ -153,7 +155,7 @@ def one():
     episode = lag_log(0)
     whole = fit(Model(), [episode], spans(0), LENGTH_S, CONFIG)
     parts = folds_of(whole.problem, 3)
-    rows = leave_out(whole, parts, 0.2, choose=False, free_run_s=20.0)
+    rows = leave_out(whole, parts, 0.2, free_run_s=20.0)
     return SimpleNamespace(episode=episode, fit=whole, parts=parts, rows=rows)
 
 
@@ -169,12 +171,12 @@ def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one):
 
 def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one):
     problem, names = one.fit.problem, one.fit.problem.table.names
-    kept = np.array([n in ("gain", "tau") for n in names])
+    present = np.array([n in ("gain", "tau") for n in names])
     fixed = Model.parameters.with_fixed({"bias": 0.0, "square": 0.0})
     alone = fit(Model(), [one.episode], spans(0), LENGTH_S, CONFIG, fixed)
-    data = problem.part(present=kept)
+    data = problem.part(present=present)
     ended = refine(problem, problem.table.start()[None], data)
-    found = problem.table.decode(ended.z, kept)
+    found = problem.table.decode(ended.z, present)
     assert ended.loss == pytest.approx(alone.loss, rel=5e-5)
     errors = dict(zip(alone.problem.table.names, alone.uncertainty().standard_error, strict=True))
     assert (float(found["bias"]), float(found["square"])) == (0.0, 0.0)
@@ -182,7 +184,7 @@ def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one)
         assert float(found[name]) == pytest.approx(alone.values[name], abs=0.1 * errors[name])
         assert abs(float(found[name]) - one.fit.values[name]) > 10 * 0.1 * errors[name]
     # A model to compare with by percents ends earlier.
-    coarse = refit(problem, kept, one.fit.z)
+    coarse = refit(problem, present, one.fit.z)
     assert (coarse["bias"], coarse["square"]) == (0.0, 0.0)
     assert problem.at(problem.table.encode(coarse), data).loss == pytest.approx(alone.loss, rel=2e-3)
     assert refit(problem, np.zeros(len(names), bool), one.fit.z)["gain"] == 1.5
@@ -218,11 +220,13 @@ def three():
     """Three logs, of which the last is of another robot: its input has ten times the bias."""
     episodes = [lag_log(1), lag_log(2), lag_log(3, 10 * BIAS / 4)]
     whole = fit(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG)
-    return whole, leave_out(whole, folds_of(whole.problem, 3), 0.2, choose=True)
+    parts = folds_of(whole.problem, 3)
+    found = select(Trials(whole, parts, 0.2, 0.0).grown())
+    return whole, leave_out(whole, parts, 0.2, trials=found.by_part), found
 
 
 def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
-    whole, rows = three
+    whole, rows, _ = three
     assert [r.name for r in rows] == ["recording 1", "recording 2", "recording 3"]
     assert float(rows[2].values["bias"]) == pytest.approx(BIAS, abs=0.003)
     assert rows[2].ahead["y"] > 20 * NOISE
@@ -230,20 +234,20 @@ def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
 
 
 def test_terms_are_chosen_without_what_is_left_out(three):
-    _, rows = three
+    _, rows, _ = three
     assert all("square" not in r.terms for r in rows)
     assert rows[2].terms == ("bias",)
     assert float(rows[2].values["square"]) == 0.0
 
 
 def test_recordings_of_one_name_go_together(three):
-    whole, _ = three
+    whole, *_ = three
     found = folds_of(whole.problem, 5, ["slow", "fast", "slow"])
     assert found == [Fold("slow", ((0, 0.0, np.inf), (2, 0.0, np.inf))), Fold("fast", ((1, 0.0, np.inf),))]
 
 
 def test_too_few_recordings_are_divided_into_blocks(three):
-    whole, _ = three
+    whole, *_ = three
     for names, least in ((["a", "b", "c"], 4), (["all", "all", "all"], 2)):
         found = folds_of(whole.problem, 5, names, least)
         assert len(found) == 6  # two of each recording: five at least

@@ -1,6 +1,5 @@
 """Terms chosen by what is left out, on a linear model: there the statistics are exact, and numpy can do it all over."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +8,15 @@ from scipy.optimize import lsq_linear
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.validation.optional_terms import Selection, Statistics, below, choose, narrowed, votes
+from sim2real.identify.validation.optional_terms import (
+    Statistics,
+    Trial,
+    on_held_out_parts,
+    select,
+    selected,
+    votes,
+)
+from sim2real.identify.validation.term_trials import grown
 
 PARTS, ROWS, NOISE = 6, 200, 0.1
 
@@ -32,8 +39,12 @@ def linear():
     w[3, 5] = 1.0
     y = np.einsum("krp,kp->kr", X, w) + NOISE * rng.normal(size=(PARTS, ROWS))
     x = np.linalg.lstsq(X.reshape(-1, 6), y.reshape(-1), rcond=None)[0] + 0.05 * rng.normal(size=6)
+    return SimpleNamespace(X=X, y=y, stats=statistics_at(X, y, x))
+
+
+def statistics_at(X, y, x):
     r = np.einsum("krp,p->kr", X, x) - y
-    stats = Statistics(
+    return Statistics(
         x=x,
         value=np.sum(r**2, axis=1),
         gradient=np.einsum("krp,kr->kp", X, r),
@@ -41,7 +52,6 @@ def linear():
         prior=np.zeros((6, 6)),
         count=np.full(PARTS, float(ROWS)),
     )
-    return SimpleNamespace(X=X, y=y, stats=stats)
 
 
 def by_numpy(linear, free, held):
@@ -56,25 +66,72 @@ def by_numpy(linear, free, held):
     return np.array(found)
 
 
-def test_excess_and_errors_are_those_of_fits_by_numpy(linear):
-    found = choose(linear.stats, TABLE)
-    assert found.order[-1] == "real"
-    held = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
-    term_of = {"real": [2], "idle": [3, 4], "once": [5]}
-    free, scores = [0, 1, 2, 3, 4, 5], []
-    for gone in [None, *found.order]:
-        free = [i for i in free if gone is None or i not in term_of[gone]]
-        own = np.where(np.isin(np.arange(6), free), 0.0, held)
-        scores.append(by_numpy(linear, free, own))
-    best = min(scores, key=lambda s: s.mean())
-    np.testing.assert_allclose(found.excess, [(s - best).mean() for s in scores], rtol=1e-6, atol=1e-12)
+HELD = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5])
+SETS = {(): [0, 1], ("real",): [0, 1, 2], ("idle",): [0, 1, 3, 4], ("real", "once"): [0, 1, 2, 5]}
+
+
+def terms(*names):
+    return np.isin(TABLE.terms, names)
+
+
+@pytest.mark.parametrize(("names", "free"), SETS.items())
+def test_predicted_errors_of_a_set_are_those_of_fits_by_numpy(linear, names, free):
+    held = np.where(np.isin(np.arange(6), free), 0.0, HELD)
     np.testing.assert_allclose(
-        found.error, [(s - best).std(ddof=1) / np.sqrt(PARTS) for s in scores], rtol=1e-6, atol=1e-12
+        on_held_out_parts(linear.stats, TABLE, terms(*names)), by_numpy(linear, free, held), rtol=1e-6
     )
 
 
+class Fits:
+    """Fits sets to the linear model by numpy; fits of ``stuck`` sets end anywhere, with twenty times the error."""
+
+    def __init__(self, linear, stuck=lambda present: False):
+        self.linear, self.stuck, self.tried = linear, stuck, []
+
+    def attempt(self, present, starts, most):
+        self.tried.append(tuple(n for n, there in zip(TABLE.terms, present, strict=True) if there))
+        assert all(len(z) == 6 for z in starts)
+        free = np.flatnonzero(TABLE.of_terms(present))
+        held = np.where(np.isin(np.arange(6), free), 0.0, HELD)
+        errors = by_numpy(self.linear, free, held) * (400.0 if self.stuck(present) else 1.0)
+        X, y = self.linear.X.reshape(-1, 6), self.linear.y.reshape(-1)
+        w = held.copy()
+        w[free] = np.linalg.lstsq(X[:, free], y - X @ held, rcond=None)[0]
+        ends = np.tile(TABLE.at_scale(w), (PARTS, 1))
+        stats = statistics_at(self.linear.X, self.linear.y, w)
+        return Trial(present, ends[0], float(errors.mean()), stats, ends, errors, 4.0 * errors)
+
+    def grown(self, wider=lambda trial: trial.stats):
+        return grown(self.attempt, wider, TABLE, [np.zeros(6)])
+
+
 def test_a_term_that_all_parts_need_stays_and_one_that_none_or_one_needs_goes(linear):
-    np.testing.assert_array_equal(choose(linear.stats, TABLE).kept, [True, False, False])
+    fits = Fits(linear)
+    assert select(fits.grown()).names(TABLE) == ("real",)
+    assert len(fits.tried) == len(set(fits.tried)) < 8, "no set is fitted twice, and not all are"
+
+
+def test_the_choice_for_a_part_does_not_depend_on_its_errors(linear):
+    trials = Fits(linear).grown()
+    spoilt = [
+        SimpleNamespace(**{**vars(t), "ahead": t.ahead * np.where(np.arange(PARTS) == 2, 1e6, 1.0)}) for t in trials
+    ]
+    assert select(spoilt).by_part[2].present.tolist() == select(trials).by_part[2].present.tolist()
+
+
+def test_a_set_whose_fit_did_not_converge_is_not_chosen_before_its_subset(linear):
+    """The widest model ends anywhere, as do all sets of two terms and more: one term remains."""
+    fits = Fits(linear, stuck=lambda present: present.sum() > 1)
+    assert select(fits.grown()).names(TABLE) == ("real",)
+
+
+def test_a_set_that_no_prediction_proposed_is_fitted_if_it_is_a_subset_of_the_chosen_one(linear):
+    """The predictions call for idle, then for idle and real together, so real alone is off the path."""
+    fits, x = Fits(linear), linear.stats.x
+    with_idle = statistics_at(linear.X, linear.y + linear.X[..., 3], x)
+    found = select(fits.grown(lambda trial: trial.stats if trial.present.any() else with_idle))
+    assert fits.tried[1:3] == [("idle",), ("real", "idle")]
+    assert found.names(TABLE) == ("real",)
 
 
 def test_steps_are_least_squares_without_the_part(linear):
@@ -86,15 +143,6 @@ def test_steps_are_least_squares_without_the_part(linear):
     np.testing.assert_allclose((linear.stats.x + step)[[3, 4]], 0.0, atol=1e-12)
 
 
-def test_without_leaves_one_part_out_of_the_choice(linear):
-    fewer = linear.stats.without(3)  # the only part that needs f
-    found = choose(fewer, TABLE)
-    assert len(fewer.value) == PARTS - 1
-    assert found.kept[0]
-    assert not found.kept[2]
-    assert found.excess[list(found.order).index("once") + 1] < 1e-3
-
-
 def test_a_table_knows_its_terms():
     assert TABLE.terms == ("real", "idle", "once")
     fewer = TABLE.with_terms(["real"])
@@ -103,9 +151,9 @@ def test_a_table_knows_its_terms():
     assert fewer["f"].nominal == 0.5
     with pytest.raises(UsageError, match="unknown term 'gone'"):
         TABLE.with_terms(["gone"])
-    kept = TABLE.of_terms(np.array([True, False, False]))
-    assert kept.tolist() == [n in "abc" for n in TABLE.names]
-    values = TABLE.decode(np.ones(6), kept)
+    present = TABLE.of_terms(np.array([True, False, False]))
+    assert present.tolist() == [n in "abc" for n in TABLE.names]
+    values = TABLE.decode(np.ones(6), present)
     assert [round(float(values[n]), 3) for n in "def"] == [0.0, 0.0, 0.5]
     assert float(values["c"]) == pytest.approx(float(TABLE.decode(np.ones(6))["c"])) != 0.0
     with pytest.raises(UsageError, match="its value without a term"):
@@ -113,22 +161,19 @@ def test_a_table_knows_its_terms():
 
 
 def test_a_model_that_other_recordings_would_choose_is_kept_with_how_often(linear):
-    found = choose(linear.stats, TABLE)
-    np.testing.assert_array_equal(found.near[0], found.kept)
+    found = select(Fits(linear).grown())
     assert found.weight.sum() == pytest.approx(1.0)
     assert found.weight[0] > 0.5, "what all parts need"
-    assert found.near[:, 0].all(), "without it all parts are worse"
-    assert len(np.unique(found.near, axis=0)) == len(found.near)
+    assert all(t.present[0] for t in found.near), "without it all parts are worse"
+    assert len({t.present.tobytes() for t in found.near}) == len(found.near)
 
 
 def test_a_term_that_half_of_the_parts_need_is_open(linear):
     X, rng = linear.X, np.random.default_rng(0)
     y = X @ np.array([1.0, -2.0, 0.0, 0.0, 0.0, 0.5]) + NOISE * rng.normal(size=(PARTS, ROWS))
-    y[:3] += 0.05 * X[:3, :, 2]
-    r = np.einsum("krp,p->kr", X, linear.stats.x) - y
-    stats = replace(linear.stats, value=np.sum(r**2, axis=1), gradient=np.einsum("krp,kr->kp", X, r))
-    found = choose(stats, TABLE)
-    with_it = found.weight[found.near[:, 0]].sum()
+    y[:3] += 0.08 * X[:3, :, 2]
+    found = select(Fits(SimpleNamespace(X=X, y=y, stats=None)).grown())
+    with_it = sum(w for t, w in zip(found.near, found.weight, strict=True) if t.present[0])
     assert 0.1 < with_it < 0.9
 
 
@@ -156,38 +201,41 @@ def test_a_bounded_step_is_that_of_a_solver_with_bounds():
     assert whole.step(table, np.ones(0, bool))[0] < -0.3
 
 
-def three_terms():
-    """All three terms chosen, with the order in which they would go: idle, once, real."""
-    one = np.ones(3, bool)
-    return Selection(one, ("idle", "once", "real"), np.zeros(4), np.zeros(4), one[None], np.ones(1))
+def trial(names, ahead, free=None):
+    errors = np.array(ahead, float), np.array(ahead if free is None else free, float)
+    return Trial(terms(*names), np.zeros(6), 0.0, None, np.zeros((len(ahead), 6)), *errors)
 
 
-def test_the_sets_below_a_choice_go_down_to_none():
-    assert [m.tolist() for m in below(three_terms(), TABLE)] == [
-        [False, False, False], [True, False, False], [True, False, True], [True, True, True],
-    ]  # fmt: skip
-    none = replace(three_terms(), kept=np.zeros(3, bool))
-    assert [m.tolist() for m in below(none, TABLE)] == [[False, False, False]]
+ONE, TWO, ALL = ("real",), ("real", "once"), ("real", "idle", "once")
 
 
 @pytest.mark.parametrize(
-    ("scores", "errors", "kept"),
+    ("two", "every", "chosen"),
     [
-        # Mean squares of each set on three parts, the smallest set first; errors up to the horizon and in one go.
-        (([9, 9, 9], [4, 4, 4], [2, 2, 2], [1, 1, 1]), None, 3),
-        (([9, 9, 9], [1.1, 0.9, 1.1], [2, 0.4, 1], [1, 1, 1]), None, 1),  # within a standard error of the best
-        (([9, 9, 9], [1, 1, 1], [100, 100, 100], [400, 1, 400]), None, 1),  # refits that ended anywhere
-        (([9, 9, 9], [1, 1, 1], [np.nan, 1, 1], [np.inf, 1, 1]), None, 1),  # refits that diverged
-        # Ahead the largest is best; in one go it is far off, and a smaller one is not.
-        (([9, 9, 9], [4, 4, 4], [2, 2, 2], [1, 1, 1]), ((3, 30), (2, 2), (1.4, 25), (1, 25)), 1),
-        (([9, 9, 9], [4, 4, 4], [2, 2, 2], [1, 1, 1]), ((3, 30), (2, 9), (1.4, 25), (1, 25)), 3),
-        (([9, 9, 9], [4, 4, 4], [2, 2, 2], [1, 1, 1]), ((3, 30), (2, 2), (1.4, 1), (1, np.inf)), 2),
+        # Mean squares on three parts; without terms it is 9, with one term 4.
+        (([2, 2, 2],), ([1, 1, 1],), ALL),
+        (([4, 4, 4],), ([4, 4, 4],), ONE),  # equal
+        (([3.9, 3.9, 3.9],), ([3.8, 3.8, 3.8],), ONE),  # better by less than five percent
+        (([1.1, 0.9, 1.1],), ([2, 0.4, 0.5],), TWO),  # within a standard error of the best
+        (([100, 100, 100],), ([400, 1, 400],), ONE),  # refits that ended anywhere
+        (([np.nan, 1, 1],), ([np.inf, 1, 1],), ONE),  # refits that diverged
+        # Up to the horizon the largest is best; in a free run it is far off, and a smaller one is not.
+        (([2, 2, 2], [100, 100, 100]), ([1, 1, 1], [100, 100, 100]), ONE),
+        (([2, 2, 2], [4, 4, 4]), ([1, 1, 1], [np.inf, 4, 4]), TWO),
     ],
 )
-def test_a_choice_is_narrowed_to_what_refits_on_other_parts_bear_out(scores, errors, kept):
-    scores = np.array(scores, float)
-    errors = np.sqrt(scores.mean(axis=1))[:, None] if errors is None else np.array(errors, float)
-    found = narrowed(three_terms(), TABLE, scores, errors)
-    assert found.kept.sum() == kept
-    np.testing.assert_array_equal(found.near[0], found.kept)
+def test_the_smallest_of_equal_sets_is_chosen_and_none_that_a_subset_beats(two, every, chosen):
+    trials = [trial((), [9, 9, 9]), trial(ONE, [4, 4, 4]), trial(TWO, *two), trial(ALL, *every)]
+    found = select(trials)
+    assert found.names(TABLE) == selected(trials).names(TABLE) == chosen
     assert found.weight.sum() == pytest.approx(1.0)
+
+
+def test_a_subset_that_is_far_better_wins_whatever_the_order():
+    trials = [
+        trial(ALL, [4, 4, 4]),
+        trial(("idle",), [400, 400, 400]),
+        trial((), [900, 900, 900]),
+        trial(ONE, [0.04] * 3),
+    ]
+    assert selected(trials).names(TABLE) == selected(trials[::-1]).names(TABLE) == ONE

@@ -147,7 +147,9 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
         return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
 
     monkeypatch.setattr(fitting, "fitted_to", fit)
-    selection = SimpleNamespace(names=lambda _: ("cogging",))
+    chosen = ParameterTable(p for p in table if p.free)
+    z = chosen.encode({"gain": 1.4, "cogging": 0.4, "bias": 0.6})
+    selection = SimpleNamespace(names=lambda _: ("cogging",), near=[SimpleNamespace(z=z)])
     monkeypatch.setattr(fitting.held_out_parts, "chosen", lambda *_: selection)
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
     inputs = SimpleNamespace(config=config, table=table, model=None, episodes=[], fitted=1, windows=[], names=["log"])
@@ -156,5 +158,6 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
     assert fewer.terms == ("cogging",)
     assert [(generations, own) for generations, own in tables] == [(config.generations, table), (0, fewer)]
     assert {p.name: (p.nominal, p.free) for p in fewer} == {
-        "gain": (1.5, True), "cogging": (0.4, True), "swing": (0.3, False), "bias": (0.2, False),
+        "gain": (1.0, True), "cogging": (0.1, True), "swing": (0.3, False), "bias": (0.2, False),
     }  # fmt: skip
+    assert {p.name: p.begin for p in fewer if p.free} == pytest.approx({"gain": 1.4, "cogging": 0.4})

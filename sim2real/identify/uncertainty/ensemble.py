@@ -19,7 +19,7 @@ from sim2real.identify.uncertainty.uncertainty import (
     linearise,
     loss_variance,
 )
-from sim2real.identify.validation.optional_terms import Selection, statistics
+from sim2real.identify.validation.optional_terms import Selection
 
 _WORSE = 0.1
 """Relative excess of the loss above which a model explains the recordings less well."""
@@ -96,20 +96,18 @@ def _descended(at: Linearised) -> tuple[np.ndarray, np.ndarray]:
 def _models(widest: Fit, estimate: Fit, spread: Uncertainty, selection: Selection) -> list[Alternative]:
     """Return the models with other terms that recordings like these might select."""
     problem, table = widest.problem, widest.problem.table
-    # Approximate the loss of the widest model by a quadratic function.
-    at = linearise(problem, widest.z)
-    whole = statistics(problem, at, np.ones((1, len(problem.train)), bool))
-    precision = whole.information[0] / loss_variance(problem, at) + at.prior
     models = []
-    for present, weight in zip(selection.near[1:], selection.weight[1:], strict=True):
-        columns = table.of_terms(present)
-        start = table.at_scale(at.x + whole.step(table, present))
-        # Refine each other model from the minimum of that function, and keep those with a similar loss.
-        ended = refine(problem, start[None], problem.part(present=columns), settle=False)
-        if ended.loss > (1.0 + _WORSE) * estimate.loss:
+    for trial, weight in zip(selection.near[1:], selection.weight[1:], strict=True):
+        present, columns = trial.present, table.of_terms(trial.present)
+        # Refine each other model from its rough fit, and keep those with a similar loss.
+        data, rest = problem.part(present=columns), np.flatnonzero(columns)
+        z = refine(problem, trial.z[None], data, settle=False).z
+        if problem.loss(z, data) > (1.0 + _WORSE) * estimate.loss:
             continue
-        # Compute its covariance from the quadratic function, widened like the estimate's.
-        z, rest = ended.z, np.flatnonzero(columns)
+        # Compute its covariance, widened like the estimate's.
+        at = linearise(problem, z, data)
+        J = at.jacobian.reshape(-1, len(at.x))
+        precision = J.T @ J / loss_variance(problem, at) + at.prior
         fewer = ParameterTable([p for p in table if p.free], table.recordings).with_terms(_named(table, present))
         covariance = _widened(np.linalg.inv(precision[np.ix_(rest, rest)]), fewer, estimate.problem.table, spread)
         drawn = _possible(fewer.posterior(z[rest], covariance), estimate.problem.table, spread)

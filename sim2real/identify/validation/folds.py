@@ -18,14 +18,11 @@ from sim2real.identify.problem.segments import Span
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.uncertainty import linearise
 from sim2real.identify.validation import optional_terms
+from sim2real.identify.validation.optional_terms import Trial
 from sim2real.identify.validation.prediction import labels
 
 MOVES = 10.0
 """Range of a joint's positions in motion, in deviations of a measurement."""
-
-
-_INSIDE = 0.01
-"""Distance from a bound at which the fit of a parameter begins [widths of the bounds]."""
 
 
 @dataclass(frozen=True)
@@ -94,111 +91,39 @@ def masks(problem: Problem, parts: Sequence[Fold]) -> np.ndarray:
 
 
 def leave_out(
-    estimate: Fit,
-    parts: Sequence[Fold],
-    settle_s: float,
-    choose: bool,
-    free_run_s: float = 0.0,
-    among: np.ndarray | None = None,
+    estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s: float = 0.0, trials: Sequence[Trial] = ()
 ) -> list[HeldOutPart]:
-    """Identify without each part, from the estimate of all, and predict that part.
+    """Identify without each part, and predict that part.
+
+    No descent begins at the estimate of all parts, which includes this part: a refinement may end where it begins. It
+    begins at the linear prediction from the other parts.
 
     Args:
+        estimate: The fit of all parts, with all terms.
         parts: Held out one at a time.
         settle_s: First part of a prediction, to which its initial state is fitted [s].
-        choose: Whether the remaining data selects the optional terms of the model; else all terms are kept.
         free_run_s: Longest free run [s]; 0 skips the free runs.
-        among: Shape ``(T,)``, bool: the terms to select from; default: all.
+        trials: For each part the fit of the terms that the other parts select; default: all terms are present.
     """
-    table, stats = estimate.problem.table, _statistics(estimate, parts)
-    all_terms = np.ones(len(table.terms), bool)
-    kept = [
-        optional_terms.choose(stats.without(k), table, among).kept if choose else all_terms for k in range(len(parts))
-    ]
-    ends = [_refit(estimate, parts, stats, k, terms, choose) for k, terms in enumerate(kept)]
-    return _predicted(estimate, parts, stats, kept, ends, settle_s, free_run_s)
+    problem, table, touched = estimate.problem, estimate.problem.table, masks(estimate.problem, parts)
+    if trials:
+        present, stats, starts = [t.present for t in trials], trials[0].stats, [t.ends[k] for k, t in enumerate(trials)]
+    else:
+        present = [np.ones(len(table.terms), bool)] * len(parts)
+        stats = optional_terms.statistics(problem, linearise(problem, estimate.z), touched)
+        starts = [table.at_scale(stats.x + stats.step(table, present[k], k, bounded=True)) for k in range(len(parts))]
+    ends = []
+    for k, start in enumerate(starts):
+        rest = problem.part(problem.train[touched[k]], table.of_terms(present[k]))
+        ends.append(refine(problem, start[None], rest, settle=False).z)
+    return predicted(estimate, parts, stats, present, ends, settle_s, free_run_s)
 
 
-def compare_sets(
-    estimate: Fit, parts: Sequence[Fold], sets: Sequence[np.ndarray], settle_s: float, free_run_s: float
-) -> list[list[HeldOutPart]]:
-    """Identify without each part with several sets of terms, and predict it: the result of ``leave_out`` for each set.
-
-    The descent of a set begins at the end of the previous set, too: with more terms a converged fit is not worse.
-
-    Args:
-        estimate: The estimate of all parts, with all terms.
-        parts: Held out one at a time.
-        sets: Shape ``(T,)`` each, bool: the terms of each set; each set contains the one before.
-        settle_s: First part of a prediction, to which its initial state is fitted [s].
-        free_run_s: Longest free run [s].
-    """
-    stats, rows = _statistics(estimate, parts), []
-    ends: list[np.ndarray] = []
-    for terms in sets:
-        before = ends or [None] * len(parts)
-        ends = [_descend(estimate, parts, stats, k, terms, z, coarse=True) for k, z in enumerate(before)]
-        rows.append(_predicted(estimate, parts, stats, [terms] * len(parts), ends, settle_s, free_run_s))
-    return rows
-
-
-def _statistics(estimate: Fit, parts: Sequence[Fold]) -> optional_terms.Statistics:
-    return optional_terms.statistics(
-        estimate.problem, linearise(estimate.problem, estimate.z), masks(estimate.problem, parts)
-    )
-
-
-def _refit(
-    estimate: Fit, parts: Sequence[Fold], stats: optional_terms.Statistics, k: int, kept: np.ndarray, narrow: bool
-) -> np.ndarray:
-    """Return the estimate without a part ``(P,)``; with ``narrow`` also from the estimate without optional terms."""
-    none = np.zeros(len(kept), bool)
-    first = _descend(estimate, parts, stats, k, none, coarse=True) if narrow and kept.any() else None
-    return _descend(estimate, parts, stats, k, kept, first)
-
-
-def _descend(
+def predicted(
     estimate: Fit,
     parts: Sequence[Fold],
     stats: optional_terms.Statistics,
-    k: int,
-    kept: np.ndarray,
-    smaller: np.ndarray | None = None,
-    coarse: bool = False,
-) -> np.ndarray:
-    """Return the estimate with some terms without a part ``(P,)``.
-
-    No descent begins at the estimate of all parts, which includes this part: a refinement may end where it begins.
-
-    Args:
-        kept: Shape ``(T,)``, bool: the terms of the model.
-        smaller: Shape ``(P,)``: the estimate with fewer terms without the same part, a further start.
-        coarse: Whether the descent ends early, as sets are compared by percents.
-    """
-    problem, table = estimate.problem, estimate.problem.table
-    # Begin at the linear prediction from the other parts.
-    starts = [table.at_scale(stats.x + stats.step(table, kept, k, bounded=True))]
-    # Begin at the estimate with fewer terms, too; the added terms start near their values without effect.
-    if smaller is not None:
-        place = {name: i for i, name in enumerate(table.terms)}
-        x = table.scale(smaller)[0]
-        for i, column in enumerate(table.columns):
-            p = column.parameter
-            if p.term:  # at its value without the term; a little inside of a bound, at which the slope is 0
-                off, inside = p.to_scale(min(max(p.without, p.low), p.high)), _INSIDE * table.span[i]
-                added = kept[place[p.term]] and abs(x[i] - off) < inside
-                x[i] = np.clip(off, table.low[i] + inside, table.high[i] - inside) if added else x[i]
-        starts.append(table.at_scale(x))
-    touched = masks(problem, [parts[k]])[0]
-    rest = problem.part(problem.train[touched], table.of_terms(kept))
-    return refine(problem, np.stack(starts), rest, coarse=coarse, settle=False).z
-
-
-def _predicted(
-    estimate: Fit,
-    parts: Sequence[Fold],
-    stats: optional_terms.Statistics,
-    kept: Sequence[np.ndarray],
+    present: Sequence[np.ndarray],
     ends: Sequence[np.ndarray],
     settle_s: float,
     free_run_s: float,
@@ -210,9 +135,9 @@ def _predicted(
             n: np.asarray(v, np.float64)
             for n, v in table.decode(jnp.asarray(z, jnp.float32), table.of_terms(own)).items()
         }
-        for z, own in zip(ends, kept, strict=True)
+        for z, own in zip(ends, present, strict=True)
     ]
-    names = [tuple(n for n, there in zip(table.terms, own, strict=True) if there) for own in kept]
+    names = [tuple(n for n, there in zip(table.terms, own, strict=True) if there) for own in present]
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
     own = np.einsum("kpp->kp", stats.information)
     shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own / np.maximum(own.sum(axis=0), 1e-300)]

@@ -1,13 +1,14 @@
 """Selection of the optional terms of a model, by the errors on held-out parts.
 
-Around the estimate of the widest model the loss of every part of the recordings is a quadratic function of the
-parameters. The loss of any smaller model, fitted to some parts and judged on another, follows by linear algebra. A term
-that matters little is near its value without effect, where the approximation is good.
+Around an estimate the loss of every part of the recordings is a quadratic function of the parameters. The estimate
+without a part, and that of a model with other terms, follow by linear algebra. They are starts and proposals; errors
+that decide are simulated (``term_trials``).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,9 +18,11 @@ from sim2real.identify.uncertainty.uncertainty import Linearised
 
 _RESAMPLED = 1000
 """Number of resampled sets of recordings."""
-_FAR, _DIVERGED = 3.0, 1e100
+_FAR, _DIVERGED = 1.5, 1e100
 """Ratio of a set's error to that of a subset above which the set is not selected; mean square of a diverged
 prediction."""
+_ALIKE = 1.05
+"""Largest ratio of two errors that count as equal."""
 _RARE = 0.02
 """Share of selections below which a model is no alternative."""
 
@@ -45,12 +48,12 @@ class Statistics:
     count: np.ndarray
 
     def step(
-        self, table: ParameterTable, kept: np.ndarray, held_out: int | None = None, bounded: bool = False
+        self, table: ParameterTable, present: np.ndarray, held_out: int | None = None, bounded: bool = False
     ) -> np.ndarray:
         """Return the step to the estimate of a smaller model from all parts, or all but one, ``(P,)``.
 
         Args:
-            kept: Shape ``(T,)``, bool: the terms of the model.
+            present: Shape ``(T,)``, bool: the terms of the model.
             held_out: Number of the held-out part; None: all parts are used.
             bounded: Whether parameters stop at their bounds, and the others are optimised with these values.
         """
@@ -59,7 +62,7 @@ class Statistics:
         step, gone = np.zeros(len(self.x)), np.zeros(len(self.x), bool)
         for i, column in enumerate(table.columns):
             p = column.parameter
-            if p.term and not kept[place[p.term]]:
+            if p.term and not present[place[p.term]]:
                 gone[i] = True
                 step[i] = p.to_scale(min(max(p.without, p.low), p.high)) - self.x[i]
         # Sum the quadratic functions of the parts.
@@ -79,18 +82,32 @@ class Statistics:
             gone |= beyond
         return step
 
-    def without(self, part: int) -> Statistics:
-        """Return the statistics without one part."""
-        return self._of(np.delete(np.arange(len(self.value)), part))
 
-    def only(self, part: int) -> Statistics:
-        """Return the statistics of one part."""
-        return self._of(np.array([part]))
+@dataclass(frozen=True)
+class Trial:
+    """The fit of one set of optional terms.
 
-    def _of(self, rows: np.ndarray) -> Statistics:
-        return Statistics(
-            self.x, self.value[rows], self.gradient[rows], self.information[rows], self.prior, self.count[rows]
-        )
+    Attributes:
+        present: Shape ``(T,)``, bool: the terms.
+        z: Shape ``(P,)``: the estimate; parameters of absent terms have their values without the term.
+        loss: Loss of the estimate.
+        stats: The loss of each part around the estimate, by the parameters of the set.
+        ends: Shape ``(K, P)``: estimates without each part.
+        ahead: Shape ``(K,)``: mean square of the errors up to the horizon on each part, with that part held out.
+        free: Shape ``(K,)``: the same in free runs; zeros without free runs.
+    """
+
+    present: np.ndarray
+    z: np.ndarray
+    loss: float
+    stats: Statistics
+    ends: np.ndarray
+    ahead: np.ndarray
+    free: np.ndarray
+
+    def names(self, table: ParameterTable) -> tuple[str, ...]:
+        """Return the names of the terms."""
+        return tuple(n for n, present in zip(table.terms, self.present, strict=True) if present)
 
 
 @dataclass(frozen=True)
@@ -98,25 +115,18 @@ class Selection:
     """A selection of terms.
 
     Attributes:
-        kept: Shape ``(T,)``, bool: which of the table's terms.
-        order: The terms in the order of their removal, the least needed first.
-        excess: Shape ``(T + 1,)``: mean square on held-out parts above that of the best model, as terms are removed one
-            after the other; the first entry is the widest model's.
-        error: Shape ``(T + 1,)``: standard error of ``excess``.
-        near: Shape ``(M, T)``, bool: terms of the models within a standard error of the best, the selected one first.
-        weight: Shape ``(M,)``: share of resampled recordings that select each model; the sum is 1.
+        near: The selected set, then other sets within a standard error of the best.
+        weight: Shape ``(M,)``: share of resampled recordings that select each of them; the sum is 1.
+        by_part: For each part the set that the errors on the other parts select among the subsets of the selected one.
     """
 
-    kept: np.ndarray
-    order: tuple[str, ...]
-    excess: np.ndarray
-    error: np.ndarray
-    near: np.ndarray
+    near: tuple[Trial, ...]
     weight: np.ndarray
+    by_part: tuple[Trial, ...]
 
     def names(self, table: ParameterTable) -> tuple[str, ...]:
         """Return the names of the selected terms."""
-        return tuple(n for n, kept in zip(table.terms, self.kept, strict=True) if kept)
+        return self.near[0].names(table)
 
 
 def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistics:
@@ -139,43 +149,63 @@ def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistic
     )
 
 
-def choose(stats: Statistics, table: ParameterTable, among: np.ndarray | None = None) -> Selection:
-    """Remove terms one after the other, each time the least needed, and select the smallest sufficient model.
+def select(trials: Sequence[Trial]) -> Selection:
+    """Return the selected set, and its alternatives.
 
-    The selected model is the smallest one whose excess over the best model is within one standard error of the
-    difference between parts (Breiman et al., Classification and Regression Trees, 1984). A term that helps in a single
-    part has a standard error as large as its gain, and is removed. ``votes`` resamples the recordings, as others might
-    select another model.
+    ``votes`` resamples the recordings, as others might select another set.
 
     Args:
-        stats: The loss of at least two parts.
-        table: The parameters, those of all terms free.
-        among: Shape ``(T,)``, bool: the terms to select from; the others are removed; default: all.
+        trials: The fits of sets of terms, among them that of no term.
     """
-    names = table.terms
-    kept = np.ones(len(names), bool) if among is None else among.copy()
-    path, scores, order = [kept.copy()], [_on_held_out_parts(stats, table, kept)], []
-    others: list[tuple[np.ndarray, np.ndarray]] = []
-    # Remove the term whose removal costs least, until none is present.
-    while kept.any():
-        trials = {}
-        for t in np.flatnonzero(kept):
-            fewer = kept.copy()
-            fewer[t] = False
-            trials[int(t)] = (_on_held_out_parts(stats, table, fewer), fewer)
-        least = min(trials, key=lambda t: float(trials[t][0].mean()))
-        others += [one for t, one in trials.items() if t != least]
-        score, kept = trials[least][0], trials[least][1].copy()
-        path.append(kept.copy())
-        scores.append(score)
-        order.append(names[least])
-    # Select the smallest model near the best, and weigh all models that were tried.
-    smallest, best, excess, error = _smallest(np.array(scores))
-    models = np.array([path[smallest], *path[:smallest], *path[smallest + 1 :], *(m for _, m in others)])
-    all_scores = np.array([scores[smallest], *scores[:smallest], *scores[smallest + 1 :], *(s for s, _ in others)])
-    share = votes(all_scores, models.sum(axis=1)) * np.less_equal(*_excess(all_scores, best))
+    chosen = selected(trials)
+    below = [t for t in trials if _within(t, chosen)]
+    parts = np.arange(len(chosen.ahead))
+    by_part = tuple(selected(below, parts != k) if len(parts) > 2 else chosen for k in parts)
+    # Weigh the sets within a standard error of the best.
+    possible = [chosen, *(t for t in trials if t is not chosen and not _worse_than_a_subset(t, trials))]
+    scores = np.array([_finite(t.ahead) for t in possible])
+    best = scores[int(np.argmin(scores.mean(axis=1)))]
+    share = votes(scores, np.array([t.present.sum() for t in possible])) * _as_good(scores, best)
     near = np.flatnonzero((share >= _RARE) | (np.arange(len(share)) == 0))
-    return Selection(path[smallest], tuple(order), excess, error, models[near], share[near] / share[near].sum())
+    weight = np.maximum(share[near], _RARE)
+    return Selection(tuple(possible[i] for i in near), weight / weight.sum(), by_part)
+
+
+def selected(trials: Sequence[Trial], parts: np.ndarray | None = None) -> Trial:
+    """Return the smallest set whose errors are within one standard error of the best set's, or within five percent.
+
+    The standard error is that of the difference between parts (Breiman et al., Classification and Regression Trees,
+    1984). A term that helps in a single part has a standard error as large as its gain, and is not selected. A set is
+    not selected either if a subset has far smaller errors, up to the horizon or in free runs: its fit ended anywhere.
+
+    Args:
+        parts: Shape ``(K,)``, bool: the parts whose errors count; default: all.
+    """
+    possible = [t for t in trials if not _worse_than_a_subset(t, trials, parts)]
+    scores = np.array([_finite(t.ahead if parts is None else t.ahead[parts]) for t in possible])
+    best = scores[int(np.argmin(scores.mean(axis=1)))]
+    within = _as_good(scores, best)
+    order = np.lexsort((scores.mean(axis=1), [t.present.sum() for t in possible], ~within))
+    return possible[order[0]]
+
+
+def _worse_than_a_subset(trial: Trial, trials: Sequence[Trial], parts: np.ndarray | None = None) -> bool:
+    """Return whether an error of a set is far above that of one of its subsets."""
+
+    def errors(t: Trial) -> np.ndarray:
+        some = slice(None) if parts is None else parts
+        return np.sqrt([_finite(t.ahead[some]).mean(), _finite(t.free[some]).mean()])
+
+    return any(_within(t, trial) and t is not trial and np.any(errors(trial) > _FAR * errors(t)) for t in trials)
+
+
+def _within(trial: Trial, other: Trial) -> bool:
+    """Return whether a set is a subset of another."""
+    return not np.any(trial.present & ~other.present)
+
+
+def _finite(squares: np.ndarray) -> np.ndarray:
+    return np.nan_to_num(squares, nan=_DIVERGED, posinf=_DIVERGED)
 
 
 def votes(scores: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -188,7 +218,7 @@ def votes(scores: np.ndarray, size: np.ndarray) -> np.ndarray:
 
     Args:
         scores: Shape ``(M, K)``: mean square of each model on each part.
-        size: Shape ``(M,)``: number of terms; of the models within a standard error of the best, the smallest wins.
+        size: Shape ``(M,)``: number of terms; of the models as good as the best, the smallest wins.
     """
     models, parts = scores.shape
     rng = np.random.default_rng(0)
@@ -198,64 +228,28 @@ def votes(scores: np.ndarray, size: np.ndarray) -> np.ndarray:
         off = scores - scores[np.argmin(mean)]
         excess = off @ share
         error = np.sqrt((off - excess[:, None]) ** 2 @ share / (parts - 1))
-        within = excess <= error
+        within = (excess <= error) | (np.sqrt(mean) <= _ALIKE * np.sqrt(mean.min()))
         chosen[np.lexsort((mean, size, ~within))[0]] += 1.0
     return chosen / chosen.sum()
 
 
-def narrowed(selection: Selection, table: ParameterTable, scores: np.ndarray, errors: np.ndarray) -> Selection:
-    """Return a selection after refits of the selected set and smaller ones.
-
-    The quadratic functions of ``choose`` are wrong if the widest model's estimate did not converge, or far from it: on
-    a linear axis they selected two terms whose error was ten times that of one.
-
-    Args:
-        scores: Shape ``(M, K)``: mean squares on each part, of the sets of ``below``, the smallest first.
-        errors: Shape ``(M, E)``: root mean square errors of each set, of any kinds.
-    """
-    order = slice(None, None, -1)  # the largest first
-    sets, errors = np.array(below(selection, table))[order], np.nan_to_num(errors[order], nan=np.inf)
-    chosen = _smallest(np.nan_to_num(scores[order], nan=_DIVERGED, posinf=_DIVERGED))[0]
-    for smaller in range(chosen + 1, len(sets)):
-        if np.any(errors[chosen] > _FAR * errors[smaller]):
-            chosen = smaller
-    if not chosen:
-        return selection
-    return replace(selection, kept=sets[chosen], near=sets[chosen][None], weight=np.ones(1))
-
-
-def below(selection: Selection, table: ParameterTable) -> list[np.ndarray]:
-    """Return the selected set and the smaller ones of its reduction, ``(T,)`` each, the smallest first."""
-    kept, sets = selection.kept.copy(), [selection.kept.copy()]
-    for name in selection.order:
-        if kept[table.terms.index(name)]:
-            kept[table.terms.index(name)] = False
-            sets.append(kept.copy())
-    return sets[::-1]
-
-
-def _smallest(scores: np.ndarray) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the smallest model within a standard error of the best, the best's scores ``(K,)``, excesses and errors.
-
-    Args:
-        scores: Shape ``(M, K)``: mean squares on each part, of the largest model first.
-    """
-    best = scores[int(np.argmin(scores.mean(axis=1)))]
-    excess, error = _excess(scores, best)
-    return int(np.flatnonzero(excess <= error)[-1]), best, excess, error
-
-
-def _excess(scores: np.ndarray, best: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the excess of models ``(M, K)`` over the best ``(K,)``, and its standard error; both ``(M,)``."""
+def _as_good(scores: np.ndarray, best: np.ndarray) -> np.ndarray:
+    """Return which models ``(M, K)`` are as good as the best ``(K,)``, ``(M,)``, bool."""
     off = scores - best
-    return off.mean(axis=1), off.std(axis=1, ddof=1) / np.sqrt(len(best))
+    error = off.std(axis=1, ddof=1) / np.sqrt(len(best))
+    return (off.mean(axis=1) <= error) | ~better(best, scores)
 
 
-def _on_held_out_parts(stats: Statistics, table: ParameterTable, kept: np.ndarray) -> np.ndarray:
+def better(squares: np.ndarray, than: np.ndarray) -> np.ndarray:
+    """Return whether mean squares ``(..., K)`` are lower than others by more than the ratio of equal errors."""
+    return np.sqrt(squares.mean(axis=-1)) * _ALIKE < np.sqrt(than.mean(axis=-1))
+
+
+def on_held_out_parts(stats: Statistics, table: ParameterTable, present: np.ndarray) -> np.ndarray:
     """Return the mean square on each part with that part held out of the fit, ``(K,)``, for a model with some terms."""
     scores = []
     for k in range(len(stats.value)):
-        step = stats.step(table, kept, k)
+        step = stats.step(table, present, k, bounded=True)
         square = stats.value[k] + 2.0 * stats.gradient[k] @ step + step @ stats.information[k] @ step
         scores.append(square / stats.count[k])
     return np.array(scores)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.special import stdtrit
@@ -12,10 +12,10 @@ from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
 from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.uncertainty.uncertainty import Uncertainty, between_parts, linearise
+from sim2real.identify.uncertainty.uncertainty import Uncertainty, between_parts
 from sim2real.identify.validation import optional_terms
-from sim2real.identify.validation.folds import compare_sets, folds_of, leave_out, masks
-from sim2real.identify.validation.prediction import labels
+from sim2real.identify.validation.folds import Fold, folds_of, leave_out
+from sim2real.identify.validation.term_trials import Trials
 from sim2real.identify.validation.verdict import Position
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
@@ -79,30 +79,11 @@ def chosen(estimate: Fit, config: IdentifyConfig, names: Sequence[str]) -> optio
     """Return the optional terms without which held-out parts are predicted worse.
 
     Args:
+        estimate: The fit with all optional terms.
         names: A name for each recording; recordings of different names are different parts.
     """
-    problem, table = estimate.problem, estimate.problem.table
-    # Select terms by the quadratic approximation of the loss on each part.
-    parts = folds_of(problem, config.folds, names, _LEAST_TO_CHOOSE)
-    selection = optional_terms.choose(
-        optional_terms.statistics(problem, linearise(problem, estimate.z), masks(problem, parts)), table
-    )
-    sets = optional_terms.below(selection, table)
-    if len(sets) == 1:
-        return selection
-    # Refit the selected set and the smaller ones, and compare their errors on held-out parts.
-    rows = compare_sets(estimate, parts, sets, config.settle_s, config.free_run_s)
-    sigma = dict(zip(labels(problem), (s for _, s, _ in problem.fields), strict=True))
-    scores = np.array([[_mean_square(row.ahead, sigma) for row in errors] for errors in rows])
-    free = np.array([[_mean_square(row.free, sigma) for row in errors] for errors in rows])
-    errors = np.sqrt(np.stack([scores.mean(axis=1), free.mean(axis=1)], axis=1))
-    return optional_terms.narrowed(selection, table, scores, errors)
-
-
-def _mean_square(errors: Mapping[str, float | None], sigma: Mapping[str, float]) -> float:
-    """Return the mean square of errors in deviations of the measurement; 0 if no joint moved."""
-    squares = [(e / sigma[name]) ** 2 for name, e in errors.items() if e is not None]
-    return float(np.mean(squares)) if squares else 0.0
+    parts = _parts(estimate, config, names, _LEAST_TO_CHOOSE)
+    return optional_terms.select(Trials(estimate, parts, config.settle_s, config.free_run_s).grown())
 
 
 def examined(
@@ -111,7 +92,7 @@ def examined(
     """Return the estimates without each part of the recordings, and their errors on that part.
 
     Args:
-        estimate: The fit; with ``--terms auto`` the fit with all optional terms, as each refit selects its own.
+        estimate: The fit; with ``--terms auto`` the fit with all optional terms.
         names: A name for each recording; recordings of different names are different parts.
         selection: The selection of terms; None if there was none.
     """
@@ -119,10 +100,13 @@ def examined(
     if segments < _LEAST:
         note(f"{segments} segments are too few to hold parts out of the fit")
         return ()
-    least = 2 if selection is None else _LEAST_TO_CHOOSE
-    parts = folds_of(estimate.problem, min(config.folds, segments // 2), names, least)
-    terms = None if selection is None else selection.kept
-    return tuple(leave_out(estimate, parts, config.settle_s, selection is not None, config.free_run_s, terms))
+    parts = _parts(estimate, config, names, 2 if selection is None else _LEAST_TO_CHOOSE)
+    trials = () if selection is None else selection.by_part
+    return tuple(leave_out(estimate, parts, config.settle_s, config.free_run_s, trials))
+
+
+def _parts(estimate: Fit, config: IdentifyConfig, names: Sequence[str], least: int) -> list[Fold]:
+    return folds_of(estimate.problem, max(2, min(config.folds, len(estimate.problem.train) // 2)), names, least)
 
 
 def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[HeldOutPart]) -> Uncertainty:

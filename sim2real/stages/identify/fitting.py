@@ -8,10 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2real.identify.fit import Fit, OnProgress
+from sim2real.identify.fit import Fit, OnProgress, as_numbers
+from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
+from sim2real.identify.uncertainty.identifiability import from_linearised
+from sim2real.identify.uncertainty.negligible import ABSENT
+from sim2real.identify.uncertainty.uncertainty import linearise
 from sim2real.identify.validation.optional_terms import Selection
 from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation.estimate import Findings
 from sim2real.stages.estimation.free_run import fitted_to
 from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.identify.interrupted import Best
@@ -20,6 +25,8 @@ from sim2real.stages.terminal.interruption import patiently
 
 _PERCENT_OF_SEARCH, _PERCENT_OF_REFINEMENT = 70, 30
 """Shares of a progress bar."""
+_AS_GOOD = 3e-4
+"""Relative excess of the loss up to which a fit with a held parameter is as good."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +70,48 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     # Refine the model with the selected terms. A value fixed by a flag stays fixed, in whichever term the parameter is;
     # the parameters of all other terms have their values without the term.
     narrow = table.with_terms(terms).with_fixed(config.fix)
-    shared = [p.name for p in narrow if p.free and not p.per_recording]
-    narrow = narrow.with_nominal({name: float(np.squeeze(widest.values[name])) for name in shared})
+    values = as_numbers(widest.problem.table, selection.near[0].z)
+    narrow = narrow.with_begin(
+        {p.name: float(np.squeeze(values[p.name])) for p in narrow if p.free and not p.per_recording}
+    )
     best.restart(narrow.for_recordings(len(inputs.episodes)))
     with _progress(f"identify with {', '.join(terms) or 'no term'}", best) as report:
         estimate = patiently(lambda: fitted_to(*data, replace(config, generations=0), narrow, report))
     return Fits(widest, estimate, selection)
+
+
+def determined(inputs: Inputs, fits: Fits, findings: Findings) -> tuple[Fits, list[str]]:
+    """Hold parameters that the data does not determine at their nominal values, as long as the fit stays as good.
+
+    Returns:
+        The fits, and a sentence for each held parameter.
+    """
+    estimate, groups, sentences = fits.estimate, findings.check.undetermined, list[str]()
+    table, tried = estimate.problem.table, set[str]()
+    absent = [n for n, verdict in zip(table.names, findings.spread.verdict, strict=True) if verdict in ABSENT]
+    config = replace(inputs.config, generations=0)
+    while names := [n for group in groups for n in group if n not in tried and _may_be_held(table, n)]:
+        # Begin with parameters that a model may be without, such as an inertia of the rotor.
+        name = min(names, key=lambda n: not table[n].vanishes)
+        tried.add(name)
+        begin = {n: float(np.squeeze(v)) for n, v in estimate.values.items() if not table[n].per_recording}
+        held = estimate.problem.table.with_fixed({name: table[name].nominal}).with_begin(begin)
+        again = fitted_to(inputs.model, inputs.episodes, inputs.fitted, inputs.windows, config, held)
+        if not again.converged or again.loss > (1.0 + _AS_GOOD) * estimate.loss:
+            continue
+        estimate = again
+        at = linearise(again.problem, again.z)
+        groups = from_linearised(again.problem, at, [n for n in absent if n != name]).undetermined
+        value = f"{table[name].nominal:.4g} {table[name].unit}".rstrip()
+        sentences.append(
+            f"{name} is held at its nominal value, {value}: the data does not determine it, and the model explains the "
+            "data as well; the other estimates are for this value"
+        )
+    return replace(fits, estimate=estimate), sentences
+
+
+def _may_be_held(table: ParameterTable, name: str) -> bool:
+    return any(p.name == name and p.kind == "dynamics" and not p.term and not p.per_recording for p in table)
 
 
 def _show_engine(problem: Problem) -> None:

@@ -19,7 +19,7 @@ from sim2real.identify.validation.verdict import NO_DELAY, positions
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import estimate, held_out_parts
 from sim2real.stages.estimation.free_run import Lack, fitted_to, free_runs, lacking, with_one_more
-from sim2real.stages.identify.fitting import Fits
+from sim2real.stages.identify.fitting import Fits, determined
 from sim2real.stages.identify.inputs import Inputs, table_of
 from sim2real.stages.identify.true_values import true_values
 from sim2real.stages.terminal.console import progress
@@ -48,7 +48,11 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         )
         # Compute intervals; they widen where estimates without one part differ.
         bar.set_description_str("identify: intervals")
-        findings = patiently(lambda: estimate.Findings.of(fits.estimate, parts))
+        findings, held = patiently(lambda: estimate.Findings.of(fits.estimate, parts)), list[str]()
+        # A choice of the model includes which parameters it has: hold those that the data does not determine.
+        if config.terms == "auto" and fits.estimate.converged and findings.check.undetermined:
+            fits, held = patiently(lambda f=findings: determined(inputs, fits, f))
+            findings = patiently(lambda: estimate.Findings.of(fits.estimate, parts)) if held else findings
         fit = findings.fit
         truth = true_values(inputs.logs[0], inputs.robot.roles) if config.reveal else {}
         # Collect the models that explain the recordings as well, for training to draw from.
@@ -69,7 +73,7 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         bar.set_description_str("identify: free runs")
         lack = patiently(lambda: _lack(document, inputs, fit))
     outside = beyond(inputs.model, inputs.episodes, inputs.windows, config.settle_s + config.horizon_s)
-    return estimate.judged(document, findings, inputs.units, config.max_delay_s, outside, lack)
+    return estimate.judged(document, findings, inputs.units, config.max_delay_s, [*outside, *held], lack)
 
 
 def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identification:

@@ -1,0 +1,188 @@
+"""Fits of sets of optional terms, from no term upwards, and their errors on held-out parts.
+
+A fit with many terms may end before its minimum. A set therefore begins at the end of a smaller one and cannot end with
+a larger loss, and the choice compares simulations of the sets, not approximations of the largest one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from sim2real.identify.fit import Fit
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.search.refine import refine
+from sim2real.identify.uncertainty.uncertainty import Linearised, linearise
+from sim2real.identify.validation import folds
+from sim2real.identify.validation.optional_terms import (
+    Statistics,
+    Trial,
+    better,
+    on_held_out_parts,
+    selected,
+    statistics,
+)
+from sim2real.identify.validation.prediction import labels
+
+_SHARES = (1.0, 0.25)
+"""Shares of the linear step without a part that are simulated; the fit itself is the third candidate."""
+_INSIDE = 0.01
+"""Distance from a bound at which the fit of a parameter begins [widths of the bounds]."""
+_TRIED = 3
+"""Most larger sets that are fitted in a round."""
+_WORSE = 0.02
+"""Relative excess of the loss over that of a smaller set above which a fit did not converge."""
+Attempt = Callable[[np.ndarray, Sequence[np.ndarray], float], Trial]
+"""Fits a set of terms ``(T,)`` from starts ``(P,)``; a converged fit has at most the loss of a smaller set."""
+
+
+def grown(
+    attempt: Attempt, wider: Callable[[Trial], Statistics], table: ParameterTable, starts: Sequence[np.ndarray]
+) -> list[Trial]:
+    """Return the fits of sets of terms: none, then larger ones as long as held-out parts are predicted better.
+
+    Each round fits sets with one or two further terms that the quadratic approximation around the smaller set proposes.
+    Then the subsets of the selected set are fitted that lack one of its terms.
+
+    Args:
+        wider: Returns the loss of each part around a fit, by the parameters of all terms.
+        starts: Starts of the fit without terms, ``(P,)`` each.
+    """
+    none = np.zeros(len(table.terms), bool)
+    base = attempt(none, starts, np.inf)
+    trials = [base]
+    # Add terms until the errors on held-out parts stay.
+    while not base.present.all():
+        stats, level = wider(base), list[Trial]()
+        for present in _proposed(stats, table, base.present):
+            if len(level) > 1 and better(_best(level).ahead, base.ahead):
+                break
+            begins = [_begin(stats, table, present), opened(table, base.z, present), *starts]
+            level.append(attempt(present, begins, base.loss))
+        trials += level
+        if not better(_best(level).ahead, base.ahead):
+            break
+        base = _best(level)
+    # Fit the selected set without each of its terms, until no subset is left.
+    while True:
+        chosen, there = selected(trials), {t.present.tobytes() for t in trials}
+        fewer = [chosen.present & (np.arange(len(none)) != i) for i in np.flatnonzero(chosen.present)]
+        lacking = [present for present in fewer if present.tobytes() not in there]
+        if not lacking:
+            return trials
+        for present in lacking:
+            below = min((t for t in trials if not np.any(t.present & ~present)), key=lambda t: t.loss)
+            begins = [_begin(chosen.stats, table, present), opened(table, below.z, present)]
+            trials.append(attempt(present, begins, below.loss))
+
+
+def _proposed(stats: Statistics, table: ParameterTable, present: np.ndarray) -> list[np.ndarray]:
+    """Return larger sets in the order in which they are fitted, ``(T,)`` each, by their predicted errors.
+
+    The first has one further term. The others have two, if that is better, or another one, if it is better than none.
+    """
+    absent, place = np.flatnonzero(~present), np.arange(len(present))
+
+    def ordered(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        sets = [present | np.isin(place, more) for more in combinations(absent, count)]
+        scored = [(one, on_held_out_parts(stats, table, one)) for one in sets]
+        return sorted(scored, key=lambda pair: float(pair[1].mean()))
+
+    (first, score), *ones = ordered(1)
+    none = on_held_out_parts(stats, table, present)
+    twos = [pair for pair in ordered(2)[:1] if better(pair[1], score)]
+    return [first, *(one for one, error in (*twos, *ones) if better(error, none))][:_TRIED]
+
+
+def _best(trials: Sequence[Trial]) -> Trial:
+    return min(trials, key=lambda t: float(np.nan_to_num(t.ahead, nan=np.inf).mean()))
+
+
+def _begin(stats: Statistics, table: ParameterTable, present: np.ndarray) -> np.ndarray:
+    """Return the minimum of a quadratic approximation for a set of terms, ``(P,)``."""
+    return table.at_scale(stats.x + stats.step(table, present, bounded=True))
+
+
+def opened(table: ParameterTable, z: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Return a point with the terms of a set near their values without effect, the others at them, ``(P,)``.
+
+    Parameters stay a little inside of their bounds, where the map to values is flat and a descent would not move them.
+    """
+    there, x = dict(zip(table.terms, present, strict=True)), table.scale(z)[0]
+    inside = _INSIDE * table.span
+    for i, column in enumerate(table.columns):
+        p = column.parameter
+        off = p.to_scale(min(max(p.without, p.low), p.high))
+        own = np.clip(x[i], table.low[i] + inside[i], table.high[i] - inside[i])
+        x[i] = off if p.term and not there[p.term] else own
+    return table.at_scale(x)
+
+
+class Trials:
+    """Fits sets of terms to the problem of a fit.
+
+    Args:
+        estimate: A fit whose table has all terms.
+        parts: Held out one at a time.
+        settle_s: First part of a prediction, to which its initial state is fitted [s].
+        free_run_s: Longest free run [s]; 0 skips the free runs.
+    """
+
+    def __init__(self, estimate: Fit, parts: Sequence[folds.Fold], settle_s: float, free_run_s: float) -> None:
+        self._estimate, self._parts, self._times = estimate, parts, (settle_s, free_run_s)
+        self._problem, self._masks = estimate.problem, folds.masks(estimate.problem, parts)
+        self._sigma = dict(zip(labels(self._problem), (s for _, s, _ in self._problem.fields), strict=True))
+
+    def grown(self) -> list[Trial]:
+        """Return the fits of ``grown``."""
+        table = self._problem.table
+        return grown(self.attempt, self.wider, table, [self._estimate.z, *table.starts()])
+
+    def wider(self, trial: Trial) -> Statistics:
+        """Return the loss of each part around a trial, by the parameters of all terms."""
+        return statistics(self._problem, linearise(self._problem, trial.z), self._masks)
+
+    def attempt(self, present: np.ndarray, starts: Sequence[np.ndarray], most: float) -> Trial:
+        """Return the fit of a set of terms ``(T,)``, from the best of some starts.
+
+        Args:
+            most: Loss of a smaller set; if the descent ends above it, it begins at the other starts, too.
+        """
+        problem, table = self._problem, self._problem.table
+        columns = table.of_terms(present)
+        data = problem.part(present=columns)
+        starts = [opened(table, z, present) for z in starts]
+        order = np.argsort(np.nan_to_num([problem.loss(z, data) for z in starts], nan=np.inf))
+        ended = refine(problem, starts[order[0]][None], data, coarse=True)
+        if ended.loss > (1.0 + _WORSE) * most:
+            others = refine(problem, np.stack([starts[i] for i in order[1:3]]), data, coarse=True)
+            ended = min(ended, others, key=lambda end: end.loss)
+        at = linearise(problem, ended.z, data)
+        stats = statistics(problem, at, self._masks)
+        ends = self._without_each(ended.z, at, stats, present)
+        rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(ends), ends, *self._times)
+        ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
+            [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
+        return Trial(present, ended.z, ended.loss, stats, ends, ahead, free)
+
+    def _without_each(self, z: np.ndarray, at: Linearised, stats: Statistics, present: np.ndarray) -> np.ndarray:
+        """Return the estimates without each part, ``(K, P)``: linear steps, shorter where a full one does not help."""
+        problem, table, parts = self._problem, self._problem.table, len(self._masks)
+        steps = np.array([stats.step(table, present, k, bounded=True) for k in range(parts)])
+        points = at.x + np.concatenate([0.0 * steps[:1], *(share * steps for share in _SHARES)])
+        # Simulate all candidates at a time, and compare each on the segments of the other parts.
+        without = [c.parameter.without for c in table.columns]
+        residuals = problem.with_values(z, np.where(table.of_terms(present), table.unscale(points), without))
+        squares = np.nan_to_num(np.sum(residuals**2, axis=(2, 3)), nan=np.inf)
+        ends = []
+        for k, touched in enumerate(self._masks):
+            candidates = [1 + k + i * parts for i in range(len(_SHARES))] + [0]
+            ends.append(points[min(candidates, key=lambda g: float(squares[g][~touched].sum()))])
+        return table.at_scale(np.array(ends))
+
+    def _mean_square(self, errors: Mapping[str, float | None]) -> float:
+        """Return the mean square of errors in deviations of the measurement; 0 if no joint moved."""
+        squares = [(e / self._sigma[name]) ** 2 for name, e in errors.items() if e is not None]
+        return float(np.mean(squares)) if squares else 0.0
