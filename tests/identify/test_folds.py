@@ -222,11 +222,11 @@ def three():
     whole = fit(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG)
     parts = folds_of(whole.problem, 3)
     found = select(Trials(whole, parts, 0.2, 0.0).grown())
-    return whole, leave_out(whole, parts, 0.2, trials=found.by_part), found
+    return whole, leave_out(whole, parts, 0.2, trials=found.by_part)
 
 
 def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
-    whole, rows, _ = three
+    whole, rows = three
     assert [r.name for r in rows] == ["recording 1", "recording 2", "recording 3"]
     assert float(rows[2].values["bias"]) == pytest.approx(BIAS, abs=0.003)
     assert rows[2].ahead["y"] > 20 * NOISE
@@ -234,20 +234,20 @@ def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
 
 
 def test_terms_are_chosen_without_what_is_left_out(three):
-    _, rows, _ = three
+    _, rows = three
     assert all("square" not in r.terms for r in rows)
     assert rows[2].terms == ("bias",)
     assert float(rows[2].values["square"]) == 0.0
 
 
 def test_recordings_of_one_name_go_together(three):
-    whole, *_ = three
+    whole, _ = three
     found = folds_of(whole.problem, 5, ["slow", "fast", "slow"])
     assert found == [Fold("slow", ((0, 0.0, np.inf), (2, 0.0, np.inf))), Fold("fast", ((1, 0.0, np.inf),))]
 
 
 def test_too_few_recordings_are_divided_into_blocks(three):
-    whole, *_ = three
+    whole, _ = three
     for names, least in ((["a", "b", "c"], 4), (["all", "all", "all"], 2)):
         found = folds_of(whole.problem, 5, names, least)
         assert len(found) == 6  # two of each recording: five at least
