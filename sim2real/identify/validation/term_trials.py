@@ -162,7 +162,7 @@ class Trials:
         at = linearise(problem, ended.z, data)
         stats = statistics(problem, at, self._masks)
         ends = self._without_each(ended.z, at, stats, present)
-        rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(ends), ends, *self._times)
+        rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(ends), list(ends), *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
         return Trial(present, ended.z, ended.loss, stats, ends, ahead, free)
