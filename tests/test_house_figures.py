@@ -8,13 +8,13 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 60_352,
+    "lines without composer": 60_880,
     "lines of composer": 12_153,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.2,
     "Any in 1,000 lines": 4.8,
-    "words of the dialect": 14,
-    "other words of the dialect": 260,
+    "words of the dialect": 13,
+    "other words of the dialect": 257,
     "largest number of project imports": 18,
     "levels of robot classes": 2,
     "public members of SO101Robot": 18,

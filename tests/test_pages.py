@@ -120,7 +120,7 @@ def test_every_noun_stands_in_the_glossary_once():
     text = (ROOT / "docs" / "reference" / "glossary.md").read_text()
     nouns = re.findall(r"^\| ([a-z][\w -]+) \| \S", text, re.MULTILINE)
     nouns = [noun for noun in nouns if noun != "noun"]
-    assert len(nouns) == len(set(nouns)) == 64
+    assert len(nouns) == len(set(nouns)) == 65
     assert {"log", "estimate", "held-out part", "false-alarm rate", "stale command", "bundle"} <= set(nouns)
 
 
@@ -171,6 +171,7 @@ PRINTED = {
         "hit a bound",
         "not identifiable",
         "lacks a term",
+        "promise broken",
         "not converged",
         "interrupted",
         "negligible",

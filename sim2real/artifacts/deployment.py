@@ -58,8 +58,7 @@ class Replay:
         name: The position's name in tables.
         horizon_s: Time between the last fitted sample and the prediction [s].
         rmse: Model -> root mean square error; None if the model diverged. ``as in this log`` is fitted to this log.
-        promised: Error of the identified model on held-out recordings, scaled up if this log moves more; None if
-            unknown.
+        promised: Bound on the error of the identified model, scaled up if this log moves more; None if unknown.
         column: The position's name among the columns.
         free_run: Mean error of the identified model in free runs over held-out recordings; None without free runs.
     """

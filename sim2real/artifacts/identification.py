@@ -12,7 +12,9 @@ import numpy as np
 from sim2real.artifacts.estimation.links import Link
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.estimation.promise import Bound, Promise, promises_table
 from sim2real.artifacts.estimation.quantity import Quantity
+from sim2real.artifacts.estimation.search import Search
 from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.run.run_folder import Source
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown
@@ -104,36 +106,6 @@ class Determined:
 
 
 @dataclass(frozen=True)
-class Refinement:
-    """A local refinement: the loss before and after, and the number of steps."""
-
-    before: float | None
-    after: float | None
-    steps: int
-
-
-@dataclass(frozen=True)
-class Search:
-    """The search for the estimate.
-
-    Attributes:
-        history: Best loss of each generation ``(G,)``.
-        loss: Best loss of an interrupted search.
-        done: Completed shares of an interrupted search and refinement.
-        engine: The simulator, and the reason for its choice.
-    """
-
-    strategy: str | None = None
-    history: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    evaluations: int = 0
-    refined: tuple[Refinement, ...] = ()
-    seconds: float | None = None
-    loss: float | None = None
-    done: Mapping[str, float] = field(default_factory=dict)
-    engine: str = ""
-
-
-@dataclass(frozen=True)
 class Prediction:
     """Errors of a model up to a horizon: field -> root mean square and mean absolute error; None without data."""
 
@@ -212,6 +184,9 @@ class Identification(Shown):
         held_out: Errors of each position on held-out data, the largest first.
         aggregate: Quantities estimated from each recording alone; empty unless configured.
         left_out: A fit for each held-out part; empty without folds.
+        promises: The ledger: each error on a held-out part or on held-out data, beside the bound that was given before.
+        bounds: Bounds on the errors of later logs.
+        ranges: Signal -> its range in the fitted segments; see ``segments.ranges``.
         terms: Optional terms of the model in the fit; None if the model has no optional terms.
         noise: Noise of the sensor; empty in older files.
         widening: Factor on the posterior's deviations that covers errors of the model; None in older files.
@@ -241,6 +216,9 @@ class Identification(Shown):
     free_run: tuple[FreeRun, ...] = ()
     aggregate: tuple[Quantity, ...] = ()
     left_out: tuple[HeldOutPart, ...] = ()
+    promises: tuple[Promise, ...] = ()
+    bounds: tuple[Bound, ...] = ()
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     terms: tuple[str, ...] | None = None
     links: tuple[Link, ...] = ()
     noise: tuple[Noise, ...] = ()
@@ -295,6 +273,10 @@ class Identification(Shown):
         ]
         horizon = f"held-out RMSE, {self.held_out[0].horizon_s:g} s ahead" if self.held_out else ""
         return ArtifactTable((horizon, *models, "unit", "no better than"), rows)
+
+    def promises_table(self) -> ArtifactTable:
+        """Return the ledger: a row for each error and the bound that was given before it."""
+        return promises_table(self.promises)
 
     @property
     def values(self) -> dict[str, float]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.estimation.search import Refinement
 from sim2real.artifacts.identification import (
     Determined,
     Estimate,
@@ -18,7 +19,6 @@ from sim2real.artifacts.identification import (
     Matrix,
     Prediction,
     Quantity,
-    Refinement,
     Search,
 )
 from sim2real.artifacts.run.run_folder import Source

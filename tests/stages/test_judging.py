@@ -46,7 +46,8 @@ def deployed(identified=0.01, here=0.01, success=1.0, simulated=1.0, drift=STEAD
     [
         ({}, "fine", "is the one that was identified"),
         ({"drift": ALARM}, "re-identify", "friction is 12 rad/s^2"),
-        ({"identified": 0.02}, "fine", "is the one that was identified"),
+        ({"identified": 0.012}, "fine", "is the one that was identified"),
+        ({"identified": 0.013}, "re-identify", "promised were 0.01 rad"),
         ({"identified": 0.04}, "re-identify", "promised were 0.01 rad"),
         ({"identified": None}, "re-identify", "it diverges"),
         ({"took_s": 0.0025}, "fine", "as fast as in training"),

@@ -1,6 +1,5 @@
 """What is said of parts that were left out: against scipy's distributions and simulated parts, not against itself."""
 
-import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +12,7 @@ from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty.uncertainty import Uncertainty
 from sim2real.identify.validation.verdict import Position
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.estimation.held_out_parts import further, promises, sentences, widened, widest
+from sim2real.stages.estimation.held_out_parts import widened, widest
 from sim2real.stages.identify import fitting
 from sim2real.stages.identify.interrupted import Best
 
@@ -22,37 +21,6 @@ ANGLE = Position("th", "tilt", "rad", 0.001)
 
 def left(name, value=1.0, ahead=0.1, share=0.2, **more):
     return HeldOutPart(name, (), {"gain": value}, {"gain": share}, {"th": ahead}, **more)
-
-
-def test_one_more_part_stays_below_the_promise_as_often_as_it_says():
-    rng = np.random.default_rng(0)
-    logs = rng.normal(-3.0, 0.4, (4000, 6))
-    held = [np.exp(row[-1]) < further(np.exp(row[:-1])) for row in logs]
-    low, high = stats.binom.interval(0.999, len(held), 0.95)
-    assert low <= sum(held) <= high
-
-
-def test_mean_worst_and_promise_are_said_of_every_position_that_has_errors():
-    rows = [left("a", ahead=0.1), left("b", ahead=0.2), left("c", ahead=0.15, free={"th": 0.3})]
-    said = sentences(rows, [ANGLE, Position("x", "place", "m", 0.1)], 0.5)
-    assert len(said) == 1  # one error in one go is no mean
-    assert re.match(r"tilt, up to 0.5 s ahead, .* off by 0.15 rad on average, 0.2 rad at worst of 3; .*0.4", said[0])
-    assert sentences([], [ANGLE], 0.5) == []
-
-
-def test_parts_that_differ_too_much_for_a_promise_are_said_to():
-    alike, apart = ([left(n, ahead=e) for n, e in zip("abc", errors, strict=True)] for errors in (
-        (0.1, 0.12, 0.11), (0.005, 0.006, 0.12)))  # fmt: skip
-    assert "further parts like these stay below 0.1" in sentences(alike, [ANGLE], 0.5)[0]
-    assert "promise no more than" in sentences(apart, [ANGLE], 0.5)[0]
-    assert "record more" in sentences(apart, [ANGLE], 0.5)[0]
-
-
-def test_what_is_promised_of_a_field_is_the_bound_on_one_more_part():
-    rows = [left("a", ahead=0.1), left("b", ahead=0.2), left("c", ahead=float("nan")), left("rests", ahead=None)]
-    assert promises(rows) == {"th": pytest.approx(further(np.array([0.1, 0.2])))}
-    assert promises(rows[:1]) == {}
-    assert promises([]) == {}
 
 
 @pytest.fixture

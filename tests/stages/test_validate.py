@@ -2,6 +2,7 @@
 
 import pytest
 
+from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Promise
 from sim2real.artifacts.identification import HeldOut
 from sim2real.stages.validate.score import position_row
 from sim2real.stages.validate.show import show
@@ -9,14 +10,22 @@ from sim2real.stages.validate.show import show
 SCORE = HeldOut("elbow", "q", "rad", 8.0, {"identified": 0.004, "nominal": 0.05, "hold": 0.0}, ("hold",))
 
 
+def ledger(bound, free=0.004):
+    """The rows of the elbow on one log."""
+    reaches = ((AHEAD, 8.0, 0.004), (FREE_RUN, 20.0, free))
+    return [Promise("b.mcap", True, "q", "elbow", "rad", reach, s, error, bound) for reach, s, error in reaches]
+
+
+RESULT = {"horizon_s": 8.0, "rmse": 0.004, "free_run_rmse": 0.004, "identified": "accepted", "why": [], "fitted": []}
+RESULT |= {"beyond": [], "ledger": [], "better": True, "promise_kept": None}
+
+
 @pytest.mark.parametrize(("moves", "beaten_by"), [(True, ["hold"]), (False, [])])
 def test_that_a_joint_rests_beats_no_model_of_how_it_moves(moves, beaten_by, capsys):
-    row = position_row(SCORE, 0.02 if moves else None, 0.004, moves)
+    row = position_row(SCORE, ledger(0.02) if moves else [], moves)
     assert row["beaten_by"] == beaten_by
     assert row["over_promised"] == (pytest.approx(0.2) if moves else None)
-    result = {"positions": {"elbow": row}, "horizon_s": 8.0, "rmse": 0.004, "free_run_rmse": 0.004}
-    result |= {"identified": "accepted", "why": [], "fitted": []}
-    show({**result, "better": not beaten_by, "promise_kept": None})
+    show({**RESULT, "positions": {"elbow": row}, "better": not beaten_by})
     said = capsys.readouterr().err
     assert ("elbow did not move here" in said) == (not moves)
     assert ("beaten are elbow by hold" in said) == moves
@@ -31,10 +40,20 @@ def test_that_a_joint_rests_beats_no_model_of_how_it_moves(moves, beaten_by, cap
     ],
 )
 def test_a_fitted_log_is_no_test_and_a_bad_identification_is_named(identified, fitted, said, never, capsys):
-    row = position_row(SCORE, 0.02, 0.004, False)
-    result = {"positions": {"elbow": row}, "horizon_s": 8.0, "rmse": 0.004, "free_run_rmse": 0.004, "better": True}
-    why = ["gain is at its bound"]
-    show({**result, "promise_kept": True, "identified": identified, "why": why, "fitted": fitted})
+    result = {**RESULT, "positions": {"elbow": position_row(SCORE, ledger(0.02), False)}, "promise_kept": True}
+    show({**result, "identified": identified, "why": ["gain is at its bound"], "fitted": fitted})
     err = capsys.readouterr().err
     assert said in err
     assert never not in err
+
+
+def test_a_free_run_that_breaks_its_promise_does_not_hold(capsys):
+    rows = ledger(0.02, free=0.031)
+    row = position_row(SCORE, rows, True)
+    assert (row["free run"], row["promised, free run"], row["over_promised"]) == (0.031, 0.02, pytest.approx(1.55))
+    beyond = ["'position' of 'sensor' reaches [-2, 2], fitted was [-1, 1]"]
+    show({**RESULT, "positions": {"elbow": row}, "ledger": rows, "promise_kept": False, "beyond": beyond})
+    err = capsys.readouterr().err
+    assert "elbow is off by 0.031 rad in a free run of 20 s on b.mcap; promised was 0.02 rad: 1.55 times" in err
+    assert "beyond the fitted data, so bounds are wider" in err
+    assert "holds on this log" not in err

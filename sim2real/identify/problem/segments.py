@@ -244,38 +244,74 @@ def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np
     return np.stack(fits)
 
 
-def beyond(
-    model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float, share: float = 0.1
-) -> list[str]:
-    """Return sentences about signals whose held-out part leaves the range of the fitted part: the model extrapolates.
+_RATE_S = 0.05
+"""Time over which a speed is averaged for the range of a signal [s]: noise of 1 mrad makes 28 mrad/s."""
+Signal = tuple[float, float]
+"""Smallest and largest value of a signal."""
+_MOST_BEYOND = 6
+"""Most sentences about signals outside their fitted range."""
+
+
+def range_of(signals: Mapping[str, Signal], column: str) -> Signal:
+    """Return the range of a measured position."""
+    return next((r for label, r in signals.items() if label.startswith(f"{column!r} of ")), (0.0, 0.0))
+
+
+def speed_range_of(signals: Mapping[str, Signal], column: str) -> Signal:
+    """Return the range of a measured position's speed."""
+    return next((r for label, r in signals.items() if label.startswith(f"the speed of {column!r} of ")), (0.0, 0.0))
+
+
+def ranges(
+    model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float
+) -> dict[str, Signal]:
+    """Return the range of each signal in some segments: commands, measured positions, and their speeds.
 
     Args:
         length_s: Length of a segment [s].
-        share: Smallest excess that is reported, as a share of the fitted range.
     """
     fields = [(n, f) for n, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
-    fields += [(model.sensor, f) for f in dict.fromkeys(c.position for c in model.channels)]
-    lines = []
-    for node, field in fields:
-        ends: dict[bool, list[np.ndarray]] = {True: [], False: []}
-        # Collect the range of each segment.
+    positions = list(dict.fromkeys(c.position for c in model.channels))
+    ends: dict[str, list[np.ndarray]] = {}
+    for node, name in [*fields, *((model.sensor, f) for f in positions)]:
         for span in spans:
             t = recordings[span.recording].steps[node].begun_s
             inside = (t >= span.begin_s) & (t <= span.begin_s + length_s)
-            if inside.any():
-                rows = recordings[span.recording].outputs[node][field][inside]
-                ends[span.fitted].append(np.stack([rows.min(axis=0), rows.max(axis=0)]).reshape(2, -1))
-        if not (ends[True] and ends[False]):
-            continue
-        (low, high), (lowest, highest) = (
-            (np.min([e[0] for e in ends[k]], axis=0), np.max([e[1] for e in ends[k]], axis=0)) for k in (True, False)
-        )
-        # Compare the fitted range with the held-out one.
-        room = share * (high - low) + 1e-9 * np.abs(high)
-        for i in np.flatnonzero((lowest < low - room) | (highest > high + room))[:3]:
-            name = field if low.size == 1 else f"{field}[{i}]"
-            lines.append(
-                f"held-out data extrapolates: {name!r} of {node!r} reaches [{lowest[i]:.3g}, {highest[i]:.3g}], "
-                f"fitted was [{low[i]:.3g}, {high[i]:.3g}]"
-            )
-    return lines
+            if not inside.any():
+                continue
+            rows = recordings[span.recording].outputs[node][name][inside].reshape(int(inside.sum()), -1)
+            signals = {f"{name!r} of {node!r}": rows}
+            if node == model.sensor and np.ptp(t[inside]) > 2 * _RATE_S:
+                signals[f"the speed of {name!r} of {node!r}"] = _rates(t[inside], rows)
+            for label, values in signals.items():
+                ends.setdefault(label, []).append(np.stack([values.min(axis=0), values.max(axis=0)]))
+    extents = {}
+    for label, pairs in ends.items():
+        low, high = np.min([e[0] for e in pairs], axis=0), np.max([e[1] for e in pairs], axis=0)
+        for i, both in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
+            extents[label if low.size == 1 else label.replace("' of", f"[{i}]' of", 1)] = both
+    return extents
+
+
+def _rates(t: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return mean speeds over ``_RATE_S`` of positions ``(N, F)`` at times ``(N,)`` [s]."""
+    grid = np.arange(t[0], t[-1], _RATE_S)
+    return np.stack([np.diff(np.interp(grid, t, column)) / _RATE_S for column in rows.T], axis=1)
+
+
+def beyond(fitted: Mapping[str, Signal], held_out: Mapping[str, Signal], share: float = 0.1) -> list[str]:
+    """Return sentences about signals that leave the range of the fitted segments: the model extrapolates.
+
+    Args:
+        fitted: Result of ``ranges``.
+        share: Smallest excess that is reported, as a share of the fitted range.
+    """
+    messages = []
+    for label in fitted.keys() & held_out.keys():
+        (low, high), (lowest, highest) = fitted[label], held_out[label]
+        room = share * (high - low) + 1e-9 * abs(high)
+        if lowest < low - room or highest > high + room:
+            excess = max(low - lowest, highest - high) / max(high - low, 1e-300)
+            text = f"{label} reaches [{lowest:.3g}, {highest:.3g}], fitted was [{low:.3g}, {high:.3g}]"
+            messages.append((excess, text))
+    return [text for _, text in sorted(messages, reverse=True)[:_MOST_BEYOND]]

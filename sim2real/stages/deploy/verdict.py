@@ -12,6 +12,7 @@ import numpy as np
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import Advice, Deployment, Gap, Replay
 from sim2real.artifacts.estimation.drift import Changed, Drift
+from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError
@@ -22,8 +23,9 @@ from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 
-_MAX_ERROR_RATIO = 3.0
-"""Largest ratio of the error to the promised one at which the model holds."""
+_FAULTY_RATIO = 2.0
+"""Ratio of the error to its bound, with the parameters fitted to the deployment, above which a joint moves as no
+parameters explain."""
 _MAX_UNEXPLAINED = 0.5
 """Largest share of the error that may remain after a fit to the log; above it no parameters explain the motion."""
 _MAX_LATE_SHARE = 0.01
@@ -100,7 +102,7 @@ def model_advice(replay: Sequence[Replay], drift: Drift | None) -> Advice | None
     # Compare the model fitted to these logs with the promise: a large error of it is no error of the parameters.
     unexplained = {r.name: _error_ratio(r, AS_HERE) / max(_error_ratio(r, "identified"), 1e-9) for r in replay}
     faulty = [
-        r for r in replay if _error_ratio(r, AS_HERE) > _MAX_ERROR_RATIO and not unexplained[r.name] <= _MAX_UNEXPLAINED
+        r for r in replay if _error_ratio(r, AS_HERE) > _FAULTY_RATIO and not unexplained[r.name] <= _MAX_UNEXPLAINED
     ]
     if faulty:
         worst = max(faulty, key=lambda r: _error_ratio(r, AS_HERE))
@@ -108,7 +110,7 @@ def model_advice(replay: Sequence[Replay], drift: Drift | None) -> Advice | None
         return Advice("look at this joint", (reason, "it may be loose, blocked, or touch something"), joint=worst.name)
     if drift is not None and (named := drift.named):
         return Advice("re-identify", (f"the robot has changed: {_change(named)}", *_other_alarms(drift)))
-    if wrong := [r for r in replay if _error_ratio(r, "identified") > _MAX_ERROR_RATIO]:
+    if wrong := [r for r in replay if _error_ratio(r, "identified") > MAX_ERROR_RATIO]:
         likely = drift.likely if drift else None
         guess = [f"most likely the robot has changed: {_change(likely)}"] if likely else []
         return Advice("re-identify", (*(f"{r.name}: {_error(r, 'identified')}" for r in wrong), *guess))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.estimation.promise import PROMISE_BROKEN
 from sim2real.artifacts.identification import (
     ROUND_TRIP,
     Determined,
@@ -22,7 +23,7 @@ from sim2real.identify.uncertainty import identifiability, noise, uncertainty
 from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
 from sim2real.identify.uncertainty.round_trip import RoundTrip, round_trip
 from sim2real.identify.validation.verdict import judge, positions, scores
-from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation import held_out_parts, promises
 from sim2real.stages.estimation.free_run import Lack
 
 
@@ -142,13 +143,15 @@ def judged(
         beyond=outside,
         left=None if fit.converged else fit.left,
     )
-    horizon_s = max((r.horizon_s for r in document.prediction), default=0.0)
-    promises = held_out_parts.sentences(document.left_out, measured, horizon_s)
-    # Add the sentences about held-out parts and free runs.
-    status = "lacks a term" if lack.flags and verdict.status == "accepted" else verdict.status
+    # Add broken promises, free runs and the bounds on later errors.
+    status = verdict.status
+    if status == "accepted":
+        broken = promises.broken(document.promises)
+        status = "lacks a term" if lack.flags else PROMISE_BROKEN if broken else status
+    reasons = promises.broken_sentences(document.promises)
+    reasons += [*promises.sentences(document, measured), *verdict.reasons, *lack.reasons]
     flags = " ".join(f for f in (verdict.next, lack.flags) if f)
-    combined = Judgement(status, (*promises, *verdict.reasons, *lack.reasons), flags)
-    return replace(document, verdict=combined, held_out=tuple(rows))
+    return replace(document, verdict=Judgement(status, tuple(reasons), flags), held_out=tuple(rows))
 
 
 def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import stdtrit
 
 from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
@@ -16,21 +14,16 @@ from sim2real.identify.uncertainty.uncertainty import Uncertainty, between_parts
 from sim2real.identify.validation import optional_terms
 from sim2real.identify.validation.folds import Fold, folds_of, leave_out
 from sim2real.identify.validation.term_trials import Trials
-from sim2real.identify.validation.verdict import Position
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.terminal.console import note
 
-_LEAST_PARTS = 2
-"""Fewest parts whose mean and worst errors are reported."""
 _LEAST = 4
 """Fewest segments from which parts are held out."""
 _LEAST_TO_CHOOSE = 3
 """Fewest parts for a selection of terms: one is held out, and the others predict each other."""
 _ANY_DELAY_S = 0.1
 """The parameters of a model do not depend on its longest delay, so any does [s]."""
-_VAGUE = 4.0
-"""Ratio of a promise to the worst error above which the text asks for more recordings."""
 _FEWEST = 4
 """Fewest parts from which the spread of estimates is computed."""
 
@@ -123,56 +116,3 @@ def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Seq
     )
     share = np.array([[row.share.get(name, 0.0) for name in table.names] for row in rows])
     return between_parts(spread, table, x, moved, share)
-
-
-def sentences(rows: Sequence[HeldOutPart], positions: Sequence[Position], horizon_s: float) -> list[str]:
-    """Return a sentence for each position: mean and worst error on held-out parts, and the promise for a further part.
-
-    Args:
-        horizon_s: Largest horizon of the errors [s].
-    """
-    if not rows:
-        return []
-    texts = []
-    for p in positions:
-        for reach, errors in (
-            (f"up to {horizon_s:g} s ahead", _of(rows, p, "ahead")),
-            ("in a free run", _of(rows, p, "free")),
-        ):
-            if errors.size >= _LEAST_PARTS:
-                unit, bound = f" {p.unit}".rstrip(), further(errors)
-                promise = f"95 % of further parts like these stay below {bound:.2g}{unit}"
-                if bound > _VAGUE * errors.max():
-                    promise = f"few parts that differ widely promise no more than {bound:.2g}{unit}: record more"
-                texts.append(
-                    f"{p.name}, {reach}, on held-out parts: off by {errors.mean():.2g}{unit} on "
-                    f"average, {errors.max():.2g}{unit} at worst of {errors.size}; {promise}"
-                )
-    return texts
-
-
-def further(errors: np.ndarray) -> float:
-    """Return the error below which a further part stays with 95 % probability, from the errors of K parts ``(K,)``.
-
-    Errors are taken as log-normal. The result is the upper end of a one-sided prediction interval (Student).
-    """
-    logs = np.log(np.maximum(errors, 1e-300))
-    k = len(logs)
-    return float(math.exp(logs.mean() + stdtrit(k - 1, 0.95) * logs.std(ddof=1) * math.sqrt(1.0 + 1.0 / k)))
-
-
-def promises(rows: Sequence[HeldOutPart]) -> dict[str, float]:
-    """Return the promise of each field, up to the horizon: field -> error.
-
-    The error on a single held-out part is no promise: half of all further parts have a larger error.
-    """
-    errors_of = {field: _finite([row.ahead.get(field) for row in rows]) for row in rows for field in row.ahead}
-    return {field: further(errors) for field, errors in errors_of.items() if errors.size >= _LEAST_PARTS}
-
-
-def _of(rows: Sequence[HeldOutPart], position: Position, kind: str) -> np.ndarray:
-    return _finite([getattr(row, kind).get(position.column) for row in rows])
-
-
-def _finite(errors: Sequence[float | None]) -> np.ndarray:
-    return np.array([e for e in errors if e is not None and math.isfinite(e)])

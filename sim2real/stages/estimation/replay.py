@@ -18,7 +18,7 @@ from sim2real.identify.search.refine import refine
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.verdict import positions
 from sim2real.robots.worlds import in_world
-from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation import held_out_parts, promises
 from sim2real.stages.estimation.later_logs import problem_of_logs
 from sim2real.stages.pipeline.pipeline import Pipeline
 
@@ -66,13 +66,14 @@ def tested(
     columns = prediction.samples(problem, models, config.settle_s, all_segments)
     errors = prediction.errors(problem, columns, list(models), config.settle_s, [ahead_s])
     # Compare the errors with those on the identification's held-out data.
-    promises, held = (_held_out(identification, model, ahead_s) for model in ("identified", "hold"))
+    held_out, held = (_held_out(identification, model, ahead_s) for model in ("identified", "hold"))
     rows = []
     for position in positions(problem.model, robot.units):
         rmse = {e.model: e.rmse.get(position.column) for e in errors if e.held_out}
         rmse = {m: e if e is not None and math.isfinite(e) else None for m, e in rmse.items()}
-        promise, moved, now = promises.get(position.column), held.get(position.column), rmse.get("hold")
+        promise, moved, now = held_out.get(position.column), held.get(position.column), rmse.get("hold")
         if promise is not None:  # a model's error grows with the motion
+            promise *= promises.room(identification, position.column)
             promise = max(promise, _NOISE * position.sigma) * max(1.0, now / moved if now and moved else 1.0)
         free = _free_run(identification, position.column)
         rows.append(Replay(position.name, position.unit, ahead_s, rmse, promise, position.column, free))

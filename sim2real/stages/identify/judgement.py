@@ -11,7 +11,6 @@ import numpy as np
 from sim2real.artifacts.identification import FreeRun, Identification
 from sim2real.identify.delays.links import links
 from sim2real.identify.fit import Fit, Value, as_numbers, refit
-from sim2real.identify.problem.segments import beyond
 from sim2real.identify.uncertainty import ensemble
 from sim2real.identify.uncertainty.per_recording import compare_recordings
 from sim2real.identify.validation import prediction
@@ -21,6 +20,7 @@ from sim2real.stages.estimation import estimate, held_out_parts
 from sim2real.stages.estimation.free_run import Lack, fitted_to, free_runs, lacking, with_one_more
 from sim2real.stages.identify.fitting import Fits, determined
 from sim2real.stages.identify.inputs import Inputs, table_of
+from sim2real.stages.identify.ledger import with_promises
 from sim2real.stages.identify.true_values import true_values
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
@@ -72,7 +72,7 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         # Try one further term where free runs are far off.
         bar.set_description_str("identify: free runs")
         lack = patiently(lambda: _lack(document, inputs, fit))
-    outside = beyond(inputs.model, inputs.episodes, inputs.windows, config.settle_s + config.horizon_s)
+    document, outside = with_promises(document, inputs, fit, parts)
     return estimate.judged(document, findings, inputs.units, config.max_delay_s, [*outside, *held], lack)
 
 

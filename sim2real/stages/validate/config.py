@@ -19,8 +19,8 @@ class ValidateConfig:
     """Later log, one flag a log."""
     horizon_s: float = 0.0
     """Horizon of the predictions [s]; 0: that of the identification's verdict."""
-    free_run_s: float = 10.0
-    """Longest simulation from a single initial state [s]."""
+    free_run_s: float = 0.0
+    """Longest simulation from a single initial state [s]; 0: that of the identification's bounds."""
     mapping: Annotated[Path | None, arg(metavar="FILE")] = None
     """Mapping of logs of another recorder; default: the pipeline's, or one is proposed."""
     force: bool = False

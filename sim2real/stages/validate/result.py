@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sim2real.artifacts.estimation.promise import FREE_RUN, Promise, promises_table
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.types import Json
 
-FREE_RUN = "free run"
 ACCEPTED = "accepted"
-MAX_ERROR_RATIO = 1.25
-"""Largest ratio of the error to the promised one at which the promise is kept."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -21,8 +19,10 @@ class Validation(Shown):
     Attributes:
         horizon_s: Horizon of the predictions [s].
         positions: Position -> its errors, the baselines with smaller errors, the promised error.
+        ledger: Each error of each log beside its bound.
+        beyond: Sentences about signals outside the range of the fitted data: there the bounds do not hold.
         better: Whether the identification predicts every position better than every baseline.
-        promise_kept: Whether the errors are as small as promised; None without a promise.
+        promise_kept: Whether no error exceeds its bound by more than ``MAX_ERROR_RATIO``; None without a bound.
         rmse: Root mean square error of all positions at the horizon.
         free_run_rmse: The same in free runs.
         identified: The verdict of the identification.
@@ -40,6 +40,8 @@ class Validation(Shown):
     identified: str = ACCEPTED
     why: Sequence[str] = ()
     fitted: Sequence[str] = ()
+    ledger: Sequence[Promise] = ()
+    beyond: Sequence[str] = ()
 
     def about(self) -> dict[str, Json]:
         """Return name -> value of the main figures."""
@@ -59,3 +61,7 @@ class Validation(Shown):
             for name, row in self.positions.items()
         ]
         return ArtifactTable(("position", "off", "promised", FREE_RUN, "unit"), rows)
+
+    def promises_table(self) -> ArtifactTable:
+        """Return the ledger: a row for each error with a bound."""
+        return promises_table(self.ledger)

@@ -7,24 +7,27 @@ from dataclasses import replace
 
 import numpy as np
 
+from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Promise
 from sim2real.artifacts.identification import HeldOut, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
-from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span, check_log
+from sim2real.identify.problem.segments import beyond, check_log, ranges
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.folds import moving
-from sim2real.identify.validation.verdict import errors_of, positions, scores
-from sim2real.stages.estimation import held_out_parts
+from sim2real.identify.validation.verdict import Position, errors_of, positions, scores
+from sim2real.stages.estimation import promises
 from sim2real.stages.estimation.fitted_logs import require_new
+from sim2real.stages.estimation.predicted_logs import Predicted, stretches
 from sim2real.stages.estimation.segment_split import reach
-from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.validate.config import ValidateConfig
-from sim2real.stages.validate.result import FREE_RUN, MAX_ERROR_RATIO
+from sim2real.stages.validate.simulated import later_logs, models_of
 from sim2real.types import Json
+
+_FREE_RUN_S = 10.0
+"""Longest free run of an identification without a bound on free runs [s]."""
 
 
 def score(
@@ -35,49 +38,35 @@ def score(
     Raises:
         UsageError: A log was fitted; or each recording has its own parameters, which a later log lacks.
     """
-    # Check that the identification has all parameters of the model, and that the logs are later ones.
-    robot = held_out_parts.having(pipeline.load(), [p.name for p in identification.parameters])
-    fitting = replace(pipeline.identify, settle_s=identification.settle_s)
-    model = robot.identifiable(fitting.max_delay_s)
-    if varying := [p.name for p in model.parameters if p.free and p.per_recording]:
-        raise UsageError(f"{', '.join(varying)} differ from recording to recording: a new log has no estimates of them")
+    robot, model, fitting, models = models_of(identification, pipeline)
     episodes = [log.episode for log in logs]
     for episode in episodes:
         check_log(episode, model)
     fitted = require_new(identification, logs, model, config.force)
-    estimates = {p.name: p.estimate for p in identification.parameters}
-    if lacking := [p.name for p in model.parameters if p.name not in estimates]:
-        raise UsageError(f"the parameters lack {', '.join(lacking)}", hint="they are of another state of the robot")
-    models = {
-        "identified": {p.name: estimates[p.name] for p in model.parameters},
-        "nominal": {p.name: p.nominal for p in model.parameters},
-    }
 
-    # Simulate windows of the promise's horizon, and free runs from one initial state a log.
+    # Simulate windows of the bounds' horizon, and free runs of their length from one initial state a log.
+    bounds = promises.of(identification)
     horizon_s = config.horizon_s or next((row.horizon_s for row in identification.held_out), fitting.horizon_s)
-    shortest_s = min(end - begin for begin, end in (reach(e, fitting) for e in episodes))
+    shortest_s = min(end - begin for begin, end in (reach(e, fitting) for e in episodes)) - fitting.settle_s
+    run_s = config.free_run_s or max((b.seconds for b in bounds.values() if b.reach == FREE_RUN), default=_FREE_RUN_S)
     with progress(None, "validate: simulate"):
-        windows = _problem(model, logs, fitting, min(horizon_s, shortest_s - fitting.settle_s))
+        windows = later_logs(model, logs, fitting, min(horizon_s, shortest_s))
         columns = prediction.samples(windows, models, fitting.settle_s)
-        errors = prediction.errors(windows, columns, list(models), fitting.settle_s, [horizon_s])
-        held_out = scores(errors, positions(model, robot.units))
-        moves = dict(zip(prediction.labels(windows), moving(windows, np.arange(windows.segments)), strict=True))
-        whole = _problem(model, logs, fitting, min(config.free_run_s, shortest_s) - fitting.settle_s, once=True)
-        columns = prediction.samples(whole, models, fitting.settle_s)
-        free_runs = prediction.free_runs(columns, prediction.labels(whole), list(models), fitting.settle_s)
-
-    # Compare each position with the promise, unless its joint does not move.
-    promised = {row.column: row.rmse.get("identified") for row in identification.held_out}
-    promised |= held_out_parts.promises(identification.left_out)
-    rows = {}
-    for s in held_out:
-        runs = [r for r in free_runs if r.field == s.column and r.model == "identified"]
-        free_run = float(np.mean([np.inf if r.rmse is None else r.rmse for r in runs]))
-        moved = moves[s.column]
-        rows[s.name] = position_row(s, promised.get(s.column) if moved else None, free_run, moved)
-    if not any(row["moves"] for row in rows.values()):
+        whole = later_logs(model, logs, fitting, min(run_s, shortest_s), once=True)
+        runs = prediction.samples(whole, models, fitting.settle_s)
+    errors = prediction.errors(windows, columns, list(models), fitting.settle_s, [horizon_s])
+    measured = positions(model, robot.units)
+    held_out = scores(errors, measured)
+    moves = dict(zip(prediction.labels(windows), moving(windows, np.arange(windows.segments)), strict=True))
+    if not any(moves[s.column] for s in held_out):
         raise UsageError("no joint moves in this log, so it tests no parameter", hint="take a log of motion")
-    ratios = [r["over_promised"] for r in rows.values() if r["over_promised"] is not None]
+
+    # Compare each position of each log with its bound, unless its joint does not move.
+    predicted, further = _predicted_logs(identification, logs, windows, measured)
+    document = replace(identification, samples=columns, free=runs, settle_s=fitting.settle_s)
+    ledger = promises.on_later_logs(document, measured, predicted, bounds)
+    rows = {s.name: position_row(s, ledger, moves[s.column]) for s in held_out}
+    free_runs = [np.inf if row.error is None else row.error for row in ledger if row.reach == FREE_RUN]
     return {
         "pipeline": pipeline.name,
         "identified": identification.verdict.status,
@@ -86,36 +75,44 @@ def score(
         "horizon_s": horizon_s,
         "positions": rows,
         "better": not any(row["beaten_by"] for row in rows.values()),
-        "promise_kept": all(ratio <= MAX_ERROR_RATIO for ratio in ratios) if ratios else None,
+        "promise_kept": not any(row.broken for row in ledger) if any(row.bound for row in ledger) else None,
+        "ledger": ledger,
+        "beyond": further,
         "rmse": float(np.sqrt(np.mean([errors_of(s)["identified"] ** 2 for s in held_out]))),
-        "free_run_rmse": float(np.sqrt(np.mean([r[FREE_RUN] ** 2 for r in rows.values()]))),
+        "free_run_rmse": float(np.sqrt(np.mean(np.square(free_runs)))),
     }
 
 
-def position_row(s: HeldOut, promised: float | None, free_run: float, moves: bool) -> dict[str, Json]:
-    """Return the row of a position.
+def _predicted_logs(
+    identification: Identification, logs: Sequence[Recording], windows: Problem, measured: Sequence[Position]
+) -> tuple[list[Predicted], list[str]]:
+    """Return the logs with the factors of their bounds, and sentences about signals outside the fitted range."""
+    predicted, sentences = [], []
+    for r, log in enumerate(logs):
+        spans = [s for s in windows.spans if s.recording == r]
+        later = ranges(windows.model, [log.episode for log in logs], spans, windows.segment_s)
+        predicted.append(Predicted(log.path.name, True, stretches(identification.ranges, later, measured)))
+        sentences += [f"{log.path.name}: {sentence}" for sentence in beyond(identification.ranges, later)]
+    return predicted, sentences
+
+
+def position_row(s: HeldOut, ledger: Sequence[Promise], moves: bool) -> dict[str, Json]:
+    """Return the row of a position; of several logs the worst errors.
 
     A joint that does not move is not compared with the baselines: "no motion" would always be best.
     """
+    of = {reach: [r for r in ledger if r.column == s.column and r.reach == reach] for reach in (AHEAD, FREE_RUN)}
+    worst = {
+        reach: max(rows, key=lambda r: np.inf if r.error is None else r.error) for reach, rows in of.items() if rows
+    }
+    ratios = [r.ratio for rows in of.values() for r in rows if r.ratio is not None]
     return {
         "moves": moves,
         "unit": s.unit,
         "rmse": errors_of(s),
         "beaten_by": list(s.beaten_by) if moves else [],
-        "promised": promised,
-        "over_promised": errors_of(s)["identified"] / promised if promised else None,
-        FREE_RUN: free_run,
+        "promised": worst[AHEAD].bound if AHEAD in worst else None,
+        "over_promised": max(ratios, default=None),
+        FREE_RUN: worst[FREE_RUN].error if FREE_RUN in worst else None,
+        f"promised, {FREE_RUN}": worst[FREE_RUN].bound if FREE_RUN in worst else None,
     }
-
-
-def _problem(
-    model: IdentifiableModel, logs: Sequence[Recording], config: IdentifyConfig, horizon_s: float, once: bool = False
-) -> Problem:
-    """Return logs in segments without a fitted one; ``once``: one segment a log."""
-    length_s = config.settle_s + horizon_s
-    spans = []
-    for r, log in enumerate(logs):
-        begin, end = reach(log.episode, config)
-        begins = np.arange(begin, end - length_s + 1e-6, length_s)
-        spans += [Span(r, float(b), False) for b in (begins[:1] if once else begins)]
-    return Problem(model, [log.episode for log in logs], spans, length_s, config)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from sim2real.artifacts.estimation.promise import FREE_RUN, MAX_ERROR_RATIO
+from sim2real.stages.estimation.promises import broken_sentences
 from sim2real.stages.terminal.console import note, table
-from sim2real.stages.validate.result import ACCEPTED, FREE_RUN, MAX_ERROR_RATIO
+from sim2real.stages.validate.result import ACCEPTED
 from sim2real.types import Json
 
 
@@ -13,25 +15,34 @@ def show(result: Mapping[str, Json]) -> None:
     """Print the errors as a table, then the verdict."""
     models = list(dict.fromkeys(m for row in result["positions"].values() for m in row["rmse"]))
     cells = [
-        [name, *(row["rmse"].get(m) for m in models), row["promised"], row[FREE_RUN], row["unit"]]
-        for name, row in result["positions"].items()
+        [n, *(row["rmse"].get(m) for m in models), row["promised"], row[FREE_RUN], row[_PROMISED], row["unit"]]
+        for n, row in result["positions"].items()
     ]
-    print(table(cells, [f"off {result['horizon_s']:g} s ahead", *models, "promised", FREE_RUN, "unit"]))
+    print(table(cells, [f"off {result['horizon_s']:g} s ahead", *models, "promised", FREE_RUN, _PROMISED, "unit"]))
     print(
         f"all positions: {result['rmse']:.4g} {result['horizon_s']:g} s ahead, "
         f"{result['free_run_rmse']:.4g} in free runs"
     )
     if resting := [name for name, row in result["positions"].items() if not row["moves"]]:
         note(f"{', '.join(resting)} did not move here, which neither keeps a promise nor breaks one")
+    for sentence in result["beyond"]:
+        note(f"beyond the fitted data, so bounds are wider: {sentence}")
     if not result["better"]:
         beaten = {n: row["beaten_by"] for n, row in result["positions"].items() if row["beaten_by"]}
         listed = "; ".join(f"{n} by {', '.join(by)}" for n, by in list(beaten.items())[:3])
         note(f"verdict: no improvement on this log: beaten are {listed}")
     elif result["promise_kept"] is False:
+        for sentence in broken_sentences(result["ledger"]):
+            note(sentence)
         note(f"verdict: better than the baselines, but more than {MAX_ERROR_RATIO:g} times as far off as was promised")
     elif result["fitted"]:
         note("verdict: none: a log that was fitted is no test")
+    elif result["promise_kept"] is None:
+        note("verdict: better than the baselines on this log; no bound was promised")
     else:
         note("verdict: holds on this log")
     if result["identified"] != ACCEPTED:
         note(f"the identification itself was not accepted: {result['identified']}: {'; '.join(result['why'][:1])}")
+
+
+_PROMISED = f"promised, {FREE_RUN}"

@@ -37,6 +37,7 @@ _TITLES: dict[str, tuple[Tone, str]] = {
     "hit a bound": ("doubt", "Hit a bound: an estimate is at a bound of the search"),
     "not identifiable": ("doubt", "Not identifiable: the data does not determine every parameter"),
     "lacks a term": ("doubt", "Lacks a term: free runs have large errors, and one more term of the model reduces them"),
+    "promise broken": ("doubt", "Promise broken: an error on held-out data is above its bound"),
     "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
 }
 _STRONG = 0.9

@@ -1,0 +1,98 @@
+"""Bounds on errors of predictions, and the errors beside the bounds that were given before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from sim2real.artifacts.summary import ArtifactTable
+
+Reach = Literal["ahead", "free run"]
+AHEAD: Reach = "ahead"
+FREE_RUN: Reach = "free run"
+MAX_ERROR_RATIO = 1.25
+"""Largest ratio of an error to its bound at which the promise is not broken: one error in twenty may exceed its bound,
+and it seldom exceeds it by this."""
+
+PROMISE_BROKEN = "promise broken"
+"""The verdict on an identification whose errors on held-out data exceed their bounds."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A promise: 95 % of the errors of a position on later logs stay below ``bound``.
+
+    Attributes:
+        column: The position among the measured fields, such as ``position[1]``.
+        name: Its name for people.
+        reach: ``ahead``: windows of a horizon, each from a state of its own; ``free run``: one run.
+        seconds: The horizon, or the length of the run [s].
+        scope: What the bound is about: ``this recording`` or ``recordings like these``.
+    """
+
+    column: str
+    name: str
+    unit: str
+    reach: Reach
+    seconds: float
+    bound: float
+    scope: str
+
+
+@dataclass(frozen=True)
+class Promise:
+    """An error beside the bound that was given before the prediction.
+
+    Attributes:
+        source: The predicted data: a held-out part, the held-out quarter, or a log.
+        fresh: Whether the estimates never depended on this data; held-out parts are fitted afterwards.
+        seconds: The horizon, or the length of the run [s]; 0 for the free run over a whole part.
+        error: Root mean square error; None if it is infinite.
+        bound: None if too few parts gave one.
+        stretch: Factor of this data in ``bound``: 1, or more if the motion is faster or reaches further than the fitted
+            one, a factor that needs no prediction.
+    """
+
+    source: str
+    fresh: bool
+    column: str
+    name: str
+    unit: str
+    reach: Reach
+    seconds: float
+    error: float | None
+    bound: float | None = None
+    stretch: float = 1.0
+
+    @property
+    def ratio(self) -> float | None:
+        """The error over its bound; None without a bound."""
+        return None if self.bound is None else math.inf if self.error is None else self.error / self.bound
+
+    @property
+    def broken(self) -> bool:
+        """Whether the error exceeds its bound by more than ``MAX_ERROR_RATIO``."""
+        return self.ratio is not None and self.ratio > MAX_ERROR_RATIO
+
+    def sentence(self) -> str:
+        """Return the error and its bound as text."""
+        unit, where = f" {self.unit}".rstrip(), self.source
+        how = f"up to {self.seconds:.3g} s ahead" if self.reach == AHEAD else f"in a free run of {self.seconds:.3g} s"
+        size = "diverges" if self.error is None else f"is off by {self.error:.2g}{unit}"
+        ratio = "" if self.ratio is None or self.error is None else f", {self.ratio:.2f} times as much"
+        bound = "" if self.bound is None else f"; promised was {self.bound:.2g}{unit}{ratio and f': {ratio[2:]}'}"
+        wider = f" (for {self.stretch:.2g} times the fitted motion)" if bound and self.stretch > 1.0 else ""
+        return f"{self.name} {size} {how} on {where}{bound}{wider}"
+
+
+def promises_table(rows: Sequence[Promise]) -> ArtifactTable:
+    """Return a row for each error and its bound, the largest ratio first."""
+    ordered = sorted(rows, key=lambda row: -(row.ratio or 0.0))
+    cells = [
+        [r.name, r.reach, r.seconds or None, r.source, r.error, r.bound, r.unit, "broken" if r.broken else "kept"]
+        for r in ordered
+        if r.bound is not None
+    ]
+    return ArtifactTable(("position", "reach", "s", "predicted", "off", "promised", "unit", "promise"), cells)

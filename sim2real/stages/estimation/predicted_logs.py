@@ -1,0 +1,79 @@
+"""Logs with data that was not fitted, and how much further their motion goes than the fitted one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from sim2real.artifacts.identification import HeldOutPart
+from sim2real.identify.problem.segments import Signal, range_of, speed_range_of
+from sim2real.identify.validation.verdict import Position
+
+LEAST_PARTS = 2
+"""Fewest errors from which a bound on another part follows."""
+_MAX_STRETCH = 10.0
+"""Largest factor of a bound: for a motion that differs more the bound is no estimate of anything."""
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """A recording with held-out data.
+
+    Attributes:
+        source: Its held-out data, for people.
+        later: Whether the bounds on later logs follow from its errors, too.
+        stretch: Column -> factor of the bound; see ``stretches``.
+    """
+
+    source: str
+    later: bool
+    stretch: Mapping[str, float] = field(default_factory=dict)
+
+
+def stretches(
+    fitted: Mapping[str, Signal], later: Mapping[str, Signal], positions: Sequence[Position]
+) -> dict[str, float]:
+    """Return the factor of each position's bound for data whose motion is faster or reaches further than the fitted.
+
+    The factor is the ratio of the largest speeds, times one more than the excess of the range of any position, as a
+    share of its fitted range. A hinge whose fitted range is a whole turn has been everywhere.
+
+    Args:
+        fitted: Ranges of the fitted segments; see ``segments.ranges``.
+        later: Ranges of the data.
+    """
+    if not fitted or not later:
+        return {p.column: 1.0 for p in positions}
+    excess, faster = 0.0, dict[str, float]()
+    for p in positions:
+        (low, high), (lowest, highest) = (range_of(r, p.column) for r in (fitted, later))
+        if not (p.unit == "rad" and high - low >= 2 * math.pi):
+            excess = max(excess, (max(low - lowest, 0.0) + max(highest - high, 0.0)) / max(high - low, 1e-300))
+        before, now = (max(map(abs, speed_range_of(r, p.column))) for r in (fitted, later))
+        faster[p.column] = max(1.0, now / before) if before > 0.0 else 1.0
+    return {column: min(ratio * (1.0 + excess), _MAX_STRETCH) for column, ratio in faster.items()}
+
+
+def predicted(
+    names: Sequence[str], fitted: int, parts: Sequence[HeldOutPart], stretch: Sequence[Mapping[str, float]] = ()
+) -> list[Predicted]:
+    """Return the recordings of an identification, in their order.
+
+    The last quarter of a fitted recording comes after all blocks of it. Beside a held-out recording it is no further
+    draw, as the rest of its recording was fitted.
+
+    Args:
+        names: The names of the logs; those that are held out whole come last.
+        stretch: For each log the factor of each position's bound.
+    """
+    blocks = in_blocks(names[:fitted], parts)
+    ends = [f"the held-out end of {name}" if fitted > 1 else "the held-out end" for name in names[:fitted]]
+    sources = [(end, blocks) for end in ends] + [(name, True) for name in names[fitted:]]
+    factors = [*stretch, *({} for _ in names[len(stretch) :])]
+    return [Predicted(source, later, f) for (source, later), f in zip(sources, factors, strict=True)]
+
+
+def in_blocks(names: Sequence[str], parts: Sequence[HeldOutPart]) -> bool:
+    """Return whether the parts are blocks of recordings instead of whole ones."""
+    return len(names) < LEAST_PARTS or len(parts) > len(names)
