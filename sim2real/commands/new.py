@@ -10,8 +10,8 @@ from sim2real.commands.config import NewConfig
 from sim2real.errors import UsageError
 from sim2real.log.importing.mapping import to_toml
 from sim2real.robots.from_model.mjcf import joints_of, read_model
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern, expand
-from sim2real.robots.from_model.mjcf_robot import RobotConfig, usual_terms
+from sim2real.robots.from_model.mjcf_parameters import expand
+from sim2real.robots.from_model.mjcf_robot import RobotConfig
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.terminal.console import wrote
 
@@ -64,7 +64,7 @@ def run(config: NewConfig) -> None:
     if folder.exists():
         raise UsageError(f"{folder} exists", hint="choose another name, or delete it")
     description, mapping = _described(config)
-    # What cannot run is refused before anything is written.
+    # Refuse a robot that cannot run before a file is written.
     expand(description.terms, description.joints, description.driven(), read_model(description.model))
     if config.log is None:
         from_model.note_held(description)
@@ -86,28 +86,15 @@ def run(config: NewConfig) -> None:
 
 
 def _described(config: NewConfig) -> tuple[RobotConfig, str]:
-    """Return what there is to know about the robot, and its mapping file; without a log, what flags say."""
+    """Return the robot's description, and the text of its mapping; without a log, by the flags alone."""
     # With a log, describe the robot by the log and its mapping.
     flags = replace(config.robot, mjcf=config.model)
     if config.log is not None:
         model_robot = from_model.from_flags(flags, [config.log])
         mapping = "" if model_robot.mapping is None else to_toml(replace(model_robot.mapping, pipeline=config.name))
         return model_robot.description, mapping
-    # Without a log, by the kind of drive.
-    commands = _COMMANDS[config.drive]
-    terms = tuple(ParameterPattern.parse(p) for p in flags.parameter) or usual_terms(
-        commands, physical=config.drive == "mit"
-    )
-    model = Path(str(config.model))
-    return RobotConfig(
-        model=model,
-        joints=flags.joints or joints_of(read_model(model)),
-        commands=commands,
-        velocity=flags.velocity,
-        rate_hz=flags.rate_hz or RobotConfig.rate_hz,
-        step_s=flags.step_s or RobotConfig.step_s,
-        fix_base=flags.fix_base,
-        contacts=flags.contacts,
-        hold=flags.hold,
-        terms=terms,
-    ), ""
+    # Without a log, describe it by the kind of drive.
+    joints = flags.joints or joints_of(read_model(Path(str(config.model))))
+    rate_hz, step_s = flags.rate_hz or RobotConfig.rate_hz, flags.step_s or RobotConfig.step_s
+    commands, physical = _COMMANDS[config.drive], config.drive == "mit"
+    return from_model.describe(flags, joints, commands, rate_hz, step_s, physical), ""

@@ -18,6 +18,7 @@ def by_name(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> dict[str, Bas
         raise UsageError(
             f"the nodes of a graph were expected, got {nodes!r}", hint="pass a list or a dictionary of them"
         )
+    # Names are unique, and keys of a dictionary are the names.
     named: dict[str, BaseNode] = {}
     for key, node in nodes.items() if isinstance(nodes, Mapping) else ((None, node) for node in nodes):
         if not isinstance(node, BaseNode):

@@ -52,6 +52,7 @@ class StaticDist(DelayDistribution):
     def __init__(self, dist: PyTree) -> None:
         self.dist = dist
         self._constant: float | None = None
+        # Numbers and distributions without spread are constants.
         if isinstance(dist, Real):
             self._constant = float(dist)
         elif type(dist).__name__ == "Deterministic" or (type(dist).__name__ == "Normal" and float(dist.scale) == 0.0):

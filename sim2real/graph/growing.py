@@ -49,6 +49,7 @@ class Growing:
         self._duration_s *= 2.0
         if self._duration_s > 1e9:
             raise UsageError("an episode cannot last longer than 30 years")
+        # Keep the delays of the first half, and draw those of the second.
         for name, node in self._nodes.items():
             earlier = self._delays.get(name, np.zeros((1, 0), np.int64))
             self._delays[name] = computation_delays(node, self._duration_s, 1, self._rng, earlier)
@@ -57,6 +58,7 @@ class Growing:
                 count = self._delays[c.output_node.name].shape[1]
                 earlier = self._transfers.get((node.name, c.name), np.zeros((1, 0), np.int64))
                 self._transfers[node.name, c.name] = transport_delays(c, (1, count), self._rng, earlier)
+        # Derive the longer timeline: its first half is the same.
         self.ticks = to_ticks(self._duration_s)
         self.timeline = derive(self._nodes, self._delays, self._transfers, self.ticks)
         self._check(self._nodes, self.timeline)

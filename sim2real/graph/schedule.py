@@ -262,6 +262,7 @@ class _BlockingRun:
         first = self.done[connection.name]
         if upto > max(first, ends.shape[1]):  # a recorded sender that stops before its reader
             return np.full(len(arrivals), NEVER)
+        # Messages arrive in order: none before the previous one.
         for m in range(first, upto):
             arrivals[:, m] = ends[:, m] + self.transfers[key][:, m]
             if m:

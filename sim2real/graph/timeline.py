@@ -74,6 +74,7 @@ class Timeline:
         Raises:
             UsageError: The record has none of the nodes.
         """
+        # Times of the steps.
         vertices, edges = {}, {}
         present = [n for n in nodes if n in episode.steps]
         if not present:
@@ -81,6 +82,7 @@ class Timeline:
         for name in present:
             steps = episode.steps[name]
             vertices[name] = Vertex(steps.begun[None], steps.end[None], np.array([len(steps)]))
+        # Times of the messages, at the smallest delay of a trainable connection.
         for (name, input_name), m in episode.messages.items():
             if name not in vertices or input_name not in nodes[name].inputs:
                 continue

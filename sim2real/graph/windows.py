@@ -68,6 +68,7 @@ def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
         if name not in nodes or input_name not in nodes[name].inputs:
             continue
         connection, reader = nodes[name].inputs[input_name], timeline.vertices[name]
+        # Steps whose window would have lost a message at the largest delay.
         places = np.argwhere(overfull(connection, edge, reader, timeline.vertices[edge.sender]))
         if len(places) and isinstance(connection.delay_dist, TrainableDist):
             episode, step = places[0]

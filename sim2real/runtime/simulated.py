@@ -233,6 +233,7 @@ class SimulatedRun:
             if self._stopped:
                 return
             self._stopped = True
+        # Record the messages that no step consumed.
         for node in self._nodes.values():
             node.set_clock(None)
         if self._recorder is not None:

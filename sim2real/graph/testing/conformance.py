@@ -26,12 +26,14 @@ def first_step_state(nodes: Mapping[str, BaseNode], name: str, key: jax.Array) -
     Args:
         key: JAX key of parameters, states and default outputs.
     """
+    # Parameters and states first, as the outputs may depend on them.
     keys = {n: jax.random.split(jax.random.fold_in(key, i), 4) for i, n in enumerate(nodes)}
     gs = GraphState()
     for n, node in nodes.items():
         gs = gs.replace(params={**gs.params, n: node.init_params(keys[n][0], gs)})
     for n, node in nodes.items():
         gs = gs.replace(state={**gs.state, n: node.init_state(keys[n][1], gs)})
+    # Fill each window with the sender's default output.
     inputs = {}
     for input_name, c in nodes[name].inputs.items():
         sender = c.output_node.name

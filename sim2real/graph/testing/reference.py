@@ -29,6 +29,7 @@ class Reference:
         self.nodes = nodes
         self.count = {n: int(timeline.vertices[n].count[episode]) for n in nodes}
         vertices = {n: timeline.vertices[n] for n in nodes}
+        # Delays as plain numbers, from the timeline.
         self.busy = {n: [int(d) for d in (v.end - v.start)[episode]] for n, v in vertices.items()}
         self.travel = {
             (n, i): [int(d) for d in (e.received - vertices[e.sender].end)[episode]]
@@ -38,6 +39,7 @@ class Reference:
         self.ends: dict[str, list[int]] = {n: [] for n in nodes}
         self._received: dict[tuple[str, str], list[int]] = {key: [] for key in self.travel}
         self._drift = dict.fromkeys(nodes, 0)
+        # Advance nodes until none can start another step.
         while any([self._advance(n) for n in nodes]):
             pass
         self.seq_in = {(n, i): self._consumers(c) for n, node in nodes.items() for i, c in node.inputs.items()}
@@ -109,6 +111,7 @@ class Reference:
         hashes: dict[str, list[int]] = {n: [] for n in self.nodes}
         order = sorted((self.starts[n][k], k, n) for n in self.nodes for k in range(self.count[n]))
         while order:  # steps that start at the same time may need each other's outputs: repeat until all are done
+            # A step needs its own previous hash, and those of the messages in its windows.
             waiting = []
             for t, k, n in order:
                 windows = []

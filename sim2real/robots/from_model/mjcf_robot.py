@@ -58,22 +58,22 @@ DRIVING = ("goal", "goal_velocity", "torque", "duty")
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """What there is to know about a robot that was recorded.
+    """The description of a robot that was recorded.
 
     Attributes:
         model: MJCF or URDF.
         joints: The joints that were recorded, in the order of the log.
-        commands: Fields of the log that drive: some of ``COMMANDS``.
-        shared: Those of them that are one number for all joints.
-        velocity: Whether velocities were measured, and count.
+        commands: Fields of the log that drive joints: some of ``COMMANDS``.
+        shared: Commands with one number for all joints.
+        velocity: Whether measured velocities are compared.
         rate_hz: Samples per second of the log, at most [Hz].
         step_s: Time step of the simulation [s].
         sigma_rad: Deviation of a measured position [rad].
         sigma_rad_s: Deviation of a measured velocity [rad/s].
-        kp_unit: What 1 stands for in the log's own stiffness.
-        kd_unit: What 1 stands for in the log's own damping.
+        kp_unit: The value of 1 in the log's unit of stiffness.
+        kd_unit: The value of 1 in the log's unit of damping.
         fix_base: Whether a floating base is held.
-        hold: Where joints that were not recorded are held: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+        hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
     """
 
     model: Path
@@ -97,7 +97,7 @@ class RobotConfig:
         return driven(self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold)
 
     def held(self) -> Holding:
-        """Return what becomes of the joints that were not recorded."""
+        """Return the held and the free joints among those that were not recorded."""
         return held_in(self.model, read_model(self.model), self.joints, self.fix_base, self.hold)
 
     def to_toml(self, model: str) -> str:

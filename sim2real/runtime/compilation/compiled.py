@@ -189,6 +189,7 @@ class CompiledGraph:
                     f"the timeline ends after step {last} of the supervisor {self.supervisor!r}",
                     hint="start again with init() and reset(), or draw longer timelines",
                 )
+        # Make the supervisor's step, then all steps until its next one.
         turn = self.walk.turn_of(gs, k)
         before = self.walk.step_state(gs, turn) if step_state is None else step_state
         after, output = self.program.call(self.supervisor, before) if output is None else (before, output)

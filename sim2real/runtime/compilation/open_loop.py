@@ -52,6 +52,7 @@ class OpenLoopGraph:
             for n, node in self.nodes.items()
             if n not in self.replayed
         }
+        # Compute senders before readers.
         try:
             self.order = tuple(graphlib.TopologicalSorter(senders).static_order())
         except graphlib.CycleError as error:

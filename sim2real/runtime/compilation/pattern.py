@@ -73,6 +73,7 @@ def _fill(placer: Placer, ticks: int, tick: Steps) -> Placement:
     count = int(placer.timeline.vertices[placer.world or ""].count.min())
     rows = -(-count // ticks)
     every = placer.fill(1, rows * ticks, tick)  # as if there were a boundary before each tick
+    # Keep the slots that are used at any boundary of a row.
     size = len(every.slots)
     used = np.zeros(ticks * size, bool)
     for n in placer.others:

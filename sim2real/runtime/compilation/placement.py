@@ -187,6 +187,7 @@ class Placer:
     def _rows(self, lowest: Steps, highest: Steps, n: int) -> Steps:
         """Return the row of each step, for rows of ``n`` ticks: early, but one step of a node a row where possible."""
         rows = {o: -(-lowest[o] // n) for o in self.others}
+        # Raise rows until each step comes after the messages that it consumes.
         changed = True
         while changed:
             changed = False

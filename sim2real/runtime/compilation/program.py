@@ -189,12 +189,14 @@ class RowProgram:
             fresh = matched(name, f"the {field} that step returns", fresh, "the one it got", old)
             return fresh if ran is None else select(ran, fresh, old)
 
+        # Replace state and random numbers, and parameters if the step changed them.
         changed: dict[str, PyTree] = {
             field: {**getattr(gs, field), name: merge(field, getattr(new, field), getattr(gs, field)[name])}
             for field in ("state", "rng")
         }
         if new.params is not gs.params[name]:
             changed["params"] = {**gs.params, name: merge("params", new.params, gs.params[name])}
+        # Push the output onto the ring of the node.
         if name in gs.buffer:
             ring = gs.buffer[name]
             fresh = matched(name, "the output of step", output, "that of init_output", ring[-1])

@@ -94,6 +94,7 @@ class Repetition:
     def _needed(self) -> Iterator[tuple[str, int]]:
         """Yield (sender, number of outputs from before the row that are read) of each input of each slot and tick."""
         wiring = self.wiring
+        # The readers: the slots of nodes, then the ticks of the world.
         ran = [table.seq >= 0 for table in wiring.tables]
         world = wiring.world_table.inputs if wiring.world_table else {}
         slots = [(wiring.slots[i], t.inputs, wiring.offsets[i], i) for i, t in enumerate(wiring.tables)]
@@ -103,6 +104,7 @@ class Repetition:
                 n: InputTable(**{f: getattr(t, f)[:, :, i] for f in t.__dataclass_fields__}) for n, t in world.items()
             }
             slots.append((self.world, at, i, before))
+        # The ring must reach back to the oldest message of the window.
         for reader, inputs, ticks, before in slots:
             for name, table in inputs.items():
                 connection = self.nodes[reader].inputs[name]

@@ -66,8 +66,10 @@ def arrange(
                 f"node {n!r} makes more than {STEPS} steps while the supervisor {supervisor!r} makes one",
                 hint="bring the rates closer together",
             )
+    # Merge the patterns of all rows into one sequence of slots.
     patterns = _patterns(names, rows, row, index, counted, heard)
     sequence, slot_of = _merge(patterns, names, names.index(supervisor) if supervisor in names else -1)
+    # Give each step the slot of its pattern.
     slots = {}
     for i, n in enumerate(names):
         e, k = np.nonzero(counted[n])
@@ -87,6 +89,7 @@ def _index_in_row(row: np.ndarray) -> np.ndarray:
 def _patterns(
     names: list[str], rows: int, row: Steps, index: Steps, counted: Steps, heard: Sequence[Heard]
 ) -> _Patterns:
+    # Count the steps of each node in each row.
     boundaries = rows * next((len(r) for r in row.values()), 0)
     counts = np.zeros((boundaries, len(names)), np.int16)
     at: dict[str, np.ndarray] = {}
@@ -94,6 +97,7 @@ def _patterns(
         e, _ = np.nonzero(counted[n])
         at[n] = e * rows + row[n][counted[n]]
         counts[:, i] = np.bincount(at[n], minlength=boundaries)
+    # For each step, the senders' steps of this row that come before it.
     most = counts.max(axis=0, initial=0)
     needs = [np.zeros((boundaries, int(m), len(names)), np.int16) for m in most]
     for reader, sender, newest in heard:
@@ -102,6 +106,7 @@ def _patterns(
         before = np.where(here, np.take_along_axis(index[sender], newest.clip(0), 1) + 1, 0)[counted[reader]]
         places = (at[reader], index[reader][counted[reader]], j)
         needs[i][places] = np.maximum(needs[i][places], before)
+    # Rows with equal numbers share a pattern.
     columns = np.concatenate([counts, *(n.reshape(boundaries, n.shape[1] * len(names)) for n in needs)], axis=1)
     first, of_row = _distinct(columns)
     return _Patterns(counts[first].astype(np.int64), [n[first].astype(np.int64) for n in needs], of_row)

@@ -223,6 +223,7 @@ class _Tables:
         ``moment (C,)`` is the time at which the program computes each, ``ticks (C,)`` the world's number of ticks then.
         """
         ts = np.where(seq >= 0, np.take_along_axis(self.timeline.vertices[name].start, seq.clip(0), 1), 0)
+        # Number of the sender's outputs before each step; None if they are recorded.
         inputs = {}
         for key, edge in self.placer.edges.items():
             if key[0] != name:
@@ -246,6 +247,7 @@ class _Tables:
         """
         connection, edge = self.nodes[key[0]].inputs[key[1]], self.placer.edges[key]
         sender: Vertex = self.timeline.vertices[edge.sender]
+        # The age of the newest message counts the sender's outputs since.
         newest = np.take_along_axis(self.placer.newest[key], seq.clip(0), 1)
         age = np.zeros_like(seq) if count is None else np.where(seq >= 0, count - 1 - newest, 0)
         if (age < 0).any():

@@ -70,6 +70,7 @@ class Handover:
             GraphTimeout: There was no reply in time.
         """
         with self._condition:
+            # Offer the step, and wait for the caller's reply.
             if not self._autonomous:
                 self._offered = step_state
                 self._condition.notify_all()

@@ -133,6 +133,7 @@ class NodeThread(threading.Thread):
 
     def _live(self) -> None:
         try:
+            # Start up, wait for the other nodes, then run.
             self.since_s = time.monotonic()
             if not self.node.startup(self.shared.graph_state, self.shared.timeout_s):
                 raise Sim2RealError(f"the startup of node {self.node.name!r} did not succeed")

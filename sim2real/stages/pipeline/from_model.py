@@ -27,6 +27,7 @@ from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
 from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY, RobotFlags
 from sim2real.stages.terminal import console
 from sim2real.stages.terminal.console import note
+from sim2real.types import MjModel
 
 _STEPS_S = (0.0005, 0.005)
 """Between these, the model's own time step is taken."""
@@ -169,7 +170,7 @@ def files_of(description: RobotConfig) -> dict[str, str]:
     return {ROBOT_FILE: description.to_toml(MODEL_FILE), MODEL_FILE: text}
 
 
-def _description(flags: RobotFlags, model: Any, episode: Episode) -> RobotConfig:
+def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotConfig:
     """Return the description of a robot, from its model and a log."""
     # The commands that drive the joints.
     joints = flags.joints or joints_of(model)
@@ -197,26 +198,37 @@ def _description(flags: RobotFlags, model: Any, episode: Episode) -> RobotConfig
         )
     # Rate and step follow from the log and the model.
     fastest = min(float(np.quantile(np.diff(episode.steps[n].begun_s), _FASTEST)) for n in ("actuator", "sensor"))
-    own_s = float(model.opt.timestep)
-    description = RobotConfig(
-        model=Path(str(flags.mjcf)),
-        joints=tuple(joints),
-        commands=driving,
-        shared=tuple(name for name in driving if shapes[name] != n),
-        velocity=flags.velocity and "velocity" in sensed,
-        rate_hz=round(1.0 / fastest, 3),
-        step_s=flags.step_s or min(max(own_s, _STEPS_S[0]), _STEPS_S[1]),
+    step_s = flags.step_s or min(max(float(model.opt.timestep), _STEPS_S[0]), _STEPS_S[1])
+    if flags.velocity and "velocity" not in sensed:
+        raise UsageError("the log has no velocity", hint="run without --velocity: it is not needed")
+    # A gain kp alone is in a firmware's unit; both gains are those of a motor's torque loop.
+    units = {n: float(np.median(commands[n][commands[n] > 0])) for n in ("kp", "kd") if n in commands}
+    description = describe(flags, joints, driving, round(1.0 / fastest, 3), step_s, set(units) == {"kp", "kd"})
+    kp_unit = units["kp"] if set(units) == {"kp"} else 1.0
+    return replace(description, shared=tuple(name for name in driving if shapes[name] != n), kp_unit=kp_unit)
+
+
+def describe(
+    flags: RobotFlags, joints: Sequence[str], commands: tuple[str, ...], rate_hz: float, step_s: float, physical: bool
+) -> RobotConfig:
+    """Return a robot's description by its flags, with the parameters that they name, or the usual ones.
+
+    Args:
+        commands: Fields of the log that drive joints.
+        rate_hz: Samples per second [Hz].
+        step_s: Time step of the simulation [s].
+        physical: Whether the gains are those of a torque loop, in SI units.
+    """
+    named = tuple(ParameterPattern.parse(p) for p in flags.parameter)
+    return RobotConfig(
+        Path(str(flags.mjcf)),
+        tuple(joints),
+        commands,
+        velocity=flags.velocity,
+        rate_hz=rate_hz,
+        step_s=step_s,
         fix_base=flags.fix_base,
         contacts=flags.contacts,
         hold=flags.hold,
+        terms=named or usual_terms(commands, physical=physical),
     )
-    if flags.velocity and not description.velocity:
-        raise UsageError("the log has no velocity", hint="run without --velocity: it is not needed")
-    # Parameters: gains in a firmware's unit, or those of a torque loop.
-    units = {n: float(np.median(commands[n][commands[n] > 0])) for n in ("kp", "kd") if n in commands}
-    if set(units) == {"kp"}:  # a firmware's own unit; both gains together are those of a motor's own torque loop
-        description = replace(description, kp_unit=units["kp"])
-    terms = tuple(ParameterPattern.parse(p) for p in flags.parameter) or usual_terms(
-        driving, physical=set(units) == {"kp", "kd"}
-    )
-    return replace(description, terms=terms)

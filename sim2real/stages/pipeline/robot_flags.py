@@ -13,7 +13,7 @@ from sim2real.stages.identify.config import IdentifyConfig
 
 @dataclass(frozen=True)
 class RobotFlags:
-    """A robot that no pipeline describes: its model, and what else there is to say of it."""
+    """A robot without a pipeline, described by its model and flags."""
 
     mjcf: Annotated[Path | None, arg(metavar="FILE")] = None
     """Model of the robot: MJCF or URDF."""
@@ -31,11 +31,11 @@ class RobotFlags:
     step_s: float = 0.0
     """Time step of the simulation [s]; 0: the model's own, between 0.5 and 5 ms."""
     fix_base: bool = False
-    """Hold a floating base where the model has it, as on a stand."""
+    """Hold a floating base at its position in the model, as on a stand."""
     contacts: bool = False
     """Simulate contacts."""
     hold: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """Where joints that were not recorded are held: JOINT=VALUE [rad or m], or a keyframe; default: keyframe home."""
+    """Positions of joints that were not recorded: JOINT=VALUE [rad or m], or a keyframe; default: keyframe home."""
     as_told: bool = False
     """Keep names, order and signs of the file or the mapping, even if the data contradicts them or is ambiguous."""
 
