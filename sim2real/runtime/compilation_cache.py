@@ -39,9 +39,6 @@ def location(place: str | None = None) -> Path | None:
 
     Args:
         place: A folder, or ``off``; None takes ``SIM2REAL_CACHE``, otherwise the platform's cache folder.
-
-    Raises:
-        UsageError: The place is an existing file.
     """
     place = place or os.environ.get(VARIABLE) or None
     if place == OFF:

@@ -16,11 +16,7 @@ from sim2real.types import PyTree
 
 
 def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timeline) -> dict[str, BaseNode]:
-    """Return the nodes of a timeline by name.
-
-    Raises:
-        UsageError: Two nodes have the same name, or a node of the timeline is missing.
-    """
+    """Return the nodes of a timeline by name."""
     named = by_name(nodes)
     missing = [n for n in timeline.vertices if n not in named]
     if missing:
@@ -29,11 +25,7 @@ def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timel
 
 
 def supervisor_of(supervisor: BaseNode | str, nodes: Mapping[str, BaseNode]) -> str:
-    """Return the supervisor's name; ``supervisor`` is the name or the node.
-
-    Raises:
-        UsageError: It is neither, or is not the object that has its name in the graph.
-    """
+    """Return the supervisor's name; ``supervisor`` is the name or the node."""
     if not isinstance(supervisor, str | BaseNode):
         raise UsageError(f"the supervisor is one node, or its name, got {supervisor!r}")
     if isinstance(supervisor, BaseNode) and nodes.get(supervisor.name, supervisor) is not supervisor:
@@ -46,9 +38,6 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, replayed: Mappi
 
     Args:
         replayed: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
-
-    Raises:
-        UsageError: A node or connection does not fit; the message names the first one.
     """
     # Nodes, and recorded outputs.
     for name, node in nodes.items():

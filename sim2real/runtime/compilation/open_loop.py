@@ -130,9 +130,6 @@ class OpenLoopGraph:
 
         Returns:
             The results, leaves ``(ticks, ...)``.
-
-        Raises:
-            UsageError: There is no world, or one of its senders is not in ``replayed``.
         """
         if self.world is None:
             raise UsageError("drive() is for graphs with a world, this one has none")

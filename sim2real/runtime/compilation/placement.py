@@ -74,11 +74,7 @@ class Placer:
         self.newest = {k: newest_message(e, timeline.vertices[k[0]]) for k, e in self.edges.items()}
 
     def place(self) -> Placement:
-        """Place all steps.
-
-        Raises:
-            UsageError: The timeline is shorter than one row, or steps wait for each other's messages.
-        """
+        """Place all steps."""
         if self.world is None:
             row = self._rows_of_supervisor()
             placement = self.fill(1, int(self.timeline.vertices[self.supervisor].count.min()), row)

@@ -54,9 +54,6 @@ def arrange(
     Args:
         row: Row of each step. Ties are decided by the order of the nodes in this dictionary.
         counted: Node -> mask of its computed steps, shape ``(E, N)``, bool.
-
-    Raises:
-        UsageError: A node makes more than ``STEPS`` steps in a row, or steps of a row wait for each other.
     """
     names = list(row)
     index = {n: _index_in_row(r) for n, r in row.items()}

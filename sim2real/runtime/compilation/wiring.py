@@ -117,10 +117,6 @@ def wire(
         replayed: Nodes with recorded outputs: they get no slot; readers look up their messages by ``seq``.
         reusable: Whether rings are longer than these timelines need, so that most timelines of a robot have rings of
             the same lengths.
-
-    Raises:
-        UsageError: The supervisor is not in the timeline, the timeline is shorter than one row, or a window with a
-            trainable delay is too short for a burst of messages.
     """
     if supervisor not in timeline.vertices:
         raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")

@@ -29,9 +29,6 @@ def draw_robots(
         values: Parameter -> the value to train on.
         identification: None: the values are those of a data sheet.
         randomise: Factor on the deviations; 0: draw only the parameters in ``vary.range``.
-
-    Raises:
-        UsageError: ``vary.range`` names an unknown parameter.
     """
     draws: dict[str, np.ndarray] = {}
     if vary.uniform and randomise:

@@ -151,11 +151,7 @@ class GraphEnvironment:
         return env
 
     def privileged(self, state: EnvState) -> jax.Array:
-        """Return the task's privileged entries of a state, shape ``(P,)``.
-
-        Raises:
-            UsageError: The task has none.
-        """
+        """Return the task's privileged entries of a state, shape ``(P,)``."""
         if not isinstance(self.task, PrivilegedTask):
             raise UsageError(
                 f"a {type(self.task).__name__} has no privileged entries for a value function",

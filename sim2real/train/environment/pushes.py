@@ -44,11 +44,7 @@ class Pushes:
 
     @staticmethod
     def of(vary: VariationConfig, world: BaseNode, rate_hz: float) -> Pushes | None:
-        """Return the configured pushes for a policy of ``rate_hz``; None if there are none.
-
-        Raises:
-            UsageError: The world cannot be pushed, or pushes are more frequent than policy steps.
-        """
+        """Return the configured pushes for a policy of ``rate_hz``; None if there are none."""
         if not vary.push:
             return None
         if not isinstance(world, PushableWorld):

@@ -20,11 +20,7 @@ Rewards = jax.Array | Mapping[str, jax.Array]
 
 
 def checked_end(ended: jax.Array, task: object) -> jax.Array:
-    """Return the result of a task's ``terminated``, checked to be one bool.
-
-    Raises:
-        UsageError: It is a number or a vector, which would terminate other episodes too.
-    """
+    """Return the result of a task's ``terminated``, checked to be one bool."""
     ended = jnp.asarray(ended)
     if ended.shape != () or ended.dtype != jnp.bool_:
         raise UsageError(
@@ -41,11 +37,7 @@ def terms_of(reward: Rewards) -> dict[str, jax.Array]:
 
 
 def total_of(reward: Rewards) -> jax.Array:
-    """Return a reward, shape ``()``: the sum of its terms, in their order.
-
-    Raises:
-        UsageError: There are no terms.
-    """
+    """Return a reward, shape ``()``: the sum of its terms, in their order."""
     if not isinstance(reward, Mapping):
         return reward
     if not reward:

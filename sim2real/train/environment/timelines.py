@@ -159,9 +159,6 @@ def draw_timelines(
 
     Args:
         recorded: The robot's times; None: draw from the nodes' own delay distributions.
-
-    Raises:
-        Sim2RealError: Most timelines have a pause in their first half.
     """
     if recorded is None:
         timeline = draw(nodes, episode_s, count, np.random.default_rng(seed))

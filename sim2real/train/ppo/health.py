@@ -21,10 +21,6 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
     Args:
         values: Name -> shape ``(num_seeds,)``; those in ``FINITE`` have a second axis, of the entries.
         names: Name of each place on the seed axis, such as ``seed 0``.
-
-    Raises:
-        Sim2RealError: A value is not finite.
-        UsageError: No evaluation episode ended.
     """
     # Causes come before their consequences: observations, rewards, then losses.
     for seed, name in enumerate(names):

@@ -69,11 +69,7 @@ class TeacherEnvironment:
 
 
 def count_privileged(env: TrainingEnvironment) -> int:
-    """Return the number of privileged entries: true in simulation, not measured by a robot.
-
-    Raises:
-        UsageError: The environment has no privileged entries.
-    """
+    """Return the number of privileged entries: true in simulation, not measured by a robot."""
     state = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))[0]
     shape = jax.eval_shape(require_privileged(env).privileged, state).shape
     if len(shape) != 1:
@@ -98,11 +94,7 @@ def advice(env: TrainingEnvironment, teacher: Policy, state: PyTree, observation
 
 
 def check_teacher(env: TrainingEnvironment, config: PPOConfig, teacher: Policy) -> None:
-    """Compare a teacher with the student's environment.
-
-    Raises:
-        UsageError: The teacher does not fit this student.
-    """
+    """Compare a teacher with the student's environment."""
     # Refuse a teacher for a teacher, and one with memory.
     privileged = count_privileged(env) if teacher.spec.privileged else 0
     if config.teacher:

@@ -125,7 +125,6 @@ def load_checkpoint(path: Path, identity: TrainingIdentity, state: TrainState, p
         state: A state of the same training, for its structure and the types of its keys.
 
     Raises:
-        Sim2RealError: The file is missing or damaged.
         UsageError: The file is of another training.
     """
     # Read and check the file.

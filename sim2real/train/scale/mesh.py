@@ -21,11 +21,7 @@ T = TypeVar("T")
 
 
 def mesh_of(config: PPOConfig) -> Mesh | None:
-    """Return the devices, those of a seed in a row; None for one device.
-
-    Raises:
-        UsageError: There are too few devices, or they cannot divide seeds and copies.
-    """
+    """Return the devices, those of a seed in a row; None for one device."""
     available = jax.local_devices()
     if config.devices > len(available):
         raise UsageError(

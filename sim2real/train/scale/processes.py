@@ -26,12 +26,7 @@ _HINT = (
 
 
 def join(hosts: HostsConfig) -> None:
-    """Join the other processes, before JAX computes anything.
-
-    Raises:
-        UsageError: There is no launcher, or JAX has computed before.
-        Sim2RealError: The other processes do not join in time.
-    """
+    """Join the other processes, before JAX computes anything."""
     if not hosts.several:
         return
     # JAX's preemption service would catch SIGTERM: a launcher's time limit would not end the training.
@@ -87,11 +82,7 @@ def wait_for_all(what: str) -> None:
 
 
 def agree(settings: Mapping[str, Json]) -> None:
-    """Compare the settings of all processes; with different programs they would wait for each other without end.
-
-    Raises:
-        UsageError: They differ; all processes raise it.
-    """
+    """Compare the settings of all processes; with different programs they would wait for each other without end."""
     if jax.process_count() == 1:
         return
 
