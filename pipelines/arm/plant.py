@@ -15,7 +15,7 @@ from sim2real.hardware.dynamixel.registers import PWM_FULL_SCALE, RAD_PER_COUNT
 from sim2real.hardware.plant import OperatingMode
 
 CENTRE_RAD: Final = 2048 * RAD_PER_COUNT
-"""Where the encoder stands while the joint is at 0 and the arm hangs [rad]."""
+"""Reading of the encoder while the joint is at 0 and the arm hangs [rad]."""
 
 NOMINAL_P_GAIN: Final = 800
 """Position P Gain that ``gain`` is given for until the host writes another."""
@@ -69,7 +69,7 @@ class _Firmware:
 
     @property
     def is_on(self) -> bool:
-        """Whether the winding is driven; else it is open, and there is no back-EMF."""
+        """Whether the winding is driven; an open winding has no back-EMF."""
         return self.mode != OperatingMode.OFF
 
     def command(self, mode: int, goal: float, angle: float) -> None:
@@ -124,7 +124,7 @@ class ArmPlant:
         self._stall, self._back_emf, self._armature = stall * _STALL, back_emf * _BACK_EMF, armature * _ARMATURE
         self._coulomb = [factor * _COULOMB for factor in coulomb]
         self._bump, self._carried_kg = bump, carried_kg
-        # As stiff as the solver bears: at the default impedance an arm that friction should hold crawls.
+        # The stiffest impedance of the solver: at the default, an arm that friction should hold creeps.
         carried = _CARRIED.format(carried_kg) if carried_kg else ""
         sizes = {"armature": self._armature, "viscous": _VISCOUS, "carried": carried}
         text = _MODEL.format(step_s=step_s, time_constant=4 * step_s, **sizes)

@@ -44,7 +44,7 @@ _GANTRY: list[_Box] = [
     ((0.10, 0.19, -0.004), (0.23, 0.22, 0.004), "table"),
     ((0.0, 0.0, 0.4175), (0.0125, 0.023, 0.017), "servo"),
 ]
-"""Its mast stands beyond the arm's reach, and on the far side from where the viewer first looks."""
+"""Its mast is beyond the arm's reach, on the far side of the viewer's first view."""
 
 _SOLID = {
     "servo": (84, 94, 108), "bracket": (150, 162, 176), "link": (214, 220, 228), "stand": (120, 132, 146),
@@ -62,7 +62,7 @@ def log_scene(rec: Any, t_s: np.ndarray, columns: Mapping[str, np.ndarray], enti
         rec: The ``rerun.RecordingStream``.
         t_s: Times ``(N,)`` [s].
         columns: Fields ``(N,)``; ``position[0]`` to ``position[2]`` [rad] are needed. Where there are ``aim[0]`` to
-            ``aim[2]`` ``(M,)`` [m], a sphere stands at the last of them.
+            ``aim[2]`` ``(M,)`` [m], a sphere marks the last one.
         ghost: Whether this is a model's motion: a wire frame around the robot, to compare both.
     """
     import rerun as rr  # the viewer is an extra

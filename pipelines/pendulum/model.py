@@ -17,7 +17,7 @@ from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 GRAVITY = 9.81  # [m/s^2]
 HISTORY = 4
-"""Past observations and actions that the policy sees."""
+"""Past steps in the policy's observation."""
 
 
 @struct.dataclass
@@ -196,6 +196,6 @@ class Agent(DirectAgent):
 
 
 def features(m: Measurement) -> Array:
-    """Return what the policy sees of a measurement, ``(3,)``; in numpy on the robot, where there is no JAX."""
+    """Return the policy's features of a measurement, ``(3,)``; in numpy on the robot, which runs without JAX."""
     xp = namespace(m.th)
     return xp.stack([xp.cos(m.th), xp.sin(m.th), m.thdot / 10.0]).astype(np.float32)

@@ -56,7 +56,7 @@ class PendulumPlant:
             step_s=step_s,
             damping=self._b,
             friction=self._c,
-            time_constant=4 * step_s,  # as stiff as the solver bears: friction, not a viscous crawl
+            time_constant=4 * step_s,  # the stiffest of the solver: friction, not viscous creep
             length=_LENGTH,
             mass=_MASS,
             inertia=self._J - _MASS * _LENGTH**2,

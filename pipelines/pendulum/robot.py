@@ -84,7 +84,7 @@ class HingeDrive(RobotDrive):
             actuation_latency_s=0.025,
             actuation_jitter_s=0.004,
             reply_loss=0.002,
-            model_number=1190,  # an XL330-M077, for 5 V: when its host dies it goes on turning
+            model_number=1190,  # an XL330-M077, for 5 V: it continues to turn if its host dies
         )
         return Embedded(f"{Path(__file__).with_name('plant.py')}:PendulumPlant", emulator)
 

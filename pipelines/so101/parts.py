@@ -1,4 +1,4 @@
-"""The SO-101's parts: links, the arm that they and six servos make, and the table that it stands on.
+"""The SO-101's parts: links, the arm of six servos, and its table.
 
 Lengths, masses, centres of mass, inertias, axes and ranges are those of TheRobotStudio's public description
 (SO-ARM100, Simulation/SO101, "new calibration"), in axes that are parallel to the world's while all joints are at 0.

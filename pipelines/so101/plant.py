@@ -113,7 +113,7 @@ class SO101Plant:
         friction: float = 1.0,
         carried_kg: float = 0.0,
     ) -> None:
-        # Friction as stiff as the solver bears: at the default impedance a joint that it should hold creeps.
+        # Friction with the stiffest impedance of the solver: at the default, a joint that should stick creeps.
         carried = _CARRIED.format(carried_kg) if carried_kg else ""
         sizes = {"armature": _ARMATURE, "damping": _OFF_DAMPING, "carried": carried}
         text = _MODEL.format(step_s=step_s, time_constant=4 * step_s, **sizes)

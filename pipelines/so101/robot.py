@@ -186,7 +186,7 @@ def read(path: Path) -> tuple[CalibratedJoint, ...]:
 
 
 def find() -> Path:
-    """Return the calibration of the arm on the port: the one that SO101_CALIBRATION names, else LeRobot's only one.
+    """Return the calibration of the arm: the file that SO101_CALIBRATION names, otherwise LeRobot's only one.
 
     Raises:
         UsageError: There is none, or there are several.

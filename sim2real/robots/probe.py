@@ -94,21 +94,21 @@ class Witness:
 
 
 def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
-    """Step one joint to and fro, through the gate, and see when it answers; torque is off before and afterwards.
+    """Step one joint to and fro, through the gate, and measure its answers; torque is off before and afterwards.
 
     Args:
         witness: Has the robot, at rest; its earlier measurements are dropped.
 
     Raises:
         Sim2RealError: The joint does not answer.
-        SafetyStop: This machine is too busy to measure, or what the gate stopped.
+        SafetyStop: This machine is too busy to measure, or the gate stopped the robot.
     """
     witness.measured, witness.sent = [], []
     witness.rig.start()
     try:
         answers = _answers(witness, probe)
     except BaseException:
-        witness.rig.stop_quietly()  # the reason must not be lost to what else fails
+        witness.rig.stop_quietly()  # a failure here must not replace the reason
         raise
     witness.rig.stop()
     estimates = delays_of(answers)
@@ -116,7 +116,7 @@ def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
 
 
 def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
-    """Return when each answer begins.
+    """Return the start of each answer.
 
     An answer is 0 until the delay is over, and then a square and a cube, the same for all: the delay and the factors
     that fit all best are found first, then the delay of each.

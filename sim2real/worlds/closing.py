@@ -1,4 +1,4 @@
-"""Where the joints of a loop stand that were not recorded: what the model's equalities make of the recorded ones."""
+"""Positions of the joints of a loop that were not recorded, by the model's equalities and the recorded joints."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from sim2real.composer.types import MjModel
 
 _PATH, _CORRECTIONS = 32, 8
-"""Steps from the model's start to the recorded angles, and Newton steps there. A loop has several solutions: on a path
-of small steps the one that the model starts with is followed."""
+"""Steps from the model's start to the recorded angles, and Newton steps there. A loop has several solutions: a path of
+small steps follows the one at the model's start."""
 _DAMPING = 1e-6
 """Share of the rows' mean square that is added: a planar loop has more rows than it has directions."""
 _MOST = 0.3
@@ -32,12 +32,13 @@ class Closing:
     """Solves the equalities of a model for the joints that were not recorded.
 
     Args:
-        model: The model; its first keyframe, else its zero, is where the path starts.
-        qpos_at: Shape ``(joints,)``: where the recorded joints' positions are.
-        qvel_at: Shape ``(joints,)``: where their velocities are.
+        model: The path starts at its first keyframe, or at its zero.
+        qpos_at: Shape ``(joints,)``: indices of the recorded joints' positions.
+        qvel_at: Shape ``(joints,)``: indices of their velocities.
     """
 
     def __init__(self, model: MjModel, qpos_at: np.ndarray, qvel_at: np.ndarray) -> None:
+        # A model with equalities alone.
         equalities: Any = copy.copy(model)
         for kind in _OTHERS:
             equalities.opt.disableflags |= int(getattr(mj.mjtDisableBit, f"mjDSBL_{kind}"))
@@ -45,6 +46,7 @@ class Closing:
         self._start = np.array(model.key_qpos[0] if model.nkey else model.qpos0)
         self._qpos_at, self._qvel_at = qpos_at, qvel_at
         self._others = np.setdiff1d(np.arange(model.nv), qvel_at)
+        # Quaternions are turned, other positions are added to.
         self._turning = [
             (int(model.jnt_qposadr[i]) + 3 * free, int(model.jnt_dofadr[i]) + 3 * free)
             for i in range(model.njnt)

@@ -96,22 +96,25 @@ class DriveLaw:
             qpos: Positions ``(..., nq)`` [rad].
             qvel: Velocities ``(..., nv)`` [rad/s].
         """
+        # Split the controls.
         v, count = values, len(self._qvel_at)
         force, kp, kd, on, goal = (control[..., i * count : (i + 1) * count] for i in range(5))
         angle, speed = qpos[..., self._qpos_at], qvel[..., self._qvel_at]
         fast = xp.abs(speed)
         beyond = v["eccentric_cos"] * xp.cos(angle) + v["eccentric_sin"] * xp.sin(angle)
-        # A servo sees what its encoder reads, and leaves an error within its dead zone alone.
+        # A servo's error is that of its encoder; it does not correct an error within its dead zone.
         force = force - kp * (beyond + xp.clip(goal - angle - beyond, -v["play"], v["play"]))
         braked = on * v["back_emf"]
         drive = xp.clip(force - kp * angle - kd * speed, -v["limit"], v["limit"]) - braked * speed
+        # Friction and damping of each joint.
         stuck = v["static"] * xp.exp(-fast / v["stribeck_rad_s"])
         damping = v["damping"] + v["drag"] * fast + braked
         friction = v["frictionloss"] + stuck + v["load"] * xp.abs(drive)
         phase = v["cogging_per_turn"] * angle
         cogging = v["cogging_cos"] * xp.cos(phase) + v["cogging_sin"] * xp.sin(phase)
-        # Friction that differs by direction is a mean one and a constant torque: it sticks in the same band.
+        # Friction that differs by direction is a mean friction and a constant torque: it sticks in the same band.
         applied = -v["bias"] - cogging
+        # Add the joints without a drive, in the model's order.
         still = 0.0 * applied[..., :1]
         beside = (v["other_damping"] + still, v["other_frictionloss"] + still, 0.0 * v["other_damping"] + still)
         rows = [

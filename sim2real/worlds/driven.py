@@ -27,10 +27,10 @@ class DriveCommand(Base):
     """Command of the drives; each entry has shape ``(joints,)`` or ``(1,)``, and is None where the log has none.
 
     Attributes:
-        goal: Where to be, by the encoder [rad].
-        goal_velocity: How fast to turn [rad/s].
+        goal: Goal position, by the encoder [rad].
+        goal_velocity: Goal velocity [rad/s].
         torque: Feed-forward torque; without a goal, the whole torque [N m].
-        duty: Share of the voltage, or the voltage, or what else is proportional to it.
+        duty: The voltage, or a quantity in proportion to it.
         kp: Stiffness, in the log's unit.
         kd: Damping, in the log's unit.
         enabled: 1 with torque on, 0 with torque off.
@@ -56,8 +56,8 @@ class DriveParams(MjxParams):
         kp: Stiffness [N m/rad], times the log's own where it has one.
         kd: Damping of the drive [N m s/rad], times the log's own where it has one.
         gain: Torque for each unit of torque or duty.
-        released: Share of the drive's damping that is left with torque off: windings that are short-circuited.
-        zero: What the encoders read at the model's zero [rad].
+        released: Share of the drive's damping with torque off, by short-circuited windings.
+        zero: Reading of the encoders at the model's zero [rad].
         terms: What friction and drive add to that; None: nothing, which costs nothing.
     """
 
@@ -78,7 +78,7 @@ class DrivenWorld(MjxWorld):
 
     Args:
         rate: Ticks per second [Hz].
-        units: What 1 stands for in the log's own gains ``kp`` and ``kd``, where it has them.
+        units: The values of 1 in the log's units of ``kp`` and ``kd``.
         terms: Whether there are ``DriveTerms``: they are evaluated before every physics step.
         **options: Options of ``MjxWorld``.
     """
@@ -125,7 +125,7 @@ class DrivenWorld(MjxWorld):
         return {n: still + v for n, v in (own | coefficients).items()} | others
 
     def started(self, params: DriveParams, angle: jax.Array, speed: jax.Array) -> DriveParams:
-        """Return parameters with an initial state; joints that were not recorded stand as the model's loops have them.
+        """Return parameters with an initial state; equalities determine the joints that were not recorded.
 
         Args:
             angle: Shape ``(joints,)``: of the recorded joints, from the model's zero [rad or m].
@@ -138,9 +138,9 @@ class DrivenWorld(MjxWorld):
         return params.replace(qpos=qpos, qvel=qvel)
 
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
-        """Return the delay of the commands, where the actuator's parameters set one.
+        """Return the delay of the commands, if the actuator's parameters set one.
 
-        MuJoCo's integrator moves a joint as if a force had acted half a time step earlier: that is added.
+        MuJoCo's integrator moves a joint as if a force had acted half a time step earlier: this half step is added.
         """
         del rng
         return {name: delay + self.lead_s for name, delay in command_delay(graph_state, self.input_name).items()}
@@ -148,14 +148,16 @@ class DrivenWorld(MjxWorld):
     def _control(self, step_state: StepState) -> jax.Array:
         """Return forces, stiffnesses and dampings, ``(3 * joints,)``, for the newest command.
 
-        With terms, 1 with torque on and 0 with torque off, and the goals, stand behind them: ``(5 * joints,)``.
+        With terms, ``(5 * joints,)``: then 1 with torque on or 0 with torque off, and the goals.
         """
+        # The gains: the log's, times the parameters.
         p: DriveParams = step_state.params
         command: DriveCommand = step_state.inputs[self.input_name][-1].data
         still = jnp.zeros(len(self.joints))
         on = still + 1.0 if command.enabled is None else jnp.asarray(command.enabled) + still
         kp = still if command.goal is None else on * p.kp * _of_log(command.kp, self.units[0])
         kd = p.kd * _of_log(command.kd, self.units[1]) * (on + (1.0 - on) * p.released) + still
+        # The force without the parts that depend on the state.
         goal = still if command.goal is None else command.goal - p.zero + still
         force = kp * goal
         force += still if command.goal_velocity is None else on * kd * command.goal_velocity
@@ -165,5 +167,5 @@ class DrivenWorld(MjxWorld):
 
 
 def _of_log(gain: Value | None, unit: float) -> Value:
-    """Return the log's own gain in its unit; 1 where it has none."""
+    """Return the log's gain in its unit; 1 without a gain."""
     return 1.0 if gain is None else gain / unit

@@ -1,4 +1,4 @@
-"""Nodes that stand for a recorded sender: they do not run, as their outputs are in the log."""
+"""Nodes in the place of a recorded sender: they do not run, as their outputs are in the log."""
 
 from __future__ import annotations
 

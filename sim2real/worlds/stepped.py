@@ -59,7 +59,7 @@ class SteppedWorld(BaseWorld):
         return state
 
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
-        """Return the output of the initial state: what a sensor sees before the first tick has ended."""
+        """Return the output of the initial state: the input of a sensor before the end of the first tick."""
         gs = graph_state or GraphState()
         state = gs.state.get(self.name) or self.init_state(rng, graph_state)
         return self.output(gs.params.get(self.name) or self.init_params(rng), state)

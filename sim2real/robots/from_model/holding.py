@@ -1,4 +1,4 @@
-"""Joints of a model that were not recorded: which are held and where, and which something else moves."""
+"""Joints of a model that were not recorded: some are held at a position, others move with recorded ones."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from sim2real.robots.from_model.couplings import Coupling, below, couplings_of, 
 from sim2real.types import MjModel, MjSpec
 
 _HOME = "home"
-"""The keyframe that is taken where a model has several."""
+"""The keyframe that is used if a model has several."""
 _ROUNDED = 1e-3
-"""By how much a keyframe may be outside a joint's range [rad or m]: it is rounded."""
+"""Largest distance of a rounded keyframe from a joint's range [rad or m]."""
 _FREE, _BALL, _SLIDE = (int(getattr(mj.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE"))
 
 
@@ -29,9 +29,9 @@ class Held:
     Attributes:
         joint: Its number in the file's model.
         name: Its name, or that of its body.
-        value: Where: an angle [rad] or a length [m]; of a ball a quaternion, of a floating base nothing.
+        value: Position: an angle [rad], a length [m], the quaternion of a ball, or empty for a floating base.
         unit: Unit of the value.
-        source: Why it is held there.
+        source: Origin of the value.
         passive: Whether no actuator of the file drives it.
     """
 
@@ -50,11 +50,11 @@ class Held:
 
 @dataclass(frozen=True)
 class Holding:
-    """What becomes of the joints that were not recorded.
+    """The joints that were not recorded.
 
     Attributes:
-        held: Those that are held.
-        moved: Those that stay free, by number, and what moves them.
+        held: Held joints.
+        moved: Free joints: number -> the coupling that moves it.
         dropped: Couplings between held joints alone, and tendons without a force.
         key: Number of the keyframe; -1: none.
     """
@@ -66,10 +66,10 @@ class Holding:
 
 
 def plan(model: MjModel, recorded: Sequence[str], hold: Sequence[str], fix_base: bool, path: Path) -> Holding:
-    """Return which joints are held and where.
+    """Return the held joints and their positions.
 
     A joint that a loop, an equality or a tendon moves together with a recorded one stays free. Others are held at a
-    named value, else at the keyframe, else at the model's zero.
+    named value, otherwise at the keyframe or at the model's zero.
 
     Args:
         hold: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
@@ -90,7 +90,7 @@ def plan(model: MjModel, recorded: Sequence[str], hold: Sequence[str], fix_base:
         if int(model.jnt_type[i]) == _FREE and not fix_base:
             raise UsageError(
                 f"the base of {path} floats: joint {model.joint(i).name or 'without a name'!r} was not recorded",
-                hint="--fix-base holds it where the model has it, as on a stand",
+                hint="--fix-base holds it at its position in the model, as on a stand",
             )
         body = int(model.jnt_bodyid[i])
         matters = body in carrying or bool(upwards(model, body) & free)
@@ -103,7 +103,7 @@ def plan(model: MjModel, recorded: Sequence[str], hold: Sequence[str], fix_base:
 
 
 def apply(spec: MjSpec, model: MjModel, holding: Holding) -> None:
-    """Hold joints of a model: their bodies stand as they do at the values, and the joints are gone.
+    """Hold joints of a model: their bodies get the pose at the held positions, and the joints are deleted.
 
     Args:
         spec: ``mujoco.MjSpec`` whose elements have the compiled model's numbers; it is changed.
@@ -135,7 +135,7 @@ def apply(spec: MjSpec, model: MjModel, holding: Holding) -> None:
 
 
 def _moved(model: MjModel, couplings: Sequence[Coupling], recorded: set[int], fix_base: bool) -> dict[int, str]:
-    """Return the joints that stay free, and what moves each."""
+    """Return the joints that stay free, and the coupling that moves each."""
     together = [group for group in groups(couplings) if group & recorded]
     causes: dict[int, str] = {}
     for c in couplings:
@@ -238,7 +238,7 @@ def _held(model: MjModel, number: int, named: float | None, key: int, matters: b
     driven = (model.actuator_trntype == int(mj.mjtTrn.mjTRN_JOINT)) & (model.actuator_trnid[:, 0] == number)
     passive = model.nu > 0 and kind != _FREE and not driven.any()
     if kind == _FREE:
-        return Held(number, shown, (), "", "where the model has it", passive)
+        return Held(number, shown, (), "", "its position in the model", passive)
     # The position: by name, by the keyframe, or the model's zero.
     source = "named" if named is not None else "the model's zero"
     value = np.array([named]) if named is not None else np.array(model.qpos0[at])
@@ -261,7 +261,7 @@ def _address(model: MjModel, number: int) -> slice:
 
 
 def _pose(model: MjModel, body: int, held: Mapping[int, Held], joints: Mapping[int, Any]) -> None:
-    """Set the pose of a body with held joints, and the joints of it that are left, which stand before held ones."""
+    """Set the pose of a body with held joints, and move its free joints that come before held ones."""
     # Apply the held joints of the body in their order.
     pos, quat = np.array(model.body_pos[body]), np.array(model.body_quat[body])
     first = int(model.body_jntadr[body])
@@ -287,7 +287,7 @@ def _pose(model: MjModel, body: int, held: Mapping[int, Held], joints: Mapping[i
 def _step(
     model: MjModel, number: int, value: Sequence[float], anchor: np.ndarray, axis: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how a joint at a value moves its body, seen from the body: a translation [m], and a quaternion."""
+    """Return the motion of a body by a joint at a value, in the body's frame: a translation [m], and a quaternion."""
     turn = np.array([1.0, 0.0, 0.0, 0.0])
     kind = int(model.jnt_type[number])
     if kind == _FREE:

@@ -1,4 +1,4 @@
-"""Files that a model names: where ROS packages lie, and which meshes a simulation without contacts can do without."""
+"""Files that a model names: the places of ROS packages, and meshes that only contacts need."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _FROM_GEOMS = 1
 
 
 def find_packages(spec: MjSpec, path: Path) -> list[str]:
-    """Name the files of ROS packages by their places, where they are found; return where else was looked.
+    """Replace the names of files in ROS packages by their paths; return the searched places if a file is missing.
 
     Args:
         spec: ``mujoco.MjSpec``; it is changed.

@@ -110,7 +110,7 @@ class IdentifiableRecording:
         self._params = {node.name: node.init_params() for node in nodes}
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
-        """Return sensor, actuator and world; the world hears commands up to ``max_delay_s`` [s] late."""
+        """Return sensor, actuator and world; the world receives commands up to ``max_delay_s`` [s] late."""
         sensor, actuator, world = self._robot.make_nodes()
         to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=self._robot.burst)
         world.connect(actuator, skip=True, delay_dist=to_world)

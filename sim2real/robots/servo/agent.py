@@ -29,7 +29,7 @@ class AgentParams(Base):
     """The agent's parameters for an episode.
 
     Attributes:
-        policy: A pytree with ``get_action(observation)``, or, if it remembers, with ``initial_carry()`` and
+        policy: A pytree with ``get_action(observation)``, or, if it has memory, with ``initial_carry()`` and
             ``step(carry, observation)``; None: the goals stay constant.
         aim: Shape ``(k,)``: the task's aim in this episode, e.g. a target [the task's units].
         start: Shape ``(joints,)``: goals at the start [rad].

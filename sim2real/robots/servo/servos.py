@@ -19,7 +19,7 @@ def name_of(joint: Joint | str) -> str:
 
 
 def gear_of(joint: Joint | str) -> float:
-    """Return the turns of the servo for one of the joint; a name stands for a joint without a gear."""
+    """Return the turns of the servo for one of the joint; a joint that is only a name has no gear."""
     return 1.0 if isinstance(joint, str) else joint.gear
 
 
