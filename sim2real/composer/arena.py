@@ -1,4 +1,4 @@
-"""Arenas: the entity that everything else stands in."""
+"""Arenas: the entity that contains all others."""
 
 from __future__ import annotations
 

@@ -71,9 +71,9 @@ NativeDefault: TypeAlias = MjsDefault
 """A class of defaults of an ``MjSpec``."""
 
 Array: TypeAlias = np.ndarray | jax.Array
-"""What an engine computes with: numpy's arrays on C, arrays and tracers of JAX on MJX."""
+"""Arrays of an engine: numpy's arrays on C, arrays and tracers of JAX on MJX."""
 ArrayLike: TypeAlias = npt.ArrayLike | jax.Array
-"""What an array can be made of; texts too, as attributes in MJCF may be."""
+"""Values that an array can be made of; attributes in MJCF may be texts, too."""
 
 
 Draw: TypeAlias = Callable[..., Any]

@@ -109,7 +109,7 @@ class PureBraxEnv(Env):
 
     @property
     def backend(self) -> str:
-        """The engine, in brax's words: ``mjx`` stands for an engine other than brax's own."""
+        """The engine, in brax's terms: ``mjx`` means an engine other than brax's."""
         return "mjx"
 
     @property

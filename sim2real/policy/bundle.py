@@ -149,7 +149,7 @@ def load_bundle(folder: str | Path, backend: str | None = None) -> PolicyRunner:
 
     Raises:
         UsageError: The backend is unknown, not installed or does not run this network.
-        Sim2RealError: A file is missing, damaged or of a format that this version does not know, or the policy is a
+        Sim2RealError: A file is missing, damaged or of an unknown format, or the policy is a
             teacher.
     """
     _check_backend(backend)
@@ -206,7 +206,7 @@ def read_contract(folder: str | Path) -> tuple[PolicyContract, NetworkSpec]:
     """Return the contract of a bundle's policy, and the description of its network.
 
     Raises:
-        Sim2RealError: A file is missing, damaged or of a format that this version does not know, or they do not fit.
+        Sim2RealError: A file is missing, damaged or of an unknown format, or they do not fit.
     """
     about = _read_about(Path(folder))
     contract = PolicyContract.from_dict(about)
@@ -225,7 +225,7 @@ def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
     """Return the weights of a bundle, as ``Policy.from_weights`` takes them.
 
     Raises:
-        Sim2RealError: A file is missing, damaged or of a format that this version does not know.
+        Sim2RealError: A file is missing, damaged or of an unknown format.
     """
     folder = Path(folder)
     content = _read_file(folder, WEIGHTS, _read_about(folder))

@@ -23,7 +23,7 @@ class ObservationTerm:
     """A part of the observation vector.
 
     Attributes:
-        units: The unit of each entry, e.g. ``("1", "1", "rad/s")``; ``"1"`` stands for no unit.
+        units: The unit of each entry, e.g. ``("1", "1", "rad/s")``; ``"1"``: no unit.
         history: Number of steps in the vector, newest step first.
         low: Lower bound of each entry [its unit]; empty: unknown. Observations are not clipped to it.
         high: Upper bound of each entry [its unit]; empty: unknown.
@@ -57,7 +57,7 @@ class ObservationTerm:
     def within(cls, name: str, units: tuple[str, ...], most: float = math.inf) -> ObservationTerm:
         """Return a term without history whose entries have magnitudes up to ``most`` [their units].
 
-        An infinite ``most`` stands for unknown bounds.
+        An infinite ``most`` means unknown bounds.
         """
         bounds = (most,) * len(units) if most <= MAX_BOUND else ()
         return cls(name, units, 1, tuple(-bound for bound in bounds), bounds)
@@ -73,7 +73,7 @@ class ActionTerm:
     """One entry of the action vector.
 
     Attributes:
-        unit: ``"1"`` stands for none.
+        unit: ``"1"``: none.
         low: Lower bound [unit].
         high: Upper bound [unit].
     """

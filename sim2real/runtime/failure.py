@@ -21,7 +21,7 @@ class GraphTimeout(Sim2RealError):  # noqa: N818
 
 
 class Stopped(Exception):  # noqa: N818
-    """Raised in a node's thread to leave it when the graph stops; callers never see it."""
+    """Raised in a node's thread to end it when the graph stops; no caller receives it."""
 
 
 def named(error: BaseException, node: str, during: str) -> Sim2RealError:

@@ -1,4 +1,4 @@
-"""Placing props where they have no contact."""
+"""Placing props without contacts."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _Contacts = tuple[Any, Any, Any]
 
 
 class PropPlacer(Initializer):
-    """Draws a pose for one prop after the other, until it has no contact; then lets them settle, if so configured.
+    """Draws a pose for each prop in turn, until it has no contact; then simulates until they settle, if configured.
 
     Args:
         position: Position ``(3,)`` [m], or a variation.

@@ -81,7 +81,7 @@ def _name_frame_joint(model: Tree[H], frame: H, joint: H, name: str | None) -> N
 
 
 def add_to_section(model: Tree[H], kind: str, tag: str, attrs: dict[str, Value]) -> H:
-    """Add an element that stands in no body; MuJoCo's parser reads its attributes.
+    """Add an element outside of bodies; MuJoCo's parser reads its attributes.
 
     Args:
         attrs: Its attributes in MJCF; they are put under PyMJCF's names.
@@ -151,7 +151,7 @@ def _fill(model: Tree[Handle], element: Handle, fixed: Mapping[str, Value], name
 def rebuild(model: Tree[Handle], element: Handle, key: str | None = None) -> None:
     """Set all attributes of an element again: the defaults of its class, then the explicit ones, as MuJoCo reads them.
 
-    For attributes that stand for several native ones, such as a servo's ``kp``, and for those that are taken back.
+    For attributes with several native ones, such as a servo's ``kp``, and for removed ones.
 
     Args:
         key: The attribute that was set or taken back; None: its class changed.
@@ -204,7 +204,7 @@ def _catch_up(element: Handle, explicit: dict[str, Value], key: str | None) -> N
 
 
 def reclass(model: Tree[Handle], element: Handle, name: str, value: Value) -> None:
-    """Give an element another class of defaults, or what stands in a body: ``name`` is ``dclass`` or ``childclass``."""
+    """Give an element, or those of a body, another class of defaults: ``name`` is ``dclass`` or ``childclass``."""
     value = getattr(value, "dclass", value)
     element.recorded().note(name, value)
     if name == "childclass":
@@ -281,7 +281,7 @@ def extend_tuple(model: Tree[H], element: H, tag: str, attrs: dict[str, Value]) 
 
 
 def remove(model: Tree[Handle], element: Handle) -> None:
-    """Delete an element with what stands in it; its handles are of no use afterwards.
+    """Delete an element and its children; their handles become invalid.
 
     An element that names it stays: composing refuses it, unless it can do without, as a geom without its material.
     """

@@ -80,7 +80,7 @@ class Element(Handle):
         """Return the elements of a kind below this body, in the order of the document.
 
         Args:
-            immediate_children_only: Only those that stand in this body itself.
+            immediate_children_only: Only elements of this body itself.
         """
         if self.kind != "body":
             return []
@@ -185,7 +185,7 @@ class Element(Handle):
                 raise
 
     def _holds(self, name: str) -> bool:
-        """Return whether the ``MjSpec`` has an attribute, rather than several attributes in MJCF that stand for it."""
+        """Return whether the ``MjSpec`` has an attribute, rather than several attributes in MJCF."""
         native = self._native
         if name == "refname" and native.reftype == mj.mjtObj.mjOBJ_UNKNOWN:  # until its type is laid down as well
             return False

@@ -69,7 +69,7 @@ class Scope:
         return bool(self._spec.compiler.degree)
 
     def expose(self) -> None:
-        """Note that the spec may change from now on without the model knowing."""
+        """Mark that the spec may change from now on without a call of the model."""
         self._revision = None
 
     def touch(self) -> None:

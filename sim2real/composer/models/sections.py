@@ -1,4 +1,4 @@
-"""What a model has besides its bodies: options, sizes, defaults, assets, actuators, sensors and so on."""
+"""The parts of a model besides its bodies: options, sizes, defaults, assets, actuators, sensors and so on."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Section:
         """Add an element, such as ``actuator.add('motor', joint=...)``.
 
         Raises:
-            UsageError: When elements of this tag do not stand in this section.
+            UsageError: Elements of this tag belong to another section.
         """
         if not self._kinds:
             raise UsageError(f"<{self._name}> holds no elements: set its attributes")

@@ -137,7 +137,7 @@ class Tree(Scope, Generic[H]):
         return model
 
     def expose(self) -> None:
-        """Note that the spec may change from now on without the model knowing."""
+        """Mark that the spec may change from now on without a call of the model."""
         super().expose()
         self.records.is_blank = False
 
@@ -168,7 +168,7 @@ class Tree(Scope, Generic[H]):
         return self._handles[key]
 
     def section_of(self, kind: str) -> Value:
-        """Return the section that elements of a kind stand in."""
+        """Return the section of a kind of elements."""
         return self._sections[SECTION_OF[kind]]
 
     def default_class(self, name: Value) -> Value:
@@ -246,7 +246,7 @@ class Tree(Scope, Generic[H]):
         """Yield the elements of a kind below a native body, in the order of the document.
 
         Args:
-            shallow: Only those that stand in the body itself.
+            shallow: Only elements of the body itself.
         """
         attachment = self.attachments.get(body.name[:-1]) if body.name.endswith("/") else None
         children = list(getattr(body, translate.plural(kind)))

@@ -139,7 +139,7 @@ class Bernoulli(Distribution):
 
 
 class BiasedRandomWalk(ContextVariation):
-    """A zero-mean Ornstein-Uhlenbeck process, one step a call; it goes on from episode to episode, but not on MJX.
+    """A zero-mean Ornstein-Uhlenbeck process, one step a call; it continues in the next episode, except on MJX.
 
     Args:
         timescale: Calls after which the correlation has fallen to 1/e; 0: uncorrelated.

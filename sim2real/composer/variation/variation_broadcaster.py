@@ -21,7 +21,7 @@ class VariationBroadcaster:
         self._waiting: weakref.WeakKeyDictionary[Proxy, deque[PyTree]] = weakref.WeakKeyDictionary()
 
     def get_proxy(self) -> Proxy:
-        """Return a variation that stands for the wrapped one."""
+        """Return a variation with the value of the wrapped one."""
         proxy = Proxy(self)
         self._waiting[proxy] = deque()
         return proxy

@@ -37,7 +37,7 @@ class LinkConfig:
     guardian: bool = True
 
     family: ClassVar[str]
-    """What the servos are called in messages."""
+    """Name of the servos in messages."""
     baud_rates: ClassVar[tuple[int, ...]]
     """Bits per second that the servos support."""
     longest_silence_s: ClassVar[float] = math.inf

@@ -163,7 +163,7 @@ class GuardedServos(Generic[L]):
         self.link.torque_withheld = True
 
     def guard(self) -> None:
-        """Let the guardian watch, before torque goes on; start it the first time.
+        """Arm the guardian before torque goes on; start it at the first call.
 
         Raises:
             SafetyStop: `make_safe` or `close` was called before, or the guardian has taken over.
@@ -215,7 +215,7 @@ class GuardedServos(Generic[L]):
     def close(self) -> None:
         """Take the torque off, and close the port. Never raises; may be called twice, and before `open`.
 
-        If a servo does not confirm, the guardian goes on trying for 10 s.
+        If a servo does not confirm, the guardian tries for another 10 s.
         """
         link = self._link
         if link is None or link.closed:
@@ -225,7 +225,7 @@ class GuardedServos(Generic[L]):
         # Let a guardian that takes the torque off finish, as both use the same line.
         if guardian is not None:
             guardian.settle()
-        # Release every servo; the guardian goes on with those that do not confirm.
+        # Release every servo; the guardian continues with those that do not confirm.
         unconfirmed = [servo_id for servo_id in self.models if not self.release(servo_id)]
         if unconfirmed:
             _LOGGER.error("servos %s did not confirm that their torque is off", unconfirmed)

@@ -24,5 +24,5 @@ MODELS: Final[Mapping[int, ServoModel]] = {
 
 
 def model(number: int) -> ServoModel:
-    """Return the model of a number; an unknown one counts as one that goes on without its host."""
+    """Return the model of a number; an unknown one counts as a model that continues without its host."""
     return MODELS.get(number, ServoModel(f"model {number}", False, "unknown model: the worst is assumed"))

@@ -52,7 +52,7 @@ class GateConfig:
 
     def __post_init__(self) -> None:
         """Check that all limits are in their ranges and fit each other."""
-        # A gate that lets no command through, or not the one at rest, would stop the robot at once.
+        # A gate that refuses every command, or the one at rest, would stop the robot at once.
         low, high = self.range
         if low.ndim > 1 or (low.ndim and high.ndim and low.shape != high.shape):
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} has another number of lows than of highs")

@@ -25,7 +25,7 @@ _INTERVAL_S: Final = 0.01  # between signs of life if silence is not limited
 # guardian hangs.
 _UNHEARD_BYTES: Final = 20_000
 # Longest time without an answer to a sign of life, for a guardian that a debugger stops: the kernel does not report it.
-# A busy machine lets no process of this priority wait for so long.
+# Even on a busy machine, no process of this priority waits longer.
 _HEARD_S: Final = 0.5
 _DEAD: Final = "the guardian has died or was stopped: the torque would stay on if this process died too"
 
@@ -102,7 +102,7 @@ class Guardian:
         return self._process.pid
 
     def arm(self) -> None:
-        """Let it watch for silence from now on; called before torque goes on.
+        """Arm the guardian; called before torque goes on.
 
         Raises:
             SafetyStop: As in `beat`.
@@ -173,7 +173,7 @@ class Guardian:
         """End the guardian. Never raises.
 
         Args:
-            confirmed: Whether all servos have confirmed that their torque is off; if not, it goes on trying for 10 s.
+            confirmed: Whether all servos have confirmed that their torque is off; if not, it tries for another 10 s.
         """
         if confirmed:
             with suppress(SafetyStop):

@@ -142,7 +142,7 @@ class Plausibility:
 
     def _require_motion(self, effort: np.ndarray, elapsed_s: float) -> None:
         limit, more = self._stuck, 2.0 * self._stuck
-        # Add the elapsed time to the rows whose push goes on, and clear the others.
+        # Add the elapsed time to the rows whose push continues, and clear the others.
         other = np.abs(effort - self._start) >= more
         pushed = [effort >= limit, effort <= -limit, other, effort >= more, effort <= -more]
         self._held_s = (self._held_s + elapsed_s) * pushed

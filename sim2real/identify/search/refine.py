@@ -27,7 +27,7 @@ from sim2real.identify.uncertainty.uncertainty import (
 )
 
 _COARSE = 1e-3
-"""Relative gain of the loss at which the descent from each start ends; that from the best goes on."""
+"""Relative gain of the loss at which the descent from each start ends; that from the best start continues."""
 _ROUGH = 1e-2
 """The same for a model that others are compared with by percents."""
 _ROUNDS, _BACK = 4, 4

@@ -138,7 +138,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     and a world that starts that much earlier or later, every message stays the same. Residuals do change a little along
     this shift, but only by rounding to the world's ticks and by noise in the initial states. So the shift counts as
     unknown within the bounds, and neither delay is ever accepted alone. Where initial states are free no other
-    estimate depends on it, and it is held while the others are judged; where they are given, the others move with it.
+    estimate depends on it, and it is held while the others are judged; if they are given, the others move with it.
     """
     # Covariance of a linear model with white noise.
     table, size = problem.table, len(at.x)
@@ -359,7 +359,7 @@ def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float) -> np.nda
     Args:
         ratio: Shape ``(Q,)``: standard error by blocks over the linearised one.
         freedom: Shape ``(Q,)``: degrees of freedom of the former.
-        quantile: What the latter is multiplied by for an interval of 95 %.
+        quantile: Factor on the latter for an interval of 95 %.
     """
     freedom = np.maximum(freedom, 1.0)
     begin, full = _BY_CHANCE

@@ -1,4 +1,4 @@
-"""Watches the nodes' threads for a step that hangs, and for a startup that goes on after the graph has stopped."""
+"""Watches the nodes' threads for a step that hangs, and for a startup that continues after the graph has stopped."""
 
 from __future__ import annotations
 

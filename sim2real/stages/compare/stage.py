@@ -46,7 +46,7 @@ def run(config: CompareConfig) -> Comparison:
 
 
 def _stages_of(target: str, root: Path) -> dict[str, StageFolder]:
-    """Return the finished stages of a run; a stage folder stands for its run, with that attempt of the stage.
+    """Return the finished stages of a run; a stage folder selects its run, with that attempt of the stage.
 
     Raises:
         UsageError: There is no such run, or none of its stages is finished.

@@ -63,7 +63,7 @@ def simulate(
     start = np.array([float(c.of(np.asarray(rest[c.position]))) for c in model.channels])
     start[driven] = [signal[0, model.channels[i].index or 0] for i in driven]
     params = model.params(values, jnp.asarray(np.concatenate([start, np.zeros_like(start)]), jnp.float32))
-    # The first command is taken to have held before, as where a log is cut into segments.
+    # The first command counts as constant before, as in segments of a log.
     gs = graph.begin(params, jax.tree_util.tree_map(lambda rows: rows[0], messages), 0)
     # Simulate by the configured engine.
     if engine.name == "c":
@@ -74,7 +74,7 @@ def simulate(
     # Return the simulation as an episode.
     count = int(timeline.vertices[model.sensor].count[0])
     outputs[model.sensor] = {n: np.asarray(v)[:count] for n, v in named_leaves(records).items()}
-    early = {model.sensor: to_ticks(model.ahead_s)}  # where it is put back when the log is cut into segments
+    early = {model.sensor: to_ticks(model.ahead_s)}  # cutting the log into segments adds it again
     steps = {n: _steps(timeline.vertices[n], len(next(iter(outputs[n].values()))), early.get(n, 0)) for n in outputs}
     return Episode(steps=steps, messages={}, outputs=outputs, metadata={})
 

@@ -77,7 +77,7 @@ def run_episode(
         hold: Whether the motors hold the robot at its last position until the user confirms.
 
     Returns:
-        The summary that also stands in the log's ``session_end``: timing by node, losses, the gate's counts.
+        The summary, which the log's ``session_end`` has too: timing by node, losses, the gate's counts.
 
     Raises:
         Sim2RealError: What stopped the robot.
@@ -228,12 +228,12 @@ def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) ->
 
 
 def _place(node: BaseNode) -> float:
-    """Return where a node stands in tables: those with an ``order`` first, the others as they are."""
+    """Return a node's place in tables: nodes with an ``order`` first, the others in the graph's order."""
     return math.inf if node.order is None else node.order
 
 
 def _numbers(values: Iterable[float]) -> list[float | None]:
-    """Return the values for JSON, which knows no NaN: a node that never stepped has no times."""
+    """Return the values for JSON, which has no NaN: a node without a step has no times."""
     return [v if math.isfinite(v) else None for v in values]
 
 

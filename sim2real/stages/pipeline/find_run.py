@@ -1,4 +1,4 @@
-"""What a user means by a run: its path, its name, a stage folder in it, or a pipeline's newest."""
+"""The run of a user's text: its path, its name, a stage folder in it, or a pipeline's newest run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def find_run(root: Path, target: str | Path, pipeline: str | None = None) -> Pat
         pipeline: The pipeline that the run has to belong to; None allows any.
     """
     path = Path(target)
-    # Only a stage folder stands for its parent: that of a pipeline's name would be the working directory.
+    # Only a stage folder selects its parent: that of a pipeline's name would be the working directory.
     options = [path.parent if read_manifest(path) is not None else path]
     options += [Path(root) / pipeline / path] if pipeline else sorted(Path(root).glob(f"*/{path.name}"))
     for folder in options:

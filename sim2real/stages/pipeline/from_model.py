@@ -143,7 +143,7 @@ def _words(flags: RobotFlags) -> tuple[str, ...]:
 
 
 def from_file(path: Path, name: str) -> DescribedPipeline:
-    """Return the pipeline of a ``robot.toml``, as an identification leaves it beside its parameters."""
+    """Return the pipeline of a ``robot.toml``, as an identification writes it beside its parameters."""
     return DescribedPipeline(
         name, f"described by {path}", "", identify=MODEL_IDENTIFY, description=RobotConfig.load(path)
     )
@@ -162,7 +162,7 @@ def pipeline_beside(parameters: Path, identification: Identification) -> Pipelin
 def files_of(description: RobotConfig) -> dict[str, str]:
     """Return ``robot.toml``, and the model where it needs no other files: name -> text.
 
-    A model that needs others, such as meshes, stays where it is, and is named by its absolute path.
+    A model that needs others, such as meshes, is named by its absolute path.
     """
     spec, text = read_spec(description.model), description.model.read_text(encoding="utf-8")
     if "<include" in text or any(part.file for part in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)):
@@ -176,7 +176,7 @@ def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotCo
     joints = flags.joints or joints_of(model)
     commands, sensed = episode.outputs.get("actuator", {}), episode.outputs.get("sensor", {})
     driving = tuple(n for n in COMMANDS if n in commands)
-    # A factor of 0 leaves its parameter open: a recorder that does not know a gain writes 0.
+    # A factor of 0 does not determine its parameter: a recorder without the gain writes 0.
     if "goal" in driving and (idle := [n for n in driving if n in _FACTORS and not commands[n].any()]):
         note(f"{', '.join(idle)} is 0 in all of the log: omitted")
         driving = tuple(n for n in driving if n not in idle)

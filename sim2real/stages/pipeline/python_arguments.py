@@ -1,4 +1,4 @@
-"""What the functions for Python accept: objects, or names and files that stand for them; anything else is an error."""
+"""Arguments of the functions for Python: objects, or their names and files; any other value is an error."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ class GRU:
     widths: tuple[int, ...]
 
     def init(self, rng: np.random.Generator, inputs: int, gain: float) -> dict[str, PyTree]:
-        """Return orthogonal kernels; the update gate's bias is 1, so that the unit remembers from the start."""
+        """Return orthogonal kernels; the update gate's bias is 1, so that the unit has memory from the start."""
         width = self.widths[0]
         bias = np.repeat(np.array([0.0, 1.0, 0.0], np.float32), width)
         kernels = [np.concatenate([orthogonal(rng, n, width, 1.0) for _ in range(3)], 1) for n in (inputs, width)]
@@ -133,7 +133,7 @@ class GRU:
 
 @dataclass(frozen=True)
 class FlaxNetwork:
-    """A module of flax.linen, called as ``module(x)``, or ``module(carry, x)`` where it has ``initialize_carry``.
+    """A module of flax.linen, called as ``module(x)``, or ``module(carry, x)`` if it has ``initialize_carry``.
 
     Attributes:
         module: The module; it may have no variables besides its parameters.

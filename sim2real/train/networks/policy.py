@@ -108,7 +108,7 @@ class Policy(Base):
             rng: JAX key of the exploration noise; None: no noise.
 
         Raises:
-            UsageError: The policy remembers: its action depends on more than this observation.
+            UsageError: The policy has memory: its action depends on earlier observations.
         """
         if is_recurrent(self.network):
             raise UsageError(

@@ -1,4 +1,4 @@
-"""Networks over the rows of a rollout: all rows at once, or in the order of time if the network remembers."""
+"""Networks over the rows of a rollout: all rows at once, or in the order of time if the network has memory."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def prepare(
     critic = _critic_input(state, x, rows.privileged)
     critic_following = _critic_input(state, x_following, rows.privileged_following)
 
-    # Compute the means of the actions, and the values, by networks that may remember.
+    # Compute the means of the actions, and the values, by networks that may have memory.
     end, copies, squash = rows.terminated | rows.truncated, state.copies, policy.spec.squash
     mean = unroll(networks.actor, policy.params, copies.carry, x, rows.valid, end).y
     values = unroll(
@@ -161,7 +161,7 @@ def update(
         return jax.lax.scan(minibatch, carry, parts)
 
     # Each minibatch has all rows of some copies: shuffling N indices is cheap, a copy's rows are adjacent in memory,
-    # and networks that remember need them in their order.
+    # and networks with memory need them in their order.
     shuffles = jax.vmap(lambda k: jax.random.permutation(k, config.num_envs))(
         jax.random.split(keys(state)[1], config.epochs)
     )

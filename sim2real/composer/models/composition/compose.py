@@ -89,7 +89,7 @@ def _wanted(models: list[Tree[Handle]]) -> dict[str, int]:
 def _compose(model: Tree[Handle], late: frozenset[str]) -> MjSpec:
     """Return a new ``MjSpec`` that holds copies of a model and of all attached models, with default options.
 
-    Names of attached elements are prefixed with ``model/``; each attached model stands in a body of that name.
+    Names of attached elements are prefixed with ``model/``; each attached model is in a body of that name.
     Bodies, joints, geoms, actuators and so on are in depth-first order, as PyMJCF writes them.
     """
     out = _copy(model, late)

@@ -1,4 +1,4 @@
-"""Keyframes of attached models: each sets its own model's part of the state and leaves the rest at its default."""
+"""Keyframes of attached models: each sets its model's part of the state; the rest keeps its default."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def copied(out: MjSpec, kind: str, native: Native, name: str) -> Native:
 
 
 def point_aside(out: MjSpec, top: Tree[Handle], models: list[Tree[Handle]], done: frozenset[str]) -> None:
-    """Let what stands in bodies, and assets, name elements of other models, now that all models are in one spec."""
+    """Set the references of bodies' elements and assets to other models, after all models are in one spec."""
     for model in models:
         for (native, key), target in model.references.items():
             element = model.handle(translate.kind_of(native), native)

@@ -47,7 +47,7 @@ class PathPart:
 
     Attributes:
         tag: ``joint``, ``site``, ``geom`` or ``pulley``.
-        values: Attribute in MJCF -> element, its name where it is not there, or number.
+        values: Attribute in MJCF -> element, the name of a missing element, or number.
         written: Attribute -> the name that the ``MjSpec`` has.
     """
 

@@ -146,7 +146,7 @@ def let_go(model: Tree[Handle], gone: Iterable[Handle]) -> None:
 
 
 def _hold(elements: Iterable[Handle]) -> None:
-    """Hold elements of a model where they are named by text."""
+    """Hold references to elements of a model that are named by text."""
     elements = [element for element in elements if element.name]
     for one in _seeing(elements[0].root) if elements else ():
         if any(element.kind in ("joint", "site", "geom") for element in elements):

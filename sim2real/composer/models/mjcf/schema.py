@@ -33,9 +33,9 @@ SECTIONS = {
     "custom": ("numeric", "text", "tuple"),
     "keyframe": ("key",),
 }
-"""Section -> the kinds of elements that stand in it."""
+"""Section -> the kinds of its elements."""
 SECTION_OF = {kind: section for section, kinds in SECTIONS.items() for kind in kinds}
-"""Kind of element -> the section that it stands in."""
+"""Kind of element -> its section."""
 FROM_DOCUMENTS = "write it in MJCF, read that with mjcf.from_xml_string and attach the model: MuJoCo's parser knows it"
 """The way to elements that programs cannot add."""
 

@@ -19,7 +19,7 @@ NAMING = {"joint": ("joint",), "site": ("site",), "geom": ("geom", "sidesite"), 
 KIND = {"joint": "joint", "site": "site", "geom": "geom", "sidesite": "site"}
 """Attribute that names an element -> the element's kind."""
 ELSEWHERE = "//elsewhere"
-"""What an ``MjSpec`` has for the name of an element of another model: a name that no element has."""
+"""Placeholder in an ``MjSpec`` for an element of another model: a name that no element has."""
 _TAGS = {
     mj.mjtWrap.mjWRAP_JOINT: "joint",
     mj.mjtWrap.mjWRAP_SITE: "site",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 mj: Any = mujoco
 
 TREE_KINDS = ("body", "geom", "joint", "site", "camera", "light")
-"""What may stand in a body."""
+"""Kinds of elements of a body."""
 
 _ORIENTATIONS = {
     "euler": mj.mjtOrientation.mjORIENTATION_EULER,

@@ -20,7 +20,7 @@ def to_xml(spec: MjSpec) -> str:
     Raises:
         ValueError: MuJoCo's own message, when the model does not compile for another reason.
     """
-    bodies = spec.bodies[1:]  # a failed spec does not list what stands in them
+    bodies = spec.bodies[1:]  # a failed spec does not list their elements
     light = [b for b in bodies if not b.explicitinertial and not b.geoms]
     thin = [b for b in bodies if b.explicitinertial and not b.inertia.any() and b.fullinertia[0] != b.fullinertia[0]]
     try:

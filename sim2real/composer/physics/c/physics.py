@@ -36,7 +36,7 @@ class Physics(BoundPhysics):
 
     Args:
         legacy_step: After a step, also compute positions and velocities of the new state, as dm_control does.
-        data: A ``mujoco.MjData`` as ``mj_resetData`` leaves it; default: a new one.
+        data: A ``mujoco.MjData`` after ``mj_resetData``; default: a new one.
     """
 
     np = np
@@ -211,7 +211,7 @@ class Physics(BoundPhysics):
     def bind(self, elements: Elements) -> PyTree:
         """Return the attributes of an element, or of several of one kind; see ``BasePhysics.bind``.
 
-        Bindings are kept: they know the places of the attributes in MuJoCo's arrays.
+        Bindings are cached: they have the places of the attributes in MuJoCo's arrays.
         """
         key: Any = tuple(elements) if isinstance(elements, list) else elements
         try:

@@ -21,7 +21,7 @@ _UPLOADED = {
     "tex_data": ("ntex", "mjr_uploadTexture"),
     "mesh_vert": ("nmesh", "mjr_uploadMesh"),
 }
-"""What a context has a copy of: the model's array -> how many objects it holds, and what uploads one of them."""
+"""Arrays that a context has a copy of: array -> the number of its objects, and the function that uploads one."""
 _ABANDONED: list[MjrContext] = []
 """Contexts of MuJoCo in threads that are no more. Their destructors would free the objects of whichever context is
 current; OpenGL frees theirs itself."""

@@ -26,7 +26,7 @@ _FRAMES = {
     "geom": ("geom_pos", "geom_quat", "body_ipos", "body_iquat"),
     "site": ("site_pos", "site_quat", "body_ipos", "body_iquat"),
 }
-"""Fields that say where something is in its body; C does not look at them where that was compiled to be its frame."""
+"""Fields of a position in a body; C ignores them if the position was compiled into the body's frame."""
 _MASSES = ("body_mass", "body_inertia")
 
 

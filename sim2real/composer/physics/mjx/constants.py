@@ -56,7 +56,7 @@ def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
     """Return the constants of an ``mjx.Model`` whose masses, inertias, lengths or poses were changed: path -> array.
 
     Raises:
-        UsageError: On Warp, where MJX's own JAX does not know the model.
+        UsageError: On Warp, if MJX in JAX does not support the model.
     """
     if is_warp(model):
         constants = derive(host, _twin(host, model)) | {"geom_aabb": _boxes(host, model)}
@@ -172,7 +172,7 @@ def _boxes(host: MjModel, model: mjx.Model) -> jax.Array:
 
 
 def _derived_equalities(host: MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return which equalities connect, and which weld, bodies as they stand at the reference position, bool."""
+    """Return which equalities connect, and which weld, bodies at the reference position, bool."""
     bodies = np.asarray(host.eq_objtype) == int(mj.mjtObj.mjOBJ_BODY)
     connects = bodies & (np.asarray(host.eq_type) == int(mj.mjtEq.mjEQ_CONNECT))
     welds = bodies & (np.asarray(host.eq_type) == int(mj.mjtEq.mjEQ_WELD))

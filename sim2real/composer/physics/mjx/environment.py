@@ -41,7 +41,7 @@ class State:
     Attributes:
         data: The ``mjx.Data``.
         leaves: Fields of the model that hooks set: name -> array.
-        variables: What the task keeps from hook to hook: name -> array.
+        variables: Variables of the task between hooks: name -> array.
         key: Randomness.
         memory: What variations keep from draw to draw: name -> array.
         rings: Samples of the observables that may still be read.
@@ -53,7 +53,7 @@ class State:
         done: Whether the episode ended with the last step.
         truncated: Whether it ended only because of the time limit.
         failed: Whether no acceptable initial state was found in ``max_reset_attempts`` attempts.
-        terms: The terms of the reward by name; none where it is a single number.
+        terms: The terms of the reward by name; empty if it is a single number.
     """
 
     data: mjx.Data
@@ -251,10 +251,10 @@ class MjxEnvironment:
         start: tuple[ArrayLike, ArrayLike] | None = None,
         data: mjx.Data | None = None,
     ) -> State:
-        """Return what ``reset`` does without physics: nothing that follows from positions and velocities is computed.
+        """Return the result of ``reset`` without physics: no quantity is computed from positions and velocities.
 
         Args:
-            data: What episodes start from; default: ``initial``.
+            data: Start of the episodes; default: ``initial``.
         """
         before = self._dry, self.initial
         self._dry, self.initial = True, self.initial if data is None else data
@@ -287,7 +287,7 @@ class MjxEnvironment:
     def step(
         self, state: State, action: jax.Array, model: mjx.Model | None = None, law: stepping.Law | None = None
     ) -> State:
-        """Return the copy one control step later; an episode that is over goes on, look at ``done``.
+        """Return the copy one control step later; an episode that is over continues; see ``done``.
 
         Args:
             action: Shape ``(nu,)``, unless the task has an ``action_spec`` of its own.
@@ -352,7 +352,7 @@ class MjxEnvironment:
             tree, rings, _, diverged = carry
         else:
             (tree, rings, dirty, diverged), _ = jax.lax.scan(substep, carry, jnp.arange(self.substeps, dtype=jnp.int32))
-            if not isinstance(physics.is_dirty, bool):  # else every physics step leaves it the same
+            if not isinstance(physics.is_dirty, bool):  # otherwise no physics step changes it
                 physics.is_dirty = entry if self._steady else dirty
         physics.load(tree, random_state)
         return rings, diverged

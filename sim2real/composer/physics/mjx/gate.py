@@ -56,7 +56,7 @@ def settle_cone(model: MjModel) -> None:
     With elliptic ones, which arenas have, MJX 3.17 fails on models that have constraints but no contact.
 
     Raises:
-        UsageError: With the geoms, where contacts without friction stand beside elliptic cones.
+        UsageError: The model has elliptic cones and geoms without friction; the message names them.
     """
     if model.opt.cone != mj.mjtCone.mjCONE_ELLIPTIC:
         return

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree
 
 _START_FIELDS = ("qpos", "qvel")
-"""What a start sets of the state, and what the physics then starts from."""
+"""Fields of the state that a start sets, and the state at the start of the physics."""
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ def forward(model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Dat
 
 @jax.jit
 def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Compute what follows from positions and velocities, and leave the state as MuJoCo does.
+    """Compute the quantities of positions and velocities, and set the state as MuJoCo does.
 
     MJX writes quaternions back normalized, and has velocities of actuators that are switched off; MuJoCo has zeros.
     """

@@ -111,7 +111,7 @@ class TracedHooks(Hooks):
         """Return what a function returns.
 
         Raises:
-            UsageError: When it does what a compiled program cannot do, or changes what only Python would know.
+            UsageError: The hook does a step that a compiled program cannot do, or changes state that only Python has.
         """
         before = [_attributes(owner) for owner in self.watched]
         drawn = _drawn() if self.watched else None
@@ -226,7 +226,7 @@ def _numbers(state: PyTree) -> tuple[bytes, int, list[PyTree]]:
 
 
 def check_variables(before: dict[str, PyTree], after: dict[str, PyTree]) -> None:
-    """Check that a step leaves the variables of a task as large as it found them; UsageError with the variable."""
+    """Raise a UsageError if a step changes the size of a variable of the task."""
     for name, value in before.items():
         old, new = (
             [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree_util.tree_leaves(v)] for v in (value, after[name])
