@@ -64,11 +64,7 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         chosen = _chosen(path, episode)
         files, rows = [pyarrow.parquet.ParquetFile(p) for p in chosen], list(chosen.values())
         schema = files[0].schema_arrow
-        notes, keys = [], []
-        for name in schema.names:
-            why = _reason_to_skip(schema.field(name).type) or _too_wide(files, name)
-            keys += [name] * (not why and name not in _COUNTERS)
-            notes += [f"skipped: {name!r}: {why}"] * bool(why)
+        keys, notes = _signals(files)
         require_signals(len(schema.names), path)
         if not keys:
             raise UsageError(f"nothing in {path} can be read: {'; '.join(notes) or 'no columns'}", hint=WHOLE)
@@ -101,6 +97,17 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         notes.append(f"'timestamp' is frame_index / fps: nominal times at {fps:g} Hz, not measured ones")
     keys += ["fps"] * bool(fps)
     return RawSignals(keys, load, _feature_names(info), tuple(notes), frozenset(nominal), info)
+
+
+def _signals(files: Sequence[pyarrow.parquet.ParquetFile]) -> tuple[list[str], list[str]]:
+    """Return the columns that can be signals, and notes on the others."""
+    schema = files[0].schema_arrow
+    keys, notes = [], []
+    for name in schema.names:
+        why = _reason_to_skip(schema.field(name).type) or _too_wide(files, name)
+        keys += [name] * (not why and name not in _COUNTERS)
+        notes += [f"skipped: {name!r}: {why}"] * bool(why)
+    return keys, notes
 
 
 def files_of(path: Path, episode: int | None = None) -> list[Path]:
