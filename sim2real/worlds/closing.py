@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,6 @@ import numpy as np
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.composer.physics.mjx.import_mjx import mjx
 from sim2real.types import MjModel, PyTree
-
-if TYPE_CHECKING:
-    from sim2real.composer.types import MjModel
 
 _PATH, _CORRECTIONS = 32, 8
 """Steps from the model's start to the recorded angles, and Newton steps there. A loop has several solutions: a path of

@@ -94,11 +94,7 @@ class JointWorld(SteppedWorld):
         return state
 
     def integrate(self, params: PyTree, state: JointState, command: PyTree) -> JointState:
-        """Return the state one tick later.
-
-        Args:
-            command: The command, constant during the tick.
-        """
+        """Return the state one tick later, under a constant command."""
 
         def substep(s: JointState, h: float) -> JointState:
             w = s.velocity

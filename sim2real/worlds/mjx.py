@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from sim2real.composer.physics.mjx.warp.warp import WarpEngine
-    from sim2real.composer.types import MjModel
 
 
 @struct.dataclass

@@ -43,11 +43,7 @@ class OdeWorld(SteppedWorld):
         return state
 
     def integrate(self, params: PyTree, state: PyTree, command: PyTree) -> PyTree:
-        """Return the state one tick later.
-
-        Args:
-            command: The command, constant during the tick.
-        """
+        """Return the state one tick later, under a constant command."""
 
         def substep(x: PyTree, h: float) -> PyTree:
             f = lambda y: self.derivative(params, y, command)  # noqa: E731

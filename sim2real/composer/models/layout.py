@@ -144,11 +144,7 @@ def index(model: MjModel, field: Field, ids: tuple[int, ...], single: bool) -> A
 
 
 def resolve(model: MjModel, kind: str, names: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the numbers of elements in a compiled model.
-
-    Raises:
-        UsageError: When the model has no element of one of the names.
-    """
+    """Return the numbers of elements in a compiled model."""
     object_type = OBJECT_TYPES[kind]
     numbers = tuple(mj.mj_name2id(model, object_type, name) for name in names)
     if -1 in numbers:

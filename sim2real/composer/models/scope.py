@@ -125,11 +125,7 @@ class Scope:
         return f"{self.parent_model.prefix(relative_to)}{self.model}/"
 
     def rename_attachment(self, old: str, new: str) -> None:
-        """Rename an attached model's frame, with the frame's joints.
-
-        Raises:
-            UsageError: When another model has that name here.
-        """
+        """Rename an attached model's frame, with the frame's joints."""
         if new in self.attachments and new != old:
             raise UsageError(
                 f"model {self.model!r} has {new!r} attached already. Attached: {', '.join(self.attachments)}"

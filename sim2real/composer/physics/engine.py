@@ -190,10 +190,6 @@ class Camera:
             scene_option: The ``MjvOption`` of the image; default: ``option``.
             render_flag_overrides: Flags of ``mjtRndFlag``, by name in small letters, such as ``shadow``, or by
                 number -> value, for this image.
-
-        Raises:
-            UsageError: When depth and segmentation are both asked for, or one of them with overlays or flags, or
-                there is no such flag.
         """
         if overlays and (depth or segmentation):
             raise UsageError("Overlays are not supported with depth or segmentation rendering.")

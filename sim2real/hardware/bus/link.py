@@ -57,6 +57,7 @@ class ServoLink(ABC):
         self.guardian: Guardian | None = None
         self.closed = False
         self.torque_withheld = False
+        # Counts of this session; the lock serialises transactions.
         self._transactions = self._retries = self._lost = self._late = self._withheld = 0
         self._late_us = array("i")
         self._withheld_goals: dict[tuple[int, Register], int] = {}

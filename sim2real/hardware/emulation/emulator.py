@@ -178,6 +178,7 @@ def _plant_arguments(text: str) -> dict[str, Any]:
 
 
 def _run(options: argparse.Namespace) -> None:
+    # Make plant and port.
     stop = _StopFlag()
     config = options.settings(**{field.name: getattr(options, field.name) for field in fields(options.settings)})
     plant = load_plant(options.plant, _plant_arguments(options.plant_args))
@@ -185,6 +186,7 @@ def _run(options: argparse.Namespace) -> None:
     _keep_time()
     start_ns = time.monotonic_ns()
     truth = TruthLog(options.truth, truth_header(plant, config, start_ns))
+    # Report the port to the parent, and serve until the end.
     try:
         bus = config.bus(plant, truth, pty.send, start_ns)
         ready = {"port": pty.port, "pid": os.getpid(), "truth": str(options.truth.resolve())}

@@ -190,6 +190,7 @@ class StsServos(GuardedServos[StsLink], Device):
         """Find a joint's servo; raise HardwareLost if it is not there, another model, or calibrated differently."""
         servo_id, link = joint.servo_id, self.link
         self.find(servo_id, f" (joint {joint.name!r})")
+        # Compare the model and the homing offset with the calibration.
         number = link.read(servo_id, reg.MODEL_NUMBER, despite_error=True)
         if number not in MODELS:
             names = ", ".join(f"{model.name} ({n})" for n, model in MODELS.items())

@@ -106,6 +106,7 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     Raises:
         UsageError: When parameters of the posterior are not tested.
     """
+    # Fit each change alone, with the other parameters within the posterior.
     table = problem.table
     posterior = _with_known(posterior, table)
     values, axes = np.linalg.eigh(posterior.covariance)
@@ -114,9 +115,11 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     fitted = [one for one in tried if one is not None]
     if not fitted:
         raise Sim2RealError("this log determines no parameter", hint="deploy a policy that moves the robot")
+    # Compare with the log's loss without a change.
     at = _finite(linearise(problem, table.at_scale(posterior.mean)))
     now = _with_the_rest(at, root, loss_variance(problem, at))
     fitted.sort(key=lambda one: one.loss)
+    # Return the better of the best change and the estimate.
     seconds = problem.segment_s * len(problem.train)
     ends = (posterior.mean + fitted[0].size * fitted[0].way.along, posterior.mean)
     losses = [problem.loss(table.at_scale(x)) for x in ends]
@@ -153,10 +156,12 @@ def _alone(problem: Problem, mean: np.ndarray, root: np.ndarray, way: Way) -> Fi
     def point(size: float) -> np.ndarray:
         return table.at_scale(mean + size * way.along)
 
+    # Find the size of the change that fits best.
     moving = way.along != 0.0
     unit = float(np.min(table.span[moving] / np.abs(way.along[moving])))
     size = _best(problem, point, unit)
     at = _finite(linearise(problem, point(size)))
+    # A log that does not depend on the change tests nothing.
     variance, informed = loss_variance(problem, at), float(np.sum((at.jacobian @ way.along) ** 2))
     if informed * unit**2 <= _FELT * variance:
         return None

@@ -28,6 +28,7 @@ def corrected(value: Stacked, slope: Stacked) -> tuple[Stacked, Stacked]:
         return last[0][1]
 
     def differentiated(y: np.ndarray) -> np.ndarray:
+        # Differentiate at the first point only; later Jacobians are corrected by Broyden's rule.
         r = evaluated(y)
         J = slope(y) if not accepted else _updated(*accepted[0], y, r)
         accepted[:] = [(y.copy(), r, slope(y) if J is None else J)]

@@ -25,6 +25,7 @@ def finite_differences(f: Callable[[PyTree], PyTree], step: float = 3e-3) -> Cal
 
     def rule(primals: tuple[Any], tangents: tuple[Any]) -> tuple[PyTree, PyTree]:
         (x,), (t,) = primals, tangents
+        # Evaluate the point and both sides of each entry in one batch.
         n = x.size
         moves = step * jnp.concatenate(
             [jnp.zeros((1, n), x.dtype), jnp.eye(n, dtype=x.dtype), -jnp.eye(n, dtype=x.dtype)]

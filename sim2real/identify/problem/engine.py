@@ -48,6 +48,7 @@ def choose(
     """
     if wanted == "compiled":
         return Choice("compiled", "requested")
+    # C needs a world of MuJoCo that runs without feedback, and no forward mode.
     try:
         if jacobian == "forward":
             raise UsageError("derivatives are taken in forward mode, which C MuJoCo does not have")

@@ -78,6 +78,7 @@ class OutsideEvaluator:
             return np.concatenate([r.reshape(-1), self._of_prior(y)[0]])
 
         def slope(y: np.ndarray) -> np.ndarray:
+            # Differences along each parameter, with the initial states of ``z``.
             moved = self._moves(y, data)
             raw = self._raw(np.concatenate([y[None], y + moved]), states, data)
             J = self._tamed_slope(raw[0])[..., None] * self._by_parameter(raw[1:] - raw[0], data, y.size)
@@ -95,6 +96,7 @@ class OutsideEvaluator:
         most_moved = self._few(data)
 
         def losses(candidates: np.ndarray, around: np.ndarray, pick: np.ndarray | None, fresh: bool) -> np.ndarray:
+            # Losses of a batch of segments, or of those with most motion.
             part = most_moved
             if pick is not None:
                 weight = np.zeros(len(data.fitted), np.float32)

@@ -34,12 +34,14 @@ def posterior(
         widest: The estimate with all optional terms.
         selection: How terms were selected; None without a selection.
     """
+    # Possible values, other optima, and models with other optional terms.
     table = estimate.problem.table
     distribution = _possible(table.posterior(estimate.z, spread.scale_covariance), table, spread)
     optima = _optima(estimate, at, spread)
     models = [] if selection is None else _models(widest, estimate, spread, selection)
     if not optima and not models:
         return distribution
+    # The estimate has the weight that the others do not have.
     left = 1.0 - sum(m.weight for m in models)
     others = (*(replace(o, weight=o.weight * left) for o in optima), *models)
     names = dict.fromkeys(n for p in (distribution, *(o.posterior for o in others)) for n in p.names)

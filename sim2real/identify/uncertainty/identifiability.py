@@ -81,6 +81,7 @@ def _groups(directions: np.ndarray) -> list[list[int]]:
     part = np.sqrt(np.diag(spread))
     taking = part > _PART * part.max()
     groups: list[list[int]] = []
+    # Parameters that move together in an undetermined direction form a group.
     for i in np.flatnonzero(taking):
         for group in groups:
             if any(abs(spread[i, j]) > _PART**2 * part[i] * part[j] for j in group):

@@ -21,11 +21,7 @@ _POSE = ("pos", "quat", "euler", "axisangle", "xyaxes", "zaxis")
 
 
 def attach(site: H, model: Tree[H]) -> H:
-    """Attach a model at a site of another one or at its world; return the frame, an empty body until compilation.
-
-    Raises:
-        UsageError: When it is no model, is attached already, would hold itself, or its options contradict the other's.
-    """
+    """Attach a model at a site of another one or at its world; return the frame, an empty body until compilation."""
     if not isinstance(model, Tree):
         raise UsageError(f"Expected a model, got {type(model).__name__}: {model!r}")
     parent: Tree[Any] = site.root

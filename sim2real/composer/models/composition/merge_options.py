@@ -201,11 +201,7 @@ class Overrides:
 
 
 def merged(models: Iterable[Member]) -> Settings:
-    """Return what holds in a world of these models.
-
-    Raises:
-        UsageError: When two of them contradict each other, with the attribute, both values and both models.
-    """
+    """Return what holds in a world of these models."""
     models = list(models)
     later = [m.overrides for m in models if m.overrides]
     values: Settings = {}

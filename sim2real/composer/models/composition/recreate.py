@@ -44,11 +44,7 @@ def foreign_kinds(models: list[Tree[Handle]]) -> frozenset[str]:
 
 
 def final_name(target: Handle, top: Tree[Handle]) -> str:
-    """Return an element's name in the spec of a world, given the model at its top.
-
-    Raises:
-        UsageError: When the element is not in that world.
-    """
+    """Return an element's name in the spec of a world, given the model at its top."""
     above: Tree[Handle] | None = target.root
     while above is not None and above is not top:
         above = above.parent_model
@@ -65,9 +61,6 @@ def named(model: Tree[Handle], element: str, kind: str, target: Handle | str, to
 
     Args:
         target: The referenced element, or its name.
-
-    Raises:
-        UsageError: When it is not there.
     """
     # Find the element by its name.
     element_named: Any = target

@@ -19,9 +19,6 @@ def export_with_assets(mjcf_model: Model, out_dir: str | os.PathLike[str], out_f
 
     Args:
         out_file_name: Name of the MJCF file; default: the model's name with ``.xml``.
-
-    Raises:
-        UsageError: When the name does not end with ``.xml``.
     """
     name = out_file_name or f"{mjcf_model.model}.xml"
     if not name.lower().endswith(".xml"):

@@ -51,9 +51,6 @@ def asset_of(model: Tree[Handle], kind: str, file: Asset | str) -> Asset:
 
     Args:
         kind: The kind of element that names the file: textures have a folder of their own.
-
-    Raises:
-        UsageError: When there is no such file.
     """
     if isinstance(file, Asset):
         return file

@@ -54,11 +54,7 @@ def _parse(text: str, assets: dict[str, bytes] | None) -> tuple[MjSpec, Document
 
 
 def from_path(path: str | os.PathLike[str], assets: dict[str, bytes] | None = None) -> tuple[MjSpec, Document]:
-    """Return the ``MjSpec`` of an MJCF file, and the document as it was read, with those that it includes.
-
-    Raises:
-        UsageError: When there is no such file, or none that it includes.
-    """
+    """Return the ``MjSpec`` of an MJCF file, and the document as it was read, with those that it includes."""
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"there is no MJCF file {str(path)!r}", hint="give the path of a file that exists")

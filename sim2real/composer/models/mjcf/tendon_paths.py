@@ -59,9 +59,6 @@ def make_part(model: Tree[Handle], tag: str, attrs: dict[str, Value]) -> PathPar
 
     Args:
         tag: ``joint``, ``site``, ``geom`` or ``pulley``.
-
-    Raises:
-        UsageError: When there is no such part, or an attribute is missing.
     """
     if tag not in NAMING:
         raise UsageError(f"a <{tag}> cannot stand in a tendon. Available: geom, joint, pulley, site")

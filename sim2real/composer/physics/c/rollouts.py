@@ -114,11 +114,7 @@ class OpenLoop(Protocol):
 
 
 def check_steps(world: BaseWorld, base: type) -> None:
-    """Refuse a world whose class overrides a step or a start: these may depend on the state.
-
-    Raises:
-        UsageError: With the method.
-    """
+    """Refuse a world whose class overrides a step or a start: these may depend on the state."""
     for name in ("step", "init_state", "init_output"):
         if getattr(type(world), name) is not getattr(base, name):
             kind = type(world).__name__
@@ -281,11 +277,7 @@ def _failing(count: int, call: Callable[[], object]) -> np.ndarray:
 
 
 def _general(model: MjModel, names: tuple[str, ...], derives: bool) -> MjModel:
-    """Return a copy of a model in which C takes no short cut past the fields that differ, and solves to the end.
-
-    Raises:
-        UsageError: When it has to take one: bodies whose inertia is aligned with their joints.
-    """
+    """Return a copy of a model in which C takes no short cut past the fields that differ, and solves to the end."""
     model = copy.copy(model)
     # What MJX can afford is no limit here: on an arm that was made for one iteration, a hundred cost nothing more.
     model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 100), max(model.opt.ls_iterations, 50)

@@ -54,9 +54,6 @@ def settle_cone(model: MjModel) -> None:
     """Make friction cones pyramidal in models without contacts, where they have no effect; refuse those that MJX lacks.
 
     With elliptic ones, which arenas have, MJX 3.17 fails on models that have constraints but no contact.
-
-    Raises:
-        UsageError: The model has elliptic cones and geoms without friction; the message names them.
     """
     if model.opt.cone != mj.mjtCone.mjCONE_ELLIPTIC:
         return
@@ -75,11 +72,7 @@ def settle_cone(model: MjModel) -> None:
 
 
 def check_observables(observables: Mapping[str, Observable]) -> None:
-    """Refuse enabled observables that cannot be computed inside a compiled program.
-
-    Raises:
-        UsageError: With the names of the observables.
-    """
+    """Refuse enabled observables that cannot be computed inside a compiled program."""
     cameras = [k for k, o in observables.items() if o.enabled and isinstance(o, MJCFCamera | MujocoCamera)]
     if cameras:
         raise UsageError(

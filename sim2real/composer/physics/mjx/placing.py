@@ -37,9 +37,6 @@ def place(
     Args:
         physics: The physics; ``physics.fail`` is called where a prop found no place.
         pose: Position ``(3,)`` [m] and quaternion ``(4,)``, or variations.
-
-    Raises:
-        UsageError: On Warp, which keeps the contacts of all copies together, unless collisions are ignored.
     """
     if is_warp(physics.mjx_model) and not ignore_collisions:
         raise UsageError(

@@ -78,11 +78,7 @@ _WORDS: tuple[tuple[type[Exception], str, str, str], ...] = (
 
 @contextlib.contextmanager
 def named(label: str) -> Iterator[None]:
-    """Say what a function did that a compiled program cannot do, rather than what JAX made of it.
-
-    Raises:
-        UsageError: With the function's name and line.
-    """
+    """Say what a function did that a compiled program cannot do, rather than what JAX made of it."""
     try:
         yield
     except Exception as error:
@@ -108,11 +104,7 @@ class TracedHooks(Hooks):
     watched: tuple[object, ...] = ()
 
     def call(self, label: str, function: Callable[..., T], *args: PyTree) -> T:
-        """Return what a function returns.
-
-        Raises:
-            UsageError: The hook does a step that a compiled program cannot do, or changes state that only Python has.
-        """
+        """Return what a function returns."""
         before = [_attributes(owner) for owner in self.watched]
         drawn = _drawn() if self.watched else None
         with named(label):

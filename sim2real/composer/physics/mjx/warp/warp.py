@@ -82,9 +82,6 @@ def make_engine(host: MjModel, impl: str, nconmax: int | None, njmax: int | None
     Args:
         nconmax: See ``WarpEngine``; None with JAX.
         njmax: See ``WarpEngine``; None with JAX.
-
-    Raises:
-        UsageError: When there is no such implementation, or it cannot be had.
     """
     if impl == "warp":
         return WarpEngine(host, nconmax, njmax)
