@@ -8,21 +8,21 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 60_880,
-    "lines of composer": 12_153,
+    "lines without composer": 60_840,
+    "lines of composer": 12_074,
     "files in the fullest folder": 15,
-    "docstring lines [%]": 20.2,
+    "docstring lines [%]": 20.0,
     "Any in 1,000 lines": 4.8,
     "words of the dialect": 13,
-    "other words of the dialect": 257,
+    "other words of the dialect": 220,
     "largest number of project imports": 18,
     "levels of robot classes": 2,
     "public members of SO101Robot": 18,
     "modules of hardware that train imports": 0,
 }
-"""The 14 words that remain are names in file formats (``left_out`` in parameters.json, the column ``told``), evosax's
+"""The 13 words that remain are names in file formats (``left_out`` in parameters.json, the column ``told``), evosax's
 ``tell``, and a word in the column names of recorders."""
-AT_LEAST = {"comment lines [%]": 1.62}
+AT_LEAST = {"comment lines [%]": 1.69}
 
 
 @pytest.fixture(scope="module")
