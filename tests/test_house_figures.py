@@ -8,8 +8,8 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 60_840,
-    "lines of composer": 12_074,
+    "lines without composer": ,
+    "lines of composer": 12_153,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.0,
     "Any in 1,000 lines": 4.8,

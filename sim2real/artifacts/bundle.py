@@ -22,6 +22,8 @@ from sim2real.types import Json
 BUNDLE, HISTORY = "bundle", "history.json"
 REWARD = "reward/"
 """Prefix of the curve of a reward term."""
+GOOD_SUCCESS = 0.9
+"""Share of success below which a policy is not good enough, in simulation and on the robot."""
 _AGAIN = "run `sim2real train` again"
 
 

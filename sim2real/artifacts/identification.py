@@ -14,7 +14,11 @@ from sim2real.artifacts.estimation.noise import Noise
 from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.estimation.promise import Bound, Promise, promises_table
 from sim2real.artifacts.estimation.quantity import Quantity
+<<<<<<< HEAD
 from sim2real.artifacts.estimation.search import Search
+=======
+from sim2real.artifacts.estimation.worst_second import WorstSecond
+>>>>>>> 8c33d51 (Pages open with the verdict and the worst second; a row for each joint; robot beside simulation with their difference; all four verdicts; the viewer's test refuses an error screen (60,986 lines: +640, of them 350 in tests))
 from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.run.run_folder import Source
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown
@@ -182,6 +186,7 @@ class Identification(Shown):
         misfit: Root mean square of the residuals, in deviations of the measurement.
         prediction: Errors over horizons.
         held_out: Errors of each position on held-out data, the largest first.
+        worst: The second in which the model explains a joint worst; None without samples, and in older files.
         aggregate: Quantities estimated from each recording alone; empty unless configured.
         left_out: A fit for each held-out part; empty without folds.
         promises: The ledger: each error on a held-out part or on held-out data, beside the bound that was given before.
@@ -213,6 +218,7 @@ class Identification(Shown):
     check: Determined | None = None
     prediction: tuple[Prediction, ...] = ()
     held_out: tuple[HeldOut, ...] = ()
+    worst: WorstSecond | None = None
     free_run: tuple[FreeRun, ...] = ()
     aggregate: tuple[Quantity, ...] = ()
     left_out: tuple[HeldOutPart, ...] = ()
@@ -238,7 +244,8 @@ class Identification(Shown):
     def about(self) -> Mapping[str, Json]:
         """Return pipeline, verdict, reasons, the next command and the number of parameters, by name."""
         facts = {"pipeline": self.pipeline, "verdict": self.verdict.status, "why": "; ".join(self.verdict.reasons)}
-        facts |= {"next": self.verdict.next, "parameters": len(self.parameters)}
+        worst = self.worst.text(self.logs) if self.worst else ""
+        facts |= {"worst": worst, "next": self.verdict.next, "parameters": len(self.parameters)}
         return {name: value for name, value in facts.items() if value}
 
     def rows(self) -> ArtifactTable:

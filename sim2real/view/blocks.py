@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from sim2real.artifacts.summary import ArtifactTable, Cell, Interval
 
 MISSING = "–"  # noqa: RUF001 - a dash, as is usual in tables
 
-
+Tone = Literal["good", "doubt", "bad"]
+MARKS: Mapping[Tone, str] = {"good": "✓", "doubt": "!", "bad": "✗"}
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)? ?%?")
 
 
@@ -42,6 +43,7 @@ class TableBlock:
         text_columns: Indices of columns with text, which are aligned left.
         remarks: A remark for each row, in small letters below its header.
         folded: Whether it is collapsed at first.
+        tones: Tone of each row, which colours its last cell; empty for none.
         kind: Kind of block, for the template.
     """
 
@@ -51,7 +53,13 @@ class TableBlock:
     text_columns: Sequence[int] = ()
     remarks: Sequence[str] = ()
     folded: bool = False
+    tones: Sequence[Tone] = ()
     kind: str = "table"
+
+    @property
+    def marks(self) -> list[str]:
+        """The sign of each row's tone."""
+        return [MARKS[tone] for tone in self.tones]
 
     @staticmethod
     def of(caption: str, table: ArtifactTable) -> TableBlock:
@@ -89,9 +97,21 @@ class ListBlock:
     kind: str = "list"
 
 
-Block = FigureBlock | TableBlock | NoteBlock | FoldBlock | ListBlock
-Tone = Literal["good", "doubt", "bad"]
-MARKS: Mapping[Tone, str] = {"good": "✓", "doubt": "!", "bad": "✗"}
+@dataclass(frozen=True)
+class PictureBlock:
+    """A picture as PNG.
+
+    Attributes:
+        data: The PNG in base64.
+        kind: Kind of block, for the template.
+    """
+
+    data: str
+    caption: str
+    kind: str = "picture"
+
+
+Block = FigureBlock | TableBlock | NoteBlock | FoldBlock | ListBlock | PictureBlock
 
 
 @dataclass(frozen=True)
@@ -119,7 +139,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class PageSection:
-    """One stage's part of a page."""
+    """One stage's part of a page; it opens with the banner and, beside it, the figure."""
 
     id: str
     title: str
@@ -127,6 +147,25 @@ class PageSection:
     tiles: Sequence[Tile] = ()
     blocks: Sequence[Block] = field(default_factory=list)
     banner: Banner | None = None
+    figure: FigureBlock | None = None
+
+    @property
+    def box(self) -> Banner:
+        """The verdict with its first reason, for the head of the page; without a verdict the first number."""
+        if self.banner is not None:
+            return replace(self.banner, reasons=self.banner.reasons[:1])
+        return Banner("doubt", "no verdict", [f"{tile.label} {tile.value}" for tile in self.tiles[:1]])
+
+
+def sentence(text: str, names: Iterable[str] = ()) -> str:
+    """Write a message as a sentence; a name at its beginning stays as it is.
+
+    Args:
+        names: Names of joints; other names have an underscore.
+    """
+    first = text.split(" ", 1)[0]
+    named = "_" in first or first.rstrip(",:") in names
+    return (text if named else text[:1].upper() + text[1:]).rstrip(".") + "."
 
 
 def cell_text(cell: Cell, unit: bool = False) -> str:

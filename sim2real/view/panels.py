@@ -16,6 +16,9 @@ from sim2real.log.schema import unit_of
 from sim2real.view import style
 from sim2real.view.style import GRID, MUTED, ROLES, SHADE, new_figure, styled, to_svg
 
+_SMALL_IN = 5.0
+"""Width of a figure beside a verdict; at 360 pixels its text is 8 pixels high."""
+
 
 @dataclass(frozen=True)
 class Line:
@@ -40,6 +43,7 @@ class Panel:
         spans: Shaded intervals [s].
         zoom: Enlarged interval in a second column [s]; None for no second column.
         framed: Roles of the lines that determine the vertical range; empty for all lines.
+        difference: Line in the second column instead of an enlarged interval; None for none.
     """
 
     label: str
@@ -48,6 +52,7 @@ class Panel:
     spans: Sequence[tuple[float, float]] = ()
     zoom: tuple[float, float] | None = None
     framed: Sequence[str] = ()
+    difference: Line | None = None
 
 
 def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held out") -> str:
@@ -58,7 +63,8 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
     """
     # Panels share a time axis unless they have titles or zooms of their own.
     zooms = {panel.zoom for panel in panels}
-    closer = zooms != {None}
+    beside = [panel.difference for panel in panels if panel.difference is not None]
+    closer = zooms != {None} or bool(beside)
     titled = sum(bool(panel.title) for panel in panels)
     with styled():
         figure = new_figure(0.7 + 1.45 * len(panels) + 0.22 * titled)
@@ -66,14 +72,18 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
             len(panels),
             1 + closer,
             sharex="col" if len(zooms) == 1 and not titled else "none",
-            sharey="row",
+            sharey="none" if beside else "row",
             squeeze=False,
             width_ratios=[2.1, 1][: 1 + closer],
         )
         # Draw each panel, and its enlarged part beside it.
         for panel, row in zip(panels, grid, strict=True):
-            for axes in row:
+            for axes in row[: 1 if beside else 2]:
                 _fill(axes, panel)
+            if panel.difference is not None:
+                _fill(row[1], Panel("", [panel.difference], spans=panel.spans))
+            elif beside:
+                row[1].set_visible(False)
             row[0].set_ylabel(panel.label)
             if panel.title:
                 row[0].set_title(panel.title, fontweight="normal", fontsize=8.5)
@@ -85,12 +95,35 @@ def over_time(panels: Sequence[Panel], name: str, label: str, shade: str = "held
         zoom = panels[0].zoom
         if zoom and len(zooms) == 1:
             grid[0, 1].set_title(f"{zoom[0]:g} to {zoom[1]:g} s", fontweight="normal", color=MUTED)
+        if beside:
+            grid[0, 1].set_title(beside[0].label, fontweight="normal", color=MUTED)
         # Add one legend with each label once.
         by_label = {line.label: line for panel in panels for line in panel.lines}
         entries: list[Artist] = [_legend_entry(line) for line in by_label.values()]
         entries += [Patch(facecolor=SHADE, edgecolor=GRID, label=shade)] if any(p.spans for p in panels) else []
         style.legend_above(figure, entries)
         return to_svg(figure, name, label)
+
+
+def compared(lines: Sequence[Line], difference: Line, label: str, span: tuple[float, float], name: str) -> str:
+    """Draw lines over time, and below them a difference, in a figure that fits on a telephone. Returns SVG.
+
+    Args:
+        label: Label of the upper vertical axis; the lower one has that of the difference.
+        span: Shaded interval [s].
+    """
+    with styled():
+        figure = new_figure(3.6, _SMALL_IN)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1])
+        framed = [role for role in ("measured", "identified") if any(line.role == role for line in lines)]
+        _fill(upper, Panel(label, lines, spans=[span], framed=framed))
+        _fill(lower, Panel(difference.label, [difference], spans=[span]))
+        lower.axhline(0.0, color=MUTED, lw=0.8)
+        upper.set_ylabel(label)
+        lower.set_ylabel(difference.label)
+        lower.set_xlabel("time [s]")
+        style.legend_above(figure, [_legend_entry(line) for line in lines])
+        return to_svg(figure, name, f"{label} and {difference.label} from {span[0]:.1f} to {span[1]:.1f} s")
 
 
 def with_unit(label: str, units: Mapping[str, str], field: str | None = None) -> str:

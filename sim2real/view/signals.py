@@ -63,6 +63,36 @@ class Signals:
         return last or self.commanded
 
 
+@dataclass(frozen=True)
+class ComparedSeries:
+    """One quantity on the robot and in simulation.
+
+    Attributes:
+        label: Name of the quantity; of a command with its node.
+        simulation: None without a simulation.
+        held: Whether each value holds until the next one, like a command.
+        angle: Whether it is an angle, whose differences are on a circle.
+    """
+
+    label: str
+    robot: Series
+    simulation: Series | None
+    held: bool = False
+    angle: bool = False
+
+    @property
+    def difference(self) -> np.ndarray | None:
+        """Robot minus simulation at the times of the robot ``(N,)``, NaN outside of the simulation's times."""
+        if self.simulation is None or not len(self.simulation.t_s):
+            return None
+        at, t_s, values = self.robot.t_s, self.simulation.t_s, self.simulation.values
+        beside = np.interp(at, t_s, values)
+        if self.held:
+            beside = values[np.maximum(np.searchsorted(t_s, at, side="right") - 1, 0)]
+        off = self.robot.values - np.where((at >= t_s[0]) & (at <= t_s[-1]), beside, np.nan)
+        return (off + np.pi) % (2 * np.pi) - np.pi if self.angle else off
+
+
 def is_dry(episode: Episode) -> bool:
     """Return whether a log is of a dry run."""
     return episode.metadata.get("dry_run") is True
@@ -125,6 +155,25 @@ def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals, units: Map
             turns = np.round((robot.values[0] - series.values[0]) / (2 * np.pi))
         shifted.append(replace(series, values=series.values + 2 * np.pi * turns) if np.isfinite(turns) else series)
     return shifted
+
+
+def pairs_of(log: Signals, simulation: Sequence[Series], units: Mapping[str, str]) -> list[ComparedSeries]:
+    """Return each measurement and each command to the motors with its simulation.
+
+    Args:
+        simulation: Result of ``simulated_beside``; empty without a simulation.
+        units: Field -> unit.
+    """
+    by_name = {s.name: s for s in simulation}
+    commands = [s for s in simulation if s.name.partition("[")[0] == "command"]
+    pairs = [
+        ComparedSeries(s.name, s, by_name.get(s.name), angle=unit_of(s.name, {**log.units, **units}) == "rad")
+        for s in log.measured
+    ]
+    for index, series in enumerate(log.last_command()):
+        other = commands[index] if index < len(commands) else None
+        pairs.append(ComparedSeries(f"{series.source}.{series.name}", series, other, held=True))
+    return pairs
 
 
 def components(name: str, source: str, t_s: np.ndarray, values: np.ndarray) -> list[Series]:

@@ -15,7 +15,8 @@ from sim2real.graph.episode import Episode, Steps
 from sim2real.stages.deploy import show, verdict
 from sim2real.stages.deploy.next_command import with_command
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.view.page.deployment_verdict import tables, verdict_blocks
+from sim2real.view.page.deployment_tables import tables
+from sim2real.view.page.stage_verdicts import deploy_banner
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 STEADY = Drift((replace(FRICTION, now=6.1, explains=0.01, p=0.8),), 0.05, (), 20.0)
@@ -183,10 +184,12 @@ def test_console_and_page_end_in_the_verdict(capsys):
     said = capsys.readouterr()
     assert "friction" in said.out
     assert said.err.splitlines() == ["verdict: re-identify", "  friction is 12", "next: sim2real identify pendulum"]
-    (block,) = verdict_blocks(shown)
-    assert (block.caption, block.items[-1]) == ("Verdict: re-identify", "next: sim2real identify pendulum")
-    assert [t.rows[0][0] for t in tables(shown)] == ["friction", "hinge"]
-    assert tables(shown)[0].rows[0][-1] == "yes"
+    banner = deploy_banner(shown)
+    assert (banner.tone, banner.title) == ("doubt", "Re-identify")
+    assert banner.reasons == ["Friction is 12.", "next: sim2real identify pendulum"]
+    gap, drift, replay = tables(shown)
+    assert [t.rows[0][0] for t in (gap, drift, replay)] == ["success", "friction", "hinge"]
+    assert drift.rows[0][-1] == "yes"
 
 
 def test_the_verdict_is_in_the_artifact(tmp_path):

@@ -129,6 +129,10 @@ def parameters(truth: bool = True) -> dict[str, Any]:
             }
             for n, f, e, b in (("th", "th", 0.0234, ["no delay"]), (EVIL, "other", 0.0117, []))
         ],
+        "worst": {
+            "name": "th", "column": "th", "unit": "rad", "recording": 0, "segment": 3, "begin_s": 3.0, "end_s": 3.98,
+            "rmse": 0.01, "times_noise": 5.0, "of_motion": 0.1,
+        },
         "free_run": [
             {
                 "model": m, "recording": 0, "begin_s": 3.3, "seconds": 1.7, "held_out": True, "field": f,

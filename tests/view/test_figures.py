@@ -22,8 +22,9 @@ from sim2real.artifacts.run.run_folder import Source, finished_stages
 from sim2real.view import style, timing
 from sim2real.view.identification import figures as identify_figures
 from sim2real.view.identification import intervals, residuals
+from sim2real.view.identification.worst import worst_figure
 from sim2real.view.page import figures
-from sim2real.view.signals import signals_of, simulated_series
+from sim2real.view.signals import pairs_of, signals_of, simulated_series
 
 SVG = "{http://www.w3.org/2000/svg}"
 QUANTITIES = [
@@ -52,6 +53,7 @@ def calls(artifacts, found, log):
     """Every figure there is, as a function and its arguments, by name."""
     deployed = Deployment.load(artifacts["deploy"].folder)
     episode, simulation = signals_of(deployed.recordings[1]), simulated_series(deployed.simulated[1])
+    pairs = pairs_of(episode, simulation, deployed.units)
     training = History.load(artifacts["train"].folder)
     return {
         "record": (figures.recording, log),
@@ -64,10 +66,17 @@ def calls(artifacts, found, log):
         "correlation": (identify_figures.correlation, found.correlation.names, found.correlation.matrix),
         "aggregate": (intervals.aggregate, QUANTITIES),
         "training": (figures.training, training),
-        "deployment": (figures.deployment, episode, simulation, deployed.units, 1),
+        "deployment": (figures.deployment, pairs, episode.units, 1),
+        "difference": (svg_of(figures.largest_difference), [pairs], ["th"], episode.units),
+        "worst": (svg_of(worst_figure), found),
         "histograms": (timing.histograms, log.episode),
         "schedule": (timing.schedule, log.episode),
     }
+
+
+def svg_of(draw):
+    """Return a function that draws the figure of a block."""
+    return lambda *arguments: draw(*arguments).svg
 
 
 def figure_of(draw, *arguments):

@@ -23,7 +23,7 @@ _BETTER = 0.95
 """Largest ratio of the held-out error to that of a baseline with which the estimate is better."""
 _ALIKE = 1.05
 """Largest ratio of two errors that count as equal."""
-_NOISE = 2.0
+NOISE = 2.0
 """Errors below this many deviations of the measurement count as noise."""
 _MOST = 3
 """Largest number of positions that the reasons name, the worst first."""
@@ -84,7 +84,7 @@ def _scored(p: Position, horizon_s: float, errors: Mapping[str, float | None]) -
     """
     # A prediction that diverged to NaN is infinitely wrong.
     finite = {m: e if e is not None and math.isfinite(e) else math.inf for m, e in errors.items()}
-    error, noise = finite.pop("identified"), _NOISE * p.sigma
+    error, noise = finite.pop("identified"), NOISE * p.sigma
     best = min(finite.values(), default=math.inf)
     excess = max(error, noise) / max(best, noise) if math.isfinite(best) else 0.0
     # The model without delays counts as better only where it is better by more than chance.
@@ -120,8 +120,8 @@ def judge(
         beyond: Sentences about held-out data outside the range of the fitted data.
         left: Length of the next step of a fit that did not converge [standard errors]; None if it converged.
     """
-    improves, reasons = _on_held_out(held_out)
-    reasons += beyond
+    improves, errors = _on_held_out(held_out)
+    reasons = [*errors, *beyond]
     if left is not None:
         return Judgement("not converged", (_not_converged(left), *reasons))
     # Collect the reasons: estimates at bounds, absent parameters, undetermined groups.
@@ -142,15 +142,16 @@ def judge(
             f"residuals are {spread.misfit:.2g} times the measurement's deviation: the model explains the data only in "
             "part, and intervals follow how much estimates vary from block to block"
         )
-    # The first of these defects is the status.
+    # The first of these defects is the status, and its sentences come first.
     status: Status = "accepted"
+    deciding = errors
     if not improves:
         status = "no improvement on held-out data"
     elif bounded:
-        status = "hit a bound"
+        status, deciding = "hit a bound", bounded
     elif undetermined:
-        status = "not identifiable"
-    return Judgement(status, tuple(reasons), flags)
+        status, deciding = "not identifiable", undetermined
+    return Judgement(status, tuple(dict.fromkeys([*deciding, *reasons])), flags)
 
 
 def _not_converged(left: float) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.bundle import GOOD_SUCCESS, Bundle
 from sim2real.artifacts.deployment import Advice, Deployment, Gap, Replay
 from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO
@@ -33,7 +33,6 @@ _MAX_LATE_SHARE = 0.01
 _LATENESS_PERIODS = 0.1
 """A step is late if it exceeds the longest of training by this share of the policy's period."""
 _MAX_REASONS = 3
-_GOOD_SUCCESS = 0.9
 _MAX_SUCCESS_GAP = 0.1
 """Largest difference of success in simulation and on the robot."""
 
@@ -125,9 +124,9 @@ def _policy_advice(deployment: Deployment, bundle: Bundle) -> Advice | None:
     if success is None or success.real is None:
         return None
     simulated = success.simulation if success.simulation is not None else 1.0
-    if success.real < min(_GOOD_SUCCESS, simulated - _MAX_SUCCESS_GAP):
+    if success.real < min(GOOD_SUCCESS, simulated - _MAX_SUCCESS_GAP):
         return Advice("re-train", (f"success is {success.real:.2f}, in simulation {simulated:.2f}",))
-    if success.real < _GOOD_SUCCESS:
+    if success.real < GOOD_SUCCESS:
         return Advice("re-train", (f"success is {success.real:.2f}, as in simulation",))
     return None
 

@@ -24,6 +24,8 @@ def show(identification: Identification) -> None:
     note(f"verdict: {identification.verdict.status}")
     for reason in identification.verdict.reasons:
         note(f"  {reason}")
+    if identification.worst is not None:
+        note(f"worst: {identification.worst.text(identification.logs)}")
     if identification.verdict.next:
         note(f"next: {identification.verdict.next}")
 

@@ -21,7 +21,9 @@ _LABELS = {
     "no delay": "model fitted without delays",
     "nominal": "nominal model",
 }
-_BASELINES = {"hold": "hold: the last measurement", "told": "told: the goal"}
+GOAL = "told"
+"""Baseline whose predictions are the goals of joints."""
+_BASELINES = {"hold": "hold: the last measurement", GOAL: f"{GOAL}: the goal"}
 
 
 def predictions(result: Identification, name: str) -> str:
@@ -209,7 +211,7 @@ def _model_look(model: str, number: int) -> tuple[str, style.Dash, str]:
         "no delay": (INK, style.DASHES[3], "D"),
         "nominal": (ORANGE, style.DASHES[1], "s"),
         "hold": (MUTED, style.DASHES[2], "^"),
-        "told": (GREEN, style.DASHES[1], "v"),
+        GOAL: (GREEN, style.DASHES[1], "v"),
     }
     return looks.get(model, ((GREEN, style.PURPLE)[number % 2], style.DASHES[1], "v"))
 

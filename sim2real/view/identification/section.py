@@ -10,6 +10,7 @@ import numpy as np
 from sim2real.artifacts.estimation.posterior import from_scale
 from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.identification import Estimate, Identification
+from sim2real.artifacts.joints import joint_rows, joints_table
 from sim2real.artifacts.run.run_folder import StageFolder
 from sim2real.log.schema import unit_of
 from sim2real.view.blocks import (
@@ -27,9 +28,11 @@ from sim2real.view.blocks import (
     interval,
     number,
     pretty_unit,
+    sentence,
 )
 from sim2real.view.identification import figures, intervals, residuals
 from sim2real.view.identification.links import link_blocks
+from sim2real.view.identification.worst import worst_figure
 from sim2real.view.provenance import about
 
 _TITLES: dict[str, tuple[Tone, str]] = {
@@ -48,8 +51,10 @@ _NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower",
 def identify_section(artifact: StageFolder) -> PageSection:
     """Return the section of an identify stage."""
     result = Identification.load(artifact.folder)
+    opening = worst_figure(result, "identify-worst")
     # Order the blocks from the results to the details.
     blocks = [
+        *_joints(result),
         *_parameters(result),
         *_aggregate(result),
         *_parts(result),
@@ -70,8 +75,8 @@ def identify_section(artifact: StageFolder) -> PageSection:
             )
         )
     lead = "Dynamics and delays from the log, each with its 95 % interval."
-    tiles = list(_tiles(result))
-    return PageSection("identify", "Identify", lead, tiles, [*blocks, *about(artifact)], _banner(result))
+    tiles, blocks = list(_tiles(result)), [*blocks, *about(artifact)]
+    return PageSection("identify", "Identify", lead, tiles, blocks, _banner(result), opening)
 
 
 def _banner(result: Identification) -> Banner | None:
@@ -79,13 +84,16 @@ def _banner(result: Identification) -> Banner | None:
     if not status:
         return None
     tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
-    return Banner(tone, title, [_sentence(r) for r in result.verdict.reasons])
+    return Banner(tone, title, [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons])
 
 
-def _sentence(text: str) -> str:
-    """Write a message as a sentence; a name at its beginning stays as it is."""
-    first = text.split(" ", 1)[0]
-    return (text if "_" in first else text[:1].upper() + text[1:]).rstrip(".") + "."
+def _joints(result: Identification) -> list[Block]:
+    """Return a row for each joint with its verdict; empty for a single joint."""
+    rows = joint_rows(result)
+    if len(rows) < 2:
+        return []
+    tones: list[Tone] = ["bad" if r.errors.beaten_by else "doubt" if r.doubts else "good" for r in rows]
+    return [replace(TableBlock.of("Joints, the worst first", joints_table(result)), tones=tones)]
 
 
 def _parameters(result: Identification) -> list[Block]:
@@ -103,7 +111,7 @@ def _parameters(result: Identification) -> list[Block]:
     # List undetermined combinations, and the errors to expect of a longer log.
     if result.check:
         check = result.check
-        items = [_sentence(m) for m in check.messages] or ["The data determines each parameter."]
+        items = [sentence(m) for m in check.messages] or ["The data determines each parameter."]
         items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(check.condition, 2)}.")
         blocks.append(ListBlock("Determined by the data", items))
         errors = check.standard_error_per_minute
@@ -240,7 +248,7 @@ def _predictions(result: Identification) -> list[Block]:
     blocks: list[Block] = []
     if len(result.held_out) > 1:
         caption = f"Held-out RMSE of every position after {result.held_out[0].horizon_s:g} s, the largest first"
-        blocks.append(TableBlock.of(caption, result.held_out_table()))
+        blocks.append(replace(TableBlock.of(caption, result.held_out_table()), folded=True))
     if result.prediction:
         blocks.append(
             FigureBlock(

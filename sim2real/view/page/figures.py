@@ -10,10 +10,15 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from sim2real.artifacts.bundle import History
+from sim2real.artifacts.estimation.worst_second import with_small_unit, worst_window
+from sim2real.log.schema import unit_of
 from sim2real.view import style
-from sim2real.view.panels import Line, Panel, over_time, with_unit
-from sim2real.view.signals import Series, Signals
+from sim2real.view.blocks import FigureBlock
+from sim2real.view.panels import Line, Panel, compared, over_time, with_unit
+from sim2real.view.signals import ComparedSeries, Signals
 from sim2real.view.style import BLUE, INK, new_figure, styled, to_svg
+
+_DIFFERENCE = "robot \u2212 simulation"
 
 
 def recording(log: Signals, name: str) -> str:
@@ -64,32 +69,60 @@ def training(curves: History, name: str) -> str:
         return to_svg(figure, name, f"Return and success of {seeds} seeds over the steps of training")
 
 
-def deployment(log: Signals, simulation: Sequence[Series], units: Mapping[str, str], number: int, name: str) -> str:
-    """Draw one episode on the robot, and the same policy in simulation.
+def deployment(pairs: Sequence[ComparedSeries], units: Mapping[str, str], number: int, name: str) -> str:
+    """Draw one episode on the robot, the same policy in simulation, and on the right their difference."""
+    panels = []
+    for pair in pairs:
+        label = with_unit(pair.label, units, pair.robot.name)
+        off = None
+        if pair.difference is not None:
+            off = Line(pair.robot.t_s, pair.difference, _DIFFERENCE, "residual", held=pair.held)
+        panels.append(Panel(label, _lines(pair), difference=off))
+    return over_time(panels, name, f"Episode {number} on the robot, in simulation, and their difference")
+
+
+def largest_difference(
+    episodes: Sequence[Sequence[ComparedSeries]], positions: Sequence[str], units: Mapping[str, str], name: str
+) -> FigureBlock | None:
+    """Draw the measurement with the largest difference to its simulation; None without a simulation.
+
+    It is the largest mean over a second, as a share of the motion on the robot.
 
     Args:
-        simulation: Series of the simulation; empty without a simulation.
+        positions: Names of the measurements to choose from; empty: all.
         units: Field -> unit.
     """
-    units = {**log.units, **units}
-    simulated = {s.name: s for s in simulation}
-    commands = [n for n in simulated if n.partition("[")[0] == "command"]
-    zoom = (0.0, round(min(3.0, log.episode.duration_s / 3), 1))
-    panels = []
-    # Draw measurements, then commands, with the simulation beside them.
-    for series in log.measured:
-        lines = [Line(series.t_s, series.values, "robot", "measured")]
-        if series.name in simulated:
-            other = simulated[series.name]
-            lines.append(Line(other.t_s, other.values, "simulation", "identified"))
-        panels.append(Panel(with_unit(series.name, units), lines, zoom=zoom))
-    for index, series in enumerate(log.last_command()):
-        lines = [Line(series.t_s, series.values, "robot", "measured", held=True)]
-        if index < len(commands):
-            other = simulated[commands[index]]
-            lines.append(Line(other.t_s, other.values, "simulation", "identified", held=True))
-        panels.append(Panel(with_unit(f"{series.source}.{series.name}", units, series.name), lines, zoom=zoom))
-    return over_time(panels, name, f"Episode {number} on the robot and in simulation")
+    best: tuple[float, int, ComparedSeries, np.ndarray, tuple[float, float, float]] | None = None
+    for number, pairs in enumerate(episodes):
+        for pair in pairs:
+            if positions and pair.robot.name not in positions:
+                continue
+            off = pair.difference
+            if pair.held or off is None or not (known := np.isfinite(off)).any():
+                continue
+            window = worst_window(pair.robot.t_s[known], off[known] ** 2)
+            share = window[2] / max(float(np.std(pair.robot.values)), 1e-12)
+            if best is None or share > best[0]:
+                best = share, number, pair, off, window
+    if best is None:
+        return None
+    _, number, pair, off, (begin_s, end_s, error) = best
+    unit = unit_of(pair.robot.name, units)
+    line = Line(pair.robot.t_s, off, f"difference [{unit}]" if unit else "difference", "residual")
+    label = with_unit(pair.label, units, pair.robot.name)
+    svg = compared(_lines(pair), line, label, (begin_s, end_s), name)
+    caption = (
+        f"The largest difference: {pair.label} in episode {number}, {begin_s:.1f} s, {with_small_unit(error, unit)}."
+    )
+    return FigureBlock(svg, caption)
+
+
+def _lines(pair: ComparedSeries) -> list[Line]:
+    lines = [Line(pair.robot.t_s, pair.robot.values, "robot", "measured", held=pair.held)]
+    if pair.simulation is not None:
+        other = pair.simulation
+        lines.append(Line(other.t_s, other.values, "simulation", "identified", held=pair.held))
+    return lines
 
 
 def _thousands(count: float) -> str:

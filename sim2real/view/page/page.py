@@ -12,9 +12,11 @@ from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, fin
 from sim2real.artifacts.run.stage_status import stage_status
 from sim2real.view.blocks import NoteBlock, PageSection
 from sim2real.view.page.iterations import iterations_sections
-from sim2real.view.page.sections import SECTIONS, headline
+from sim2real.view.page.sections import SECTIONS
 
 PAGE = "report.html"
+_MOST_REASONS = 4
+"""Number of reasons in a verdict's box; the others are folded, so that its figure stays on the first screen."""
 
 
 def report(run_dir: Path) -> Path:
@@ -70,7 +72,7 @@ def _write(
         run=run,
         started=started.replace("T", " ")[:19] + (" UTC" if started.endswith("+00:00") else ""),
         version=next((a.manifest["versions"].get("sim2real") for a in artifacts if "versions" in a.manifest), ""),
-        stages=[(stage, stage in {s.id for s in sections}) for stage in STAGES],
+        absent=[stage for stage in STAGES if stage not in {s.id for s in sections}],
         notes=notes,
     )
 
@@ -83,13 +85,13 @@ def write_page(
     run: str = "",
     started: str = "",
     version: str = "",
-    stages: Sequence[tuple[str, bool]] = (),
+    absent: Sequence[str] = (),
     notes: Sequence[NoteBlock] = (),
 ) -> Path:
     """Render sections as a page and write it at once, so that no browser reads a half of it.
 
     Args:
-        stages: Stages in the head of the page, and whether each has a section.
+        absent: Stages without a section, for the head of a page with several sections.
     """
     environment = Environment(
         loader=PackageLoader("sim2real.view"),
@@ -104,8 +106,8 @@ def write_page(
         started=started,
         version=version,
         sections=sections,
-        tiles=headline(sections) if len(sections) > 1 else [],
-        stages=stages,
+        absent=absent,
+        most_reasons=_MOST_REASONS,
         notes=notes,
     )
     # Write a draft and rename it, as a rename is atomic.

@@ -9,7 +9,7 @@ from sim2real.types import Json
 from sim2real.view.blocks import Banner, Block, ListBlock, TableBlock, fixed, number
 from sim2real.view.signals import is_dry
 
-_MAX_LATE = 0.01
+MAX_LATE = 0.01
 """Share of late answers above which the page gives advice."""
 
 DRY = Banner(
@@ -44,7 +44,7 @@ def _answers(end: Mapping[str, Json]) -> list[str]:
     items = [f"{number(count)} answers came; {number(end.get('lost_replies', 0))} were lost, and requested again."]
     share = late / count
     count_late = f"{number(late)} answers ({share:.1%})" if late else "No answer"
-    advice = ": set the adapter's latency timer to 1 ms, and close other programs" if share > _MAX_LATE else ""
+    advice = ": set the adapter's latency timer to 1 ms, and close other programs" if share > MAX_LATE else ""
     items.append(f"{count_late} came so late that the sample's time is uncertain{advice}.")
     if all(isinstance(q, int | float) for q in end.get("late_s") or [None]):
         half, most, last = (fixed(1e3 * q, 2) for q in end["late_s"])

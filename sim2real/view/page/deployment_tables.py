@@ -1,29 +1,14 @@
-"""The verdict on a deployment, on a page: reasons, commands played again, drift, times."""
+"""The tables of a deployment on a page: gap, drift, commands played again, times."""
 
 from __future__ import annotations
 
 from sim2real.artifacts.deployment import Deployment
-from sim2real.view.blocks import Block, ListBlock, TableBlock, Tile
-
-
-def verdict_blocks(deployed: Deployment) -> list[Block]:
-    """Return the verdict with its reasons and the next command; empty for older files."""
-    if deployed.advice is None:
-        return []
-    items = list(deployed.advice.reasons)
-    if deployed.advice.next:
-        items.append(f"next: {deployed.advice.next}")
-    return [ListBlock(f"Verdict: {deployed.advice.status}", items)]
-
-
-def verdict_tile(deployed: Deployment) -> list[Tile]:
-    """Return the verdict as a tile; empty for older files."""
-    return [] if deployed.advice is None else [Tile("verdict", deployed.advice.status, deployed.advice.joint)]
+from sim2real.view.blocks import Block, TableBlock
 
 
 def tables(deployed: Deployment) -> list[Block]:
-    """Return the tables of the tests behind the verdict."""
-    blocks: list[Block] = []
+    """Return the gap between robot and simulation, and the tests behind the verdict."""
+    blocks: list[Block] = [TableBlock.of("Robot and simulation", deployed.rows())]
     if deployed.drift is not None:
         caption = (
             "Has the robot changed? Each row compares one estimate with its value in the new log, if only this has "

@@ -1,0 +1,206 @@
+"""Twelve faults, each planted in a log of an arm: the identification is rejected, and its page shows where.
+
+Each log is simulated in C MuJoCo and identified with the command line, without folds and free runs. The page's first
+figure is compared as data: its joint, its second, and the measured values in it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from sketches import sketched
+
+from sim2real import cli
+
+RATE_HZ, SECONDS, DELAY_S, KP = 100.0, 16.0, 0.02, 10.0
+BEGIN_S, END_S = 11.0, 15.0
+"""The faulty part; the last quarter of the log is held out."""
+JOINTS = LIFT, ELBOW, WRIST = "lift", "elbow", "wrist"
+LINK = """<body name="{name}" pos="0 0 {at}"><joint name="{name}" axis="0 1 0" damping="0.2" armature="0.02"
+  frictionloss="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -{long}" size="0.02" mass="{mass}" contype="0"
+  conaffinity="0"/>{child}</body>"""
+HAND = LINK.format(name=WRIST, at=-0.2, long=0.1, mass=0.1, child="")
+LOWER = LINK.format(name=ELBOW, at=-0.25, long=0.2, mass=0.2, child=HAND)
+XML = f"""<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+{LINK.format(name=LIFT, at=0, long=0.25, mass=0.3, child=LOWER)}</worldbody></mujoco>"""
+
+
+def simulated(fault: Callable[..., None] | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return stamps [s], goals and positions [rad] of three joints with a delay of 20 ms, in steps of 1 ms.
+
+    Args:
+        fault: Called before each step with the time [s], the model, and a dict of the arm's ``delay_s``, ``kp``,
+            ``most`` (largest torque) and ``share`` of delivered messages, each ``(3,)``.
+    """
+    model = mujoco.MjModel.from_xml_string(XML.replace("0.002", "0.001"))
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    t = np.arange(round(SECONDS * RATE_HZ)) / RATE_HZ
+    rates = np.array([0.3, 0.7, 1.3, 2.1]) * rng.uniform(0.8, 1.25, (3, 4))
+    goal = 0.2 * np.sin(2 * np.pi * t[:, None, None] * rates + rng.uniform(0, 6, (3, 4))).sum(axis=2)
+    goal *= np.minimum(1, t)[:, None]
+    delivered, heard = rng.random(goal.shape), np.zeros(3)
+    q = np.zeros_like(goal)
+    for k in range(round(1e3 * SECONDS)):
+        arm = {"delay_s": np.full(3, DELAY_S), "kp": np.full(3, KP), "most": np.full(3, np.inf), "share": np.ones(3)}
+        if fault is not None:
+            fault(1e-3 * k, model, arm)
+        if k % 10 == 0:
+            q[k // 10] = data.qpos
+        rows = np.floor((1e-3 * k - arm["delay_s"]) * RATE_HZ + 1e-6).astype(int)
+        for j, row in enumerate(rows):
+            if row >= 0 and delivered[row, j] < arm["share"][j]:
+                heard[j] = goal[row, j]
+        data.qfrc_applied[:] = np.clip(arm["kp"] * (heard - data.qpos), -arm["most"], arm["most"])
+        mujoco.mj_step(model, data)
+    return t, goal, q + 2e-4 * rng.standard_normal(q.shape)
+
+
+def in_motion(change: Callable[[mujoco.MjModel, dict[str, Any]], None], end_s: float = END_S) -> Callable[..., Any]:
+    """Return a log whose arm is changed during the faulty part."""
+
+    def fault(now_s: float, model: mujoco.MjModel, arm: dict[str, Any]) -> None:
+        if BEGIN_S <= now_s < end_s:
+            change(model, arm)
+        elif now_s >= end_s:
+            model.dof_frictionloss[1] = 0.05
+
+    return lambda: simulated(fault)
+
+
+def in_log(change: Callable[[np.ndarray, np.ndarray], None], end_s: float = END_S) -> Callable[..., Any]:
+    """Return a log whose measurements are changed in the faulty part; ``change`` gets the positions and its rows."""
+
+    def log() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        t, goal, q = simulated()
+        change(q, np.flatnonzero((t >= BEGIN_S) & (t < end_s)))
+        return t, goal, q
+
+    return log
+
+
+def setting(name: str, value: float) -> Callable[[mujoco.MjModel, dict[str, Any]], None]:
+    """Return a change of the elbow's ``delay_s``, ``kp``, ``most`` or ``share``."""
+
+    def change(model: mujoco.MjModel, arm: dict[str, Any]) -> None:
+        del model
+        arm[name][1] = value
+
+    return change
+
+
+def friction(value: float) -> Callable[[mujoco.MjModel, dict[str, Any]], None]:
+    """Return a change of the elbow's friction [N m]."""
+
+    def change(model: mujoco.MjModel, arm: dict[str, Any]) -> None:
+        del arm
+        model.dof_frictionloss[1] = value
+
+    return change
+
+
+def laden(model: mujoco.MjModel, arm: dict[str, Any]) -> None:
+    """Add 1.5 kg to the hand."""
+    del arm
+    model.body_mass[model.body(WRIST).id] = 1.6
+
+
+def lost(q: np.ndarray, rows: np.ndarray) -> None:
+    """Repeat the elbow's last position for most messages."""
+    gone = np.random.default_rng(3).random(len(rows)) < 0.97
+    for k in rows[gone]:
+        q[k, 1] = q[k - 1, 1]
+
+
+def noisy(q: np.ndarray, rows: np.ndarray) -> None:
+    """Add uniform noise of up to 0.58 rad to the elbow's positions."""
+    q[rows, 1] += np.random.default_rng(5).uniform(-0.58, 0.58, len(rows))
+
+
+def reversed_sign(q: np.ndarray, rows: np.ndarray) -> None:
+    """Reverse the sign of the elbow's positions."""
+    q[rows, 1] *= -1
+
+
+def swapped(q: np.ndarray, rows: np.ndarray) -> None:
+    """Exchange the positions of elbow and wrist."""
+    q[np.ix_(rows, [1, 2])] = q[np.ix_(rows, [2, 1])]
+
+
+def zero_moved(q: np.ndarray, rows: np.ndarray) -> None:
+    """Add 1 rad to the elbow's positions."""
+    q[rows, 1] += 1.0
+
+
+def frozen(q: np.ndarray, rows: np.ndarray) -> None:
+    """Repeat the elbow's first position of the faulty part."""
+    q[rows, 1] = q[rows[0], 1]
+
+
+def slow_clock(q: np.ndarray, rows: np.ndarray) -> None:
+    """Stretch the elbow's positions in time by a tenth."""
+    q[rows, 1] = np.interp(rows[0] + 0.9 * (rows - rows[0]), np.arange(len(q)), q[:, 1])
+
+
+ALWAYS = float("inf")
+FAULTS: dict[str, tuple[Callable[..., Any], set[str], float]] = {
+    "a joint sticks": (in_motion(friction(1e3)), {ELBOW}, END_S),
+    "a wrong sign": (in_log(reversed_sign, ALWAYS), {ELBOW}, SECONDS),
+    "the delay jumps": (in_motion(setting("delay_s", 0.35), ALWAYS), {ELBOW}, SECONDS),
+    "saturation": (in_motion(setting("most", 0.3)), {ELBOW}, END_S),
+    "two joints are swapped": (in_log(swapped, ALWAYS), {ELBOW, WRIST}, SECONDS),
+    "the zero moves": (in_log(zero_moved, ALWAYS), {ELBOW}, SECONDS),
+    "a payload is added": (in_motion(laden, ALWAYS), {LIFT, ELBOW}, SECONDS),
+    "messages are lost": (in_log(lost), {ELBOW}, END_S),
+    "a frozen encoder": (in_log(frozen), {ELBOW}, END_S),
+    "a noisy sensor": (in_log(noisy, ALWAYS), {ELBOW}, SECONDS),
+    "friction changes": (in_motion(friction(3.0), ALWAYS), {ELBOW}, SECONDS),
+    "a wrong time scale": (in_log(slow_clock, ALWAYS), {ELBOW}, SECONDS),
+}
+"""Name -> function that returns the log, the joints that may be named, and the end of the faulty part [s]."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n == "a frozen encoder" else [pytest.mark.full]) for n in FAULTS]
+)
+def test_the_first_figure_shows_the_fault(name, tmp_path, monkeypatch, capsys):
+    log, joints, end_s = FAULTS[name]
+    t, goal, q = log()
+    monkeypatch.chdir(tmp_path)
+    Path("robot.xml").write_text(XML)
+    np.savez("run.npz", t_s=t, q_rad=q, goal_rad=goal)
+    flags = ["--mjcf", "robot.xml", "--log", "run.npz", "--as-told", "--folds", "0", "--free-run-s", "0"]
+    with sketched() as figures:
+        assert cli.main(["identify", *flags]) == 0
+    said = capsys.readouterr().err
+    (folder,) = tmp_path.glob("runs/robot/*/identify")
+    result = json.loads((folder / "parameters.json").read_text())
+    assert result["verdict"]["status"] != "accepted", said
+    # The first figure of the page is that of the worst second: joint, shaded second, and measured values.
+    upper, _ = figures[0].axes
+    joint, _, unit = upper.get_ylabel().partition(" ")
+    assert joint in joints, said
+    assert unit == "[rad]"
+    (shaded,) = upper.patches
+    first_s, last_s = shaded.get_x(), shaded.get_x() + shaded.get_width()
+    assert first_s >= BEGIN_S - 0.5, said
+    assert last_s <= end_s + 0.5, said
+    measured = next(
+        np.array(line.get_data()) for line in upper.lines if line.get_linestyle() == "-" and line.get_lw() == 1.5
+    )
+    at = np.isfinite(measured[0]) & (measured[0] >= first_s) & (measured[0] <= last_s)
+    np.testing.assert_allclose(measured[1, at], np.interp(measured[0, at], t, q[:, JOINTS.index(joint)]), atol=2e-3)
+    # Page, console and JSON have the same joint, time and error.
+    text = re.search(r"worst: (joint .*)", said)[1]
+    page = (folder / "report.html").read_text()
+    assert page.index("identify-worst-") == min(m.start() for m in re.finditer("identify-[a-z]+-figure_", page))
+    assert text in page
+    worst = result["worst"]
+    assert text.startswith(f"joint {worst['name']}, {worst['begin_s']:.1f} s, ")
+    assert worst["begin_s"] == pytest.approx(first_s)
