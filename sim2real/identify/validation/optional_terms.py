@@ -82,6 +82,12 @@ class Statistics:
             gone |= beyond
         return step
 
+    def only(self, part: int) -> Statistics:
+        """Return the statistics of one part."""
+        one = slice(part, part + 1)
+        rows = self.value[one], self.gradient[one], self.information[one]
+        return Statistics(self.x, *rows, self.prior, self.count[one])
+
 
 @dataclass(frozen=True)
 class Trial:
