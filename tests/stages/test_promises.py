@@ -1,6 +1,7 @@
 """The ledger of promises: against scipy's distributions and simulated parts, not against itself."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,8 @@ from scipy import stats
 from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Bound, Promise
 from sim2real.artifacts.identification import HeldOut, HeldOutPart, Identification, Judgement
 from sim2real.identify.validation.verdict import Position
-from sim2real.stages.estimation import predicted_logs, promises
+from sim2real.stages.estimation import estimate, predicted_logs, promises
+from sim2real.stages.estimation.free_run import Lack
 
 ANGLE = Position("th", "tilt", "rad", 0.001)
 
@@ -185,3 +187,20 @@ def test_the_error_of_a_faster_end_is_taken_per_motion():
     assert not promises.broken(doc.promises)
     (bound,) = promises.bounds(doc, faster, True)
     assert bound.bound == pytest.approx(promises.further(np.full(5, 0.01), np.array([0.01])))
+
+
+@pytest.mark.parametrize(
+    ("before", "end", "status"),
+    [("accepted", 0.04, "promise broken"), ("accepted", 0.012, "accepted"), ("hit a bound", 0.04, "hit a bound")],
+)
+def test_a_broken_promise_is_the_verdict_where_nothing_worse_is(before, end, status, monkeypatch):
+    doc = with_ledger(document([left(n, 0.01) for n in "abcde"], [end]), ["log"], 1)
+    monkeypatch.setattr(estimate, "judge", lambda *_, **__: Judgement(before, ("a reason",)))
+    monkeypatch.setattr(estimate, "positions", lambda *_: [ANGLE])
+    monkeypatch.setattr(estimate, "scores", lambda *_: [])
+    fit = SimpleNamespace(problem=SimpleNamespace(model=None, table=None), converged=True)
+    findings = SimpleNamespace(fit=fit, x=None, spread=None, check=None, trip=None)
+    verdict = estimate.judged(doc, findings, {}, 0.1, [], Lack()).verdict
+    assert verdict.status == status
+    assert verdict.reasons[0].startswith("a promise is broken: tilt") == (end == 0.04)
+    assert any("95 % of later parts" in r or "record more" in r for r in verdict.reasons)
