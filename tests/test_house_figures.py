@@ -8,19 +8,19 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": ,
+    "lines without composer": 61_473,
     "lines of composer": 12_153,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.0,
     "Any in 1,000 lines": 4.8,
-    "words of the dialect": 13,
+    "words of the dialect": 11,
     "other words of the dialect": 220,
     "largest number of project imports": 18,
     "levels of robot classes": 2,
     "public members of SO101Robot": 18,
     "modules of hardware that train imports": 0,
 }
-"""The 13 words that remain are names in file formats (``left_out`` in parameters.json, the column ``told``), evosax's
+"""The 11 words that remain are names in file formats (``left_out`` in parameters.json, the column ``told``), evosax's
 ``tell``, and a word in the column names of recorders."""
 AT_LEAST = {"comment lines [%]": 1.69}
 

@@ -14,11 +14,8 @@ from sim2real.artifacts.estimation.noise import Noise
 from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.estimation.promise import Bound, Promise, promises_table
 from sim2real.artifacts.estimation.quantity import Quantity
-<<<<<<< HEAD
 from sim2real.artifacts.estimation.search import Search
-=======
 from sim2real.artifacts.estimation.worst_second import WorstSecond
->>>>>>> 8c33d51 (Pages open with the verdict and the worst second; a row for each joint; robot beside simulation with their difference; all four verdicts; the viewer's test refuses an error screen (60,986 lines: +640, of them 350 in tests))
 from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.run.run_folder import Source
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown

@@ -23,12 +23,8 @@ from sim2real.identify.uncertainty import identifiability, noise, uncertainty
 from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
 from sim2real.identify.uncertainty.round_trip import RoundTrip, round_trip
 from sim2real.identify.validation.verdict import judge, positions, scores
-<<<<<<< HEAD
-from sim2real.stages.estimation import held_out_parts, promises
-=======
 from sim2real.identify.validation.worst_second import worst_second
-from sim2real.stages.estimation import held_out_parts
->>>>>>> 8c33d51 (Pages open with the verdict and the worst second; a row for each joint; robot beside simulation with their difference; all four verdicts; the viewer's test refuses an error screen (60,986 lines: +640, of them 350 in tests))
+from sim2real.stages.estimation import held_out_parts, promises
 from sim2real.stages.estimation.free_run import Lack
 
 
@@ -148,29 +144,20 @@ def judged(
         beyond=outside,
         left=None if fit.converged else fit.left,
     )
-<<<<<<< HEAD
-    # Add broken promises, free runs and the bounds on later errors.
-    status = verdict.status
-    if status == "accepted":
-        broken = promises.broken(document.promises)
-        status = "lacks a term" if lack.flags else PROMISE_BROKEN if broken else status
-    reasons = promises.broken_sentences(document.promises)
-    reasons += [*promises.sentences(document, measured), *verdict.reasons, *lack.reasons]
+    # Add broken promises, free runs and the bounds on later errors; the reason for the status comes first.
+    status, reasons = verdict.status, list(verdict.reasons)
+    broken = promises.broken_sentences(document.promises)
+    bounds = promises.sentences(document, measured)
+    if status != "accepted":
+        reasons += [*broken, *bounds, *lack.reasons]
+    elif lack.flags:
+        status, reasons = "lacks a term", [*lack.reasons, *broken, *bounds, *reasons]
+    else:
+        status = PROMISE_BROKEN if promises.broken(document.promises) else status
+        reasons = [*broken, *bounds, *reasons, *lack.reasons]
     flags = " ".join(f for f in (verdict.next, lack.flags) if f)
-    return replace(document, verdict=Judgement(status, tuple(reasons), flags), held_out=tuple(rows))
-=======
-    horizon_s = max((r.horizon_s for r in document.prediction), default=0.0)
-    promises = held_out_parts.sentences(document.left_out, measured, horizon_s)
-    # Add the sentences about held-out parts and free runs; the reason for the status comes first.
-    status = "lacks a term" if lack.flags and verdict.status == "accepted" else verdict.status
-    flags = " ".join(f for f in (verdict.next, lack.flags) if f)
-    reasons = (*verdict.reasons, *promises, *lack.reasons)
-    if verdict.status == "accepted":
-        first, later = (lack.reasons, ()) if lack.flags else ((), lack.reasons)
-        reasons = (*first, *promises, *verdict.reasons, *later)
     worst = worst_second(document.samples, measured, document.settle_s)
-    return replace(document, verdict=Judgement(status, reasons, flags), held_out=tuple(rows), worst=worst)
->>>>>>> 8c33d51 (Pages open with the verdict and the worst second; a row for each joint; robot beside simulation with their difference; all four verdicts; the viewer's test refuses an error screen (60,986 lines: +640, of them 350 in tests))
+    return replace(document, verdict=Judgement(status, tuple(reasons), flags), held_out=tuple(rows), worst=worst)
 
 
 def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:

@@ -98,9 +98,9 @@ def largest_difference(
             if positions and pair.robot.name not in positions:
                 continue
             off = pair.difference
-            if pair.held or off is None or not (known := np.isfinite(off)).any():
+            if pair.held or off is None or not (finite := np.isfinite(off)).any():
                 continue
-            window = worst_window(pair.robot.t_s[known], off[known] ** 2)
+            window = worst_window(pair.robot.t_s[finite], off[finite] ** 2)
             share = window[2] / max(float(np.std(pair.robot.values)), 1e-12)
             if best is None or share > best[0]:
                 best = share, number, pair, off, window
