@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, HeldOut, Identification
 from sim2real.artifacts.summary import ArtifactTable
 
+_DOUBTFUL = ("at a bound", "not identifiable", "not converged")
+
 
 @dataclass(frozen=True)
 class JointRow:
@@ -30,7 +32,7 @@ class JointRow:
         return [
             f"{name} {estimate.verdict}"
             for name, estimate in (("delay", self.delay), ("friction", self.friction))
-            if estimate is not None and estimate.verdict in ("at a bound", "not identifiable", "not converged")
+            if estimate is not None and estimate.verdict in _DOUBTFUL and not _is_absent(estimate)
         ]
 
     @property
@@ -67,6 +69,11 @@ def joints_table(identification: Identification) -> ArtifactTable:
     ]
     horizon = f"error, {identification.held_out[0].horizon_s:g} s ahead" if identification.held_out else "error"
     return ArtifactTable(("joint", horizon, "delay", "friction", "verdict"), rows)
+
+
+def _is_absent(estimate: Estimate) -> bool:
+    """Return whether an estimate is at its lower bound 0, which is the smallest possible value and no defect."""
+    return estimate.lower == 0.0 and estimate.upper is not None and estimate.estimate < 1e-3 * estimate.upper
 
 
 def _of_joint(parameters: Sequence[Estimate], joint: str, shared: bool = True) -> Estimate | None:

@@ -1,5 +1,7 @@
 """The rows of joints: which delay and which friction is that of a joint, and its verdict."""
 
+from dataclasses import replace
+
 from sim2real.artifacts.identification import Estimate, HeldOut, Identification, Judgement
 from sim2real.artifacts.joints import joint_rows, joints_table
 
@@ -25,4 +27,8 @@ def test_each_joint_has_its_delay_friction_and_verdict():
         ["left_knee", "0.01 rad", "20.0 ms", "0.4 N m", "friction at a bound"],
         ["wrist", "0.01 rad", "30.0 ms", "0.2 N m", "no better than hold"],
     ]
+    still = (replace(estimate("delay_wrist", 0.0, "delay", "at a bound"), lower=0.0, upper=0.05),)
+    (row,) = joint_rows(replace(found, parameters=still, held_out=(replace(held_out[2], beaten_by=()),)))
+    assert row.delay is still[0]
+    assert row.verdict == "accepted", "a delay of 0 is the smallest possible one"
     assert joint_rows(Identification("dog", (), Judgement("", ()), ())) == []

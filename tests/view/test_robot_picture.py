@@ -3,9 +3,11 @@
 import base64
 import math
 from dataclasses import replace
+from io import BytesIO
 
 import pytest
 import synthetic_run
+from matplotlib.image import imread
 
 from sim2real.artifacts.deployment import Deployment, Replay
 from sim2real.artifacts.run.run_folder import open_folder
@@ -36,10 +38,15 @@ def test_the_picture_has_the_measured_pose(run, monkeypatch):
     manifest.write_text(manifest.read_text().replace('"outputs": {}', f'"outputs": {outputs}'.replace("'", '"')))
     assert "mjcf" in open_folder(run / "identify", "identify").outputs
     poses = []
-    monkeypatch.setattr(robot_picture, "drawn", lambda model, pose: (poses.append((model.name, pose)), (b"PNG", ""))[1])
+    monkeypatch.setattr(
+        robot_picture,
+        "drawn",
+        lambda model, pose: (poses.append((model.name, pose)), robot_picture.Drawing(b"PNG", ("th",)))[1],
+    )
     (block,) = blocks(run)
     assert isinstance(block, PictureBlock)
     assert base64.b64decode(block.data) == b"PNG"
+    assert block.caption == "The identified MuJoCo model: th as measured in the middle of episode 0."
     middle_s = synthetic_run.STEPS // 2 * synthetic_run.PERIOD_US / 1e6
     assert poses == [("identified.xml", {"th": pytest.approx(math.sin(middle_s), abs=1e-5)})]
 
@@ -47,24 +54,22 @@ def test_the_picture_has_the_measured_pose(run, monkeypatch):
 def test_a_driver_that_fails_leaves_a_reason(tmp_path, monkeypatch):
     (tmp_path / "robot.xml").write_text(MODEL)
     monkeypatch.setenv("MUJOCO_GL", "no such driver")
-    png, reason = robot_picture.drawn(tmp_path / "robot.xml", {})
-    assert png is None
-    assert reason.startswith("MuJoCo did not draw it (")
-    assert "no such driver" in reason
+    drawing = robot_picture.drawn(tmp_path / "robot.xml", {})
+    assert drawing.png is None
+    assert drawing.reason.startswith("MuJoCo did not draw it (")
+    assert "no such driver" in drawing.reason
 
 
-def test_a_picture_is_drawn_or_its_driver_is_named(tmp_path, monkeypatch):
+@pytest.mark.parametrize("joint", ["th", "arm/lower/th/joint"])
+def test_a_picture_is_drawn_or_its_driver_is_named(joint, tmp_path, monkeypatch):
     """CI may have no driver."""
-    (tmp_path / "robot.xml").write_text(MODEL)
+    (tmp_path / "robot.xml").write_text(MODEL.replace('"th"', f'"{joint}"'))
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    png, reason = robot_picture.drawn(tmp_path / "robot.xml", {"th": 0.5, "no joint": 1.0})
-    if png is None:
-        assert reason.startswith("MuJoCo did not draw it (")
+    drawing = robot_picture.drawn(tmp_path / "robot.xml", {"th": 0.5, "no joint": 1.0})
+    if drawing.png is None:
+        assert drawing.reason.startswith("MuJoCo did not draw it (")
         return
-    from io import BytesIO
-
-    from matplotlib.image import imread
-
-    pixels = imread(BytesIO(png))
+    pixels = imread(BytesIO(drawing.png))
     assert pixels.shape[:2] == (360, 480)
     assert pixels[..., :3].std() > 0.05
+    assert drawing.placed == ("th",)

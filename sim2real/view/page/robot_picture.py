@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +38,25 @@ def robot_blocks(run_dir: Path, deployed: Deployment, log: Signals) -> list[Bloc
     measured = {series.name: series.values for series in log.measured}
     rows = [(row.name, measured.get(row.column)) for row in deployed.replay]
     pose = {name: float(values[len(values) // 2]) for name, values in rows if values is not None and len(values)}
-    png, reason = drawn(model, pose)
-    if png is None:
-        return [NoteBlock(f"There is no picture of the robot: {reason}.")]
-    caption = "The identified MuJoCo model at the positions measured in the middle of episode 0."
-    return [PictureBlock(base64.b64encode(png).decode("ascii"), caption)]
+    drawing = drawn(model, pose)
+    if drawing.png is None:
+        return [NoteBlock(f"There is no picture of the robot: {drawing.reason}.")]
+    placed = f"{', '.join(drawing.placed)} as measured in the middle of episode 0" if drawing.placed else "at rest"
+    caption = f"The identified MuJoCo model: {placed}."
+    return [PictureBlock(base64.b64encode(drawing.png).decode("ascii"), caption)]
 
 
-def drawn(model: Path, pose: Mapping[str, float]) -> tuple[bytes | None, str]:
-    """Return a picture as PNG and an empty reason, or None and the reason.
+@dataclass(frozen=True)
+class Drawing:
+    """A picture as PNG with the joints that have a measured position, or None with a reason."""
+
+    png: bytes | None
+    placed: tuple[str, ...] = ()
+    reason: str = ""
+
+
+def drawn(model: Path, pose: Mapping[str, float]) -> Drawing:
+    """Draw a model.
 
     Args:
         model: MJCF.
@@ -69,14 +80,14 @@ def drawn(model: Path, pose: Mapping[str, float]) -> tuple[bytes | None, str]:
                 reason = f"MuJoCo did not draw it within {_LIMIT_S:g} s"
                 continue
             if done.returncode == 0 and png.is_file():
-                return png.read_bytes(), ""
+                return Drawing(png.read_bytes(), tuple(json.loads(done.stdout)))
             last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
             reason = f"MuJoCo did not draw it ({last})"
-    return None, reason
+    return Drawing(None, reason=reason)
 
 
 def _draw(model: Path, png: Path, pose: Mapping[str, float]) -> None:
-    """Draw a model in front of a light background, seen by its free camera."""
+    """Draw a model in front of a light background, seen by its free camera; print the joints that were placed."""
     import matplotlib.image
 
     mujoco: Any = importlib.import_module("mujoco")  # pyright does not see the names of its C extension
@@ -87,15 +98,20 @@ def _draw(model: Path, png: Path, pose: Mapping[str, float]) -> None:
     data = mujoco.MjData(compiled)
     if compiled.nkey:
         mujoco.mj_resetDataKeyframe(compiled, data, 0)
-    simple = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    # A composed model names a joint by the path of its parts: arm/upper/elbow/joint.
+    simple = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    placed = []
     for i in range(compiled.njnt):
-        name = compiled.joint(i).name
+        full = compiled.joint(i).name
+        name = full if full in pose else full.removesuffix("/joint").rsplit("/", 1)[-1]
         if name in pose and compiled.jnt_type[i] in simple:
             data.qpos[compiled.jnt_qposadr[i]] = pose[name]
+            placed.append(name)
     mujoco.mj_forward(compiled, data)
     with mujoco.Renderer(compiled, _HEIGHT, _WIDTH) as renderer:
         renderer.update_scene(data)
         matplotlib.image.imsave(png, renderer.render())
+    print(json.dumps(placed))
 
 
 if __name__ == "__main__":
