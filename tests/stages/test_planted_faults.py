@@ -166,6 +166,16 @@ FAULTS: dict[str, tuple[Callable[..., Any], set[str], float]] = {
 """Name -> function that returns the log, the joints that may be named, and the end of the faulty part [s]."""
 
 
+def identified(t: np.ndarray, goal: np.ndarray, q: np.ndarray) -> tuple[Path, dict[str, Any]]:
+    """Identify from a log in the working directory; return the stage's folder and its parameters.json."""
+    Path("robot.xml").write_text(XML)
+    np.savez("run.npz", t_s=t, q_rad=q, goal_rad=goal)
+    flags = ["--mjcf", "robot.xml", "--log", "run.npz", "--as-told", "--folds", "0", "--free-run-s", "0"]
+    assert cli.main(["identify", *flags]) == 0
+    (folder,) = Path.cwd().glob("runs/robot/*/identify")
+    return folder, json.loads((folder / "parameters.json").read_text())
+
+
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=[] if n == "a frozen encoder" else [pytest.mark.full]) for n in FAULTS]
 )
@@ -173,14 +183,9 @@ def test_the_first_figure_shows_the_fault(name, tmp_path, monkeypatch, capsys):
     log, joints, end_s = FAULTS[name]
     t, goal, q = log()
     monkeypatch.chdir(tmp_path)
-    Path("robot.xml").write_text(XML)
-    np.savez("run.npz", t_s=t, q_rad=q, goal_rad=goal)
-    flags = ["--mjcf", "robot.xml", "--log", "run.npz", "--as-told", "--folds", "0", "--free-run-s", "0"]
     with sketched() as figures:
-        assert cli.main(["identify", *flags]) == 0
+        folder, result = identified(t, goal, q)
     said = capsys.readouterr().err
-    (folder,) = tmp_path.glob("runs/robot/*/identify")
-    result = json.loads((folder / "parameters.json").read_text())
     assert result["verdict"]["status"] != "accepted", said
     # The first figure of the page is that of the worst second: joint, shaded second, and measured values.
     upper, _ = figures[0].axes
@@ -204,3 +209,17 @@ def test_the_first_figure_shows_the_fault(name, tmp_path, monkeypatch, capsys):
     worst = result["worst"]
     assert text.startswith(f"joint {worst['name']}, {worst['begin_s']:.1f} s, ")
     assert worst["begin_s"] == pytest.approx(first_s)
+
+
+@pytest.mark.full
+def test_a_fault_in_the_fitted_part_is_named_though_the_verdict_does_not_see_it(tmp_path, monkeypatch, capsys):
+    t, goal, q = simulated()
+    frozen(q, np.flatnonzero((t >= 4.0) & (t < 5.5)))
+    monkeypatch.chdir(tmp_path)
+    folder, result = identified(t, goal, q)
+    assert result["verdict"]["status"] == "accepted", "held-out errors are those of a good model"
+    said = capsys.readouterr().err
+    begin_s = float(re.search(r"not explain elbow in the second from (\d+\.\d) s on", said)[1])
+    assert 4.0 <= begin_s <= 4.7
+    assert result["verdict"]["reasons"][0].startswith("the model does not explain elbow")
+    assert "Accepted, but the model does not explain one second" in (folder / "report.html").read_text()

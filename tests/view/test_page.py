@@ -16,6 +16,7 @@ from sketches import sketched
 
 from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.estimation.posterior import Alternative, Posterior
+from sim2real.artifacts.estimation.worst_second import WorstSecond
 from sim2real.artifacts.identification import HeldOutPart, Identification, Judgement
 from sim2real.artifacts.summary import ArtifactTable, words_and_unit
 from sim2real.errors import Sim2RealError
@@ -120,6 +121,14 @@ def test_each_verdict_has_a_tone(status, tone):
     assert found is not None
     assert found.tone == tone
     assert found.title.lower().startswith(status)
+
+
+def test_an_unexplained_second_makes_an_accepted_identification_doubtful():
+    worst = WorstSecond("elbow", "q", "rad", 0, 3, 5.1, 6.1, 0.8, 400.0, 0.49)
+    found = Identification("robot", (), Judgement("accepted", ()), (), worst=worst)
+    banners = [_banner(replace(found, worst=replace(worst, of_motion=share))) for share in (0.49, 0.5, None)]
+    assert [banner.tone for banner in banners] == ["good", "doubt", "doubt"]
+    assert banners[1].title == "Accepted, but the model does not explain one second"
 
 
 def test_what_the_data_determines_is_told(page):

@@ -11,6 +11,8 @@ import numpy as np
 from sim2real.artifacts.run.run_folder import Source
 
 _WINDOW_S = 1.0
+_UNEXPLAINED = 0.5
+"""Share of a joint's motion from which an error means that the model does not explain the second."""
 _SMALLER = {"rad": "mrad", "m": "mm", "s": "ms"}
 """Unit -> a thousandth of it, for errors below 1."""
 
@@ -42,6 +44,11 @@ class WorstSecond:
     rmse: float | None
     times_noise: float | None
     of_motion: float | None
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether the model does not explain this second: a fault of the log, of the robot or of the model."""
+        return self.of_motion is None or self.of_motion >= _UNEXPLAINED
 
     @property
     def error(self) -> str:

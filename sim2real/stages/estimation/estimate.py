@@ -156,7 +156,11 @@ def judged(
         status = PROMISE_BROKEN if promises.broken(document.promises) else status
         reasons = [*broken, *bounds, *reasons, *lack.reasons]
     flags = " ".join(f for f in (verdict.next, lack.flags) if f)
+    # A fault in fitted data changes no held-out error, so it does not change the status.
     worst = worst_second(document.samples, measured, document.settle_s)
+    if worst is not None and worst.unexplained:
+        where = f"the model does not explain {worst.name} in the second from {worst.begin_s:.1f} s on: {worst.error}"
+        reasons.insert(0 if status == "accepted" else len(verdict.reasons), f"{where}; look at the log there")
     return replace(document, verdict=Judgement(status, tuple(reasons), flags), held_out=tuple(rows), worst=worst)
 
 

@@ -84,6 +84,8 @@ def _banner(result: Identification) -> Banner | None:
     if not status:
         return None
     tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
+    if status == "accepted" and result.worst is not None and result.worst.unexplained:
+        tone, title = "doubt", "Accepted, but the model does not explain one second"
     return Banner(tone, title, [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons])
 
 
