@@ -274,17 +274,17 @@ def read_reports() -> dict[str, dict[str, Any]]:
 def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
     """Return the tables whose reports are all present."""
     write: dict[str, Callable[[dict[str, dict[str, Any]]], str]] = {
-        "evidence": lambda own: evidence(own["randomise"], own["league"]),
-        "demo": lambda own: demo(own["demo"]),
-        "arm": lambda own: arm("the arm: three position-controlled servos on one bus", *own.values()),
-        "so101": lambda own: arm("the SO-101: six servos with the parameters of a real one", *own.values()),
+        "evidence": lambda chosen: evidence(chosen["randomise"], chosen["league"]),
+        "demo": lambda chosen: demo(chosen["demo"]),
+        "arm": lambda chosen: arm("the arm: three position-controlled servos on one bus", *chosen.values()),
+        "so101": lambda chosen: arm("the SO-101: six servos with the parameters of a real one", *chosen.values()),
         "real": real_motors,
-        "league": lambda own: league(own["league"]),
-        "randomise": lambda own: randomise(own["randomise"], own["randomise_worn"]),
+        "league": lambda chosen: league(chosen["league"]),
+        "randomise": lambda chosen: randomise(chosen["randomise"], chosen["randomise_worn"]),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}
-    own = {table: {name: reports[name] for name in names} for table, names in there.items()}
-    return {table: write[table](own[table]) + origin(own[table]) for table in there}
+    chosen = {table: {name: reports[name] for name in names} for table, names in there.items()}
+    return {table: write[table](chosen[table]) + origin(chosen[table]) for table in there}
 
 
 def stale(reports: Mapping[str, dict[str, Any]], root: Path = ROOT) -> dict[str, str]:

@@ -49,7 +49,7 @@ BENCHES = {
         (
             *(*_GRAPH, "sim2real/identify", "sim2real/train", "sim2real/stages/deploy/verdict.py"),
             *("sim2real/stages/deploy/next_command.py", "sim2real/stages/estimation/replay.py"),
-            "sim2real/stages/estimation/later_logs.py",
+            "sim2real/stages/estimation/replay_problem.py",
             *("scripts/benches/hidden", "pipelines/arm", "pipelines/so101"),
         ),
     ),

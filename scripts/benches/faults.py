@@ -212,14 +212,14 @@ def run_once(fault: Fault, seed: int, bundle: Path, folder: Path, watchdog_s: fl
             child.kill()
             child.join()
         time.sleep(0.3)  # the last commands take effect
-    words = messages.read_text(errors="replace")
+    printed = messages.read_text(errors="replace")
     (log,) = (folder / "runs").glob("pendulum/*/deploy/episode_0.mcap")
     account = read_truth(truth)
     if stopped_before(account, began_ns):
-        raise NotBegun(f"the motor stopped before the fault: {words}")
+        raise NotBegun(f"the motor stopped before the fault: {printed}")
     safe_s = safe_after(account, began_ns)
-    right = code in fault.codes and fault.message in words and (fault.name == KILLED or "error: " in words)
-    return Outcome(fault.name, seed, safe_s, code, words.strip()[-300:], _readable(log), right)
+    right = code in fault.codes and fault.message in printed and (fault.name == KILLED or "error: " in printed)
+    return Outcome(fault.name, seed, safe_s, code, printed.strip()[-300:], _readable(log), right)
 
 
 def begun(fault: Fault, seed: int, bundle: Path, root: Path, watchdog_s: float) -> Outcome:

@@ -110,9 +110,9 @@ class DrivenWorld(MjxWorld):
         return DriveParams(params.model, params.qpos, params.qvel, terms=terms)
 
     def law_values(self, params: DriveParams) -> dict[str, jax.Array]:
-        """Return what the law needs of the joints: the model's own friction and limits, and the terms' coefficients."""
+        """Return the values of the law: friction and limits of the model, and the coefficients of the terms."""
         model, still = params.model, jnp.zeros(len(self.joints))
-        own = {
+        drives = {
             "damping": model.dof_damping[self.qvel_at],
             "frictionloss": model.dof_frictionloss[self.qvel_at],
             "limit": jnp.asarray(model.jnt_actfrcrange)[self.joints, 1],
@@ -122,7 +122,7 @@ class DrivenWorld(MjxWorld):
             "other_damping": jnp.asarray(model.dof_damping)[self._others],
             "other_frictionloss": jnp.asarray(model.dof_frictionloss)[self._others],
         }
-        return {n: still + v for n, v in (own | coefficients).items()} | others
+        return {n: still + v for n, v in (drives | coefficients).items()} | others
 
     def started(self, params: DriveParams, angle: jax.Array, speed: jax.Array) -> DriveParams:
         """Return parameters with an initial state; equalities determine the joints that were not recorded.

@@ -19,7 +19,7 @@ from sim2real.identify.validation import prediction
 from sim2real.identify.validation.verdict import positions
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts, promises
-from sim2real.stages.estimation.later_logs import problem_of_logs
+from sim2real.stages.estimation.replay_problem import problem_of_logs
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 AS_HERE = "as in this log"

@@ -26,7 +26,7 @@ IDLE, CLOSED_LOOP = 1, 8  # axis states
 STATE, WATCHDOG = "axis0.current_state", "axis0.config.enable_watchdog"
 
 _ANSWER_S = 0.02  # longest wait for an answer, besides its time on the wire
-_LATE_S = 0.004  # an answer that took so much longer does not say well when it was asked for
+_LATE_S = 0.004  # the time of the request is uncertain if the answer took longer by this
 _LOSSES = 5  # missing answers in a row that mean: it is gone
 _CHANGE_S = 0.5  # longest wait for the axis to change its state
 
@@ -42,7 +42,7 @@ def unframed(line: bytes) -> str | None:
     return text.decode("ascii", "replace") if star and checksum == str(reduce(xor, text, 0)).encode() else None
 
 
-_OFF = b"\n" + framed(f"w axis0.requested_state {IDLE}")  # the first end of line closes what was being written
+_OFF = b"\n" + framed(f"w axis0.requested_state {IDLE}")  # the first end of line closes an unfinished line
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class SpeedLoop:
     speed: float = 20.0
 
     def properties(self) -> dict[str, float]:
-        """Return what is written to the board, name -> value: 2 is speed control, 1 takes speeds as they come."""
+        """Return the settings of the board, name -> value: 2 is speed control, 1 takes speeds without a ramp."""
         control = "axis0.controller.config"
         return {
             f"{control}.control_mode": 2,
@@ -85,7 +85,7 @@ class ODrive(Device):
         silence_s: Time without a command after which the board takes the torque off [s]; 0: never.
 
     Raises:
-        UsageError: Another axis is asked for.
+        UsageError: Another axis is requested.
     """
 
     def __init__(self, port: str, ids: Sequence[int], drive: SpeedLoop, *, baud_rate: int, silence_s: float) -> None:
@@ -99,7 +99,7 @@ class ODrive(Device):
         self._answers = self._losses = self._late = self._kept = 0
         self._late_s: list[float] = []
 
-    # -- what it says about itself
+    # -- its description
 
     @property
     def motors(self) -> tuple[str, ...]:
@@ -166,7 +166,7 @@ class ODrive(Device):
 
     @property
     def torque_withheld(self) -> bool:
-        """Whether nothing can move the motor."""
+        """Whether no command can move the motor."""
         return self._withheld
 
     def enable(self) -> None:
@@ -219,7 +219,7 @@ class ODrive(Device):
     # -- the ways out
 
     def disable(self) -> None:
-        """Switch the torque off, and wait until the axis says so."""
+        """Switch the torque off, and wait until the axis confirms it."""
         self._on = False
         self._tell(f"w axis0.requested_state {IDLE}")
         self._await(IDLE)
@@ -250,7 +250,7 @@ class ODrive(Device):
     # -- lines and answers
 
     def _tell(self, text: str) -> Transaction:
-        """Send what is not answered."""
+        """Send a line without an answer."""
         asked_ns = time.monotonic_ns()
         with self._lock:
             sent_ns, _ = self._send(text)
@@ -258,7 +258,7 @@ class ODrive(Device):
             return Transaction(sent_ns, sent_ns - asked_ns, time.monotonic_ns() - sent_ns, 0)
 
     def _ask(self, text: str, count: int) -> tuple[list[float], Transaction]:
-        """Ask until there is an answer with so many numbers."""
+        """Ask until an answer has this many numbers."""
         asked_ns = time.monotonic_ns()
         with self._lock:
             began_ns = time.monotonic_ns()

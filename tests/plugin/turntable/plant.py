@@ -31,7 +31,7 @@ class Turntable:
         for _ in range(round(t_s / self.step_s) - self.steps):
             drive = 0.0 if self.goal is None else self.loop * (self.goal - self.speed)
             free = self.speed + self.step_s * (drive - self.drag * self.speed)
-            # Friction takes up to so much of the speed, and never turns it round.
+            # Friction reduces the speed by at most this, and never reverses it.
             self.speed = math.copysign(max(0.0, abs(free) - self.step_s * self.friction), free)
             self.angle += self.step_s * self.speed
             self.steps += 1
