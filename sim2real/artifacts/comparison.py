@@ -132,6 +132,7 @@ def _verdict(parameter: ComparedParameter) -> str:
 
 def _figures_of(run: ComparedRun) -> dict[str, Json]:
     """Return name -> value of one run's verdicts, held-out errors and scores on the robot."""
+    # Figures of the identification, then those of the deployment.
     figures: dict[str, Json] = {"started": run.started}
     if (identification := run.identification) is not None:
         figures["identification"] = identification.verdict.status

@@ -167,6 +167,7 @@ class Timing(Shown):
         delays: dict[str, DelayDistribution] = {}
         dropped: dict[str, int] = {}
         for name, took in self.steps_s.items():
+            # Drop steps that took much longer than usual, if they are few.
             usual = took[took <= longest_s]
             if usual.size < 2 or usual.size < took.size / 2:
                 raise Sim2RealError(

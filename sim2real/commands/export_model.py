@@ -83,6 +83,7 @@ def _export(identification: Identification, pipeline: Pipeline, to: str, out: Pa
             f"the identification in {where} {ended}: its estimates may be far off",
             hint=identification.verdict.next or f"sim2real identify {identification.pipeline}",
         )
+    # Describe the source at the head of the file.
     robot = having(pipeline.load(), [p.name for p in identification.parameters])
     table = robot.identifiable(pipeline.identify.max_delay_s).parameters
     about = [
@@ -142,6 +143,7 @@ def find_parameters(config: ExportConfig) -> Path:
             f"export needs a run folder, a pipeline or a {PARAMETERS}. Pipelines: {', '.join(sorted(available()))}",
             hint="sim2real export identified PIPELINE --to mjcf",
         )
+    # A file or a stage folder, then a pipeline's name, then a run.
     path = Path(source)
     if path.is_file():
         return path

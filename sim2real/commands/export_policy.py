@@ -32,6 +32,7 @@ def run(config: ShipConfig) -> Path:
     out = config.to or Path(f"{bundle.resolve().parent.name}_policy")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} is there and not empty", hint="name another folder with --to")
+    # Copy the bundle, and the example that runs it in numpy.
     out.mkdir(parents=True, exist_ok=True)
     for name in (WEIGHTS, GRAPH, CONTRACT):
         shutil.copyfile(bundle / name, out / name)

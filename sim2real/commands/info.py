@@ -104,6 +104,7 @@ def log(path: Path) -> str:
     """
     from sim2real.log import summary  # imports JAX, which the rest of `info` does without
 
+    # Facts of the file, then its topics and metadata.
     facts = summary(path)
     head = {
         "log": shown(path),

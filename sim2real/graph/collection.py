@@ -9,11 +9,7 @@ from sim2real.graph.node import BaseNode
 
 
 def by_name(nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> dict[str, BaseNode]:
-    """Return nodes as a dictionary by name, checked.
-
-    Raises:
-        UsageError: An entry is not a node, two nodes have the same name, or a key is not its node's name.
-    """
+    """Return nodes as a dictionary by name, checked."""
     if not isinstance(nodes, Mapping | Sequence) or isinstance(nodes, str):
         raise UsageError(
             f"the nodes of a graph were expected, got {nodes!r}", hint="pass a list or a dictionary of them"
@@ -36,9 +32,6 @@ def check_senders(nodes: Mapping[str, BaseNode], among: Mapping[str, object] | N
 
     Args:
         among: Check only senders with these names, as others are missing on purpose; None: all senders.
-
-    Raises:
-        UsageError: A sender is missing, or is another object than the node of its name.
     """
     for node in nodes.values():
         for c in node.inputs.values():

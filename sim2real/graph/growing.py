@@ -41,11 +41,7 @@ class Growing:
         self.grow()
 
     def grow(self) -> None:
-        """Draw a timeline of twice the length that begins as the one so far.
-
-        Raises:
-            UsageError: As ``draw``.
-        """
+        """Draw a timeline of twice the length that begins as the one so far."""
         self._duration_s *= 2.0
         if self._duration_s > 1e9:
             raise UsageError("an episode cannot last longer than 30 years")

@@ -28,11 +28,7 @@ def slot(node: BaseNode, k: np.ndarray | int, phase: int | None = None) -> np.nd
 
 
 def waits_for_schedule(node: BaseNode) -> bool:
-    """Return whether steps wait for their slot (rule 3): unless ``advance`` is set and all inputs block.
-
-    Raises:
-        UsageError: When ``advance`` is set and no input blocks.
-    """
+    """Return whether steps wait for their slot (rule 3): unless ``advance`` is set and all inputs block."""
     if not node.advance:
         return True
     if not any(c.blocking for c in node.inputs.values()):

@@ -59,11 +59,7 @@ def bursty_episodes(nodes: Mapping[str, BaseNode], timeline: Timeline) -> np.nda
 
 
 def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
-    """Check that every window is long enough for every trainable delay within its bounds.
-
-    Raises:
-        UsageError: A window is too short; the message has the first such step and their number.
-    """
+    """Check that every window is long enough for every trainable delay within its bounds."""
     for (name, input_name), edge in timeline.edges.items():
         if name not in nodes or input_name not in nodes[name].inputs:
             continue

@@ -101,10 +101,12 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
         """
         super().reset(seed=seed if isinstance(seed, int | np.integer) else None)
         mask = self._mask(options)
+        # New keys for the reset copies.
         if seed is not None or self._keys is None:
             keys = self._keys_of(self._seeds(seed))
             is_partial = self._keys is not None and mask is not None
             self._keys = select_copies(jax.numpy.asarray(mask), keys, self._keys) if is_partial else keys
+        # Reset all copies, or those of the mask.
         if mask is None or self._last is None:
             last, self._keys = self._start(self._keys)
             self._done = np.zeros(self.num_envs, bool)

@@ -44,6 +44,7 @@ def decode(record: Mapping[str, str]) -> dict[str, Json] | None:
     Raises:
         Sim2RealError: When it was written in a newer format.
     """
+    # A damaged record has another checksum.
     text = record.get("json")
     if text is None or record.get("crc32") != f"{zlib.crc32(text.encode()):08x}":
         return None

@@ -112,6 +112,7 @@ def opened(path: str | Path) -> Iterator[mmap.mmap]:
             f"there is no log {path}", hint=f"logs in that folder: {', '.join(names)}" if names else "check the path"
         )
     with open(path, "rb") as stream:
+        # An MCAP file starts with its magic bytes.
         magic = stream.read(len(MCAP0_MAGIC))
         if len(magic) < len(MCAP0_MAGIC) and MCAP0_MAGIC.startswith(magic):
             raise cut_before_session(path)

@@ -127,6 +127,7 @@ class _Copier:
 
     def take(self, data: mmap.mmap, record: Record, damage: Damage) -> None:
         """Copy a record of the data section."""
+        # Messages can be inside of chunks, or outside.
         if record.opcode == Opcode.HEADER:
             self._header = parsed(Header, data, record, damage) or self._header
         elif record.opcode == Opcode.CHUNK:

@@ -223,6 +223,7 @@ class McapRecorder:
         report_s = time.monotonic() + REPORT_PERIOD_S
         while self._thread.is_alive():
             self._thread.join(CHECK_PERIOD_S)
+            # Wait as long as the disk takes data.
             left = self.backlog()
             if left.stuck and self._thread.is_alive():
                 raise Sim2RealError(

@@ -285,11 +285,13 @@ def _shapes(
     weights: Mapping[str, np.ndarray], contract: PolicyContract, spec: NetworkSpec
 ) -> dict[str, tuple[int, ...]]:
     """Return the shape that each array must have, from the contract and the other arrays."""
+    # Normaliser and bounds.
     require(weights, BESIDES)
     size, actions = contract.observation_size, len(contract.action)
     expected = {"mean": (size,), "std": (size,), "low": (actions,), "high": (actions,), "log_std": (actions,)}
     if not spec.built_in:
         return {name: weights[name].shape for name in weights} | expected
+    # The recurrent unit, then the layers behind it.
     width = size
     if spec.name == "gru":
         width = gru_of(weights)["recurrent"].shape[0]

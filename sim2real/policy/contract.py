@@ -176,6 +176,7 @@ class PolicyContract:
             Sim2RealError: A part is missing or of the wrong type.
         """
         try:
+            # Convert each entry, as the file may hold any JSON.
             return cls(
                 observation=tuple(
                     ObservationTerm(

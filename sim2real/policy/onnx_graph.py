@@ -97,6 +97,7 @@ def make_model(
     def described(name: str, shape: tuple[int, ...]) -> ValueInfoProto:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, *shape])
 
+    # The carry is an input and an output of the graph; its first value is in the model's properties.
     carried = [np.shape(array) for array in initial]
     graph = helper.make_graph(
         list(nodes),

@@ -128,6 +128,7 @@ class OnnxBackend:
                 "backend 'onnx' needs onnxruntime, which is not installed",
                 hint="pip install 'sim2real[hardware]', or use backend 'numpy'",
             ) from error
+        # One thread: the policy is small, and the control loop has one core.
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         try:

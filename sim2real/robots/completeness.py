@@ -42,11 +42,7 @@ def is_joints(value: object) -> bool:
 
 
 def complete(cls: type[T], *args: object, **options: object) -> T:
-    """Make an object, as ``__new__`` of its class.
-
-    Raises:
-        UsageError: Its class lacks methods; the message lists all of them.
-    """
+    """Make an object, as ``__new__`` of its class."""
     del args, options
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
         ours = [base for base in reversed(cls.__mro__) if base.__module__.startswith("sim2real.robots")]

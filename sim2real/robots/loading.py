@@ -56,9 +56,6 @@ def checked(robot: Any, where: str) -> RecordedRobot:
 
     Args:
         robot: The module's ``ROBOT``; None if it has none.
-
-    Raises:
-        UsageError: It is no robot, or it is incomplete.
     """
     # List the gaps of a robot and of its parts.
     if isinstance(robot, Robot):

@@ -123,9 +123,6 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
 
     Args:
         answers: Each of shape ``(N, 2)``: time since the command [s], and motion since then in its direction [rad].
-
-    Raises:
-        Sim2RealError: They show no motion.
     """
     if np.median([np.max(a[:, 1]) for a in answers]) < _RISE_RAD:
         raise Sim2RealError(

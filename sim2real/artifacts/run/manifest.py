@@ -51,6 +51,7 @@ def _is_manifest(value: object) -> bool:
     """Return whether a JSON document has a manifest's entries, and its outputs are in its folder."""
     if not isinstance(value, dict) or any(not isinstance(value.get(k), str) for k in _TEXTS):
         return False
+    # Outputs lie inside the stage's folder; inputs may lie elsewhere.
     for kind in ("inputs", "outputs"):
         entries = value.get(kind)
         if not isinstance(entries, dict):

@@ -59,6 +59,7 @@ class LoopTask:
         """Draw the parameters of an episode that has a share of all differences; None: all of them."""
         draw = partial(self._draw, width=width)
         task = self.robot.task
+        # Draw values and start; then move the start, and scale the noise.
         if any(self.start):
             key, key_start = jax.random.split(key)
             values, start = task.random(key, draw)

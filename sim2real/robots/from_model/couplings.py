@@ -60,6 +60,7 @@ def joints_of_tendon(model: MjModel, tendon: int) -> frozenset[int]:
     joints: set[int] = set()
     bodies: list[int] = []
     begin = int(model.tendon_adr[tendon])
+    # Walk along the tendon; a pulley begins a new branch.
     for i in range(begin, begin + int(model.tendon_num[tendon])):
         kind, number = int(model.wrap_type[i]), int(model.wrap_objid[i])
         if kind == int(mj.mjtWrap.mjWRAP_JOINT):

@@ -41,11 +41,13 @@ def leave_out(spec: MjSpec) -> list[str]:
     Args:
         spec: ``mujoco.MjSpec``; it is changed.
     """
+    # Delete geoms that contribute no inertia, and contacts of theirs.
     gone = [g for g in spec.geoms if (g.meshname or g.hfieldname) and _spare(spec, g.parent)]
     names = {g.name for g in gone if g.name}
     pairs = [p for p in spec.pairs if {p.geomname1, p.geomname2} & names]
     for element in (*pairs, *gone):
         spec.delete(element)
+    # Delete the files that no geom uses any more.
     meshes, fields = {g.meshname for g in spec.geoms}, {g.hfieldname for g in spec.geoms}
     files = [m for m in spec.meshes if m.name not in meshes] + [h for h in spec.hfields if h.name not in fields]
     for material in spec.materials:

@@ -241,12 +241,14 @@ def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[Pa
         wanted: ``auto``, ``all``, or names separated by commas, in addition to those of ``auto``. A quantity that a
             pattern names is available without the others of its term.
     """
+    # Choose the optional terms.
     quantities_named, names = {term.what for term in terms}, {n.strip() for n in wanted.split(",")}
     if "cogging" in names and "cogging_per_turn" not in quantities_named:
         raise UsageError("cogging needs its number of repeats in a turn", hint="add --parameter cogging_per_turn=N")
     available = {name for name in OPTIONAL if name not in ONLY_NAMED or name in names}
     if wanted == "all":
         available |= set(ONLY_NAMED) - (set() if "cogging_per_turn" in quantities_named else {"cogging"})
+    # Give each pattern its term, and add patterns for the other quantities of the terms.
     return (
         *(replace(term, term=name) if (name := _term_of(term.what)) else term for term in terms),
         *(
@@ -321,6 +323,7 @@ def tilted(placed: Sequence[Placed], values: Mapping[str, Scalar], gravity: Arra
 
 
 def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: float) -> Parameter:
+    # Bounds: fixed ones, a factor of another quantity, or factors of the nominal value.
     unit, about = _ABOUT[term.what]
     transform: Transform = "log"
     kind = "measurement" if term.what == "zero" else "dynamics"
@@ -347,6 +350,7 @@ def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel) 
         return _FIXED[term.what][0]
     if term.what in _OF_MODEL:
         return 0.0
+    # The file's values, of joints that have one.
     values: list[float] = []
     for name in names:
         if term.what in ON_DOF:
