@@ -8,13 +8,13 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 61_900,
-    "lines of composer": 12_153,
+    "lines without composer": 61_500,
+    "lines of composer": 12_074,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.0,
-    "Any in 1,000 lines": 4.8,
+    "Any in 1,000 lines": 4.7,
     "words of the dialect": 11,
-    "other words of the dialect": 220,
+    "other words of the dialect": 181,
     "largest number of project imports": 18,
     "levels of robot classes": 2,
     "public members of SO101Robot": 18,
@@ -22,7 +22,7 @@ LIMITS = {
 }
 """The 11 words that remain are names in file formats (``left_out`` in parameters.json, the column ``told``), evosax's
 ``tell``, and a word in the column names of recorders."""
-AT_LEAST = {"comment lines [%]": 1.69}
+AT_LEAST = {"comment lines [%]": 1.72}
 
 
 @pytest.fixture(scope="module")

@@ -29,11 +29,7 @@ def learn_policy(
     watch: Watch | None,
     teacher: Bundle | None,
 ) -> TrainResult:
-    """Train by PPO.
-
-    Args:
-        checkpoint: File that receives the whole training after each evaluation.
-    """
+    """Train by PPO, with a progress bar; ``checkpoint`` is written after each evaluation, ``resume`` is continued."""
     master = None if teacher is None else teacher_policy(teacher, contract)
     ppo = replace(config.ppo, eval_steps=setup.env.length + 1)
     key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)

@@ -55,7 +55,6 @@ def check_values(values: dict[str, np.ndarray], env_steps: int, config: PPOConfi
 
 def check_target(env: TrainingEnvironment, config: PPOConfig) -> None:
     """Raise a ``UsageError`` if the configuration has a target and the environment reports no success."""
-    # The metrics are those of a step.
     if config.target is not None and "success" not in (names := metric_names(env)):
         raise UsageError(
             f"target={config.target} is a share of success, and the environment's metrics have none: {sorted(names)}",
