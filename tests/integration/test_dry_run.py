@@ -125,7 +125,7 @@ def test_the_log_holds_what_would_have_been_sent_and_says_that_it_was_not(record
 def test_the_console_says_so_at_both_ends(recorded):
     assert recorded.err.startswith("recording 1 s of multisine")
     assert "dry run: torque stays off and no goal is sent; what would have been sent is logged" in recorded.err
-    assert "dry run: nothing was moved; no later stage takes this for a recording" in recorded.err
+    assert "dry run: no joint was moved; no later stage uses this as a recording" in recorded.err
     assert "would have been sent to" in recorded.out
 
 
