@@ -8,7 +8,7 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 61_510,
+    "lines without composer": 62_595,
     "lines of composer": 12_074,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.0,
@@ -17,7 +17,7 @@ LIMITS = {
     "other words of the dialect": 181,
     "largest number of project imports": 18,
     "levels of robot classes": 2,
-    "public members of SO101Robot": 18,
+    "public members of SO101Robot": 19,
     "modules of hardware that train imports": 0,
 }
 """The 11 words that remain are names in file formats (``left_out`` in parameters.json, the column ``told``), evosax's

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import SafetyStop
-from sim2real.identify.model import Channel
+from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask, Session
@@ -22,8 +22,9 @@ from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.probe import Probe
 from sim2real.robots.servo.agent import AgentParams
-from sim2real.types import Key
+from sim2real.types import Key, Scalar
 
+from .mjcf import HINGE, STEP_S, mjcf_of
 from .model import HISTORY, Agent, Command, Measurement, PendulumParams, PendulumWorld, causes, dynamics, from_groups
 
 if TYPE_CHECKING:
@@ -37,8 +38,6 @@ SERVO_ID = 1
 LIMIT_V = 2.0
 """Largest voltage of the policy [V]."""
 WORLD_HZ = 100.0
-HINGE = "hinge"
-"""The joint; angle 0 is upright."""
 _UNITS, _LOW, _HIGH = ("1", "1", "rad/s"), (-1.0, -1.0, -6.0), (1.0, 1.0, 6.0)
 """Units and bounds of the measurement in the observation; the model limits the speed to 60 rad/s."""
 _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
@@ -176,6 +175,25 @@ class HingeModel(RobotModel):
     def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PendulumParams:
         """Return the world's parameters for values and a start."""
         return from_groups(values, jnp.concatenate([jnp.asarray(x) for x in (start.position, start.velocity)]))
+
+    @property
+    def export_lead_s(self) -> float:
+        """Half a step of MuJoCo, which moves a joint as if a force had acted that earlier [s]."""
+        return 0.5 * STEP_S
+
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str:
+        """Return the pendulum in MuJoCo; its actuator takes a voltage."""
+        return mjcf_of(values)
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
+        """Return the pendulum with MuJoCo's forces and the integrator of its world."""
+
+        def begin(start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return start[:1], start[1:]
+
+        world = self.make_world()
+        mjcf = mjcf_of(values, self.tick_s / world.substeps)
+        return PlainSimulation(mjcf, (HINGE,), self.tick_s, begin, integrator="verlet")
 
 
 class SwingUp(RobotTask):

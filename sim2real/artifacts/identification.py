@@ -24,7 +24,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.types import Json
 
 FORMAT = 3
-PARAMETERS, PREDICTIONS, FREE_RUNS = "parameters.json", "predictions.npz", "free_runs.npz"
+PARAMETERS, PREDICTIONS, FREE_RUNS, REPLAYS = "parameters.json", "predictions.npz", "free_runs.npz", "replays.npz"
 ROUND_TRIP = "round_trip_delay"
 """Name of the sum of all delays."""
 MODELS = ("identified", "no delay", "nominal")
@@ -200,6 +200,7 @@ class Identification(Shown):
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
             ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field.
         free: The same columns of the free runs; empty without free runs.
+        replays: Initial states and commands of held-out segments and free runs; see ``identify.validation.replays``.
         timing: Timing of the first recording, from which training draws its delays; None if only the estimates exist.
     """
 
@@ -235,6 +236,7 @@ class Identification(Shown):
     posterior: Posterior | None = None
     samples: Mapping[str, np.ndarray] = field(default_factory=dict)
     free: Mapping[str, np.ndarray] = field(default_factory=dict)
+    replays: Mapping[str, np.ndarray] = field(default_factory=dict)
     timing: Timing | None = None
     format: int = FORMAT
 
@@ -322,15 +324,14 @@ class Identification(Shown):
         folder = make_folder(folder)
         written = {"parameters": PARAMETERS}
         self.write(folder / PARAMETERS)
-        for name, file, columns in (("predictions", PREDICTIONS, self.samples), ("free_runs", FREE_RUNS, self.free)):
+        for name, columns in (("predictions", self.samples), ("free_runs", self.free), ("replays", self.replays)):
             if columns:
-                write_arrays(folder / file, columns)
-                written[name] = file
+                write_arrays(folder / written.setdefault(name, f"{name}.npz"), columns)
         return written if self.timing is None else {**written, **self.timing.save(folder)}
 
     def write(self, path: Path) -> None:
         """Write estimates and verdict as JSON, without samples and timing."""
-        arrays = ("samples", "free", "timing")
+        arrays = ("samples", "free", "replays", "timing")
         write_json(path, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays})
 
     @staticmethod
@@ -357,10 +358,10 @@ class Identification(Shown):
         others: dict[str, Json] = {}
         if file.with_name(TIMING).is_file():
             others["timing"] = Timing.load(file.with_name(TIMING))
-        for name, samples_file in (("samples", PREDICTIONS), ("free", FREE_RUNS)):
+        for name, samples_file in (("samples", PREDICTIONS), ("free", FREE_RUNS), ("replays", REPLAYS)):
             if (samples_path := file.with_name(samples_file)).is_file():
                 with malformed(samples_path, _AGAIN):
-                    others[name] = _columns(read_arrays(samples_path))
+                    others[name] = (dict if name == "replays" else _columns)(read_arrays(samples_path))
         return replace(identification, **others)
 
 

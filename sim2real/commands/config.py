@@ -52,8 +52,9 @@ class ExportConfig:
 
     source: Annotated[Positional[str | None], arg(metavar="RUN|PIPELINE|FILE")] = None
     """A run folder, a pipeline, whose newest identification is taken, or a parameters.json."""
-    to: Literal["mjcf", "mjlab", "isaaclab", "json"] = "mjcf"
-    """Format: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, or everything as JSON."""
+    to: Literal["mjcf", "mjlab", "isaaclab", "json", "card"] = "mjcf"
+    """Format: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, everything as JSON, or a model card: a
+    folder with a page and a script that computes each figure again."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """The file to write; default: one in the working directory that is called after the pipeline."""
     runs: Path = Path("runs")

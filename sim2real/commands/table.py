@@ -48,15 +48,16 @@ COMMANDS: dict[str, Command] = {
         "write the estimates for MuJoCo, mjlab, Isaac Lab or as JSON; or a policy for a machine with numpy alone",
         {
             "identified": ConfigCommand(
-                "RUN|PIPELINE|FILE --to mjcf|mjlab|isaaclab|json",
-                "commands.export_model", "commands.config.ExportConfig",
+                "RUN|PIPELINE|FILE --to mjcf|mjlab|isaaclab|json|card",
+                "commands.export.model", "commands.config.ExportConfig",
                 examples=(
                     "export identified pendulum --to json",
                     "export identified runs/arm/TIME --to mjcf --out arm.xml",
+                    "export identified pendulum --to card",
                 ),
             ),
             "policy": ConfigCommand(
-                "RUN|PIPELINE|BUNDLE --to DIR", "commands.export_policy", "commands.config.ShipConfig",
+                "RUN|PIPELINE|BUNDLE --to DIR", "commands.export.policy", "commands.config.ShipConfig",
                 examples=("export policy pendulum --to policy",),
             ),
         },

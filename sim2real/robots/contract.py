@@ -16,7 +16,7 @@ import numpy as np
 
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.node import BaseNode, NodeOptions
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.model import IdentifiableModel, PlainSimulation
 from sim2real.policy.upright import Runner
 from sim2real.robots.completeness import complete
 from sim2real.robots.control_loop.hardware import Excitation, ServoActuator, ServoSensor
@@ -102,6 +102,11 @@ class RecordedRobot(Protocol):
         del values
         return None
 
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
+        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
+        del values
+        return None
+
 
 class Robot:
     """A robot that can be recorded, trained for and deployed to. It has five parts, which its ``__init__`` sets.
@@ -167,6 +172,10 @@ class Robot:
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""
         return self.model.identified_mjcf(values)
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
+        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
+        return self.model.plain_simulation(values)
 
     # -- graphs on hardware
 

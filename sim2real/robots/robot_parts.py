@@ -16,7 +16,7 @@ import numpy as np
 
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, NodeOptions
-from sim2real.identify.model import Channel
+from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.completeness import complete
@@ -253,6 +253,11 @@ class RobotModel(_Part, Protocol):
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""
+        del values
+        return None
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
+        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
         del values
         return None
 

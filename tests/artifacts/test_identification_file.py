@@ -81,7 +81,7 @@ def test_everything_comes_back_to_the_last_bit(found, tmp_path):
 def test_parameters_may_stand_alone(found, tmp_path):
     found.write(tmp_path / "mine.json")
     alone = Identification.load(tmp_path / "mine.json")
-    assert (alone.samples, alone.free, alone.timing) == ({}, {}, None)
+    assert (alone.samples, alone.free, alone.replays, alone.timing) == ({}, {}, {}, None)
     assert alone.values == {"gain": 0.1 + 0.2}
 
 

@@ -11,8 +11,8 @@ from sim2real import cli, errors
 from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.run import run_folder
-from sim2real.commands import export_model
 from sim2real.commands.config import ExportConfig
+from sim2real.commands.export import model as export_model
 from sim2real.identify.export import terms
 from sim2real.stages.pipeline.pipeline import load_pipeline
 

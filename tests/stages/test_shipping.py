@@ -10,8 +10,8 @@ import venv
 import numpy as np
 import pytest
 
-from sim2real.commands import export_policy
 from sim2real.commands.config import ShipConfig
+from sim2real.commands.export import policy as export_policy
 from sim2real.errors import UsageError
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle, standalone
 from sim2real.policy.bundle import sealed

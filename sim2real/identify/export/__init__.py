@@ -1,1 +1,1 @@
-"""What was identified, in the terms of other simulators: MJCF, mjlab, Isaac Lab, and a JSON document."""
+"""The estimates in the terms of other simulators: MJCF, mjlab, Isaac Lab, a JSON document, and a model card."""

@@ -1,4 +1,4 @@
-"""The JSON document: everything that is known, for programs; docs/guides/export.md describes it."""
+"""The JSON document with all results, for programs; docs/guides/export.md describes it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COLUMNS = (
 
 
 def json_document(
-    found: Identification, terms: Terms | None, delays: Delays, about: Sequence[tuple[str, str]]
+    identification: Identification, terms: Terms | None, delays: Delays, about: Sequence[tuple[str, str]]
 ) -> dict[str, Any]:
     """Return the document.
 
@@ -27,9 +27,9 @@ def json_document(
     return {
         "format": FORMAT,
         "about": dict(about),
-        "verdict": {"status": found.verdict.status, "reasons": found.verdict.reasons},
-        "parameters": [{n: getattr(p, n) for n in _COLUMNS} for p in found.parameters],
-        "posterior": found.posterior,
+        "verdict": {"status": identification.verdict.status, "reasons": identification.verdict.reasons},
+        "parameters": [{n: getattr(p, n) for n in _COLUMNS} for p in identification.parameters],
+        "posterior": identification.posterior,
         "delays_s": delays,
         "mujoco": {n: getattr(terms, n) for n in mujoco} if terms else None,
     }

@@ -22,7 +22,7 @@ class Late:
     """What of a robot's timing the model's text does not hold.
 
     Attributes:
-        lead_s: What is added to the delay of commands [s], for the integrator's sake.
+        lead_s: Time that is added to the delay of commands [s], for the integrator's sake.
         profile_rad_s: How fast setpoints move to goals; infinite: at once.
     """
 

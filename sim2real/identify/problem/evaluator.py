@@ -59,13 +59,13 @@ class Evaluator(Protocol):
         """Return the losses of a generation, in the form that ``search`` takes."""
         ...
 
-    def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> np.ndarray:
-        """Return the residuals ``(R, K, F)`` of segments whose initial states are fitted to their first parts.
+    def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residuals ``(R, K, F)`` of segments with fitted initial states, and these ``(R, 2 * channels)``.
 
         Args:
             values: Parameters by name, ``(R, ...)``.
             eps: Shape ``(R,)``: numbers of the segments.
-            fit_s: Shape ``(R,)``: lengths of the first parts [s].
+            fit_s: Shape ``(R,)``: lengths of the first parts, to which initial states are fitted [s].
         """
         ...
 
@@ -114,12 +114,13 @@ class CompiledEvaluator:
         del data
         return self._residuals.losses
 
-    def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> np.ndarray:
+    def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> tuple[np.ndarray, np.ndarray]:
         """See ``Evaluator``."""
         many = jax.vmap(self._residuals.predict, in_axes=(0, 0, 0, None))
         program = self._residuals.program("predict", many)
         arrays = {n: _single(v) for n, v in values.items()}
-        return np.asarray(program(arrays, jnp.asarray(eps, jnp.int32), _single(fit_s), data), np.float64)
+        residuals, starts = program(arrays, jnp.asarray(eps, jnp.int32), _single(fit_s), data)
+        return np.asarray(residuals, np.float64), np.asarray(starts, np.float64)
 
     def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
         """See ``Evaluator``."""

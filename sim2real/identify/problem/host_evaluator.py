@@ -141,12 +141,17 @@ class OutsideEvaluator:
         priors = self._priors(candidates)
         return np.array([self._loss(self._tamed(r), p, data) for r, p in zip(raw, priors, strict=True)])
 
-    def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> np.ndarray:
+    def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> tuple[np.ndarray, np.ndarray]:
         """See ``Evaluator``."""
-        arrays = {n: np.asarray(v, np.float32) for n, v in values.items()}
-        if not self._free:
-            return self._errors(arrays, eps, np.zeros((len(eps), self._n)), data)
-        return np.asarray(self._initial.best(arrays, np.asarray(eps), fit_s, data).residuals)
+        arrays, shift = {n: np.asarray(v, np.float32) for n, v in values.items()}, np.zeros((len(eps), self._n))
+        if self._free:
+            fitted = self._initial.best(arrays, np.asarray(eps), fit_s, data)
+            shift, errors = fitted.shift, fitted.residuals
+        else:
+            errors = self._errors(arrays, eps, shift, data)
+        started = self._residuals.program("started", jax.vmap(self._residuals.started, (0, 0, 0, None)))
+        starts = started(arrays, np.asarray(eps, np.int32), np.asarray(shift, np.float32), data)
+        return np.asarray(errors), np.asarray(starts, np.float64)
 
     def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
         """See ``Evaluator``."""

@@ -186,21 +186,31 @@ class Problem:
         return self.evaluator.losses(np.asarray(candidates), np.asarray(around), segments)
 
     def predict(self, values: Any, segments: np.ndarray, fit_s: np.ndarray) -> np.ndarray:
-        """Return the residuals of segments whose initial states are fitted to their first parts, ``(R, K, F)``.
+        """Return the residuals of ``simulated``."""
+        return self.simulated(values, segments, fit_s)[0]
+
+    def simulated(self, values: Any, segments: np.ndarray, fit_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residuals of segments whose initial states are fitted to their first parts, and these states.
 
         Args:
             values: Parameters by name, ``(R, ...)``: each segment with its own.
             segments: Shape ``(R,)``: numbers of the segments.
             fit_s: Shape ``(R,)``: lengths of the first parts [s].
+
+        Returns:
+            Residuals ``(R, K, F)``, and initial states ``(R, 2 * channels)``: positions, then velocities.
         """
         # Predict a fixed number at a time: one program serves all, and compiling takes longer than running.
         size = len(self.data.recording)
-        residuals = []
+        residuals, starts = [], []
         for first in range(0, len(segments), size):
             rows = np.minimum(np.arange(first, first + size), len(segments) - 1)
             arrays = {n: np.asarray(v)[rows] for n, v in values.items()}
-            residuals.append(self.evaluator.predict(arrays, segments[rows], fit_s[rows], self.data))
-        return np.concatenate(residuals)[: len(segments), : self._ts.shape[1]].astype(np.float64)
+            errors, states = self.evaluator.predict(arrays, segments[rows], fit_s[rows], self.data)
+            residuals.append(errors)
+            starts.append(states)
+        whole = np.concatenate(residuals)[: len(segments), : self._ts.shape[1]].astype(np.float64)
+        return whole, np.concatenate(starts)[: len(segments)]
 
     def with_values(self, z: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the robust residuals of the fitted segments with some parameters set, ``(G, S, K, F)``.

@@ -224,15 +224,25 @@ class SegmentResiduals:
         step = self._solve(state._replace(residuals=error), self._fitted(eps, data, None))
         return error + jnp.tensordot(step, state.slope, axes=1)
 
-    def predict(self, values: Mapping[str, Array], eps: Array | int, fit_s: Array, data: Data) -> Array:
-        """Return the residuals ``(K, F)`` of a segment whose initial state is fitted to its first part.
+    def predict(self, values: Mapping[str, Array], eps: Array | int, fit_s: Array, data: Data) -> tuple[Array, Array]:
+        """Return the residuals ``(K, F)`` of a segment whose initial state is fitted to its first part, and that state.
 
         Args:
             fit_s: Length of that part [s].
         """
+        shift = jnp.zeros(len(self.prior))
         if self.config.initial_state != "free":
-            return self.residuals(values, eps, jnp.zeros(len(self.prior)), data)
-        return self.initial_state(values, eps, data, fit_s, _STATE_STEPS + 1).residuals
+            return self.residuals(values, eps, shift, data), self.started(values, eps, shift, data)
+        fitted = self.initial_state(values, eps, data, fit_s, _STATE_STEPS + 1)
+        return fitted.residuals, self.started(values, eps, fitted.shift, data)
+
+    def started(self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data) -> Array:
+        """Return a segment's initial state ``(2 * channels,)``: positions, then velocities.
+
+        Args:
+            shift: Shape ``(2 * channels,)``: distance from the estimate from the log, in deviations of the prior.
+        """
+        return self._started(values, eps, shift * self.prior, data)[1]
 
     def initial_states(self, z: Array, data: Data, pick: Array) -> InitialState | None:
         """Return ``initial_state`` of several segments, leaves ``(B, ...)``; None if states are not fitted.

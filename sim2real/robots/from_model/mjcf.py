@@ -13,7 +13,7 @@ from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.robots.from_model import model_file
 from sim2real.robots.from_model.holding import Holding, apply, plan
-from sim2real.types import MjModel, MjSpec
+from sim2real.types import MjModel, MjSpec, PyTree
 
 NO_LIMIT = 1e6
 _LEAST_FRICTION = 1e-9
@@ -48,7 +48,7 @@ def unit_for(unit: str, slide: bool) -> str:
     return _OF_SLIDES.get(unit, unit) if slide else unit
 
 
-def driven(
+def driven_spec(
     path: Path,
     joints: Sequence[str],
     step_s: float,
@@ -56,8 +56,8 @@ def driven(
     contacts: bool,
     rubbing: bool = True,
     hold: Sequence[str] = (),
-) -> MjModel:
-    """Return the model with a drive on each recorded joint: actuators of force, of stiffness and of damping.
+) -> MjSpec:
+    """Return the ``MjSpec`` with a drive on each recorded joint: actuators of force, of stiffness and of damping.
 
     The actuators of force come first, in the order of the joints, then those of stiffness, whose force is
     ``-ctrl * angle``, then those of damping, ``-ctrl * velocity``. Their sum stays within the torque limits of the
@@ -95,6 +95,12 @@ def driven(
     option.cone, option.noslip_iterations = mj.mjtCone.mjCONE_PYRAMIDAL, 0
     if not contacts:
         option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
+    return spec
+
+
+def driven(path: Path, *how: PyTree) -> MjModel:
+    """Return the compiled model of ``driven_spec``, and raise what that raises."""
+    spec = driven_spec(path, *how)
     try:
         return spec.compile()
     except ValueError as error:

@@ -17,7 +17,7 @@ from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
-from sim2real.identify.model import Channel
+from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.log.toml_text import toml_value
 from sim2real.robots.from_model.holding import Holding
@@ -44,6 +44,7 @@ from sim2real.robots.from_model.mjcf_parameters import (
     place,
     tilted,
 )
+from sim2real.robots.from_model.plain import driven_simulation
 from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
 from sim2real.types import Array, Key, PyTree, Scalar
 from sim2real.worlds.drive_terms import DriveTerms
@@ -94,7 +95,11 @@ class RobotConfig:
 
     def driven(self, rubbing: bool = True) -> PyTree:
         """Return the model with a drive on each recorded joint, see ``mjcf.driven``."""
-        return driven(self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold)
+        return driven(*self.how(rubbing))
+
+    def how(self, rubbing: bool) -> tuple[PyTree, ...]:
+        """Return the arguments of ``mjcf.driven_spec``."""
+        return self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold
 
     def held(self) -> Holding:
         """Return the held and the free joints among those that were not recorded."""
@@ -204,8 +209,8 @@ class MjcfRobot(LoggedRobot):
         self.config, self.tick_s = config, config.step_s
         file_model = read_model(config.model)
         self.lawful = any(term.what in LAWS for term in config.terms)
-        rubbing = self.lawful or any(term.what == "frictionloss" for term in config.terms)
-        self.model = config.driven(rubbing)
+        self._rubbing = self.lawful or "frictionloss" in {term.what for term in config.terms}
+        self.model = config.driven(self._rubbing)
         self.placed = tuple(expand(config.terms, config.joints, self.model, file_model))
         self._limits = [limit_of(file_model, joint) for joint in config.joints]
 
@@ -296,6 +301,11 @@ class MjcfRobot(LoggedRobot):
                     getattr(model, ON_DOF[p.what])[dofs[i]] = value
         spec.copy_back(model)
         return spec.to_xml()
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
+        """Return the driven model with identified values."""
+        loop, world, how = self.identifiable(1.0), self.make_nodes()[2], self.config.how(self._rubbing)
+        return driven_simulation(lambda start: loop.params(values, start)[world.name], world, how)
 
     def _drives(self, values: Mapping[str, Scalar]) -> list[JointDrive]:
         """Return the joints' drives with identified values."""

@@ -14,7 +14,7 @@ import jax
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import BaseNode
-from sim2real.identify.model import Channel
+from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.robots.completeness import complete, tuple_of
 from sim2real.robots.roles import ROLES, Roles
@@ -81,6 +81,11 @@ class LoggedRobot(ABC):
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""
+        del values
+        return None
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
+        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
         del values
         return None
 

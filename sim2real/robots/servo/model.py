@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
+from sim2real.identify.export.card.plain import PlainSimulation, converged
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.contract import RobotModel
 from sim2real.robots.control_loop.hardware import Embedded
@@ -20,7 +23,7 @@ from sim2real.robots.roles import ROLES, Roles
 from sim2real.robots.servo import parameters
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.robots.servo.payload import PAYLOAD, Hand
-from sim2real.robots.servo.servos import Servos
+from sim2real.robots.servo.servos import Servos, gear_of
 from sim2real.robots.servo.simulated_world import ServoWorld
 from sim2real.robots.servo.task import NO_AIM, Aim
 from sim2real.types import Array, PyTree, Scalar
@@ -28,6 +31,9 @@ from sim2real.types import Array, PyTree, Scalar
 if TYPE_CHECKING:
     from sim2real.composer.world import WorldParams
     from sim2real.hardware.emulation.emulated_bus import BusEmulation
+
+_AT_ONCE = 1e9
+"""Speed that stands for an infinite one in a document [rad/s]."""
 
 
 class ComposedModel(RobotModel):
@@ -121,6 +127,39 @@ class ComposedModel(RobotModel):
         s, task = self.servos, self.task
         mjcf = parameters.identified_mjcf(self._mjcf, task.robot, values, s.sheet, s.joints)
         return self.hand.loaded(mjcf, task, values) if self.hand else mjcf
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
+        """Return the composed model with identified values, and the numbers of its servos."""
+        s, task = self.servos, self.task
+        spec = mj.MjSpec.from_string(self.identified_mjcf(values))
+        model = spec.compile()
+        joints = tuple(j.full_identifier for j in task.joints)
+        at = [(int(model.joint(j).qposadr[0]), int(model.joint(j).dofadr[0])) for j in joints]
+        numbers = {"profile_rad_s": np.array([min(x.profile_rad_s, _AT_ONCE) for x in task.robot.servos])}
+        if s.sheet.worn:
+            widths = np.full(model.nv, _AT_ONCE)
+            for (_, dof), joint, width in zip(
+                at, s.joints, parameters.of_joints(values, "stribeck", s.joints), strict=True
+            ):
+                widths[dof] = float(width) / gear_of(joint)
+            numbers["stribeck_rad_s"] = widths
+
+        def begin(start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
+            for (place, dof), position, speed in zip(at, *np.split(start, 2), strict=True):
+                qpos[place], qvel[dof] = position, speed
+            return qpos, qvel
+
+        return PlainSimulation(
+            converged(spec),
+            joints,
+            self.tick_s,
+            begin,
+            "setpoint",
+            numbers,
+            lead_s=self.lead_s,
+            velocity_lead_s=self.lead_s,
+        )
 
     def twin(self, emulator: BusEmulation, **factors: float) -> Embedded:
         """Return an emulated robot with this model's physics.

@@ -18,6 +18,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation import prediction
+from sim2real.identify.validation.replays import replays
 from sim2real.identify.validation.verdict import Position
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.estimation import held_out_parts
@@ -42,8 +43,8 @@ class Lack:
 
 def free_runs(
     estimate: Fit, episodes: Sequence[Episode], fitted: int, config: IdentifyConfig, models: Mapping[str, Any]
-) -> tuple[list[FreeRun], dict[str, np.ndarray]]:
-    """Simulate the held-out part of each log in one run; return its errors and its columns.
+) -> tuple[list[FreeRun], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Simulate the held-out part of each log in one run; return its errors, its columns, and its commands and starts.
 
     Args:
         fitted: Number of fitted logs; the later ones are held out whole.
@@ -55,11 +56,12 @@ def free_runs(
     # Take the held-out part of each log that is long enough, all cut to the length of the shortest.
     held_out = [Span(r, split, False) for r, split in enumerate(splits) if ends[r] - split > least_s]
     if not held_out or not config.free_run_s:
-        return [], {}
+        return [], {}, {}
     length_s = min(config.free_run_s, min(ends[s.recording] - s.begin_s for s in held_out))
     problem = estimate.windows.recut(held_out, length_s)
     columns = prediction.samples(problem, models, config.settle_s)
-    return prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s), columns
+    runs = prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s)
+    return runs, columns, replays(problem, estimate.values, config.settle_s, "free")
 
 
 def fitted_to(

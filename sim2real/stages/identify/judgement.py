@@ -14,6 +14,7 @@ from sim2real.identify.fit import Fit, Value, as_numbers, refit
 from sim2real.identify.uncertainty import ensemble
 from sim2real.identify.uncertainty.per_recording import compare_recordings
 from sim2real.identify.validation import prediction
+from sim2real.identify.validation.replays import replays
 from sim2real.identify.validation.verdict import NO_DELAY, positions
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import estimate, held_out_parts
@@ -83,11 +84,12 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
     models: dict[str, Mapping[str, Value]] = {"identified": fit.values, **_without_delays(fit), "nominal": nominal}
     samples = prediction.samples(problem, models, config.settle_s)
     horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
-    runs, columns = free_runs(fit, inputs.episodes, inputs.fitted, config, models)
+    runs, columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, models)
     return replace(
         document,
         samples=samples,
         free=columns,
+        replays={**replays(problem, fit.values, config.settle_s, "ahead"), **long},
         settle_s=config.settle_s,
         prediction=tuple(prediction.errors(problem, samples, list(models), config.settle_s, horizons)),
         free_run=tuple(runs),

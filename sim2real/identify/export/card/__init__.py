@@ -1,0 +1,1 @@
+"""The model card of an identification: numbers, limits of the data, and a script that computes each figure again."""

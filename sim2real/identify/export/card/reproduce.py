@@ -1,0 +1,230 @@
+"""Compute the figures of a model card again: ``python reproduce.py`` needs numpy and mujoco, and this folder.
+
+``card.json`` holds the figures with their recipes and the equations of the drives, ``model.xml`` the robot, and
+``signals.npz`` the measurements and commands. Each line shows the card's figure, the value of this script, and by how
+much they differ.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+FAR_S = 1e3
+Arrays = Mapping[str, np.ndarray]
+Untyped = Any
+"""Objects of mujoco, which has no types, and of JSON."""
+Memory = dict[str, np.ndarray]
+Law = Callable[[Untyped, Untyped, Untyped, Arrays, Memory], None]
+"""Sets controls, forces and friction of one step from the model, its data, the drive's numbers, commands and memory."""
+_mj: Untyped = mujoco
+
+
+def tick_means(sent_s: np.ndarray, rows: np.ndarray, delay_s: float, tick_s: float, ticks: int) -> np.ndarray:
+    """Return the mean of a command over each tick, ``(ticks, n)``; each command holds until the next one arrives."""
+    there = np.isfinite(sent_s)
+    arrives_s = sent_s[there] + delay_s
+    rows = rows[there].reshape(len(arrives_s), -1)
+    # The integral of held commands is linear between arrivals; the first command holds before, and the last one after.
+    knots = np.concatenate([[arrives_s[0] - FAR_S], arrives_s, [arrives_s[-1] + FAR_S]])
+    held = np.concatenate([rows[:1], rows])
+    integral = np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(held * np.diff(knots)[:, None], axis=0)])
+    edges = tick_s * np.arange(ticks + 1)
+    at = np.stack([np.interp(edges, knots, column) for column in integral.T], axis=1)
+    return np.diff(at, axis=0) / tick_s
+
+
+def held(model: Untyped, data: Untyped, numbers: Untyped, command: Arrays, memory: Memory) -> None:
+    """Set the controls to the command."""
+    del model, numbers, memory
+    data.ctrl[:] = next(iter(command.values()))
+
+
+def setpoint(model: Untyped, data: Untyped, numbers: Untyped, command: Arrays, memory: Memory) -> None:
+    """Move the servos' setpoints to the goals with limited speed; dry friction wears off with speed."""
+    (goal,) = command.values()
+    most = np.array(numbers["profile_rad_s"]) * model.opt.timestep
+    before = memory.setdefault("setpoint", goal)
+    move = np.clip(goal - before, -most, most)
+    memory["setpoint"] = before + move
+    data.ctrl[:] = before + move * (1.0 - 0.5 * np.abs(move) / most)
+    if "stribeck_rad_s" in numbers:
+        friction = memory.setdefault("frictionloss", model.dof_frictionloss.copy())
+        model.dof_frictionloss[:] = friction * np.exp(-np.abs(data.qvel) / np.array(numbers["stribeck_rad_s"]))
+
+
+def drive(model: Untyped, data: Untyped, numbers: Untyped, command: Arrays, memory: Memory) -> None:
+    """Set force, stiffness and damping of each drive, and the friction of its joint."""
+    n = {name: np.array(value) for name, value in numbers.items()}
+    zero, one = np.zeros(len(n["kp"])), np.ones(len(n["kp"]))
+    at, dof = n["qpos_at"], n["qvel_at"]
+    # The control: gains of the log count in the log's units; with torque off a share of the damping is left.
+    on = command.get("enabled", one) + zero
+    goal = command["goal"] - n["zero"] if "goal" in command else zero
+    kp = on * n["kp"] * (command["kp"] / n["kp_unit"] if "kp" in command else one) if "goal" in command else zero
+    kd = n["kd"] * (command["kd"] / n["kd_unit"] if "kd" in command else one) * (on + (one - on) * n["released"])
+    force = kp * goal + on * kd * command.get("goal_velocity", zero)
+    force = force + on * n["gain"] * (command.get("torque", zero) + command.get("duty", zero))
+    # The terms of friction, dead zone, back-EMF and cogging, which are 0 unless they were identified.
+    if "load" in n:
+        usual = memory.setdefault("usual", np.stack([model.dof_damping[dof], model.dof_frictionloss[dof]]))
+        angle, speed, limit = data.qpos[at], data.qvel[dof], model.jnt_actfrcrange[n["joints_at"], 1]
+        fast, braked = np.abs(speed), on * n["back_emf"]
+        beyond = n["eccentric_cos"] * np.cos(angle) + n["eccentric_sin"] * np.sin(angle)
+        force = force - kp * (beyond + np.clip(goal - angle - beyond, -n["play"], n["play"]))
+        torque = np.clip(force - kp * angle - kd * speed, -limit, limit) - braked * speed
+        model.dof_damping[dof] = usual[0] + n["drag"] * fast + braked
+        stuck = n["static"] * np.exp(-fast / n["stribeck_rad_s"])
+        model.dof_frictionloss[dof] = usual[1] + stuck + n["load"] * np.abs(torque)
+        turn = n["cogging_per_turn"] * angle
+        data.qfrc_applied[dof] = -n["bias"] - n["cogging_cos"] * np.cos(turn) - n["cogging_sin"] * np.sin(turn)
+    data.ctrl[:] = np.concatenate([force, kp + zero, kd + zero])
+
+
+LAWS: Mapping[str, Law] = {"held": held, "setpoint": setpoint, "drive": drive}
+
+
+def verlet(model: Untyped, data: Untyped) -> None:
+    """Move joints that do not act on each other by a step of position Verlet, with exact dry friction."""
+    h, before, position = model.opt.timestep, data.qvel.copy(), data.qpos.copy()
+    # MuJoCo gives inertia, gravity and drive at the middle of the step.
+    data.qpos[:] = position + 0.5 * h * before
+    _mj.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    _mj.mj_fullM(model, data, inertia)
+    damping, dry = model.dof_damping / inertia.diagonal(), h * model.dof_frictionloss / inertia.diagonal()
+    push = h * (data.qfrc_actuator + data.qfrc_applied - data.qfrc_bias) / inertia.diagonal()
+    moving = before * (1.0 - 0.5 * h * damping)
+    # Friction opposes the motion until it stops; for the rest of the step the joint sticks, or moves the other way.
+    slowed = moving + push - np.sign(moving) * dry
+    turns = moving * slowed < 0.0
+    rest = np.where(turns, slowed / np.where(turns, slowed - moving, 1.0), 1.0)
+    after = np.where((moving != 0.0) & ~turns, slowed, rest * np.sign(push) * np.maximum(np.abs(push) - dry, 0.0))
+    data.qvel[:] = after / (1.0 + 0.5 * h * damping)
+    data.qpos[:] = position + 0.5 * h * (before + data.qvel)
+
+
+def readings(xml: str, about: Untyped, signals: Arrays, kind: str, row: int, ts: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Simulate one segment; return what the encoders read at times ``ts``: positions and velocities ``(N, joints)``."""
+    model = _mj.MjModel.from_xml_string(xml)
+    data, law, memory = _mj.MjData(model), LAWS[about["law"]], {}
+    step = verlet if about["integrator"] == "verlet" else _mj.mj_step
+    tick_s, substeps = about["tick_s"], round(about["tick_s"] / model.opt.timestep)
+    ticks = math.ceil(ts.max() / tick_s) + 2
+    prefix = f"{kind}/command/"
+    sent_s, delay_s = signals[f"{kind}/sent_s"][row], about["command_delay_s"] + about["lead_s"]
+    commands = {
+        name.removeprefix(prefix): tick_means(sent_s, rows[row], delay_s, tick_s, ticks)
+        for name, rows in signals.items()
+        if name.startswith(prefix)
+    }
+    data.qpos[:], data.qvel[:] = signals[f"{kind}/qpos"][row], signals[f"{kind}/qvel"][row]
+    _mj.mj_forward(model, data)
+    joints = [model.joint(name) for name in about["joints"]]
+    at, dof = [int(j.qposadr[0]) for j in joints], [int(j.dofadr[0]) for j in joints]
+    moved = [(data.qpos[at].copy(), data.qvel[dof].copy())]
+    for k in range(ticks):
+        command = {name: rows[k] for name, rows in commands.items()}
+        for _ in range(substeps):
+            law(model, data, about["numbers"], command, memory)
+            step(model, data)
+        # Velocities of a leapfrog are those of half a step before.
+        moved.append((data.qpos[at].copy(), data.qvel[dof] + about["velocity_lead_s"] * data.qacc[dof]))
+    read = ts - about["measurement_delay_s"]
+    position, speed = (
+        np.stack([np.interp(read, tick_s * np.arange(ticks + 1), c) for c in np.array(rows).T], axis=1)
+        for rows in zip(*moved, strict=True)
+    )
+    e_cos, e_sin = (np.array(about["numbers"].get(n, 0.0)) for n in ("eccentric_cos", "eccentric_sin"))
+    reading = (
+        position + e_cos * np.cos(position) + e_sin * np.sin(position) + np.array(about["numbers"].get("zero", 0.0))
+    )
+    return reading, speed * (1.0 - e_cos * np.sin(position) + e_sin * np.cos(position))
+
+
+def predictions(xml: str, about: Untyped, signals: Arrays, kind: str) -> dict[str, np.ndarray]:
+    """Return field -> error of the simulation ``(N,)`` at each measurement of the segments ``ahead`` or ``free``."""
+    rows, ts = signals[f"{kind}/row"], signals[f"{kind}/into"]
+    errors = {name: np.full(len(ts), np.nan) for name in about["fields"]}
+    for row in np.unique(rows):
+        pick = rows == row
+        both = readings(xml, about, signals, kind, int(row), ts[pick])
+        for name, (quantity, joint) in about["fields"].items():
+            errors[name][pick] = both[quantity][:, joint] - signals[f"{kind}/measured/{name}"][pick]
+    return errors
+
+
+class Card:
+    """The folder of a card; simulates when the first figure needs it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.card = json.loads((folder / "card.json").read_text(encoding="utf-8"))
+        xml = folder / "model.xml"
+        self._xml = xml.read_text(encoding="utf-8") if xml.is_file() else ""
+        with np.load(folder / "signals.npz") as file:
+            self.signals = {name: file[name] for name in file.files}
+        self._errors: dict[str, dict[str, np.ndarray]] = {}
+
+    def value(self, recipe: Untyped) -> float:
+        """Return the number of a recipe of ``card.json``."""
+        return float(getattr(self, f"_{recipe['kind']}")(recipe))
+
+    def _error(self, recipe: Untyped) -> float:
+        """Root mean square, or mean absolute value, of simulation less measurement up to a horizon."""
+        run = recipe["run"]
+        if run not in self._errors:
+            self._errors[run] = predictions(self._xml, self.card["simulation"], self.signals, run)
+        ahead = self.signals[f"{run}/into"] - self.card["simulation"]["settle_s"]
+        pick = (ahead > 0) & (ahead <= recipe["horizon_s"])
+        if "recording" in recipe:
+            pick &= self.signals[f"{run}/recording"][self.signals[f"{run}/row"]] == recipe["recording"]
+        error = self._errors[run][recipe["field"]][pick]
+        return float(np.sqrt(np.mean(error**2)) if recipe["measure"] == "rmse" else np.mean(np.abs(error)))
+
+    def _quantile(self, recipe: Untyped) -> float:
+        """Quantile of recorded numbers."""
+        values = self.signals[recipe["signal"]]
+        return np.quantile(values[np.isfinite(values)], recipe["q"])
+
+    def _speed(self, recipe: Untyped) -> float:
+        """Quantile of the speed between two measurements of a field, without gaps of the log."""
+        took, moved = np.diff(self.signals["stamps"]), np.diff(self.signals[recipe["signal"]])
+        usual = (took > 0) & (took < 3 * np.median(took))
+        return np.quantile(np.abs(moved[usual] / took[usual]), recipe["q"])
+
+    def _interval(self, recipe: Untyped) -> float:
+        """End of the interval of a Normal distribution on the parameter's scale."""
+        x = recipe["mean"] + recipe["deviations"] * recipe["deviation"]
+        return {"linear": x, "log": math.exp(min(x, 700.0)), "logit": 1.0 / (1.0 + math.exp(-x))}[recipe["scale"]]
+
+    def _sum(self, recipe: Untyped) -> float:
+        """Sum of estimates."""
+        return sum(p["estimate"] for p in self.card["parameters"] if p["name"] in recipe["parameters"])
+
+    def _model(self, recipe: Untyped) -> float:
+        """Number of a joint in ``model.xml``."""
+        model = _mj.MjModel.from_xml_string(self._xml)
+        return getattr(model, recipe["field"])[int(model.joint(recipe["joint"]).dofadr[0])]
+
+
+def main() -> int:
+    """Print each figure; return 1 if one differs by more than 1 %."""
+    card, worst = Card(Path(__file__).resolve().parent), 0.0
+    for figure in card.card["figures"]:
+        value = card.value(figure["recipe"])
+        off = abs(value - figure["value"]) / max(abs(figure["value"]), 1e-12)
+        worst = max(worst, off)
+        print(f"{figure['name']}: card {figure['value']:.6g}, here {value:.6g} {figure['unit']} ({100 * off:.2f} %)")
+    print(f"{len(card.card['figures'])} figures, the largest difference is {100 * worst:.2f} %")
+    return int(not worst <= 0.01)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""The page of a model card: its numbers, the limits of its data, and the recipe of each figure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from sim2real.artifacts.summary import ArtifactTable, Interval
+from sim2real.types import Json
+from sim2real.view import style
+from sim2real.view.blocks import Banner, Block, FigureBlock, ListBlock, NoteBlock, PageSection, TableBlock
+from sim2real.view.page.page import write_page
+from sim2real.view.style import BLUE, new_figure, styled, to_svg
+
+PAGE = "card.html"
+_RECIPES = {
+    "error": "{measure} of simulation less measurement of {field}, segments {run}, settle_s to {horizon_s:g} s later",
+    "quantile": "quantile {q:g} of {signal}",
+    "interval": "{scale} scale: mean {mean:.6g}, {deviations:+g} times the deviation {deviation:.4g}",
+    "sum": "estimates of {parameters} added",
+    "speed": "quantile {q:g} of the differences of {signal} over those of stamps",
+    "model": "{field} of the joint {joint} in model.xml",
+}
+"""Kind of a recipe -> its text."""
+
+
+def model_card_page(card: Mapping[str, Json], signals: Mapping[str, np.ndarray], folder: Path) -> Path:
+    """Write the page of a card into its folder.
+
+    Args:
+        card: The document of ``card.json``.
+        signals: Arrays of ``signals.npz``.
+    """
+    about, status = card["about"], card["verdict"]["status"]
+    blocks: list[Block] = [NoteBlock(text) for text in card["notes"]]
+    headers = ("parameter", "estimate", "95 % interval", "unit", "verdict", "about")
+    rows = [
+        [p["name"], p["estimate"], Interval(p["low95"], p["high95"]), p["unit"], p["verdict"], p["about"]]
+        for p in card["parameters"]
+    ]
+    blocks.append(TableBlock.of("Parameters", ArtifactTable(headers, rows)))
+    times = {n.removeprefix("times/"): v for n, v in signals.items() if n.startswith("times/")}
+    if times:
+        blocks.append(FigureBlock(times_figure(times), "Distribution of the recorded times in the log."))
+    blocks.append(ListBlock("Not known", card["unknown"] or ["every parameter of the model was identified"]))
+    blocks.append(ListBlock("Firmware, supply and temperature", [f"{n}: {v}" for n, v in card["session"].items()]))
+    if card["simulation"]:
+        blocks.append(ListBlock("Equations of drives and delays", card["simulation"]["equations"]))
+        blocks.append(TableBlock.of("Numbers of these equations", _numbers(card["simulation"])))
+    blocks.append(ListBlock("Logs", [f"{log['name']}, SHA-256 {log['sha256']}" for log in card["logs"]]))
+    figures: list[list[Json]] = [[f["name"], f["value"], f["unit"], recipe_text(f["recipe"])] for f in card["figures"]]
+    caption = "Figures: the motion and times that the log covers, and errors to expect"
+    blocks.append(TableBlock.of(caption, ArtifactTable(("figure", "value", "unit", "recipe"), figures)))
+    tone = "good" if status == "accepted" else "doubt"
+    lead = (
+        "python reproduce.py computes each figure again with numpy and MuJoCo alone, from the files beside this page."
+    )
+    section = PageSection("card", "Model card", lead, (), blocks, Banner(tone, status, card["verdict"]["reasons"]))
+    return write_page(folder / PAGE, about["pipeline"], [section], version=about["sim2real"])
+
+
+def recipe_text(recipe: Mapping[str, Json]) -> str:
+    """Return a recipe of ``card.json`` as text."""
+    texts = {name: ", ".join(value) if isinstance(value, list) else value for name, value in recipe.items()}
+    return _RECIPES[recipe["kind"]].format(**texts)
+
+
+def times_figure(times: Mapping[str, np.ndarray]) -> str:
+    """Draw a histogram of each series of times, as SVG."""
+    names, columns = list(times), min(3, len(times))
+    rows = -(-len(names) // columns)
+    with styled():
+        figure = new_figure(0.4 + 1.2 * rows, style.WIDTH_IN * columns / 3)
+        grid = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes in grid[len(names) :]:
+            axes.set_visible(False)
+        for name, axes in zip(names, grid, strict=False):
+            axes.hist(1e3 * times[name], bins=40, color=BLUE)
+            axes.set_title(name)
+            axes.set_xlabel("ms")
+            axes.set_yticks([])
+            axes.xaxis.set_major_locator(MaxNLocator(4))
+        return to_svg(figure, "card-times", f"Histograms of {', '.join(names)}")
+
+
+def _numbers(simulation: Mapping[str, Json]) -> ArtifactTable:
+    """Return the numbers of the timing and of the drive, a row each; a list is one text."""
+    scalars = ("tick_s", "command_delay_s", "measurement_delay_s", "lead_s", "velocity_lead_s", "settle_s")
+    rows: list[Sequence[Json]] = [[name, _text(simulation[name])] for name in scalars]
+    rows += [[name, _text(value)] for name, value in simulation["numbers"].items()]
+    return ArtifactTable(("number", "value"), rows)
+
+
+def _text(value: Json) -> str:
+    if isinstance(value, list):
+        same = len(value) > 1 and all(v == value[0] for v in value)
+        return f"{value[0]:.6g} of each" if same else ", ".join(f"{v:.6g}" for v in value)
+    return f"{value:.6g}"
