@@ -76,6 +76,7 @@ def refine(
     data: Data | None = None,
     coarse: bool = False,
     settle: bool = True,
+    gain: float | None = None,
     on_step: OnStep | None = None,
     on_compile: OnCompile | None = None,
 ) -> Refined:
@@ -85,6 +86,7 @@ def refine(
         starts: Shape ``(K, P)``.
         coarse: Whether the first descents suffice, to compare with a model by percents.
         settle: Whether the end is tested, and points around it are tried if it is no minimum.
+        gain: Relative gain of the loss at which the first descents end; default: by the other arguments.
     """
     descent = _Descent(problem, problem.data if data is None else data, on_step, on_compile)
     first = [descent.at(np.asarray(z, np.float64)) for z in starts]
@@ -95,7 +97,7 @@ def refine(
         )
     # Descend roughly from each start, with the shift of the delays held.
     fine = problem.evaluator.precision
-    first_gain = _ROUGH if coarse else _COARSE if settle else fine
+    first_gain = gain or (_ROUGH if coarse else _COARSE if settle else fine)
     ends = [descent.down(z, first_gain, _PIN) for z, loss in zip(starts, first, strict=True) if np.isfinite(loss)]
     z, loss = min(ends, key=lambda end: end[1])
     if coarse or not settle:

@@ -18,7 +18,6 @@ from sim2real.identify.problem.segments import Span
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.uncertainty import linearise
 from sim2real.identify.validation import optional_terms
-from sim2real.identify.validation.optional_terms import Trial
 from sim2real.identify.validation.prediction import labels
 
 MOVES = 10.0
@@ -90,33 +89,25 @@ def masks(problem: Problem, parts: Sequence[Fold]) -> np.ndarray:
     return np.array([p.touches(spans, problem.segment_s) for p in parts])
 
 
-def leave_out(
-    estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s: float = 0.0, trials: Sequence[Trial] = ()
-) -> list[HeldOutPart]:
+def leave_out(estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s: float = 0.0) -> list[HeldOutPart]:
     """Identify without each part, and predict that part.
 
     No descent begins at the estimate of all parts, which includes this part: a refinement may end where it begins. It
     begins at the linear prediction from the other parts.
 
     Args:
-        estimate: The fit of all parts, with all terms.
         parts: Held out one at a time.
         settle_s: First part of a prediction, to which its initial state is fitted [s].
         free_run_s: Longest free run [s]; 0 skips the free runs.
-        trials: For each part the fit of the terms that the other parts select; default: all terms are present.
     """
     problem, table, touched = estimate.problem, estimate.problem.table, masks(estimate.problem, parts)
-    if trials:
-        present, stats, starts = [t.present for t in trials], trials[0].stats, [t.ends[k] for k, t in enumerate(trials)]
-    else:
-        present = [np.ones(len(table.terms), bool)] * len(parts)
-        stats = optional_terms.statistics(problem, linearise(problem, estimate.z), touched)
-        starts = [table.at_scale(stats.x + stats.step(table, present[k], k, bounded=True)) for k in range(len(parts))]
+    every = np.ones(len(table.terms), bool)
+    stats = optional_terms.statistics(problem, linearise(problem, estimate.z), touched)
     ends = []
-    for k, start in enumerate(starts):
-        rest = problem.part(problem.train[touched[k]], table.of_terms(present[k]))
-        ends.append(refine(problem, start[None], rest, settle=False).z)
-    return predicted(estimate, parts, stats, present, ends, settle_s, free_run_s)
+    for k in range(len(parts)):
+        start = table.at_scale(stats.x + stats.step(table, every, k, bounded=True))
+        ends.append(refine(problem, start[None], problem.part(problem.train[touched[k]]), settle=False).z)
+    return predicted(estimate, parts, stats, [every] * len(parts), ends, settle_s, free_run_s)
 
 
 def predicted(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim2real.artifacts.identification import HeldOutPart
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty.uncertainty import Linearised
@@ -98,7 +99,7 @@ class Trial:
         z: Shape ``(P,)``: the estimate; parameters of absent terms have their values without the term.
         loss: Loss of the estimate.
         stats: The loss of each part around the estimate, by the parameters of the set.
-        ends: Shape ``(K, P)``: estimates without each part.
+        rows: The estimates without each part, and their errors on it.
         ahead: Shape ``(K,)``: mean square of the errors up to the horizon on each part, with that part held out.
         free: Shape ``(K,)``: the same in free runs; zeros without free runs.
     """
@@ -107,7 +108,7 @@ class Trial:
     z: np.ndarray
     loss: float
     stats: Statistics
-    ends: np.ndarray
+    rows: Sequence[HeldOutPart]
     ahead: np.ndarray
     free: np.ndarray
 

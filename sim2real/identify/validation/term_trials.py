@@ -26,8 +26,12 @@ from sim2real.identify.validation.optional_terms import (
 )
 from sim2real.identify.validation.prediction import labels
 
-_SHARES = (1.0, 0.25)
-"""Shares of the linear step without a part that are simulated; the fit itself is the third candidate."""
+_SHARES = (1.0, 0.25, 0.06)
+"""Shares of the linear step without a part that are simulated; the best begins the descent without that part."""
+_GAIN = 1e-3
+"""Relative gain of the loss at which a descent without a part ends."""
+_CLEAR = 2.0
+"""Ratio of a set's loss to the least loss from which the set is clearly worse: descents without parts are skipped."""
 _INSIDE = 0.01
 """Distance from a bound at which the fit of a parameter begins [widths of the bounds]."""
 _TRIED = 3
@@ -133,6 +137,7 @@ class Trials:
     def __init__(self, estimate: Fit, parts: Sequence[folds.Fold], settle_s: float, free_run_s: float) -> None:
         self._estimate, self._parts, self._times = estimate, parts, (settle_s, free_run_s)
         self._problem, self._masks = estimate.problem, folds.masks(estimate.problem, parts)
+        self._least = estimate.loss
         self._sigma = dict(zip(labels(self._problem), (s for _, s, _ in self._problem.fields), strict=True))
 
     def grown(self) -> list[Trial]:
@@ -162,23 +167,30 @@ class Trials:
         at = linearise(problem, ended.z, data)
         stats = statistics(problem, at, self._masks)
         ends = self._without_each(ended.z, at, stats, present)
+        # Descend without each part, unless the set is clearly worse: the linear steps are still near the whole fit.
+        self._least = min(self._least, ended.loss)
+        if ended.loss <= _CLEAR * self._least:
+            rest = [problem.part(problem.train[touched], columns) for touched in self._masks]
+            ends = [
+                refine(problem, z[None], one, settle=False, gain=_GAIN).z for z, one in zip(ends, rest, strict=True)
+            ]
         rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(ends), list(ends), *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
-        return Trial(present, ended.z, ended.loss, stats, ends, ahead, free)
+        return Trial(present, ended.z, ended.loss, stats, tuple(rows), ahead, free)
 
     def _without_each(self, z: np.ndarray, at: Linearised, stats: Statistics, present: np.ndarray) -> np.ndarray:
         """Return the estimates without each part, ``(K, P)``: linear steps, shorter where a full one does not help."""
         problem, table, parts = self._problem, self._problem.table, len(self._masks)
         steps = np.array([stats.step(table, present, k, bounded=True) for k in range(parts)])
-        points = at.x + np.concatenate([0.0 * steps[:1], *(share * steps for share in _SHARES)])
+        points = at.x + np.concatenate([share * steps for share in _SHARES])
         # Simulate all candidates at a time, and compare each on the segments of the other parts.
         without = [c.parameter.without for c in table.columns]
         residuals = problem.with_values(z, np.where(table.of_terms(present), table.unscale(points), without))
         squares = np.nan_to_num(np.sum(residuals**2, axis=(2, 3)), nan=np.inf)
         ends = []
         for k, touched in enumerate(self._masks):
-            candidates = [1 + k + i * parts for i in range(len(_SHARES))] + [0]
+            candidates = range(k, len(points), parts)
             ends.append(points[min(candidates, key=lambda g: float(squares[g][~touched].sum()))])
         return table.at_scale(np.array(ends))
 

@@ -93,9 +93,9 @@ def examined(
     if segments < _LEAST:
         note(f"{segments} segments are too few to hold parts out of the fit")
         return ()
-    parts = _parts(estimate, config, names, 2 if selection is None else _LEAST_TO_CHOOSE)
-    trials = () if selection is None else selection.by_part
-    return tuple(leave_out(estimate, parts, config.settle_s, config.free_run_s, trials))
+    if selection is not None:  # the trials have these errors
+        return tuple(trial.rows[k] for k, trial in enumerate(selection.by_part))
+    return tuple(leave_out(estimate, _parts(estimate, config, names, 2), config.settle_s, config.free_run_s))
 
 
 def _parts(estimate: Fit, config: IdentifyConfig, names: Sequence[str], least: int) -> list[Fold]:
