@@ -1,4 +1,4 @@
-"""Write the tables and the figure of README.md and docs/results.md from reports/: ``python scripts/readme.py``.
+"""Write the tables and figures of README.md and of pages in docs/ from reports/: ``python scripts/readme.py``.
 
 A report that is of another state of the code than this one is refused, unless it is named after --stale-ok.
 """
@@ -23,13 +23,15 @@ TABLES = {
     "demo": ("demo",),
     "arm": ("arm_cpu", "arm_h200"),
     "so101": ("so101_cpu",),
+    "demo_time": ("demo",),
+    "so101_time": ("so101_cpu",),
     "real": ("identify_disk", "identify_xl330", "identify_so101"),
     "league": ("league",),
     "randomise": ("randomise", "randomise_worn"),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
-PAGES = ("README.md", "docs/results.md")
-"""Pages with tables."""
+PAGES = ("README.md", "docs/results.md", "docs/getting_started.md", "docs/guides/so101.md")
+"""Pages with tables, or with a sentence of figures."""
 FIGURE = "docs/images/what_training_knows.svg"
 LEAGUE_SETS = {
     "disk": "motor with eccentric mass, RMSE",
@@ -89,6 +91,19 @@ def demo(report: dict[str, Any]) -> str:
         ("time", f"{max(s['total_s'] for s in seeds):.0f} s at most on two CPU cores ({stages} s)"),
     ]
     return "".join(f"| {a} | {b} |\n" for a, b in lines)
+
+
+def run_time(report: Mapping[str, Any], subject: str) -> str:
+    """Return the sentence on the time of a run: the median over its seeds, and that of each stage."""
+    seeds = report["seeds"]
+    total, *stages = (
+        statistics.median(s[f"{name}_s"] for s in seeds) for name in ("total", "record", "identify", "train", "deploy")
+    )
+    record, identify, train, deploy = (f"{stage:.0f} s" for stage in stages)
+    return (
+        f"On two CPU cores {subject} takes {total:.0f} s: {record} to record, {identify} to\n"
+        f"identify, {train} to train and {deploy} to deploy.\n"
+    )
 
 
 def real_motors(reports: Mapping[str, dict[str, Any]]) -> str:
@@ -278,6 +293,8 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "demo": lambda chosen: demo(chosen["demo"]),
         "arm": lambda chosen: arm("the arm: three position-controlled servos on one bus", *chosen.values()),
         "so101": lambda chosen: arm("the SO-101: six servos with the parameters of a real one", *chosen.values()),
+        "demo_time": lambda own: run_time(own["demo"], "the demo"),
+        "so101_time": lambda own: run_time(own["so101_cpu"], "the run"),
         "real": real_motors,
         "league": lambda chosen: league(chosen["league"]),
         "randomise": lambda chosen: randomise(chosen["randomise"], chosen["randomise_worn"]),
@@ -300,7 +317,7 @@ def stale(reports: Mapping[str, dict[str, Any]], root: Path = ROOT) -> dict[str,
 def main(arguments: Sequence[str] | None = None) -> int:
     """Update the pages in place."""
     parser = argparse.ArgumentParser(prog="readme.py", description=__doc__)
-    names = [name for table in TABLES.values() for name in table]
+    names = list(dict.fromkeys(name for table in TABLES.values() for name in table))
     parser.add_argument(
         "--stale-ok", nargs="+", default=[], choices=names, metavar="REPORT",
         help=f"take these reports although their measured files have changed since: {', '.join(names)}",

@@ -1,4 +1,4 @@
-"""The figures in README.md and docs/results.md are those of the reports."""
+"""The figures in README.md and in pages of docs/ are those of the reports."""
 
 import importlib.util
 import json
@@ -59,7 +59,7 @@ def test_a_report_without_its_state_is_refused_until_told(script, monkeypatch, t
         for name, r in script.read_reports().items()
     }
     for name, text in pages.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     (tmp_path / script.FIGURE).parent.mkdir()
     monkeypatch.setattr(script, "ROOT", tmp_path)
@@ -110,7 +110,7 @@ def test_a_table_whose_reports_are_not_all_there_is_left_as_it_is(script):
     reports = script.read_reports()
     assert set(script.tables(reports)) >= {"demo", "arm", "real"}
     few = {name: r for name, r in reports.items() if name not in ("arm_h200", "league", "randomise")}
-    assert set(script.tables(few)) == {"demo", "so101", "real"}
+    assert set(script.tables(few)) == {"demo", "so101", "demo_time", "so101_time", "real"}
 
 
 def test_the_citation_names_the_version_of_the_package():
