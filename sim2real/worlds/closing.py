@@ -81,6 +81,10 @@ class Closing:
         qvel = -self._solved(jacobian, jacobian[:, self._qvel_at] @ speed, np.inf)
         return qpos, qvel.at[self._qvel_at].set(speed)
 
+    def gap(self, angle: jax.Array) -> jax.Array:
+        """Return the largest error of the equalities at recorded angles ``(joints,)``; above 0 if a loop stays open."""
+        return jnp.abs(self._rows(self(angle, jnp.zeros(len(self._qvel_at)))[0])[0]).max(initial=0.0)
+
     def _rows(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return errors ``(rows,)`` and Jacobian ``(rows, nv)`` of the equalities."""
         data: PyTree = mjx.com_pos(self._model, mjx.kinematics(self._model, self._data.replace(qpos=qpos)))

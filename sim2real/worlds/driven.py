@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -17,8 +18,6 @@ from sim2real.worlds.mjx import MjxParams, MjxWorld
 from sim2real.worlds.recorded import command_delay
 
 if TYPE_CHECKING:
-    import jax
-
     from sim2real.graph.base import Value
 
 
@@ -136,6 +135,12 @@ class DrivenWorld(MjxWorld):
         else:
             qpos, qvel = params.qpos.at[self.qpos_at].set(angle), params.qvel.at[self.qvel_at].set(speed)
         return params.replace(qpos=qpos, qvel=qvel)
+
+    def gaps(self, angles: np.ndarray) -> np.ndarray:
+        """Return the error with which loops close at positions ``(N, joints)``, ``(N,)`` [m or rad]."""
+        if not self._closing:
+            return np.zeros(len(angles))
+        return np.asarray(jax.jit(jax.vmap(self._closing.gap))(jnp.asarray(angles)))
 
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of the commands, if the actuator's parameters set one.

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.robots.from_model import model_file
 from sim2real.robots.from_model.mjcf import driven, read_model
@@ -300,3 +301,14 @@ def test_millimetres_of_a_slide_are_not_taken_for_degrees(tmp_path):
     asked = import_logs_stage.description_of_model(tmp_path / "robot.xml", "axis")
     with pytest.raises(UsageError, match=r"(?s)x slides, but .*not in metres.*0.001 for mm"):
         import_logs_stage.proposed(open_foreign(tmp_path / "run.npz"), asked)
+
+
+@pytest.mark.parametrize(("to", "share"), [(0.3, None), (1.0, "47%")])
+def test_recorded_positions_at_which_a_loop_cannot_close_are_reported(tmp_path, to, share):
+    """A rocker of 0.04 m stops the crank of 0.1 m at 0.44 rad; the gap is 5 mm at 0.48 rad."""
+    (tmp_path / "bar.xml").write_text(FOUR_BAR.replace('"rocker" pos=".2 0 0"', '"rocker" pos=".2 0 .06"'))
+    robot = MjcfRobot(RobotConfig(tmp_path / "bar.xml", ("crank",), ("torque",)))
+    episode = Episode(steps={}, messages={}, outputs={"sensor": {"position": np.linspace(-0.1, to, 100)[:, None]}})
+    doubts = robot.doubts(episode)
+    assert bool(doubts) == (share is not None)
+    assert share is None or f"loops of bar.xml cannot close at {share} of the recorded positions" in doubts[0]

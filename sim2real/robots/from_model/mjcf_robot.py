@@ -16,6 +16,7 @@ from sim2real.artifacts.files import check
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
@@ -51,6 +52,8 @@ from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
 
+_CHECKED, _OPEN = 100, 5e-3
+"""Number of recorded positions at which loops must close, and the largest error of a closed one [m or rad]."""
 ROBOT_FILE = "robot.toml"
 COMMANDS = tuple(f.name for f in fields(DriveCommand))
 DRIVING = ("goal", "goal_velocity", "torque", "duty")
@@ -245,6 +248,19 @@ class MjcfRobot(LoggedRobot):
         world = DrivenWorld("world", 1 / config.step_s, self.model, units, terms=self.lawful)
         sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
         return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
+
+    def doubts(self, episode: Episode) -> list[str]:
+        """Return a sentence on recorded positions at which a loop of the model cannot close."""
+        position = np.asarray(episode.outputs[self.roles.sensor]["position"], np.float64)
+        some = position[:: max(len(position) // _CHECKED, 1)]
+        gaps = self.make_nodes()[2].gaps(some)
+        if not (open_ := gaps > _OPEN).any():
+            return []
+        worst = ", ".join(f"{n} {x:.3g}" for n, x in zip(self.config.joints, some[gaps.argmax()], strict=True))
+        return [
+            f"the loops of {self.config.model.name} cannot close at {open_.mean():.0%} of the recorded positions; the "
+            f"largest gap is {gaps.max():.3g} (m or rad), at {worst}: check order, signs, units and zeros of the joints"
+        ]
 
     def with_optional_terms(self, wanted: str = "all") -> MjcfRobot:
         """Return the robot with optional terms to choose from; a step of its simulation then takes longer.

@@ -28,7 +28,7 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
         # A log of this package must be of this pipeline, and complete.
         recording = Recording(path, import_file(path, mapping))
         if robot is not None:
-            require_units(recording, robot)
+            _require_fitting(recording, robot)
         return recording
     recording = Recording.load(path)
     for warning in recording.warnings:
@@ -42,11 +42,17 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
         )
     require_moved(recording.episode, str(path))
     if robot is not None:
-        require_units(recording, robot)
+        _require_fitting(recording, robot)
     holes = {n: m for n, m in (recording.episode.metadata["log"].get("missing_steps") or {}).items() if m}
     if holes:
         raise Sim2RealError(f"{path} lacks steps of {', '.join(holes)}: a part of it is damaged", hint="record again")
     return recording
+
+
+def _require_fitting(recording: Recording, robot: RecordedRobot) -> None:
+    require_units(recording, robot)
+    for line in robot.doubts(recording.episode):
+        note(f"warning: {recording.path.name}: {line}")
 
 
 def require_units(recording: Recording, robot: RecordedRobot) -> None:

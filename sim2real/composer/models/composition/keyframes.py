@@ -33,26 +33,41 @@ def restore(out: MjSpec, models: list[Tree[Handle]]) -> None:
 
 
 def _spread(compiled: MjModel, model: Tree[Handle], name: str, part: str, values: np.ndarray) -> np.ndarray:
-    """Return a part of the state of the whole world that holds a model's values at the model's own places."""
-    if part in ("mpos", "mquat"):
-        whole = np.array(compiled.body_pos if part == "mpos" else compiled.body_quat)
-        bodies = [e for e in model.find_all("body", exclude_attachments=True) if e._native.mocap]
-        ids = layout.resolve(compiled, "body", tuple(e.full_identifier for e in bodies))
-        mocap = np.argsort(compiled.body_mocapid)[-compiled.nmocap :]
-        whole = whole[mocap]
-        whole[compiled.body_mocapid[list(ids)]] = values.reshape(len(ids), -1)
-        return whole.ravel()
-    # Fill the model's own entries; the rest of the world keeps its default.
-    kind, size = ("joint", f"n{part[1]}") if part[0] == "q" else ("actuator", "na" if part == "act" else "nu")
-    whole = np.array(compiled.qpos0) if part == "qpos" else np.zeros(getattr(compiled, size))
-    elements_here = [model.handle(kind, n) for n in getattr(model._spec, f"{kind}s")]
+    """Return a part of the state of the whole world that holds a keyframe's values at their places.
+
+    The values are of the model itself, or of the model with all models that are attached below it.
+    """
+    kind, whole = _defaults(compiled, part)
+    every = model.find_all("body" if kind == "mocap" else kind)
+    every = [e for e in every if kind != "mocap" or e._native.mocap]
+    elements_here = [e for e in every if e.root is model]
     frames = [e for e in elements_here if e.kind == "joint" and e.parent.is_frame]  # their joints came later
-    rows = np.zeros(0)
-    # The values may have been written before the frames got joints.
-    for elements in (elements_here, [e for e in elements_here if e not in frames]):
-        ids = layout.resolve(compiled, kind, tuple(e.full_identifier for e in elements))
-        rows = np.atleast_1d(layout.index(compiled, layout.attributes(kind)[part], ids, False))
+    sizes = []
+    # The values may have been written before the frames got joints, or be of the whole world.
+    for elements in (elements_here, [e for e in elements_here if e not in frames], every):
+        rows = _rows(compiled, kind, part, [e.full_identifier for e in elements])
         if rows.size == values.size:
-            whole[rows] = values
+            whole[np.sort(rows) if elements is every else rows] = values
             return whole
-    raise UsageError(f"keyframe {name!r} has {values.size} values for {part}, its model has {rows.size}")
+        sizes.append(rows.size)
+    below = f", and {sizes[2]} with the attached ones" if sizes[2] != sizes[0] else ""
+    raise UsageError(f"keyframe {name!r} has {values.size} values for {part}, its model has {sizes[0]}{below}")
+
+
+def _defaults(compiled: MjModel, part: str) -> tuple[str, np.ndarray]:
+    """Return the kind of element that a part of the state is of, and the whole world's default."""
+    if part in ("mpos", "mquat"):
+        mocap = np.argsort(compiled.body_mocapid)[len(compiled.body_mocapid) - compiled.nmocap :]
+        return "mocap", np.array(compiled.body_pos if part == "mpos" else compiled.body_quat)[mocap].ravel()
+    kind, size = ("joint", f"n{part[1]}") if part[0] == "q" else ("actuator", "na" if part == "act" else "nu")
+    return kind, np.array(compiled.qpos0) if part == "qpos" else np.zeros(getattr(compiled, size))
+
+
+def _rows(compiled: MjModel, kind: str, part: str, names: list[str]) -> np.ndarray:
+    """Return the places of elements in a part of the state of the whole world."""
+    if kind != "mocap":
+        ids = layout.resolve(compiled, kind, tuple(names))
+        return np.atleast_1d(layout.index(compiled, layout.attributes(kind)[part], ids, False))
+    width = 3 if part == "mpos" else 4
+    first = width * compiled.body_mocapid[list(layout.resolve(compiled, "body", tuple(names)))]
+    return (first[:, None] + np.arange(width)).ravel()
