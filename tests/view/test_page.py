@@ -344,6 +344,39 @@ def test_a_browser_shows_it_without_an_error(path, tmp_path):
     assert synthetic_run.EVIL in dom.words
 
 
+FRAME = """<iframe src="{url}" style="border:0;width:{width}px;height:800px"></iframe><pre id="wide"></pre><script>
+document.querySelector("iframe").onload = event => {{
+  const page = event.target.contentDocument
+  const wide = [...page.querySelectorAll("body *:not(.skip)")].filter(
+    e => !e.closest(".scroll, svg, .hidden") && e.getBoundingClientRect().right > {width} + 1)
+  document.getElementById("wide").textContent = JSON.stringify(
+    {{width: page.documentElement.scrollWidth, wide: wide.map(e => e.outerHTML.slice(0, 80))}})
+}}
+</script>"""
+"""Measures a page in a frame, as a window of Chromium is at least 500 pixels wide; figures and tables scroll inside."""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+@pytest.mark.parametrize("width", [1280, 390])
+def test_nothing_is_wider_than_the_screen(path, tmp_path, width):
+    assert CHROMIUM is not None
+    frame = tmp_path / "frame.html"
+    frame.write_text(FRAME.format(url=path.resolve().as_uri(), width=width))
+    flags = [
+        *FLAGS,
+        "--hide-scrollbars",
+        "--allow-file-access-from-files",
+        "--virtual-time-budget=3000",
+        f"--user-data-dir={tmp_path}/own",
+    ]
+    command = [CHROMIUM, *flags, f"--window-size={width + 20},900", "--dump-dom", frame.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    (measured,) = re.findall(r'<pre id="wide">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert json.loads(measured.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")) == {
+        "width": width, "wide": []
+    }  # fmt: skip
+
+
 def test_parts_that_were_left_out_have_a_table_with_mean_and_worst():
     rows = tuple(
         HeldOutPart(name, terms, {}, {}, {"th": error}, {})

@@ -15,8 +15,8 @@ from sim2real.view.page.iterations import iterations_sections
 from sim2real.view.page.sections import SECTIONS
 
 PAGE = "report.html"
-_MOST_REASONS = 4
-"""Number of reasons in a verdict's box; the others are folded, so that its figure stays on the first screen."""
+_MOST_REASONS = 2
+"""Number of reasons in a verdict's box; the others are folded, so that a telephone's first screen has the figure."""
 
 
 def report(run_dir: Path) -> Path:

@@ -38,11 +38,12 @@ def train_banner(success: float) -> Banner:
 
 
 def deploy_banner(deployed: Deployment) -> Banner | None:
-    """Return the verdict on a deployment with its reasons and the next command; None for older files."""
+    """Return the verdict on a deployment: the first reason, the next command, further reasons; None for older files."""
     advice = deployed.advice
     if advice is None:
         return None
     title = f"{advice.status[:1].upper()}{advice.status[1:]}" + (f": {advice.joint}" if advice.joint else "")
     names = [row.name for row in deployed.replay]
-    reasons = [*(sentence(r, names) for r in advice.reasons), *([f"next: {advice.next}"] if advice.next else [])]
+    reasons = [sentence(reason, names) for reason in advice.reasons]
+    reasons[1:1] = [f"next: {advice.next}"] if advice.next else []
     return Banner(_DEPLOYED.get(advice.status, "doubt"), title, reasons)
