@@ -12,6 +12,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, Transform
+from sim2real.robots.from_model.joint_patterns import require_quick
 from sim2real.robots.from_model.mjcf import gains_of, limit_of, slides_of, unit_for
 from sim2real.types import Array, MjModel, PyTree, Scalar
 
@@ -156,6 +157,7 @@ class ParameterPattern:
             raise UsageError(
                 f"{self.joints!r} is no pattern for joints: {error}", hint="such as .*_hip_joint"
             ) from None
+        require_quick(self.joints, ())
         if self.what == "cogging_per_turn" and self.free:
             raise UsageError(
                 "cogging_per_turn is counted, not identified",
@@ -203,6 +205,7 @@ def expand(
         # The joints or bodies that match the pattern.
         names = [model.body(i).name for i in range(1, model.nbody)] if term.what == "payload" else list(joints)
         offset = 1 if term.what == "payload" else 0
+        require_quick(term.joints, names)
         at = [i for i, name in enumerate(names) if re.fullmatch(term.joints, name, re.DOTALL)]
         if not at:
             raise UsageError(

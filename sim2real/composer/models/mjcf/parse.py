@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sim2real.composer.models.mjcf.budget import Budget
 from sim2real.composer.models.mjcf.explicit_values import Document
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _INCLUDE = re.compile(r"""<include\s+file\s*=\s*["']([^"']*)["']\s*(?:/>|>\s*</include>)""")
 _ROOT = re.compile(r"<(mujoco\w*)[^>]*>(.*)</\1\s*>", re.DOTALL)
+_MOST_INCLUDES = 50
+"""Largest number of documents that include each other in a row."""
 _BETWEEN = re.compile(r">\s*<(?!!)")
 
 
@@ -36,8 +39,10 @@ def from_string(
         ValueError: MuJoCo's own message, when the document cannot be parsed.
         UsageError: When a document that it includes is not there.
     """
-    text = text.decode() if isinstance(text, bytes) else text
-    whole = _with_included(text, Path(folder), Path(folder), assets or {})
+    budget = Budget(Path(folder) / "the document", finite=False)
+    text = _decoded(text, "the document") if isinstance(text, bytes) else text
+    whole = _with_included(text, Path(folder), Path(folder), assets or {}, budget)
+    budget.count(whole)
     spec, document = _parse(whole, assets)
     if os.fspath(folder):
         spec.modelfiledir = str(Path(folder).resolve())
@@ -58,20 +63,41 @@ def from_path(path: str | os.PathLike[str], assets: dict[str, bytes] | None = No
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"there is no MJCF file {str(path)!r}", hint="give the path of a file that exists")
-    spec, document = _parse(_read(path, path.parent, assets or {}), assets)
+    budget = Budget(path, finite=False)
+    whole = _read(path, path.parent, assets or {}, budget)
+    budget.count(whole)
+    spec, document = _parse(whole, assets)
     spec.modelfiledir = str(path.parent.resolve())
     return spec, document
 
 
-def _read(path: Path, folder: Path, assets: dict[str, bytes]) -> str:
+def _decoded(text: bytes, what: str) -> str:
+    try:
+        return text.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{what} is not UTF-8: byte 0x{text[error.start]:02x}", hint="save it as UTF-8") from None
+
+
+def _read(path: Path, folder: Path, assets: dict[str, bytes], budget: Budget, level: int = 0) -> str:
     """Return the text of a document with its included documents in place."""
     name = str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
-    text = assets[name].decode() if name in assets else path.read_text(encoding="utf-8")
-    return _with_included(text, path.parent, folder, assets)
+    if name not in assets:
+        budget.add(path.stat().st_size)
+    text = _decoded(assets[name] if name in assets else path.read_bytes(), str(path))
+    return _with_included(text, path.parent, folder, assets, budget, level)
 
 
-def _with_included(text: str, beside: Path, folder: Path, assets: dict[str, bytes]) -> str:
-    """Return a document with its included documents in place; two folders are searched for them."""
+def _with_included(
+    text: str, beside: Path, folder: Path, assets: dict[str, bytes], budget: Budget, level: int = 0
+) -> str:
+    """Return a document with its included documents in place; two folders are searched for them.
+
+    Args:
+        level: Number of documents that include this one.
+    """
+    budget.add(len(text))
+    if level > _MOST_INCLUDES:
+        raise UsageError(f"{beside} has documents that include each other", hint="remove the circle")
 
     def included(match: re.Match[str]) -> str:
         candidates = [folder / match[1], beside / match[1]]
@@ -81,7 +107,7 @@ def _with_included(text: str, beside: Path, folder: Path, assets: dict[str, byte
                 f"the document includes {match[1]!r}, which is not there",
                 hint=f"looked for {candidates[0]}; from_xml_string takes model_dir and assets",
             )
-        body = _ROOT.search(_read(path, folder, assets))
+        body = _ROOT.search(_read(path, folder, assets, budget, level + 1))
         return body[2] if body else ""
 
     return _INCLUDE.sub(included, _COMMENT.sub("", text)) if "<include" in text else text
