@@ -8,7 +8,7 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 62_622,
+    "lines without composer": 62_900,
     "lines of composer": 12_074,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.0,

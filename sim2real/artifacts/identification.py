@@ -141,7 +141,11 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class FreeRun:
-    """Errors of one model in one field, with all held-out data of a recording simulated from one initial state."""
+    """Errors of one model in one field, with all held-out data of a recording simulated from one initial state.
+
+    Attributes:
+        low95: Lower end of the 95 % interval of ``rmse`` over draws of the posterior; None for other models.
+    """
 
     model: str
     recording: int
@@ -151,6 +155,8 @@ class FreeRun:
     field: str
     rmse: float | None
     mae: float | None
+    low95: float | None = None
+    high95: float | None = None
 
 
 @dataclass(frozen=True)
@@ -163,6 +169,7 @@ class HeldOutPart:
         share: Parameter -> share of the information in all recordings that the part holds.
         ahead: Field -> root mean square error on the part up to the longest horizon.
         free: Field -> root mean square error of a free run over the part; empty without a free run.
+        run_s: Length of the free run [s]; 0 in older files.
     """
 
     name: str
@@ -171,6 +178,7 @@ class HeldOutPart:
     share: Mapping[str, float]
     ahead: Mapping[str, float | None]
     free: Mapping[str, float | None] = field(default_factory=dict)
+    run_s: float = 0.0
 
 
 @dataclass(frozen=True, repr=False)

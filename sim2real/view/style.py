@@ -94,6 +94,7 @@ ROLES = {
     "no delay": Role(MUTED, DASHES[2], 1.0, 2.2),
     "nominal": Role(ORANGE, DASHES[2], 1.4, 2.5),
     "truth": Role(GREEN, DASHES[3], 1.3, 2.0),
+    "interval": Role(BLUE, DASHES[2], 0.7, 1.0),
     "residual": Role(BLUE, DASHES[0], 1.2, 3.0),
     "command": Role(PURPLE, DASHES[0], 1.0, 3.0),
 }

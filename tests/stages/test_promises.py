@@ -206,3 +206,13 @@ def test_a_broken_promise_is_the_verdict_where_nothing_worse_is(before, end, sta
     assert verdict.reasons[0].startswith("a promise is broken: tilt") == (status == "promise broken")
     assert any(r.startswith("a promise is broken: tilt") for r in verdict.reasons) == (end == 0.04)
     assert any("95 % of later parts" in r or "record more" in r for r in verdict.reasons)
+
+
+def test_the_bound_of_a_free_run_is_wider_where_drawn_trajectories_part():
+    names, p = [predicted_logs.Predicted("a.mcap", True), predicted_logs.Predicted("b.mcap", True)], ANGLE
+    limit = {("th", FREE_RUN): Bound("th", "tilt", "rad", FREE_RUN, 3.0, 0.03, "recordings like these")}
+    doc = document([], [0.01], free=[0.01, 0.01])
+    spread = np.where(doc.free["recording"] == 1, 0.04, 0.0)
+    plain, apart = promises.on_later_logs(replace(doc, free={**doc.free, "th_spread": spread}), [p], names, limit)[1:]
+    assert (plain.source, plain.bound) == ("a.mcap", pytest.approx(0.03))
+    assert (apart.source, apart.bound) == ("b.mcap", pytest.approx(0.05))

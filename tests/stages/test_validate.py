@@ -17,7 +17,7 @@ def ledger(bound, free=0.004):
 
 
 RESULT = {"horizon_s": 8.0, "rmse": 0.004, "free_run_rmse": 0.004, "identified": "accepted", "why": [], "fitted": []}
-RESULT |= {"beyond": [], "ledger": [], "better": True, "promise_kept": None}
+RESULT |= {"beyond": [], "drawn": [], "ledger": [], "better": True, "promise_kept": None}
 
 
 @pytest.mark.parametrize(("moves", "beaten_by"), [(True, ["hold"]), (False, [])])

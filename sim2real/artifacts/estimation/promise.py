@@ -48,7 +48,7 @@ class Promise:
     Attributes:
         source: The predicted data: a held-out part, the held-out quarter, or a log.
         fresh: Whether the estimates never depended on this data; held-out parts are fitted afterwards.
-        seconds: The horizon, or the length of the run [s]; 0 for the free run over a whole part.
+        seconds: The horizon, or the length of the run [s]; 0 for a part in older files.
         error: Root mean square error; None if it is infinite.
         bound: None if too few parts gave one.
         stretch: Factor of this data in ``bound``: 1, or more if the motion is faster or reaches further than the fitted

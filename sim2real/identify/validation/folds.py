@@ -133,9 +133,11 @@ def predicted(
     own = np.einsum("kpp->kp", stats.information)
     shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own / np.maximum(own.sum(axis=0), 1e-300)]
     ahead = _ahead(estimate.windows, parts, stacked, settle_s)
-    free = _free(problem, parts, stacked, settle_s, free_run_s) if free_run_s else [{} for _ in parts]
+    free, run_s = [{} for _ in parts], 0.0
+    if free_run_s:
+        free, run_s = _free(problem, parts, stacked, settle_s, free_run_s)
     rows = zip(parts, names, values, shares, ahead, free, strict=True)
-    return [HeldOutPart(part.name, *row) for part, *row in rows]
+    return [HeldOutPart(part.name, *row, run_s=run_s) for part, *row in rows]
 
 
 def _ahead(
@@ -148,8 +150,8 @@ def _ahead(
 
 def _free(
     problem: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float, longest_s: float
-) -> list[dict[str, float | None]]:
-    """Return the errors of a free run of each part."""
+) -> tuple[list[dict[str, float | None]], float]:
+    """Return the errors of a free run of each part, and the length of the runs beyond their first part [s]."""
     fitted = [problem.spans[i] for i in problem.train]
     where = []
     for k, part in enumerate(parts):
@@ -161,7 +163,7 @@ def _free(
     length_s = min(longest_s, *(w[2] for w in where))
     runs = problem.recut([w[1] for w in where], length_s)
     fold = np.array([w[0] for w in where])
-    return _errors(runs, stacked, fold, np.arange(len(where)), settle_s, len(parts))
+    return _errors(runs, stacked, fold, np.arange(len(where)), settle_s, len(parts)), length_s - settle_s
 
 
 def _errors(

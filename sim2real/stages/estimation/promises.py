@@ -16,6 +16,7 @@ from scipy.special import stdtrit
 
 from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Bound, Promise, Reach
 from sim2real.artifacts.identification import HeldOutPart, Identification
+from sim2real.identify.validation.draws import SPREAD
 from sim2real.identify.validation.folds import MOVES
 from sim2real.identify.validation.verdict import Position
 from sim2real.stages.estimation.predicted_logs import LEAST_PARTS, Predicted
@@ -69,12 +70,14 @@ def ledger(
         for reach in (AHEAD, FREE_RUN):
             held_out = _held_out(document, p, reach, recordings)
             seconds = max((run_s for _, _, run_s in held_out), default=0.0)
-            errors = [(part.name, _of_part(part, p, reach)) for part in parts]
-            errors = [(name, error) for name, error in errors if error is not None]
+            errors = [(part, _of_part(part, p, reach)) for part in parts]
+            errors = [(part, error) for part, error in errors if error is not None]
             # Each held-out part beside the other parts, then held-out data beside all parts.
-            for k, (name, error) in enumerate(errors):
+            for k, (part, error) in enumerate(errors):
                 others = [e for i, (_, e) in enumerate(errors) if i != k]
-                rows.append(_promise(p, name, False, reach, seconds if reach == AHEAD else 0.0, error, others))
+                rows.append(
+                    _promise(p, part.name, False, reach, seconds if reach == AHEAD else part.run_s, error, others)
+                )
             inside = [error for _, error in errors]
             for recording, error, run_s in held_out:
                 stretch = recording.stretch.get(p.column, 1.0)
@@ -139,9 +142,25 @@ def on_later_logs(
             bound = limits.get((p.column, reach))
             for log, error, seconds in _held_out(document, p, reach, logs):
                 row = Promise(log.source, True, p.column, p.name, p.unit, reach, seconds, _or_none(error))
-                stretch = log.stretch.get(p.column, 1.0)
-                rows.append(row if bound is None else replace(row, bound=stretch * bound.bound, stretch=stretch))
+                if bound is not None:
+                    stretch = log.stretch.get(p.column, 1.0)
+                    size = math.hypot(stretch * bound.bound, _spread(document, p, reach, logs.index(log)))
+                    row = replace(row, bound=size, stretch=stretch)
+                rows.append(row)
     return rows
+
+
+def _spread(document: Identification, p: Position, reach: Reach, recording: int) -> float:
+    """Return the root mean square distance of draws of the posterior from the estimate's free run; 0 without draws.
+
+    The parts of the recordings had errors of the parameters, too. Where the drawn trajectories part, as where an arm
+    sticks, this log's are larger than theirs.
+    """
+    columns = document.free
+    if reach == AHEAD or f"{p.column}_{SPREAD}" not in columns:
+        return 0.0
+    pick = (columns["into"] > document.settle_s) & (columns["recording"] == recording)
+    return float(np.sqrt(np.mean(columns[f"{p.column}_{SPREAD}"][pick] ** 2))) if pick.any() else 0.0
 
 
 def sentences(document: Identification, positions: Sequence[Position]) -> list[str]:

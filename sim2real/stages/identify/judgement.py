@@ -84,7 +84,8 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
     models: dict[str, Mapping[str, Value]] = {"identified": fit.values, **_without_delays(fit), "nominal": nominal}
     samples = prediction.samples(problem, models, config.settle_s)
     horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
-    runs, columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, models)
+    posterior = document.posterior
+    runs, columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, models, posterior)
     return replace(
         document,
         samples=samples,

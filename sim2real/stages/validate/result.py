@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sim2real.artifacts.estimation.promise import FREE_RUN, Promise, promises_table
@@ -20,6 +20,7 @@ class Validation(Shown):
         horizon_s: Horizon of the predictions [s].
         positions: Position -> its errors, the baselines with smaller errors, the promised error.
         ledger: Each error of each log beside its bound.
+        drawn: For each log and column the 95 % interval of the error of a free run over draws of the posterior.
         beyond: Sentences about signals outside the range of the fitted data: there the bounds do not hold.
         better: Whether the identification predicts every position better than every baseline.
         promise_kept: Whether no error exceeds its bound by more than ``MAX_ERROR_RATIO``; None without a bound.
@@ -42,6 +43,7 @@ class Validation(Shown):
     fitted: Sequence[str] = ()
     ledger: Sequence[Promise] = ()
     beyond: Sequence[str] = ()
+    drawn: Sequence[Mapping[str, Json]] = ()
 
     def about(self) -> dict[str, Json]:
         """Return name -> value of the main figures."""

@@ -11,19 +11,18 @@ from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Promise
 from sim2real.artifacts.identification import HeldOut, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import beyond, check_log, ranges
+from sim2real.identify.problem.segments import check_log
 from sim2real.identify.validation import prediction
+from sim2real.identify.validation.draws import intervals
 from sim2real.identify.validation.folds import moving
-from sim2real.identify.validation.verdict import Position, errors_of, positions, scores
+from sim2real.identify.validation.verdict import errors_of, positions, scores
 from sim2real.stages.estimation import promises
 from sim2real.stages.estimation.fitted_logs import require_new
-from sim2real.stages.estimation.predicted_logs import Predicted, stretches
 from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.validate.config import ValidateConfig
-from sim2real.stages.validate.simulated import later_logs, models_of
+from sim2real.stages.validate.simulated import later_logs, models_of, predicted_logs
 from sim2real.types import Json
 
 _FREE_RUN_S = 10.0
@@ -54,6 +53,7 @@ def score(
         columns = prediction.samples(windows, models, fitting.settle_s)
         whole = later_logs(model, logs, fitting, min(run_s, shortest_s), once=True)
         runs = prediction.samples(whole, models, fitting.settle_s)
+        bands, drawn = intervals(whole, runs, models["identified"], identification.posterior, fitting.settle_s)
     errors = prediction.errors(windows, columns, list(models), fitting.settle_s, [horizon_s])
     measured = positions(model, robot.units)
     held_out = scores(errors, measured)
@@ -62,8 +62,8 @@ def score(
         raise UsageError("no joint moves in this log, so it tests no parameter", hint="take a log of motion")
 
     # Compare each position of each log with its bound, unless its joint does not move.
-    predicted, further = _predicted_logs(identification, logs, windows, measured)
-    document = replace(identification, samples=columns, free=runs, settle_s=fitting.settle_s)
+    predicted, further = predicted_logs(identification, logs, windows, measured)
+    document = replace(identification, samples=columns, free={**runs, **bands}, settle_s=fitting.settle_s)
     ledger = promises.on_later_logs(document, measured, predicted, bounds)
     rows = {s.name: position_row(s, ledger, moves[s.column]) for s in held_out}
     free_runs = [np.inf if row.error is None else row.error for row in ledger if row.reach == FREE_RUN]
@@ -77,23 +77,15 @@ def score(
         "better": not any(row["beaten_by"] for row in rows.values()),
         "promise_kept": not any(row.broken for row in ledger) if any(row.bound for row in ledger) else None,
         "ledger": ledger,
+        "drawn": [
+            {"log": logs[k].path.name, "column": column, "low95": low, "high95": high}
+            for (k, column), (low, high) in drawn.items()
+            if moves[column]
+        ],
         "beyond": further,
         "rmse": float(np.sqrt(np.mean([errors_of(s)["identified"] ** 2 for s in held_out]))),
         "free_run_rmse": float(np.sqrt(np.mean(np.square(free_runs)))),
     }
-
-
-def _predicted_logs(
-    identification: Identification, logs: Sequence[Recording], windows: Problem, measured: Sequence[Position]
-) -> tuple[list[Predicted], list[str]]:
-    """Return the logs with the factors of their bounds, and sentences about signals outside the fitted range."""
-    predicted, sentences = [], []
-    for r, log in enumerate(logs):
-        spans = [s for s in windows.spans if s.recording == r]
-        later = ranges(windows.model, [log.episode for log in logs], spans, windows.segment_s)
-        predicted.append(Predicted(log.path.name, True, stretches(identification.ranges, later, measured)))
-        sentences += [f"{log.path.name}: {sentence}" for sentence in beyond(identification.ranges, later)]
-    return predicted, sentences
 
 
 def position_row(s: HeldOut, ledger: Sequence[Promise], moves: bool) -> dict[str, Json]:

@@ -23,6 +23,9 @@ def show(result: Mapping[str, Json]) -> None:
         f"all positions: {result['rmse']:.4g} {result['horizon_s']:g} s ahead, "
         f"{result['free_run_rmse']:.4g} in free runs"
     )
+    for row in result["drawn"]:
+        ends = f"{row['low95']:.2g} to {row['high95']:.2g}"
+        print(f"{row['column']} in a free run of {row['log']}: off by {ends} for 95 % of draws of the posterior")
     if resting := [name for name, row in result["positions"].items() if not row["moves"]]:
         note(f"{', '.join(resting)} did not move here, which neither keeps a promise nor breaks one")
     for sentence in result["beyond"]:

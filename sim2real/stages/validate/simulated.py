@@ -12,9 +12,11 @@ from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
+from sim2real.identify.problem.segments import Span, beyond, ranges
+from sim2real.identify.validation.verdict import Position
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation.predicted_logs import Predicted, stretches
 from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -51,3 +53,16 @@ def later_logs(
         begins = np.arange(begin, end - length_s + 1e-6, length_s)
         spans += [Span(r, float(b), False) for b in (begins[:1] if once else begins)]
     return Problem(model, [log.episode for log in logs], spans, length_s, config)
+
+
+def predicted_logs(
+    identification: Identification, logs: Sequence[Recording], windows: Problem, measured: Sequence[Position]
+) -> tuple[list[Predicted], list[str]]:
+    """Return the logs with the factors of their bounds, and sentences about signals outside the fitted range."""
+    predicted, sentences = [], []
+    for r, log in enumerate(logs):
+        spans = [s for s in windows.spans if s.recording == r]
+        later = ranges(windows.model, [log.episode for log in logs], spans, windows.segment_s)
+        predicted.append(Predicted(log.path.name, True, stretches(identification.ranges, later, measured)))
+        sentences += [f"{log.path.name}: {sentence}" for sentence in beyond(identification.ranges, later)]
+    return predicted, sentences
