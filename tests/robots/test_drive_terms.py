@@ -39,7 +39,7 @@ XML = f"""<mujoco><option timestep="{STEP_S}"/><worldbody><body>
 OWN = {"damping": 0.02, "armature": 0.004, "frictionloss": 0.03, "kp": 9.0, "kd": 0.3, "limit": 3.0}
 ON = {"load": 0.25, "static": 0.25, "stribeck_rad_s": 0.3, "drag": 0.02, "bias": 0.05, "back_emf": 0.12, "play": 0.04,
       "cogging_cos": 0.1, "cogging_sin": -0.2, "cogging_per_turn": 9.0, "eccentric_cos": 0.05, "eccentric_sin": 0.08,
-      "tilt_x": 0.25, "tilt_y": -0.2}  # fmt: skip
+      "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7}  # fmt: skip
 OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1, "cogging_per_turn": 9.0}
 PER_TURN = ParameterPattern("cogging_per_turn", nominal=9.0, free=False)
 
@@ -69,7 +69,9 @@ def by_hand(terms, goals, on, start):
         cogging = p["cogging_cos"] * math.cos(9.0 * q) + p["cogging_sin"] * math.sin(9.0 * q)
         # Gravity, turned about x and then about y, in the plane of a joint about y.
         down, aside = 9.81 * math.cos(p["tilt_x"]), math.sin(p["tilt_y"])
-        lever = MASS * LENGTH * down * (math.cos(p["tilt_y"]) * math.sin(q) - aside * math.cos(q))
+        lever = (
+            (1.0 - p["gravcomp"]) * MASS * LENGTH * down * (math.cos(p["tilt_y"]) * math.sin(q) - aside * math.cos(q))
+        )
         drive = max(-p["limit"], min(p["limit"], servo)) - enabled * p["back_emf"] * w
         dry = p["frictionloss"] + p["static"] * math.exp(-abs(w) / p["stribeck_rad_s"]) + p["load"] * abs(drive)
         inside = drive + enabled * p["back_emf"] * w
@@ -83,7 +85,7 @@ def by_hand(terms, goals, on, start):
 
 
 def in_c(model_file, terms, goals, on, start):
-    model = driven(model_file, ("servo",), STEP_S, False, False)
+    model = driven(model_file, ("servo",), STEP_S, False, False, True, (), True)
     law = DriveLaw(np.array([0]), np.array([0]), np.zeros(0, int))
     kp = OWN["kp"] * on
     control = np.stack([kp * goals, kp, OWN["kd"] * on, on, goals], axis=1)[:, None]
@@ -92,6 +94,7 @@ def in_c(model_file, terms, goals, on, start):
     state = Start(np.array([start[0]]), np.array([start[1]]), np.zeros(1))
     tilt = expand([ParameterPattern("tilt_x"), ParameterPattern("tilt_y")], ["servo"], model, model)
     fields = {"opt.gravity": np.asarray(tilted(tilt, terms, model.opt.gravity))}
+    fields["body_gravcomp"] = np.array([0.0, terms["gravcomp"]])
     return Rollouts(model, 1, tuple(fields), law=law)(fields, state, control, values)[0][1:, 0]
 
 
@@ -257,7 +260,9 @@ def test_parameters_of_a_term_bring_it_back(model_file):
 def test_a_term_of_the_users_own_is_one_of_those_to_choose_from():
     own = optional((ParameterPattern("load", each=True, high=0.5),))
     assert own[0] == ParameterPattern("load", each=True, high=0.5, term="load")
-    assert sorted(t.what for t in own) == sorted({*LAWS, "tilt_x", "tilt_y"} - {w for w in LAWS if "cogging" in w})
+    assert sorted(t.what for t in own) == sorted(
+        {*LAWS, "tilt_x", "tilt_y", "gravcomp"} - {w for w in LAWS if "cogging" in w}
+    )
 
 
 def test_every_coefficient_can_be_identified():

@@ -16,7 +16,7 @@ from sim2real.robots.from_model.holding import Holding, apply, plan
 from sim2real.types import MjModel, MjSpec, PyTree
 
 NO_LIMIT = 1e6
-_LEAST_FRICTION = 1e-9
+_LEAST_FRICTION, _LEAST_GRAVCOMP = 1e-9, 1e-9
 _OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
               "N m s^2/rad^2": "N s^2/m^2"}  # fmt: skip
 """Units of hinges -> units of slides."""
@@ -56,6 +56,7 @@ def driven_spec(
     contacts: bool,
     rubbing: bool = True,
     hold: Sequence[str] = (),
+    carried: bool = False,
 ) -> MjSpec:
     """Return the ``MjSpec`` with a drive on each recorded joint: actuators of force, of stiffness and of damping.
 
@@ -69,6 +70,7 @@ def driven_spec(
         fix_base: Whether a floating base is held at its position in the model.
         rubbing: Whether joints have at least a little dry friction: MJX compiles no friction for a model without any.
         hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+        carried: Whether bodies have at least a little gravity compensation: MuJoCo computes none without any.
     """
     # Hold the joints that were not recorded.
     spec = read_spec(path, contacts)
@@ -90,12 +92,22 @@ def driven_spec(
             spec.joint(joint).frictionloss = max(float(np.ravel(spec.joint(joint).frictionloss)[0]), _LEAST_FRICTION)
 
     # Set the options that identification needs, and compile.
+    if carried and not np.any(model.body_gravcomp > 0.0):
+        for body in spec.bodies[1:]:
+            body.gravcomp = _LEAST_GRAVCOMP
     option = spec.option
     option.timestep, option.integrator = step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone, option.noslip_iterations = mj.mjtCone.mjCONE_PYRAMIDAL, 0
     if not contacts:
         option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
     return spec
+
+
+def copy_back(spec: MjSpec, model: MjModel) -> None:
+    """Copy a compiled model's numbers into its ``MjSpec``, with the gravity compensation, which MuJoCo's own omits."""
+    spec.copy_back(model)
+    for body in spec.bodies[1:]:
+        body.gravcomp = float(model.body_gravcomp[body.id])
 
 
 def driven(path: Path, *how: PyTree) -> MjModel:

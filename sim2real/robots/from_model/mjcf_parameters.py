@@ -18,7 +18,7 @@ from sim2real.types import Array, MjModel, PyTree, Scalar
 
 What = Literal[
     "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
-    "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf", "play", "tilt_x", "tilt_y",
+    "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf", "play", "tilt_x", "tilt_y", "gravcomp",
     "eccentric_cos", "eccentric_sin", "cogging_cos", "cogging_sin", "cogging_per_turn",
 ]  # fmt: skip
 ALL = ".*"
@@ -49,6 +49,7 @@ _ABOUT = {
     "play": ("rad", "error of the angle that the drive leaves alone: dead zone, play of gears"),
     "tilt_x": ("rad", "turn of the direction of gravity about the model's x axis"),
     "tilt_y": ("rad", "turn of the direction of gravity about the model's y axis"),
+    "gravcomp": ("1", "share of the bodies' weight that the robot's own controller carries"),
     "eccentric_cos": ("rad", "reading of an encoder off its axis beyond the angle, by the angle's cosine"),
     "eccentric_sin": ("rad", "reading of an encoder off its axis beyond the angle, by the angle's sine"),
     "cogging_cos": ("N m", "torque that repeats with the angle, by the cosine"),
@@ -76,6 +77,7 @@ _EXCITE = {
     "play": "slow motion of each joint, with reversals, and goals that change little",
     "tilt_x": "motion of joints whose axes are not upright, against gravity, up and down",
     "tilt_y": "motion of joints whose axes are not upright, against gravity, up and down",
+    "gravcomp": "motion of each joint against gravity, up and down, over a wide range of angles",
     "eccentric_cos": "motion of each joint over most of a turn",
     "eccentric_sin": "motion of each joint over most of a turn",
     "cogging_cos": "slow motion of each joint over many of its repeats, both ways",
@@ -87,7 +89,7 @@ _VANISHING = ("kd", "damping", "armature", "frictionloss")
 """Quantities that may be 0."""
 _FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0),
           "load": (0.0, 0.0, 1.0), "play": (0.0, 0.0, 0.1), "tilt_x": (0.0, -0.3, 0.3), "tilt_y": (0.0, -0.3, 0.3),
-          "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
+          "gravcomp": (0.0, 0.0, 1.5),          "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
           "cogging_per_turn": (1.0, 0.0, 10_000.0)}  # fmt: skip
 _OF_MODEL = {
     "static": ("frictionloss", 5.0),
@@ -107,15 +109,18 @@ OPTIONAL = {
     "direction": ("bias",),
     "back_emf": ("back_emf",),
     "play": ("play",),
+    "gravcomp": ("gravcomp",),
     "tilt": ("tilt_x", "tilt_y"),
     "eccentricity": ("eccentric_cos", "eccentric_sin"),
     "cogging": ("cogging_cos", "cogging_sin"),
 }
 """Optional terms, and the quantities that each has."""
 TILT = OPTIONAL["tilt"]
+WHOLE = (*TILT, *OPTIONAL["gravcomp"])
+"""Quantities of the whole robot, without effect in a model without gravity."""
 ONLY_NAMED = ("tilt", "eccentricity", "cogging")
 """Terms that ``auto`` omits unless a parameter names them: in few robots they differ from a zero or a stiffness."""
-LAWS = (*(q for term in OPTIONAL.values() if term != TILT for q in term), "cogging_per_turn")
+LAWS = (*(q for term in OPTIONAL.values() for q in term if q not in WHOLE), "cogging_per_turn")
 """Quantities that are set before every step."""
 _ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
 ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
@@ -163,7 +168,7 @@ class ParameterPattern:
                 "cogging_per_turn is counted, not identified",
                 hint="write cogging_per_turn=N: of a motor the least common multiple of poles and slots, times gears",
             )
-        if self.what in TILT and (self.each or self.joints != ALL):
+        if self.what in WHOLE and (self.each or self.joints != ALL):
             raise UsageError(f"{self.what} is the whole robot's", hint=f"write {self.what}")
 
     @staticmethod
@@ -220,7 +225,7 @@ def expand(
             groups = [(part, term.label() + suffix) for part, suffix in _by_unit(term.what, at, names, sliding)]
         for group, name in groups:
             nominal = _nominal(term, [names[i] for i in group], file_model)
-            unit = unit_for(_ABOUT[term.what][0], term.what not in TILT and names[group[0]] in sliding)
+            unit = unit_for(_ABOUT[term.what][0], term.what not in WHOLE and names[group[0]] in sliding)
             p = replace(_parameter(term, name, nominal, _size(term, [names[i] for i in group], file_model)), unit=unit)
             placed.append(Placed(p, term.what, tuple(i + offset for i in group)))
     return placed
@@ -230,7 +235,7 @@ def _by_unit(what: str, at: list[int], names: Sequence[str], sliding: set[str]) 
     """Return the groups of joints that may share a value, and the suffix of its name: slides have other units."""
     slides = [i for i in at if names[i] in sliding]
     hinges = [i for i in at if names[i] not in sliding]
-    if what in TILT or unit_for(_ABOUT[what][0], True) == _ABOUT[what][0] or not (slides and hinges):
+    if what in WHOLE or unit_for(_ABOUT[what][0], True) == _ABOUT[what][0] or not (slides and hinges):
         return [(at, "")]
     return [(hinges, ""), (slides, "_slide")]
 
@@ -285,6 +290,10 @@ def place(
     # A speed without load is the torque limit divided by the damping, so set the limit first.
     for p in sorted(placed, key=lambda p: p.what == "speed"):
         if p.what in TILT:
+            continue
+        if p.what == "gravcomp":
+            carried = base.model.body_gravcomp
+            model["body_gravcomp"] = jnp.where(carried > 0.0, values[p.parameter.name], carried)
             continue
         value, at = jnp.asarray(values[p.parameter.name], float), np.array(p.at)
         if p.what in _ON_DRIVE:
@@ -349,6 +358,8 @@ def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel) 
     """Return the nominal value: the median of the joints' values in the file."""
     if term.nominal is not None:
         return term.nominal
+    if term.what == "gravcomp" and np.any(file_model.body_gravcomp > 0.0):
+        return float(np.median(file_model.body_gravcomp[file_model.body_gravcomp > 0.0]))
     if term.what in _FIXED:
         return _FIXED[term.what][0]
     if term.what in _OF_MODEL:

@@ -25,6 +25,7 @@ from sim2real.robots.from_model.holding import Holding
 from sim2real.robots.from_model.mjcf import (
     NO_LIMIT,
     JointDrive,
+    copy_back,
     driven,
     held_in,
     limit_of,
@@ -38,6 +39,7 @@ from sim2real.robots.from_model.mjcf_parameters import (
     FALLBACK,
     LAWS,
     ON_DOF,
+    WHOLE,
     ParameterPattern,
     Placed,
     expand,
@@ -96,13 +98,13 @@ class RobotConfig:
     hold: tuple[str, ...] = ()
     terms: tuple[ParameterPattern, ...] = ()
 
-    def driven(self, rubbing: bool = True) -> PyTree:
+    def driven(self, rubbing: bool = True, carried: bool = False) -> PyTree:
         """Return the model with a drive on each recorded joint, see ``mjcf.driven``."""
-        return driven(*self.how(rubbing))
+        return driven(*self.how(rubbing, carried))
 
-    def how(self, rubbing: bool) -> tuple[PyTree, ...]:
+    def how(self, rubbing: bool, carried: bool) -> tuple[PyTree, ...]:
         """Return the arguments of ``mjcf.driven_spec``."""
-        return self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold
+        return self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold, carried
 
     def held(self) -> Holding:
         """Return the held and the free joints among those that were not recorded."""
@@ -212,8 +214,9 @@ class MjcfRobot(LoggedRobot):
         self.config, self.tick_s = config, config.step_s
         file_model = read_model(config.model)
         self.lawful = any(term.what in LAWS for term in config.terms)
-        self._rubbing = self.lawful or "frictionloss" in {term.what for term in config.terms}
-        self.model = config.driven(self._rubbing)
+        quantities = {term.what for term in config.terms}
+        self._how = self.lawful or "frictionloss" in quantities, "gravcomp" in quantities
+        self.model = config.driven(*self._how)
         self.placed = tuple(expand(config.terms, config.joints, self.model, file_model))
         self._limits = [limit_of(file_model, joint) for joint in config.joints]
 
@@ -268,7 +271,9 @@ class MjcfRobot(LoggedRobot):
         Args:
             wanted: ``auto``, ``all``, or names with commas between.
         """
-        return MjcfRobot(replace(self.config, terms=optional(self.config.terms, wanted)))
+        heavy = bool(np.any(self.model.opt.gravity))
+        terms = (t for t in optional(self.config.terms, wanted) if heavy or t.free or t.what not in WHOLE)
+        return MjcfRobot(replace(self.config, terms=tuple(terms)))
 
     def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
         """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
@@ -306,8 +311,11 @@ class MjcfRobot(LoggedRobot):
         # A speed without load makes a damping of the torque limit, after a damping that was identified.
         for p in sorted(self.placed, key=lambda p: p.what == "speed"):
             value = float(values[p.parameter.name])
-            for i in p.at:
-                if p.what == "payload":
+            for i in p.at[:1] if p.what in WHOLE else p.at:
+                if p.what == "gravcomp":
+                    compensated = model.body_gravcomp > 0.0
+                    model.body_gravcomp[1:] = np.where(compensated.any() & ~compensated, 0.0, value)[1:]
+                elif p.what == "payload":
                     # By name: a body that hangs on a held joint may be fused in one of both models.
                     name = self.model.body(i).name
                     model.body_mass[model.body(name).id if name else i] += value
@@ -315,12 +323,12 @@ class MjcfRobot(LoggedRobot):
                     model.dof_damping[dofs[i]] = (drives[i].most or NO_LIMIT) / value
                 elif p.what in ON_DOF:
                     getattr(model, ON_DOF[p.what])[dofs[i]] = value
-        spec.copy_back(model)
+        copy_back(spec, model)
         return spec.to_xml()
 
     def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
         """Return the driven model with identified values."""
-        loop, world, how = self.identifiable(1.0), self.make_nodes()[2], self.config.how(self._rubbing)
+        loop, world, how = self.identifiable(1.0), self.make_nodes()[2], self.config.how(*self._how)
         return driven_simulation(lambda start: loop.params(values, start)[world.name], world, how)
 
     def _drives(self, values: Mapping[str, Scalar]) -> list[JointDrive]:

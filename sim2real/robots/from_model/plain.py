@@ -8,7 +8,7 @@ from dataclasses import fields
 import numpy as np
 
 from sim2real.identify.export.card.plain import PlainSimulation, converged
-from sim2real.robots.from_model.mjcf import driven_spec
+from sim2real.robots.from_model.mjcf import copy_back, driven_spec
 from sim2real.types import Json
 from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DrivenWorld, DriveParams
@@ -31,7 +31,7 @@ def driven_simulation(
     for name, value in world.fields(params, None).items():
         holder, _, field = name.rpartition(".")
         getattr(model.opt if holder else model, field)[...] = np.asarray(value)
-    spec.copy_back(model)
+    copy_back(spec, model)
     # Collect the numbers of the drives.
     numbers = {f: np.asarray(getattr(params, f)) + np.zeros(n) for f in ("kp", "kd", "gain", "released", "zero")}
     numbers |= {"kp_unit": np.array(world.units[0]), "kd_unit": np.array(world.units[1])}

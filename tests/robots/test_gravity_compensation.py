@@ -1,0 +1,93 @@
+"""An arm whose own controller carries its weight: C MuJoCo records, and ``auto`` has to find the share."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.identify.fit import fit
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.validation.folds import folds_of
+from sim2real.identify.validation.optional_terms import select
+from sim2real.identify.validation.term_trials import Trials
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.estimation import held_out_parts
+
+STEP_S, PERIOD, SECONDS, SHARE, NOISE = 0.002, 5, 4.0, 0.9, 2e-4
+XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="upper">
+  <joint name="shoulder" axis="0 1 0" damping="0.5" armature="0.05"/>
+  <inertial pos="0 0 -0.2" mass="3" diaginertia="0.02 0.02 0.02"/></body></worldbody></mujoco>"""
+KP = 60.0
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """The robot from its MJCF, and an episode in which its controller carries nine tenths of the weight."""
+    path = tmp_path_factory.mktemp("model") / "arm.xml"
+    path.write_text(XML)
+    spec = mujoco.MjSpec.from_string(XML)
+    for body in spec.bodies[1:]:
+        body.gravcomp = SHARE
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    count = round(SECONDS / STEP_S / PERIOD)
+    t = STEP_S * PERIOD * np.arange(count)
+    goals = (0.8 * np.sin(2.1 * t) + 0.4 * np.sin(5.3 * t))[:, None]
+    data.qpos[:] = goals[0]
+    angles = []
+    for goal in goals:
+        angles.append(data.qpos.copy())
+        for _ in range(PERIOD):
+            data.qfrc_applied[:] = KP * (goal - data.qpos)
+            mujoco.mj_step(model, data)
+    at = np.arange(count) * round(1e6 * STEP_S * PERIOD)
+    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
+    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
+    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals}}
+    terms = (ParameterPattern("kp"), ParameterPattern("damping"))
+    config = RobotConfig(path, ("shoulder",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=terms)
+    config = replace(config, sigma_rad=NOISE)
+    return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+
+
+def test_auto_finds_that_the_controller_carries_the_weight(recorded):
+    robot, episode = recorded
+    config = IdentifyConfig(terms="auto", generations=0, folds=3, max_delay_s=0.02, free_run_s=0.0)
+    model = held_out_parts.offering(robot, "gravcomp").identifiable(0.02)
+    table = model.parameters.with_terms(["gravcomp"])
+    spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
+    widest = fit(model, [episode], spans, 0.6, config, table)
+    every = Trials(widest, folds_of(widest.problem, 3), config.settle_s, config.free_run_s).grown()
+    chosen = select(every)
+    assert chosen.names(table) == ("gravcomp",)
+    values = table.decode(chosen.near[0].z, table.of_terms(chosen.near[0].present))
+    assert float(values["gravcomp"]) == pytest.approx(SHARE, abs=0.02)
+    assert float(values["kp"]) == pytest.approx(KP, rel=0.02)
+    errors = {t.names(table): float(np.sqrt(t.ahead.mean())) for t in every}
+    assert errors["gravcomp",] < 0.1 * errors[()]
+
+
+def test_the_share_is_the_models_own_unless_it_is_chosen_and_none_without_gravity(recorded, tmp_path):
+    robot, _ = recorded
+    assert "gravcomp" not in {p.what for p in robot.placed}
+    offered = {p.what: p.parameter for p in robot.with_optional_terms("auto").placed}
+    assert offered["gravcomp"].without == 0.0
+    for change, without in (
+        ('<body name="upper"', '<body gravcomp="1" name="upper"'),
+        ("<option", '<option gravity="0 0 0"'),
+    ):
+        path = tmp_path / "changed.xml"
+        path.write_text(XML.replace(change, without))
+        other = MjcfRobot(replace(robot.config, model=path)).with_optional_terms("auto")
+        found = {p.what: p.parameter for p in other.placed}
+        assert ("gravcomp" in found) == ("gravity" not in without)
+        if "gravcomp" in found:
+            assert found["gravcomp"].without == 1.0
+            text = other.identified_mjcf(
+                {p.parameter.name: p.parameter.nominal for p in other.placed} | {"gravcomp": 0.6}
+            )
+            assert text.count('gravcomp="0.6"') == 1
