@@ -3,9 +3,11 @@
     python scripts/bench.py demo --seeds 0 1 2 3 4 --json reports/demo.json
     python scripts/bench.py graph --help
     python scripts/bench.py train --quick
+    python scripts/bench.py all --list
 
 prints a table and, with --json, writes a report: rows (``{"name", "value", "unit", "yardstick", "goal"}``), flags,
-machine, versions, and the state of the code that was measured.
+machine, versions, and the state of the code that was measured. ``all`` measures every report of ``reports/`` that this
+machine can.
 """
 
 from __future__ import annotations
@@ -70,13 +72,43 @@ def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
     return module, parser.parse_args(chosen.flags)
 
 
+def measure_all(arguments: Sequence[str]) -> int:
+    """Measure every report of a folder that this machine can, or list them."""
+    parser = argparse.ArgumentParser(prog="bench.py all", description=measure_all.__doc__, allow_abbrev=False)
+    parser.add_argument("--list", action="store_true", help="list the reports with machine, commit and state")
+    parser.add_argument("--only", nargs="+", metavar="REPORT", help="these reports; default: all")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the public recordings")
+    parser.add_argument("--reports", type=Path, default=ROOT / "reports", metavar="DIR", help="folder of the reports")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes: shows that the benches run")
+    options = parser.parse_args(arguments)
+    import jax
+    from benches.all_reports import listed, plans
+    from benches.all_reports import measure_all as measured
+
+    from sim2real.stages.terminal.console import table
+
+    kinds = sorted({d.device_kind for d in jax.devices()})
+    module_of = lambda bench: importlib.import_module(f"benches.{BENCHES[bench].module}")  # noqa: E731
+    rows = [p for p in plans(options.reports, module_of, options.data, kinds)
+            if not options.only or p.report.stem in options.only]  # fmt: skip
+    if options.only and (unknown := sorted(set(options.only) - {p.report.stem for p in rows})):
+        parser.error(f"{options.reports} has no report {unknown[0]}")
+    if options.list:
+        print(table(listed(rows), ["report", "measured on", "commit", "state", "here"]))
+        return 0
+    return measured(rows, main, options.quick)
+
+
 def reported_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
     """Return flags as in a report: paths without their folders."""
     return {name: value.name if isinstance(value, Path) else value for name, value in flags.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one bench; return its exit code."""
+    """Run one bench, or all; return the exit code."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words[:1] == ["all"]:
+        return measure_all(words[1:])
     module, options = parse(arguments)
     from sim2real.artifacts.run.manifest import plain, versions
     from sim2real.errors import Sim2RealError
