@@ -34,8 +34,13 @@ def encode(name: str, document: Mapping[str, Json]) -> dict[str, str]:
             f"the {name} metadata cannot be written as JSON: {error}",
             hint="use dictionaries with text keys, lists, numbers, texts, arrays, paths and dataclasses",
         ) from error
-    plain = {str(k): str(v) for k, v in document.items() if isinstance(v, str | int | float | bool)}
+    plain = {_utf8(k): _utf8(v) for k, v in document.items() if isinstance(v, str | int | float | bool)}
     return {**plain, "format": str(FORMAT), "crc32": f"{zlib.crc32(text.encode()):08x}", "json": text}
+
+
+def _utf8(value: Json) -> str:
+    """Return a text that UTF-8 has: JSON escapes half a surrogate pair, as in names of files, and MCAP cannot."""
+    return str(value).encode("utf-8", "replace").decode()
 
 
 def decode(record: Mapping[str, str]) -> dict[str, Json] | None:

@@ -74,8 +74,8 @@ def test_rewards_of_the_rows_between_are_added_to_the_step_before(played):
 
 def test_a_step_returns_what_the_policy_sees_next(played):
     before = np.flatnonzero(played.turns)[1:] - 1  # a row returns the observation of the row after it
-    # Rounding grows where friction bends: by 5e-6 in an episode.
-    np.testing.assert_allclose(played.steps.observation, played.rows.observation[before], rtol=1e-4, atol=2e-5)
+    # The two programs round differently, and friction that bends near standstill makes 5.3e-6 of it in this episode.
+    np.testing.assert_allclose(played.steps.observation, played.rows.observation[before], rtol=1e-5, atol=1e-5)
 
 
 def test_the_last_step_s_observation_is_the_final_one(played):
