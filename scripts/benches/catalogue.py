@@ -71,7 +71,7 @@ BENCHES = {
     ),
     "league": Bench(
         "league.bench",
-        "every recording, held out in parts, against mujoco.sysid, PACE and BAM",
+        "every recording, held out in parts, against mujoco.sysid, PACE, BAM, a textbook servo and published sets",
         (
             *(*_IDENTIFY, "pipelines/disk", "pipelines/xl330", "pipelines/so101", "scripts/benches/jobs.py"),
             *("sim2real/composer/physics/c", "sim2real/stages/config.py", "sim2real/stages/pipeline/from_model.py"),

@@ -1,6 +1,7 @@
 """The league's entrants and its sets: each finds again what made a recording of its own form."""
 
 import argparse
+import hashlib
 import importlib
 import os
 import sys
@@ -20,7 +21,7 @@ from benches import jobs
 from benches.identify import recordings
 from benches.identify.sysid import Recording
 from benches.league import bam as league_bam
-from benches.league import cmaes
+from benches.league import bench, cmaes, published, textbook
 from benches.league import ours as league_ours
 from benches.league import sets as league_sets
 from benches.league.sets import Fold
@@ -120,10 +121,113 @@ def test_what_pace_predicts_does_not_depend_on_what_it_tried_before():
 def test_scores():
     own = Recording(np.arange(3.0), np.array([[0, 0], [1, 0], [0, 0.0]]), np.zeros((3, 2)), np.zeros((2, 2)))
     predicted = np.array([[0.003, 9.0], [0.0, 9.0], [0.003, 9.0]])
-    assert league_sets.rmse_mrad(predicted, own) == pytest.approx(np.sqrt(6)), (
-        "a joint that is not moved does not count"
-    )
-    assert league_sets.mae_mrad(predicted[:, :1], own.joint(0)) == pytest.approx(2.0)
+    (only,) = league_sets.rmse(predicted, own)
+    assert only == pytest.approx(np.sqrt(6)), "a joint that is not moved does not count"
+    assert league_sets.mae(predicted[:, :1], own.joint(0)) == pytest.approx([2.0])
+    both = {"set": "s", "entrant": "e", "unit": "mm", "seconds": 1.0, "summary": ""}
+    folds = [
+        {**both, "fold": str(i), "value": v, "worst_joint": w} for i, (v, w) in enumerate([(1.0, 5.0), (3.0, 4.0)])
+    ]
+    rows = bench.rows(folds)
+    assert [(r["name"], r["value"]) for r in rows] == [
+        ("league/s/e/mean", 2.0), ("league/s/e/worst", 3.0), ("league/s/e/worst_joint", 5.0)
+    ]  # fmt: skip
+
+
+def steps(length_s=3.0, seed=0):
+    """A recording of a goal that jumps, without positions yet."""
+    t = 0.01 * np.arange(round(100 * length_s))
+    goal = np.random.default_rng(seed).uniform(-0.5, 0.5, 10)[(t / 0.6).astype(int) % 10]
+    return Recording(t, goal[:, None], np.zeros((len(t), 1)), np.zeros((1, 2)))
+
+
+def test_the_textbook_servo_moves_as_its_equation_says_and_its_fit_predicts_another_motion():
+    own = replace(steps(), command=np.full((300, 1), 0.3))
+    servo = textbook.Servo([own], force=False, loaded=False)
+    free = {"stiffness": 400.0, "damping": 10.0, "dry": 1e-4, "delay": 0.1, "rate": 100.0}
+    (q,) = servo.predict(np.log([[free[n] for n in servo.names]]))
+    s, w = own.t, np.sqrt(400.0 - 25.0)
+    exact = 0.3 * (1 - np.exp(-5 * s) * (np.cos(w * s) + 5 / w * np.sin(w * s)))
+    np.testing.assert_allclose(q[0], exact, atol=0.01)
+    twice = replace(own, constants={"duty_per_rad": 2.0})
+    both = servo.__class__([own, twice], force=False, loaded=False)
+    stiff, half = (np.log([[(free | {"stiffness": k})[n] for n in servo.names]]) for k in (400.0, 200.0))
+    np.testing.assert_allclose(both.predict(half)[1], servo.predict(stiff)[0], err_msg="a gain is a factor, in any set")
+    true = np.log([[300.0, 20.0, 2.0, 0.023, 3.0]])
+    moved = lambda r: replace(r, position=textbook.Servo([r], False, False).predict(true)[0].T)  # noqa: E731
+    fitted, test = moved(steps()), moved(steps(seed=1))
+    predict, summary = textbook.fit([fitted], force=False, loaded=False, budget_s=2.0, seed=0)
+    assert league_sets.rmse(predict([test])[0], test)[0] < 3.0, summary
+
+
+def test_a_textbook_axis_takes_forces_and_long_recordings_are_fitted_in_windows():
+    long = steps(21.0)
+    axis = textbook.Servo([long], force=True, loaded=False)
+    assert axis.names == ["stiffness", "damping", "dry", "delay", "constant"]
+    (q,) = axis.predict(np.array([[*np.log([2.0, 1.0, 1e-4, 1e-4]), 0.5]]))
+    pushed = replace(long, position=q.T)
+    parts = textbook.windows(pushed)
+    assert [len(p.t) for p in parts] == [500, 500, 500, 600]
+    assert parts[1].start[0] == pytest.approx([q[0, 500], (q[0, 501] - q[0, 499]) / 0.02], abs=0.01)
+    assert textbook.windows(fitted := steps()) == [fitted]
+
+
+def test_published_sets_hold_their_goals_and_differ():
+    ends = {
+        name: published.predict(name, [replace(steps(), command=np.full((300, 1), 0.3))])[0] for name in published.SETS
+    }
+    for name, q in ends.items():
+        assert q.shape == (300, 1)
+        assert q[0, 0] == 0.0
+        assert q[-1, 0] == pytest.approx(0.3, abs=0.02), f"{name}: friction over stiffness"
+    assert np.ptp([q[10, 0] for q in ends.values()]) > 0.01
+
+
+def described_set(folder, **changed):
+    """A folder with a model, a log of a goal that is followed late, and a description."""
+    (folder / "arm").mkdir()
+    (folder / "arm" / "arm.xml").write_text(league_ours.ARM.format(mass=0.5, length=0.1))
+    own = steps(12.0)
+    late = np.interp(own.t - 0.05, own.t, np.convolve(own.command[:, 0], np.full(9, 1 / 9), "same"))
+    np.savez(folder / "arm" / "a.npz", t_s=own.t, q_rad=late[:, None], q_goal_rad=own.command)
+    about = {"mjcf": "arm.xml", "fit": ["a.npz[0:0.6]"], "test": ["a.npz[0.6:1]"], "terms": "auto", **changed}
+    (folder / "arm" / "league.toml").write_text("".join(f"{n} = {v!r}\n" for n, v in about.items()))
+    return league_sets.available(folder)
+
+
+def test_a_folder_with_a_description_is_a_set_and_a_fit_gets_no_test_part(tmp_path, monkeypatch):
+    (own,) = described_set(tmp_path).values()
+    (fold,) = own.folds(tmp_path)
+    assert [len(r.t) for r in (*fold.fitted, *fold.test)] == [720 - recordings.PAST, 480]
+    assert fold.test[0].constants["terms"] == "auto"
+    options = argparse.Namespace(budget_s=0.5, seed=0, samples=None, data=tmp_path)
+    for entrant in ("textbook", "sysid"):
+        result = bench.judge(own, fold, entrant, options)
+        assert 0.0 < result["value"] <= result["worst_joint"] < 1000.0
+    assert bench.judge(own, fold, "bam_m1", options)["value"] is None
+
+    def fit(name, fold, data, seed):
+        assert fold.test == ()
+        return lambda test: [r.position + 0.002 for r in test], "", "terms a\ngain"
+
+    monkeypatch.setattr(league_ours, "fit", fit)
+    result = bench.judge(own, fold, "ours", options)
+    assert (result["value"], result["unit"]) == (pytest.approx(2.0), "mrad")
+    assert result["sha256"] == hashlib.sha256(b"terms a\ngain").hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"test": ["a.npz[0.5:1]"]}, "parts of a.npz are fitted and judged"),
+        ({"test": ["a.npz[1:0]"]}, "no part of a file"),
+        ({"tests": ["b.npz"]}, "tests is missing, unknown"),
+        ({"test": []}, "mjcf, fit or test is missing"),
+    ],
+)
+def test_a_description_that_is_wrong_is_refused(tmp_path, changed, message):
+    with pytest.raises(UsageError, match=message):
+        described_set(tmp_path, **changed)["arm"].folds(tmp_path)
 
 
 @pytest.fixture
@@ -159,12 +263,14 @@ def recorded():
 def test_ours_identifies_an_arm_from_logs_and_sees_of_the_test_its_start_alone(recorded, quick_to_compile, monkeypatch):
     monkeypatch.setattr(league_ours, "CHOOSES", ())  # two logs of 2 s are too few to choose terms
     fold = Fold("a gain", (recorded(5.0, 4.0), recorded(10.0, 7.0)), (recorded(7.0, 5.0, (0.2, -1.0)),))
-    predict, told = league_ours.fit("sts3250", fold, Path(), 0)
+    predict, told, structure = league_ours.fit("sts3250", fold, Path(), 0)
+    assert len(structure.splitlines()) == 7
+    assert structure.startswith("terms \n")
     assert told == "6 parameters of --mjcf, refined from the model's; terms none; engine c"
     (test,) = fold.test
     found, blind = predict([test, replace(test, position=np.full_like(test.position, 9.0))])
     assert np.ptp(test.position) > 0.5
-    assert league_sets.mae_mrad(found, test) < 3.0, "gains that differ are a factor of one stiffness"
+    assert league_sets.mae(found, test)[0] < 3.0, "gains that differ are a factor of one stiffness"
     assert found[0, 0] == 0.2
     np.testing.assert_allclose(blind, found, atol=1e-5)
 

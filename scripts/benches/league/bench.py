@@ -5,20 +5,24 @@
 
 Each entrant fits the same parts of the same recordings within the same processor time, compilation included, and
 predicts the held-out part. The settings of its pipeline determine the time of ours, which is reported. The rows are
-mean and worst over the folds of a set. --jobs runs several fits at once, each in its own process on one processor.
+mean and worst over the folds of a set, and the worst joint. A fit gets no test part: the structure of our model, its
+parameters, bounds and terms, is hashed before the test part is passed on, and each fold's hash is in the report. A
+folder in --data with a league.toml (benches/league/sets.py) is a set, too. --jobs runs several fits at once, each in
+its own process on one processor.
 --results gets a line for each fold and entrant at once: an interrupted run continues from there.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,18 +32,30 @@ from benches.identify.sysid import Recording
 from benches.league import bam as league_bam
 from benches.league import mujoco_joints as league_mujoco
 from benches.league import ours as league_ours
-from benches.league.sets import SETS, Fold
+from benches.league import published, textbook
+from benches.league.sets import FORCES, Fold, LeagueSet, available
 from sim2real.errors import UsageError
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
-Fitted = tuple[Predict, str]
+
+
+class Fitted(NamedTuple):
+    """A predictor, a line on the fit, and the structure of the model as text; "": it has one structure only."""
+
+    predict: Predict
+    summary: str
+    structure: str = ""
+
+
 ENTRANTS = {
-    "ours": "sim2real identify with the pipeline's settings; go2 and sts3250 only with --mjcf and --log",
+    "ours": "sim2real identify with the pipeline's settings; sets without a pipeline with --mjcf and --log",
     "sysid": "mujoco.sysid with a user's terms: gain, damping, dry friction, inertia; no delay",
     "sysid_delay": "mujoco.sysid with a delay and our terms",
     "pace": "PACE's form: inertia, damping, friction, bias of each joint, a delay in steps; CMA-ES",
     "bam_m1": "BAM M1: Coulomb and viscous friction; CMA-ES",
     "bam_m6": "BAM M6: Stribeck, load, direction, quadratic; CMA-ES",
+    "textbook": "stiffness, damping, dry friction, delay, limit of the rate; scipy.optimize.least_squares",
+    **dict.fromkeys(published.SETS, "published parameters of the SO-101, not fitted"),
 }
 QUICK: dict[str, Any] = {"budget_s": 0.2, "folds": 1, "samples": 120, "entrants": [e for e in ENTRANTS if e != "ours"]}
 
@@ -51,7 +67,7 @@ class NoFormError(Exception):
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     parser.add_argument("--data", type=Path, required=True, help="folder of all recordings")
-    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
+    parser.add_argument("--sets", nargs="+", help="default: all whose folders are there")
     parser.add_argument("--entrants", nargs="+", choices=list(ENTRANTS), default=list(ENTRANTS))
     parser.add_argument("--budget-s", type=float, default=60.0, help="processor time of a fit, over all threads")
     parser.add_argument("--folds", type=int, help="largest number of folds of a set; default: all")
@@ -78,50 +94,61 @@ def run(options: argparse.Namespace) -> Report:
 _KEY = ("set", "fold", "entrant", "budget_s", "seed")
 
 
-def _tasks(options: argparse.Namespace) -> dict[tuple[Any, ...], tuple[str, Fold, str]]:
+def _tasks(options: argparse.Namespace) -> dict[tuple[Any, ...], tuple[LeagueSet, Fold, str]]:
     """Return the fits to do: key in --results -> set, fold and entrant."""
-    tasks = {}
-    for name in options.sets:
-        league_set = SETS[name]
-        if not (options.data / league_set.folder).is_dir():
-            print(f"{options.data / league_set.folder} is not there: {name} is skipped", file=sys.stderr)
-            continue
-        for fold in league_set.folds(options.data)[: options.folds]:
+    tasks, there = {}, available(options.data)
+    for name in options.sets or there:
+        if name not in there:
+            raise UsageError(f"{options.data} has no set {name!r}", hint=f"available: {', '.join(there)}")
+        for fold in there[name].folds(options.data)[: options.folds]:
             for entrant in options.entrants:
-                tasks[name, fold.name, entrant, options.budget_s, options.seed] = (name, fold, entrant)
+                if name == "so101" or entrant not in published.SETS:
+                    tasks[name, fold.name, entrant, options.budget_s, options.seed] = (there[name], fold, entrant)
     return tasks
 
 
-def judge(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Return one entrant's figure on one fold of a set, or the reason why it has none."""
-    league_set = SETS[name]
-    short = replace(fold, fitted=_short(fold.fitted, options.samples), test=_short(fold.test, options.samples))
-    begin = time.process_time()
+def judge(league_set: LeagueSet, fold: Fold, entrant: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Return one entrant's figures on one fold of a set, or the reason why it has none."""
+    fitted, test = (_short(part, options.samples) for part in (fold.fitted, fold.test))
+    begin, unit = time.process_time(), "mm" if test[0].constants.get("sliding") else "mrad"
     try:
-        predict, summary = fit(name, short, entrant, options)
-        seconds = time.process_time() - begin
-        each = [league_set.score(p, r) for p, r in zip(predict(short.test), short.test, strict=True)]
+        predict, summary, structure = fit(league_set.name, replace(fold, fitted=fitted, test=()), entrant, options)
     except NoFormError as reason:
-        return {"value": None, "seconds": None, "summary": str(reason)}
-    value = float(np.mean(each))
-    return {"value": value if np.isfinite(value) else None, "seconds": seconds, "summary": summary}
+        return {"value": None, "worst_joint": None, "unit": unit, "seconds": None, "summary": str(reason)}
+    seconds = time.process_time() - begin
+    # The structure is hashed here: the fit has seen no test part.
+    frozen = {"structure": structure, "sha256": hashlib.sha256(structure.encode()).hexdigest()} if structure else {}
+    each = [league_set.score(p, r) for p, r in zip(predict(test), test, strict=True)]
+    errors = np.concatenate(each)
+    known = len(errors) > 0 and bool(np.isfinite(errors).all())
+    value, worst = (float(errors.mean()), float(errors.max())) if known else (None, None)
+    return {"value": value, "worst_joint": worst, "unit": unit, "seconds": seconds, "summary": summary, **frozen}
 
 
 def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fitted:
-    """Fit one entrant; return its predictor and a summary; raise NoFormError if it has no form for such a rig."""
-    budget_s, seed = options.budget_s, options.seed
+    """Fit one entrant; raise NoFormError if it has no form for such a rig."""
+    budget_s, seed, constants = options.budget_s, options.seed, fold.fitted[0].constants
     if entrant == "ours":
-        return league_ours.fit(name, fold, options.data, seed)
+        return Fitted(*league_ours.fit(name, fold, options.data, seed))
+    if entrant in published.SETS:
+        return Fitted(lambda recordings: published.predict(entrant, recordings), "not fitted")
+    if entrant == "textbook":
+        force = name == "disk" or constants.get("command") in FORCES
+        loaded = name in ("disk", "xl330", "sts3250")
+        return _joint_by_joint(fold, lambda rs, s: Fitted(*textbook.fit(rs, force, loaded, s, seed)), budget_s)
     if entrant.startswith("bam"):
-        if name == "go2":
-            raise NoFormError("BAM's form is a bench with one joint and a given load; a leg's load is not one number")
+        if "mjcf" in constants:
+            raise NoFormError("BAM's form is a bench with one joint and a given load; a robot's load is not one number")
         kind = entrant.removeprefix("bam_").upper()
         load = league_bam.DISK_LOAD if name == "disk" else league_bam.ARM_LOAD if name == "so101" else {}
         loaded = replace(fold, fitted=tuple(_loaded(r, load) for r in fold.fitted))
-        predict, summary = _joint_by_joint(loaded, lambda rs, s: league_bam.fit(kind, rs, s, seed), budget_s)
-        return lambda recordings: predict([_loaded(r, load) for r in recordings]), summary
-    if name == "go2":
-        rig = league_mujoco.legs(fold.fitted[0])
+        single = lambda rs, s: Fitted(*league_bam.fit(kind, rs, s, seed))  # noqa: E731
+        predict, summary, _ = _joint_by_joint(loaded, single, budget_s)
+        return Fitted(lambda recordings: predict([_loaded(r, load) for r in recordings]), summary)
+    if "mjcf" in constants:
+        rig = (league_mujoco.legs if name == "go2" else league_mujoco.described)(fold.fitted[0])
+        if rig is None:
+            raise NoFormError("the model has other joints than those that were recorded")
         return _mujoco(entrant, rig, fold.fitted, budget_s, seed)
     rig = league_mujoco.one_joint(name)
     return _joint_by_joint(fold, lambda rs, s: _mujoco(entrant, rig, rs, s, seed), budget_s)
@@ -129,8 +156,8 @@ def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fit
 
 def _mujoco(entrant: str, rig: Any, fitted: Sequence[Recording], budget_s: float, seed: int) -> Fitted:
     if entrant == "pace":
-        return league_mujoco.fit_pace(rig, fitted, budget_s, seed)
-    return league_mujoco.fit_sysid(rig, fitted, entrant == "sysid_delay", budget_s, seed)
+        return Fitted(*league_mujoco.fit_pace(rig, fitted, budget_s, seed))
+    return Fitted(*league_mujoco.fit_sysid(rig, fitted, entrant == "sysid_delay", budget_s, seed))
 
 
 def _joint_by_joint(fold: Fold, single: Callable[[list[Recording], float], Fitted], budget_s: float) -> Fitted:
@@ -142,10 +169,10 @@ def _joint_by_joint(fold: Fold, single: Callable[[list[Recording], float], Fitte
         fits.append(single(moved or [fold.fitted[0].joint(j)], budget_s / joints))
 
     def predict(recordings: Sequence[Recording]) -> list[np.ndarray]:
-        columns = [p([r.joint(j) for r in recordings]) for j, (p, _) in enumerate(fits)]
+        columns = [p([r.joint(j) for r in recordings]) for j, (p, _, _) in enumerate(fits)]
         return [np.hstack(joint_columns) for joint_columns in zip(*columns, strict=True)]
 
-    return predict, "; ".join(dict.fromkeys(summary for _, summary in fits))
+    return Fitted(predict, "; ".join(dict.fromkeys(f.summary for f in fits)))
 
 
 def _loaded(recording: Recording, load: dict[str, Any]) -> Recording:
@@ -163,18 +190,21 @@ def _first(recording: Recording, samples: int) -> Recording:
 
 
 def rows(measured: Sequence[dict[str, Any]]) -> list[Row]:
-    """Return mean and worst over the folds of each set and entrant, or the reason why there is no figure."""
+    """Return mean, worst fold and worst joint of each set and entrant, or the reason why there is no figure."""
     table = []
     for name in dict.fromkeys(r["set"] for r in measured):
         for entrant in dict.fromkeys(r["entrant"] for r in measured if r["set"] == name):
             selected = [r for r in measured if r["set"] == name and r["entrant"] == entrant]
-            values, unit = [r["value"] for r in selected if r["value"] is not None], SETS[name].unit
+            values, unit = [r["value"] for r in selected if r["value"] is not None], selected[0]["unit"]
+            joints = [r["worst_joint"] for r in selected if r["value"] is not None]
             lost = f", {len(selected) - len(values)} without a figure" if len(values) < len(selected) else ""
             took = [r["seconds"] for r in selected if r["seconds"] is not None]
             spent = f"{len(selected)} folds, {np.median(took):.0f} s of processor time a fit{lost}" if took else ""
             about = spent if values else selected[0].get("summary", "")
-            for what, of in (("mean", np.mean), ("worst", np.max)):
-                value = float(f"{of(values):.4g}") if values else None
+            for what, of, figures_of in (
+                ("mean", np.mean, values), ("worst", np.max, values), ("worst_joint", np.max, joints)
+            ):  # fmt: skip
+                value = float(f"{of(figures_of):.4g}") if values else None
                 table.append(figures.row(f"league/{name}/{entrant}/{what}", value, unit, about))
     return table
 

@@ -236,6 +236,44 @@ def legs(recording: Recording) -> Rig:
     )
 
 
+def described(recording: Recording) -> Rig | None:
+    """Return a robot from its MJCF, whose values are the guesses; None if its joints are not those recorded."""
+    spec, force = _legs_spec(recording.constants["mjcf"]), recording.constants.get("command", "goal") != "goal"
+    model, count = spec.compile(), recording.position.shape[1]
+    if not model.njnt == model.nv == count:
+        return None
+
+    def each(name: str, j: int) -> rigs.Put:
+        return lambda s, v: _set_joint(s.joints[j], name, v)
+
+    def drives(put: Callable[[Any, float], None]) -> rigs.Put:
+        return lambda s, v: [put(actuator, v) for actuator in s.actuators] and None
+
+    def factor(drive: Any, v: float) -> None:
+        drive.gainprm[0] = v
+
+    def constant(drive: Any, v: float) -> None:
+        drive.biasprm[0] = v
+
+    rows: dict[str, Row] = {}
+    for name, least in {"damping": 0.1, "frictionloss": 0.05, "armature": 0.01}.items():
+        for j, value in enumerate(getattr(model, f"dof_{name}")):
+            guess = float(np.squeeze(value)) or least
+            rows[f"{name}{j}"] = (guess, 1e-6, 10 * guess, each(name, j))
+    more: dict[str, Row] = {}
+    if force:
+        for actuator in spec.actuators:
+            actuator.biasprm[:3] = 0.0
+        drive = {"gain": (1.0, 0.1, 10.0, drives(factor))}
+        most = 0.2 * float(np.abs(recording.command).max())
+        more = {"constant": (0.0, -most, most, drives(constant))}
+    else:
+        drive = {"kp": (GO2_KP, 1.0, 500.0, drives(lambda a, v: _set_drive(a, v, None)))}
+        drive["kd"] = (GO2_KD, 0.0, 20.0, drives(lambda a, v: _set_drive(a, None, v)))
+    runs = lambda r: [_LegsRun(r, spec)]  # noqa: E731
+    return Rig(runs, {**drive, **rows}, more, {**drive, **rows}, None if force else _feed_back)
+
+
 class _LegsRun(rigs._Run):
     """A recording of all joints."""
 

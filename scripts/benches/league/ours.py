@@ -19,6 +19,7 @@ from benches.identify.sysid import Recording
 from benches.league.sets import DISK_BLOCK, DISK_BLOCKS, Fold
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
+from sim2real.identify.fit import as_numbers
 from sim2real.identify.fit import fit as fit_model
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
@@ -29,10 +30,17 @@ from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
+Fit = tuple[Predict, str, str]
+"""Predictor, summary, and the structure of the fitted model."""
 SETS = {"disk": "disk", "xl330": "xl330", "so101": "so101_log"}
 """Sets with a pipeline of ours, and its name."""
 CHOOSES = ("sts3250",)
-"""Sets with `--terms auto`; for a quadruped's twelve joints that takes 15 min."""
+"""Sets with `--terms auto`, besides described ones; for a quadruped's twelve joints that takes 15 min."""
+COLUMNS = (
+    {"position": "q_rad", "goal": "q_goal_rad", "torque": "torque_nm", "duty": "duty"},
+    {"position": "q_m", "goal": "q_goal_m", "torque": "force_n", "duty": "duty"},
+)
+"""Names of columns that an import understands, of hinges and of sliding joints."""
 ARM = """<mujoco>
   <option timestep="0.002"/>
   <worldbody>
@@ -46,8 +54,8 @@ ARM = """<mujoco>
 """The model that docs/guides/any_robot.md gives for a servo with a mass on an arm."""
 
 
-def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
-    """Identify with our own settings, without a limit of time; return the predictor and a summary.
+def fit(name: str, fold: Fold, data: Path, seed: int) -> Fit:
+    """Identify with our own settings, without a limit of time.
 
     Args:
         fold: If the set has a pipeline, its recordings are read again, as logs.
@@ -55,7 +63,7 @@ def fit(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
     return _fit_pipeline(name, fold, data, seed) if name in SETS else _fit_described(name, fold, seed)
 
 
-def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict, str]:
+def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> Fit:
     pipeline = SETS[name]
     case = identify.make_case(argparse.Namespace(case=pipeline, **dict.fromkeys(identify.BUDGET)))
     case = replace(case, config=replace(case.config, seed=seed))
@@ -66,28 +74,38 @@ def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> tuple[Predict
         specs = [f"{DISK_BLOCK * i}:{DISK_BLOCK * (i + 1)}" for i in range(DISK_BLOCKS) if i != left]
     fitted = {k: e for spec in specs for k, e in recordings.load(pipeline, data, spec).items()}
     identified = identify.identify(case, fitted)
-    test = recordings.load(pipeline, data, test_spec, recordings.PAST)
 
     def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
+        test = recordings.load(pipeline, data, test_spec, recordings.PAST)
         columns = identify.predict(case, {"identified": identified.values}, test)
         return [_at(case, columns, r, one) for r, one in enumerate(test_recordings)]
 
-    return predict, f"{identified.search.record.evaluations if identified.search else 0} candidates, then refined"
+    tried = identified.search.record.evaluations if identified.search else 0
+    return predict, f"{tried} candidates, then refined", structure(identified.problem)
 
 
-def _fit_described(name: str, fold: Fold, seed: int) -> tuple[Predict, str]:
+def structure(problem: Problem) -> str:
+    """Return the fitted model's terms, and name, scale and bounds of each parameter, a line each."""
+    lines = [f"terms {' '.join(problem.table.terms)}"]
+    lines += [f"{p.name} {p.transform} {p.low:.6g} {p.high:.6g}{'' if p.free else ' held'}" for p in problem.table]
+    return "\n".join(lines)
+
+
+def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
     """Identify a robot from a model and logs, with the terms and the settings of `--mjcf`."""
     # The logs have the gains only if the fitted recordings differ in them: a constant gain has no effect of its own.
-    gains = len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
+    known, gains = fold.fitted[0].constants, len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
     with tempfile.TemporaryDirectory() as folder:
-        logs = _written(fold.fitted, Path(folder), gains)
+        logs, model = _written(fold.fitted, Path(folder), gains), _model(fold.fitted, Path(folder))
         with contextlib.redirect_stderr(io.StringIO()):  # drops the messages on columns, which repeat for each fold
-            pipeline = from_model.from_flags(RobotFlags(mjcf=_model(fold.fitted, Path(folder))), [str(p) for p in logs])
-        robot = held_out_parts.offering(pipeline.load(), "auto" if name in CHOOSES else "own")
+            flags = RobotFlags(mjcf=model, **known.get("flags", {}))
+            pipeline = from_model.from_flags(flags, [str(p) for p in logs])
+        wanted = "auto" if name in CHOOSES else known.get("terms", "own")
+        robot = held_out_parts.offering(pipeline.load(), wanted)
         fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
     config = replace(pipeline.identify, seed=seed)
     case = identify.Case(name, config, robot, robot.identifiable(config.max_delay_s))
-    identified = _fit_with_terms(case, fitted) if name in CHOOSES else identify.identify(case, fitted)
+    identified = _fit_with_terms(case, fitted) if wanted == "auto" else identify.identify(case, fitted)
 
     def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
         with tempfile.TemporaryDirectory() as folder:
@@ -95,9 +113,9 @@ def _fit_described(name: str, fold: Fold, seed: int) -> tuple[Predict, str]:
         columns = _free_run(case, identified.values, test, test_recordings)
         return [_at(case, columns, r, one, started=True) for r, one in enumerate(test_recordings)]
 
-    terms = f"{len(identified.problem.table)} parameters of --mjcf, refined from the model's"
-    terms += f"; terms {', '.join(identified.problem.table.terms) or 'none'}"
-    return predict, f"{terms}; engine {identified.problem.engine.name}"
+    about = f"{len(identified.problem.table)} parameters of --mjcf, refined from the model's"
+    about += f"; terms {', '.join(identified.problem.table.terms) or 'none'}"
+    return predict, f"{about}; engine {identified.problem.engine.name}", structure(identified.problem)
 
 
 def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
@@ -107,9 +125,9 @@ def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
     table = held_out_parts.widest(model.parameters, c.terms)
     spans = identify.windows(episodes, length, c.spacing_s, c.initial_state == "free")
     every = fit_model(model, episodes, spans, length, c, table)
-    terms = held_out_parts.chosen(every, c, list(fitted)).names(table)
-    fewer = table.with_terms(terms)
-    fewer = fewer.with_nominal({p.name: every.values[p.name] for p in fewer if p.free})
+    selection = held_out_parts.chosen(every, c, list(fitted))
+    fewer, values = table.with_terms(selection.names(table)), as_numbers(every.problem.table, selection.near[0].z)
+    fewer = fewer.with_begin({p.name: float(np.squeeze(values[p.name])) for p in fewer if p.free})
     return fit_model(model, episodes, spans, length, c, fewer)
 
 
@@ -134,7 +152,9 @@ def _written(recordings_to_write: Sequence[Recording], folder: Path, gains: bool
     """
     paths = []
     for i, r in enumerate(recordings_to_write):
-        columns: dict[str, Any] = {"t_s": r.t, "q_rad": r.position, "q_goal_rad": r.command}
+        names = COLUMNS[bool(r.constants.get("sliding"))]
+        columns: dict[str, Any] = {"t_s": r.t, names["position"]: r.position}
+        columns[names[r.constants.get("command", "goal")]] = r.command
         if "torque_enable" in r.constants:
             columns["torque_enable"] = np.asarray(r.constants["torque_enable"], np.float64)[:, None]
         if gains:

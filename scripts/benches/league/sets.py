@@ -1,11 +1,22 @@
-"""The sets of the league: all recordings, and their parts that are held out in turn."""
+"""The sets of the league: all recordings, and their parts that are held out in turn.
+
+A folder with a ``league.toml`` is a set without code. Its files are read as by ``identify --mjcf``:
+
+    mjcf = "robot.xml"
+    fit = ["a.csv", "b.npz[0:0.6]"]     # what is fitted; [a:b]: a part, in shares of the file's samples
+    test = ["b.npz[0.6:1]"]             # what is judged
+    terms = "auto"                      # optional: as --terms; default "own"
+    flags = {joints = ["pan", "tilt"]}  # optional: of identify, as in robot_flags.py
+"""
 
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +26,21 @@ from benches.identify import recordings
 from benches.identify.sysid import Recording
 from benches.identify.sysid_rows import recording
 from sim2real.errors import UsageError
+from sim2real.stages.pipeline import from_model
+from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 DISK_BLOCK, DISK_BLOCKS, PAST = 5000, 5, 12
 GO2_BLOCKS = 3
+SO101_FOLDS = 9
 STS_KP, STS_DUTY_PER_KP = 32, 0.166
 """Firmware gain of the STS3250's recordings, and the duty per radian of error that one unit of it makes: BAM's source,
 bam/feetech/actuator.py."""
+FORCES = ("torque", "duty")
+"""Commands of described robots that are no positions."""
+EMPS = {"mjcf": "emps.xml", "fit": ["fit.npz[0:0.6]"], "test": ["fit.npz[0.6:1]"], "terms": "auto"}
+"""The axis's validation file is not read: the end of the estimation file is held out."""
+DESCRIPTION = "league.toml"
 
 
 @dataclass(frozen=True)
@@ -43,32 +63,30 @@ class LeagueSet:
 
     Attributes:
         folder: Its folder below ``--data``.
-        unit: Unit of its figure.
-        score: Predicted positions ``(N, joints)`` and the recording -> the figure.
+        score: Predicted positions ``(N, joints)`` and the recording -> an error for each joint that is moved.
         folds: Makes the folds from the folder of all data.
     """
 
     name: str
     folder: str
-    unit: str
-    score: Callable[[np.ndarray, Recording], float]
+    score: Callable[[np.ndarray, Recording], np.ndarray]
     folds: Callable[[Path], list[Fold]]
 
 
-def rmse_rad(predicted: np.ndarray, recording: Recording) -> float:
-    """Return the root mean square error over time and joints [rad]."""
-    return float(np.sqrt(np.mean((predicted - recording.position) ** 2)))
-
-
-def rmse_mrad(predicted: np.ndarray, recording: Recording) -> float:
-    """Return the median over the joints that are moved of the root mean square error [mrad]."""
+def rmse(predicted: np.ndarray, recording: Recording) -> np.ndarray:
+    """Return the root mean square error of each joint that is moved, in thousandths of the positions' unit."""
     each = 1e3 * np.sqrt(np.mean((predicted - recording.position) ** 2, axis=0))
-    return float(np.median(each[np.ptp(recording.command, axis=0) > 0.02]))
+    return each[_moved(recording)]
 
 
-def mae_mrad(predicted: np.ndarray, recording: Recording) -> float:
-    """Return the mean absolute error [mrad]."""
-    return float(1e3 * np.mean(np.abs(predicted - recording.position)))
+def mae(predicted: np.ndarray, recording: Recording) -> np.ndarray:
+    """Return the mean absolute error of each joint that is moved, in thousandths of the positions' unit."""
+    return 1e3 * np.mean(np.abs(predicted - recording.position), axis=0)[_moved(recording)]
+
+
+def _moved(recording: Recording) -> np.ndarray:
+    """Return which joints are moved, ``(joints,)``; the only joint of a rig is."""
+    return (np.ptp(recording.command, axis=0) > 0.02) | (recording.position.shape[1] == 1)
 
 
 def part(t: np.ndarray, command: np.ndarray, position: np.ndarray, begin: int, end: int, ahead: bool) -> Recording:
@@ -134,18 +152,16 @@ def xl330(data: Path) -> list[Fold]:
 
 
 def so101(data: Path) -> list[Fold]:
-    """Return one fold a motion."""
+    """Return nine folds; of 27 motions, three are held out at once."""
     every = recordings.load("so101_log", data, "*")
     by_motion = {name: recording(e, "goal", "position") for name, e in every.items()}
-    return [
-        Fold(
-            n,
-            tuple(r for m, r in by_motion.items() if m != n),
-            (by_motion[n],),
-            (" ".join(m for m in by_motion if m != n), n),
-        )
-        for n in by_motion
-    ]
+    folds = []
+    for k in range(min(SO101_FOLDS, len(by_motion))):
+        test = list(by_motion)[k::SO101_FOLDS]
+        rest = [m for m in by_motion if m not in test]
+        parts = (tuple(by_motion[m] for m in names) for names in (rest, test))
+        folds.append(Fold(", ".join(test), *parts, (" ".join(rest), " ".join(test))))
+    return folds
 
 
 def go2(data: Path) -> list[Fold]:
@@ -188,14 +204,74 @@ def _files(data: Path, folder: str, pattern: str) -> list[Path]:
     return files
 
 
+def described(about: dict[str, Any], folder: str, data: Path) -> list[Fold]:
+    """Return the fold of a description, as in a ``league.toml``."""
+    where = data / folder
+    known = {"mjcf": str, "fit": list, "test": list, "terms": str, "flags": dict}
+    wrong = [n for n, v in about.items() if not isinstance(v, known.get(n, ()))]
+    if wrong or not (about.get("mjcf") and about.get("fit") and about.get("test")):
+        raise UsageError(
+            f"{where / DESCRIPTION}: {', '.join(wrong) or 'mjcf, fit or test'} is missing, unknown or of a wrong type",
+            hint='mjcf = "robot.xml", fit = ["a.csv[0:0.6]"], test = ["b.csv"]; optional: terms, flags',
+        )
+    given = about.get("flags", {})
+    if unknown := sorted(set(given) - {f.name for f in fields(RobotFlags)}):
+        raise UsageError(f"{where / DESCRIPTION}: unknown flags {', '.join(unknown)}", hint="names of robot_flags.py")
+    parts = {key: [_share(item, where) for item in about[key]] for key in ("fit", "test")}
+    for (name, low, high), (other, begin, end) in product(parts["fit"], parts["test"]):
+        if name == other and low < end and begin < high:
+            raise UsageError(f"{where / DESCRIPTION}: parts of {name} are fitted and judged", hint="judge others")
+    given = {n: tuple(v) if isinstance(v, list) else v for n, v in given.items()}
+    flags = RobotFlags(mjcf=where / about["mjcf"], **given)
+    pipeline = from_model.from_flags(flags, [str(where / parts["fit"][0][0])])
+    constants = {"mjcf": str(flags.mjcf), "flags": given, "terms": about.get("terms", "own")}
+
+    def read(name: str, low: float, high: float, ahead: bool) -> Recording:
+        episode = open_recording(where / name, pipeline, pipeline.load()).episode
+        sent = [c for c in ("goal", *FORCES) if c in episode.outputs["actuator"]]
+        if not sent:
+            raise UsageError(f"{where / name} has no goal, torque or duty", hint="name its columns, or give a mapping")
+        whole = recording(episode, sent[0], "position")
+        begin, end = (round(x * len(whole.t)) for x in (low, high))
+        known = {**constants, "command": sent[0], "sliding": bool(pipeline.load().units.get("position") == "m")}
+        return replace(part(whole.t, whole.command, whole.position, begin, end, ahead), constants=known)
+
+    fitted, test = (tuple(read(*p, n == "fit") for p in parts[n]) for n in ("fit", "test"))
+    return [Fold(", ".join(about["test"]), fitted, test)]
+
+
+def _share(item: str, where: Path) -> tuple[str, float, float]:
+    """Return file, begin and end of ``FILE`` or ``FILE[a:b]``."""
+    name, _, share = str(item).partition("[")
+    try:
+        low, high = (float(x) for x in share.removesuffix("]").split(":")) if share else (0.0, 1.0)
+    except ValueError:
+        low, high = 1.0, 0.0
+    if not 0.0 <= low < high <= 1.0:
+        raise UsageError(f"{where / DESCRIPTION}: {item!r} is no part of a file", hint='as in "a.npz[0:0.6]"')
+    return name, low, high
+
+
+def available(data: Path) -> dict[str, LeagueSet]:
+    """Return the sets whose folders are there: ours, and those with a ``league.toml``."""
+    files = {path.parent.name: path for path in sorted(data.glob(f"*/{DESCRIPTION}"))}
+    if known := sorted(set(files) & set(SETS)):
+        raise UsageError(f"{', '.join(known)} is the name of a set with code", hint="rename the folder")
+    more = {
+        n: LeagueSet(n, n, rmse, partial(described, tomllib.loads(path.read_text()), n)) for n, path in files.items()
+    }
+    return {n: s for n, s in {**SETS, **more}.items() if (data / s.folder).is_dir()}
+
+
 SETS = {
     s.name: s
     for s in (
-        LeagueSet("disk", "unbalanced_disk", "rad", rmse_rad, disk),
-        LeagueSet("xl330", "bam_xl330", "mrad", mae_mrad, xl330),
-        LeagueSet("so101", "so101", "mrad", rmse_mrad, so101),
-        LeagueSet("go2", "go2", "mrad", rmse_mrad, go2),
-        LeagueSet("sts3250", "bam_sts3250", "mrad", mae_mrad, sts3250),
+        LeagueSet("disk", "unbalanced_disk", rmse, disk),
+        LeagueSet("xl330", "bam_xl330", mae, xl330),
+        LeagueSet("so101", "so101", rmse, so101),
+        LeagueSet("go2", "go2", rmse, go2),
+        LeagueSet("sts3250", "bam_sts3250", mae, sts3250),
+        LeagueSet("emps", "emps", rmse, partial(described, EMPS, "emps")),
     )
 }
-"""Disk: free run over a block, RMSE. Servos: whole episodes from rest, MAE. Arm: median over joints that move."""
+"""Disk, axis: free run over a part, RMSE. Servos: whole episodes from rest, MAE. Robots: RMSE, mean over joints."""
