@@ -1,4 +1,4 @@
-"""Parameter sets that others have published for the SO-101's servo, simulated in C MuJoCo; nothing is fitted.
+"""Parameter sets that others have published for the SO-101's servo, simulated in C MuJoCo without a fit.
 
 Each joint is a hinge with a position actuator, the published armature, friction and damping, and the inertia of the
 arm at that joint with all joints in the middle of their ranges (pipelines/so101/parts.py). Weight is absent, as the

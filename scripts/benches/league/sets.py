@@ -3,8 +3,8 @@
 A folder with a ``league.toml`` is a set without code. Its files are read as by ``identify --mjcf``:
 
     mjcf = "robot.xml"
-    fit = ["a.csv", "b.npz[0:0.6]"]     # what is fitted; [a:b]: a part, in shares of the file's samples
-    test = ["b.npz[0.6:1]"]             # what is judged
+    fit = ["a.csv", "b.npz[0:0.6]"]     # the fitted files; [a:b]: a part, in shares of the file's samples
+    test = ["b.npz[0.6:1]"]             # the judged ones
     terms = "auto"                      # optional: as --terms; default "own"
     flags = {joints = ["pan", "tilt"]}  # optional: of identify, as in robot_flags.py
 """
