@@ -120,8 +120,8 @@ def judge(league_set: LeagueSet, fold: Fold, entrant: str, options: argparse.Nam
     frozen = {"structure": structure, "sha256": hashlib.sha256(structure.encode()).hexdigest()} if structure else {}
     each = [league_set.score(p, r) for p, r in zip(predict(test), test, strict=True)]
     errors = np.concatenate(each)
-    known = len(errors) > 0 and bool(np.isfinite(errors).all())
-    value, worst = (float(errors.mean()), float(errors.max())) if known else (None, None)
+    finite = len(errors) > 0 and bool(np.isfinite(errors).all())
+    value, worst = (float(errors.mean()), float(errors.max())) if finite else (None, None)
     return {"value": value, "worst_joint": worst, "unit": unit, "seconds": seconds, "summary": summary, **frozen}
 
 

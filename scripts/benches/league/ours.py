@@ -94,13 +94,13 @@ def structure(problem: Problem) -> str:
 def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
     """Identify a robot from a model and logs, with the terms and the settings of `--mjcf`."""
     # The logs have the gains only if the fitted recordings differ in them: a constant gain has no effect of its own.
-    known, gains = fold.fitted[0].constants, len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
+    constants, gains = fold.fitted[0].constants, len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
     with tempfile.TemporaryDirectory() as folder:
         logs, model = _written(fold.fitted, Path(folder), gains), _model(fold.fitted, Path(folder))
         with contextlib.redirect_stderr(io.StringIO()):  # drops the messages on columns, which repeat for each fold
-            flags = RobotFlags(mjcf=model, **known.get("flags", {}))
+            flags = RobotFlags(mjcf=model, **constants.get("flags", {}))
             pipeline = from_model.from_flags(flags, [str(p) for p in logs])
-        wanted = "auto" if name in CHOOSES else known.get("terms", "own")
+        wanted = "auto" if name in CHOOSES else constants.get("terms", "own")
         robot = held_out_parts.offering(pipeline.load(), wanted)
         fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
     config = replace(pipeline.identify, seed=seed)

@@ -207,24 +207,25 @@ def _files(data: Path, folder: str, pattern: str) -> list[Path]:
 def described(about: dict[str, Any], folder: str, data: Path) -> list[Fold]:
     """Return the fold of a description, as in a ``league.toml``."""
     where = data / folder
-    known = {"mjcf": str, "fit": list, "test": list, "terms": str, "flags": dict}
-    wrong = [n for n, v in about.items() if not isinstance(v, known.get(n, ()))]
+    types = {"mjcf": str, "fit": list, "test": list, "terms": str, "flags": dict}
+    wrong = [n for n, v in about.items() if not isinstance(v, types.get(n, ()))]
     if wrong or not (about.get("mjcf") and about.get("fit") and about.get("test")):
         raise UsageError(
             f"{where / DESCRIPTION}: {', '.join(wrong) or 'mjcf, fit or test'} is missing, unknown or of a wrong type",
             hint='mjcf = "robot.xml", fit = ["a.csv[0:0.6]"], test = ["b.csv"]; optional: terms, flags',
         )
-    given = about.get("flags", {})
-    if unknown := sorted(set(given) - {f.name for f in fields(RobotFlags)}):
+    words = about.get("flags", {})
+    if unknown := sorted(set(words) - {f.name for f in fields(RobotFlags)} | set(words) & {"mjcf"}):
         raise UsageError(f"{where / DESCRIPTION}: unknown flags {', '.join(unknown)}", hint="names of robot_flags.py")
     parts = {key: [_share(item, where) for item in about[key]] for key in ("fit", "test")}
     for (name, low, high), (other, begin, end) in product(parts["fit"], parts["test"]):
         if name == other and low < end and begin < high:
             raise UsageError(f"{where / DESCRIPTION}: parts of {name} are fitted and judged", hint="judge others")
-    given = {n: tuple(v) if isinstance(v, list) else v for n, v in given.items()}
-    flags = RobotFlags(mjcf=where / about["mjcf"], **given)
+    chosen = {n: tuple(v) if isinstance(v, list) else v for n, v in words.items() if n != "mapping"}
+    mapping = where / words["mapping"] if "mapping" in words else None
+    flags = RobotFlags(mjcf=where / about["mjcf"], mapping=mapping, **chosen)
     pipeline = from_model.from_flags(flags, [str(where / parts["fit"][0][0])])
-    constants = {"mjcf": str(flags.mjcf), "flags": given, "terms": about.get("terms", "own")}
+    constants = {"mjcf": str(flags.mjcf), "flags": chosen, "terms": about.get("terms", "own")}
 
     def read(name: str, low: float, high: float, ahead: bool) -> Recording:
         episode = open_recording(where / name, pipeline, pipeline.load()).episode
@@ -233,8 +234,8 @@ def described(about: dict[str, Any], folder: str, data: Path) -> list[Fold]:
             raise UsageError(f"{where / name} has no goal, torque or duty", hint="name its columns, or give a mapping")
         whole = recording(episode, sent[0], "position")
         begin, end = (round(x * len(whole.t)) for x in (low, high))
-        known = {**constants, "command": sent[0], "sliding": bool(pipeline.load().units.get("position") == "m")}
-        return replace(part(whole.t, whole.command, whole.position, begin, end, ahead), constants=known)
+        about_it = {**constants, "command": sent[0], "sliding": bool(pipeline.load().units.get("position") == "m")}
+        return replace(part(whole.t, whole.command, whole.position, begin, end, ahead), constants=about_it)
 
     fitted, test = (tuple(read(*p, n == "fit") for p in parts[n]) for n in ("fit", "test"))
     return [Fold(", ".join(about["test"]), fitted, test)]
@@ -255,8 +256,8 @@ def _share(item: str, where: Path) -> tuple[str, float, float]:
 def available(data: Path) -> dict[str, LeagueSet]:
     """Return the sets whose folders are there: ours, and those with a ``league.toml``."""
     files = {path.parent.name: path for path in sorted(data.glob(f"*/{DESCRIPTION}"))}
-    if known := sorted(set(files) & set(SETS)):
-        raise UsageError(f"{', '.join(known)} is the name of a set with code", hint="rename the folder")
+    if taken := sorted(set(files) & set(SETS)):
+        raise UsageError(f"{', '.join(taken)} is the name of a set with code", hint="rename the folder")
     more = {
         n: LeagueSet(n, n, rmse, partial(described, tomllib.loads(path.read_text()), n)) for n, path in files.items()
     }
