@@ -98,7 +98,7 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
     with tempfile.TemporaryDirectory() as folder:
         logs, model = _written(fold.fitted, Path(folder), gains), _model(fold.fitted, Path(folder))
         with contextlib.redirect_stderr(io.StringIO()):  # drops the messages on columns, which repeat for each fold
-            flags = RobotFlags(mjcf=model, **constants.get("flags", {}))
+            flags = RobotFlags(mjcf=model, **{**constants.get("flags", {}), "as_told": True})
             pipeline = from_model.from_flags(flags, [str(p) for p in logs])
         wanted = "auto" if name in CHOOSES else constants.get("terms", "own")
         robot = held_out_parts.offering(pipeline.load(), wanted)
