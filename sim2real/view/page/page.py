@@ -112,7 +112,7 @@ def write_page(
     )
     # Write a draft and rename it, as a rename is atomic.
     draft = path.with_name(f".{path.name}.tmp")
-    draft.write_text(text, encoding="utf-8")
+    draft.write_text(text, encoding="utf-8", errors="replace")  # such as half a surrogate pair in the name of a file
     os.replace(draft, path)
     return path
 
