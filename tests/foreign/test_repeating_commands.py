@@ -56,12 +56,17 @@ def square(f, t):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(
     ("shape", "f", "late"),
-    [("sine", 0.55, 0.05), ("sine", 1.0, 0.1), ("sine", 3.0, 0.25), ("triangle", 1.7, 0.4), ("square", 2.5, 0.3)],
+    [("sine", 0.55, 0.05), ("sine", 1.0, 0.05), ("sine", 3.0, 0.25), ("triangle", 1.7, 0.4), ("square", 2.5, 0.3)],
 )
 def test_a_sign_that_no_data_can_tell_is_refused_with_both_candidates(tmp_path, shape, f, late, sign):
     """One joint, one tone, no start from rest: the opposite sign half a period later is the same log."""
     wave = SHAPES.get(shape, square)
     path = log(tmp_path, wave(f, T), sign * wave(f, T - late))
+    if sign > 0 and late <= 0.3 and late + 0.5 / f > 0.6:  # no servo is 959 ms late
+        _, found = imported(path)
+        assert goal_scales(found) == [1.0]
+        assert "which no servo is: the sign of the file is kept" in "\n".join(found.evidence)
+        return
     with pytest.raises(
         UsageError, match=r"signs are ambiguous: a follows \d+ ms later, or with the opposite sign \d+ ms"
     ):

@@ -17,6 +17,8 @@ _MIN_GOAL_R = 0.9
 """A command without a name is a goal from this correlation on."""
 _SAME_S = 0.01
 """Lags of one robot's joints differ by at most this [s], plus two samples."""
+_LIKELY_S = 0.3
+"""A servo follows its command within this lag [s]; none is later by twice of it."""
 _MAX_COMMON_S = 0.5
 """Largest common lag of several joints [s]: beyond, lags of periodic commands agree by chance."""
 _MIN_SLOPE = 0.15
@@ -109,7 +111,10 @@ def goal(
 def _signs(names: Sequence[str], ordered: Following, sure: np.ndarray, path: str, as_told: bool) -> list[str]:
     """Return notes on commands that repeat; raise a UsageError if a sign is ambiguous."""
     lag, against, repeats = (np.diag(a) for a in (ordered.lag_s, ordered.against_s, ordered.repeats_s))
-    ambiguous = _open_signs(ordered, sure)
+    # The sign of the file stands where its lag is that of a servo, and that of the opposite sign is not.
+    likely = (np.diag(ordered.r) > 0) & (lag <= _LIKELY_S) & (against > 2.0 * _LIKELY_S)
+    repeated = _open_signs(ordered, sure)
+    ambiguous = repeated & ~likely
     if ambiguous.any():
         listed = "; ".join(
             f"{names[i]} follows {_ms(lag[i])} ms later, or with the opposite sign {_ms(against[i])} ms later"
@@ -119,6 +124,12 @@ def _signs(names: Sequence[str], ordered: Following, sure: np.ndarray, path: str
         if not as_told:
             raise UsageError(f"the commands of {path} {why}", hint=KEEP_ORDER_HINT)
         return [f"the commands {why}; the signs of the file are kept"]
+    if repeated.any():
+        first = int(np.flatnonzero(repeated)[0])
+        return [
+            f"commands repeat: {names[first]} follows {_ms(lag[first])} ms later, or with the opposite sign "
+            f"{_ms(against[first])} ms later, which no servo is: the sign of the file is kept"
+        ]
     # Mention other lags that fit equally well.
     for i in np.flatnonzero(sure & np.isfinite(repeats))[:1].tolist():
         return [
