@@ -7,6 +7,8 @@ from dataclasses import fields
 
 import numpy as np
 
+from sim2real.composer.models.mjcf.translate import mj
+from sim2real.errors import UsageError
 from sim2real.identify.export.card.plain import PlainSimulation, converged
 from sim2real.robots.from_model.mjcf import copy_back, driven_spec
 from sim2real.types import Json
@@ -32,6 +34,13 @@ def driven_simulation(
         holder, _, field = name.rpartition(".")
         getattr(model.opt if holder else model, field)[...] = np.asarray(value)
     copy_back(spec, model)
+    mjcf = converged(spec)
+    made = mj.MjModel.from_xml_string(mjcf)
+    for name in world.fields(params, None):
+        holder, _, field = name.rpartition(".")
+        pair = (getattr(m.opt if holder else m, field) for m in (model, made))
+        if not np.allclose(*pair, rtol=1e-4, atol=1e-9):
+            raise UsageError(f"MJCF does not keep the identified {name} of this model", hint="export to json")
     # Collect the numbers of the drives.
     numbers = {f: np.asarray(getattr(params, f)) + np.zeros(n) for f in ("kp", "kd", "gain", "released", "zero")}
     numbers |= {"kp_unit": np.array(world.units[0]), "kd_unit": np.array(world.units[1])}
@@ -43,4 +52,4 @@ def driven_simulation(
         started = params_of(start)
         return np.asarray(started.qpos), np.asarray(started.qvel)
 
-    return PlainSimulation(converged(spec), how[1], how[2], begin, "drive", numbers, lead_s=world.lead_s)
+    return PlainSimulation(mjcf, how[1], how[2], begin, "drive", numbers, lead_s=world.lead_s)
