@@ -34,6 +34,8 @@ def driven_simulation(
         holder, _, field = name.rpartition(".")
         getattr(model.opt if holder else model, field)[...] = np.asarray(value)
     copy_back(spec, model)
+    for joint, number in zip(how[1], world.joints, strict=True):  # MuJoCo's copy_back omits the limits, too
+        spec.joint(joint).actfrcrange = model.jnt_actfrcrange[number]
     mjcf = converged(spec)
     made = mj.MjModel.from_xml_string(mjcf)
     for name in world.fields(params, None):
