@@ -116,7 +116,8 @@ def draw(seed):
     shared = wave(kind, rng)
     waves = [shared if kind == "gait" or rng.random() < 0.2 else wave(kind, rng) for _ in range(n)]
     apart = rng.uniform(0, 0.5, n) if kind == "gait" else np.zeros(n)
-    size, mean = rng.uniform(0.5, 1.6, n), rng.uniform(-0.6, 0.6, n)
+    # Without a level, the sign of a tone is open; the first thousand logs have levels.
+    size, mean = rng.uniform(0.5, 1.6, n), rng.uniform(-0.6, 0.6, n) * (seed < 1000 or rng.random() < 0.5)
     turning = rng.random(n) < 0.15
     onward = np.where(turning, rng.choice([-1, 1], n) * rng.uniform(0.4, 1.2, n), 0.0)
 

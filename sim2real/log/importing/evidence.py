@@ -48,26 +48,27 @@ def open_pairs(relation: Following, scale: float = 1.0) -> list[tuple[int, int]]
     """
     relation = relation.by_level(scale)
     distance, lag = relation.distance(scale), relation.lag_s
-    typical = float(np.median(np.diag(lag)))
+    moved, selected = relation.moved.all(axis=1), np.arange(len(lag))
     pairs = []
-    for i, k in combinations(np.flatnonzero(relation.moved.all(axis=1)), 2):
-        here, there = (i, i), (k, k)
-        swapped = [(i, k), (k, i)]
-        if np.abs([relation.r[at] for at in swapped]).min() < SURE:
+    for i, k in combinations(np.flatnonzero(moved), 2):
+        swapped = selected.copy()
+        swapped[[i, k]] = k, i
+        two, orders = np.array([i, k]), (selected, swapped)
+        if np.abs(relation.r[two, swapped[two]]).min() < SURE:
             continue
-        straight_distance, swapped_distance = (
-            sum(distance[at] for at in places) for places in ([here, there], swapped)
+        apart, misfits = (
+            [sum(values[at, places[at]] for at in two) for places in orders] for values in (distance, 1 - relation.r**2)
         )
-        misfits = [sum(1 - relation.r[at] ** 2 for at in places) for places in ([here, there], swapped)]
-        if swapped_distance > 1.5 * straight_distance + 0.02 or misfits[1] > 1.5 * misfits[0] + 0.01:
+        if apart[1] > 1.5 * apart[0] + 0.02 or misfits[1] > 1.5 * misfits[0] + 0.01:
             continue
-        off = [max(abs(lag[at] - typical) for at in places) for places in ([here, there], swapped)]
-        same = all(
-            np.sign(relation.r[a]) == np.sign(relation.r[b]) for a, b in zip(swapped, (here, there), strict=True)
-        )
-        alike = same and off[1] <= off[0] + 1.5 * relation.period_s
+        # An order that changes neither signs nor lags is the same import.
+        signs, lags = ([values[two, places[two]] for places in orders] for values in (np.sign(relation.r), lag))
+        if (signs[0] == signs[1]).all() and np.abs(lags[1] - lags[0]).max() <= 1.5 * relation.period_s:
+            continue
         # Joints share the delay of their robot, so an order with more different lags is wrong.
-        if not alike and off[1] < 2.0 * off[0] + 3.0 * relation.period_s:
+        all_lags = [lag[moved, places[moved]] for places in orders]
+        off = [np.abs(x - np.median(x)).max() for x in all_lags]
+        if off[1] < 2.0 * off[0] + 3.0 * relation.period_s:
             pairs.append((int(i), int(k)))
     return pairs
 

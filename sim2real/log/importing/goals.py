@@ -8,7 +8,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log.importing import evidence
-from sim2real.log.importing.command_response import Following
+from sim2real.log.importing.command_response import Following, following, on_grid
 from sim2real.log.importing.evidence import DEGREES, SURE
 from sim2real.log.importing.quantities import taken
 from sim2real.log.importing.signals import Signal
@@ -21,6 +21,8 @@ _LIKELY_S = 0.3
 """A servo follows its command within this lag [s]; none is later by twice of it."""
 _MAX_COMMON_S = 0.5
 """Largest common lag of several joints [s]: beyond, lags of periodic commands agree by chance."""
+_SCALED = 0.5, 1.6
+"""A position that follows a command closely has a slope between these, unless the command is scaled."""
 _MIN_SLOPE = 0.15
 """A position follows a command from this slope on, in one unit."""
 KEEP_ORDER_HINT = (
@@ -36,6 +38,17 @@ def follows(relation: Following, command: Signal, path: str) -> bool:
         UsageError: When they follow it weakly, so that it is neither a goal nor unrelated.
     """
     best, moved = np.abs(relation.r).max(axis=1), relation.moved.any(axis=1)
+    slopes = _slopes(relation)[moved & (best > _MIN_GOAL_R)]
+    ratio = evidence.unit_ratio(slopes)
+    own = float(np.median(np.abs(slopes))) / (ratio or 1.0) if slopes.size else 1.0
+    # Positions that follow closely, at another size, follow a scaled quantity.
+    if len(slopes) > 0.5 * moved.sum() and (ratio is None or not _SCALED[0] < own < _SCALED[1]):
+        raise UsageError(
+            f"positions in {path} follow {command.name!r} (r {np.median(best[moved]):.2f}), but with slopes of "
+            f"{', '.join(f'{x:.3g}' for x in slopes[:3])}: it is scaled, or commands no position",
+            hint="write its quantity and unit into its name, as in goal_rad, duty or torque, or write a mapping with "
+            "the scale and the offset that its maker gives",
+        )
     if not moved.any() or evidence.unit_ratio(_slopes(relation)[best > SURE]) is None:
         return False
     if np.mean(best[moved] > _MIN_GOAL_R) > 0.5:
@@ -215,6 +228,25 @@ def refuse_copies(measured: Signal, command: Signal, copies: np.ndarray, path: s
             hint="record the commands that are sent to the motors, not their answers; --joints can omit a joint",
         )
     return [f"warning: commands are copies of the measurements: {listed}"]
+
+
+def refuse_rates(
+    command: np.ndarray,
+    measured: np.ndarray,
+    clocks: Sequence[np.ndarray],
+    rows: Sequence[np.ndarray],
+    name: str,
+    path: str,
+) -> None:
+    """Raise a UsageError if the speeds of the joints follow a command whose name has no quantity."""
+    t, c = clocks[0][rows[0]], clocks[1][rows[1]]
+    held, joined, period_s = on_grid(c, command, t, np.gradient(measured, t, axis=0))
+    r = np.abs(np.diag(following(held, joined, period_s).r))
+    if r.size and np.median(r) > _MIN_GOAL_R:
+        raise UsageError(
+            f"does {name!r} in {path} command velocities or duty? The speeds follow it (r {np.median(r):.2f})",
+            hint="write its quantity into its name, as in goal_velocity or duty, or write a mapping",
+        )
 
 
 def _ms(seconds: float | np.ndarray) -> str:

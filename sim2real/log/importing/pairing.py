@@ -9,7 +9,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.log.importing.command_response import following, on_grid
-from sim2real.log.importing.signal_names import Meaning, same_joint
+from sim2real.log.importing.signal_names import OTHER_UNITS, Meaning, same_joint
 from sim2real.log.importing.signals import Signal, find_stamps
 
 _SURE = 0.8
@@ -60,9 +60,21 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None, joint
         joints = joints if all(joints) else ()
     measured = _one(_of_joints(positions, joints), "measured position", path)
     command = _one(_of_joints(goals or commands, joints), "command", path)
+    for chosen in (measured, command):
+        if chosen is not None and chosen.meaning.unit in OTHER_UNITS:
+            raise UsageError(
+                f"{chosen.name!r} in {path} is in {chosen.meaning.unit} by its name",
+                hint="convert it to radians or degrees, or write a mapping with a scale",
+            )
     if measured is not None and command is not None:
         names = f"{measured.name!r} is measured and {command.name!r} commanded, by their names"
-        return Pair(measured, command, _kind(command), (names,))
+        chosen = measured, command
+        others = [s.name for group in (positions, goals or commands) for s in group if all(s is not c for c in chosen)]
+        notes = (
+            names,
+            *([f"other positions and commands are skipped: {', '.join(others[:_MAX_LISTED])}"] if others else []),
+        )
+        return Pair(measured, command, _kind(command), notes)
     unnamed = [s for s in series if s.meaning == Meaning(label=s.meaning.label) and s is not measured and _moves(s)]
     if measured is None and command is None:
         return _by_data(_together(unnamed), path, rate_hz, signals)

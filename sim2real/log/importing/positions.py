@@ -24,6 +24,8 @@ _FAST_RAD_S, _SMALL_RAD = 30.0, 2.0
 """Positions that would be faster and larger in radians can be in degrees: their unit is ambiguous."""
 _SMALL_WAY = 2.0
 """Positions that move farther can be a small motion in degrees, or a large one in radians."""
+_MIXED_WAY = 0.3
+"""Beside joints in degrees, a joint that moves farther than this, but stays within 3.1, can be in radians."""
 _RADIAN_WORDS = {"qpos", "dof"}
 """Names that simulators give to positions in radians."""
 
@@ -68,6 +70,7 @@ def checked_positions(
             f"{path} has {len(rows)} samples with a number in every column of {measured.name!r}",
             hint="name only the joints with numbers with --joints",
         )
+    _refuse_empty_beginning(measured, q, rows, path)
     # Guess the unit from name, jumps by a turn, and size, then find leaps in this unit.
     hinges = hints.hinges(measured.width)
     named = {"rad": 1.0, "deg": DEGREES}.get(measured.meaning.unit)
@@ -106,6 +109,18 @@ def checked_positions(
         notes.append(_on_leaps(measured, rows[~good], leaps[~good]))
         values[leapt] = np.nan
     return CheckedPositions(replace(measured, values=values), to_rad, turn * bool(over.any()), hinges, leapt, notes)
+
+
+def _refuse_empty_beginning(measured: Signal, q: np.ndarray, rows: np.ndarray, path: str) -> None:
+    """Raise a UsageError if all positions are exactly 0 until the first reading."""
+    empty = int((q != 0.0).any(axis=1).argmax())
+    steps = np.abs(np.diff(q[empty:], axis=0)).max(axis=1)
+    if empty > 1 and steps.size and np.abs(q[empty]).max() > 3.0 * steps.max():
+        raise UsageError(
+            f"{measured.name!r} in {path} is 0 in its first {empty} samples and then {q[empty].round(3).tolist()}: the "
+            "recorder had no reading before",
+            hint=f"omit these samples with --samples {rows[empty]}: and a mapping, or leave their cells empty",
+        )
 
 
 def _on_leaps(measured: Signal, rows: np.ndarray, leaps: np.ndarray) -> str:
@@ -198,6 +213,14 @@ def radian(
         return 1.0, f"it stays within {largest:.3g}, and {usual}"
     if largest <= _MAX_RAD and way <= _SMALL_WAY:
         return 1.0, f"as degrees it would move by {way:.2g} degrees only"
+    # A joint that moves by less than a turn in radians could be in radians beside others in degrees.
+    mixed = [i for i, x in enumerate(q.T) if np.ptp(x) > _MIXED_WAY and np.abs(x).max() <= np.pi]
+    if mixed and largest > 30.0:
+        listed = ", ".join(f"{measured.sources[i]} moves by {np.ptp(q[:, i]):.3g}" for i in mixed[:3])
+        raise UsageError(
+            f"are all joints of {measured.name!r} in {path} in degrees? They reach {largest:.4g}, but {listed}",
+            hint="end all names with the unit, as in q_deg, give the robot's model with --mjcf, or write a mapping",
+        )
     if 30.0 < largest <= 400.0 and speed > 2.0 * _FAST_RAD_S:
         return DEGREES, f"as radians it would move at {speed:.3g} rad/s"
     # A joint that turns without limit has such values also in radians.

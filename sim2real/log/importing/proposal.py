@@ -13,7 +13,7 @@ from sim2real.log.importing import evidence
 from sim2real.log.importing.command_response import Following, following, on_grid
 from sim2real.log.importing.evidence import SURE
 from sim2real.log.importing.files.foreign import ForeignFile
-from sim2real.log.importing.goals import follows, goal, refuse_copies
+from sim2real.log.importing.goals import follows, goal, refuse_copies, refuse_rates
 from sim2real.log.importing.mapping import FieldMapping, ImportMapping, NodeMapping
 from sim2real.log.importing.pairing import Pair, find_pair
 from sim2real.log.importing.plausibility import TURN_RAD
@@ -141,6 +141,8 @@ def _commanded(
     # A command without a following position is taken by its name.
     if kind != "position":
         command = _other_command(command, measured, places)
+        if not pair.kind:
+            refuse_rates(command.values[rows[1]], measured.values[rows[0]], clocks, rows, command.name, path)
         unit = {"velocity": "rad/s", "torque": "N m"}.get(kind, "")
         notes = f"its name decides, as no position follows it (|r| at most {np.abs(relation.r).max():.2f})"
         fields = {_FIELDS[kind]: field_of(command, unit, [1.0] * command.width)}

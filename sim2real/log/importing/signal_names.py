@@ -34,7 +34,13 @@ _UNITS = {
     "us": "us usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds nanosec",
     "raw": "raw counts ticks",
+    "rev": "rev revs revolution revolutions turns rotations",
+    "mrad": "mrad milliradians",
+    "mm": "mm millimeters millimetres",
+    "percent": "percent pct normalized normalised",
 }
+OTHER_UNITS = ("rev", "mrad", "mm", "percent")
+"""Units that need a mapping with a scale."""
 _WEAK_WORDS = {"state", "states"}
 _SIDE = {word: side for side, listed in _SIDES.items() for word in listed.split()}
 _QUANTITY = {word: quantity for quantity, listed in _QUANTITIES.items() for word in listed.split()}
@@ -66,7 +72,8 @@ class Meaning:
         side: ``command`` or ``measured``.
         quantity: ``stamp``, ``position``, ``velocity``, ``torque``, ``duty``, ``voltage``, ``kp``, ``kd``,
             ``enabled``, ``rate``, ``period``, or ``error`` (a difference of two signals).
-        unit: ``rad``, ``deg``, ``s``, ``ms``, ``us``, ``ns`` or ``raw``.
+        unit: ``rad``, ``deg``, ``s``, ``ms``, ``us``, ``ns``, ``raw``, or one of
+            ``OTHER_UNITS``.
         label: The remaining words, which name the joint.
     """
 

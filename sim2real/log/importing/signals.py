@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,9 @@ _RATES_HZ = (5.0, 12_000.0)
 """Usual sampling rates of recorders."""
 _WALL_S = (1e9, 4e9)
 """Wall clocks read this many seconds since 1970 (2001 to 2096)."""
+
+
+_WORD = re.compile("[a-z]+")
 
 
 @dataclass(frozen=True)
@@ -88,12 +92,14 @@ def collect(file: ForeignFile) -> tuple[list[Signal], list[str]]:
     signals: list[Signal] = []
     notes: list[str] = []
     text: list[str] = []
+    names_of_columns: dict[str, list[str]] = {}
     for key in file.keys:
         named = meaning(key)
         try:
             values = file.signal(key).astype(np.float64)
         except NoNumbersError:
             text.append(key)
+            names_of_columns |= _names(file, key)
             continue
         except UsageError as error:
             # Raise for such a column: without it, another one could be taken for the positions.
@@ -121,7 +127,38 @@ def collect(file: ForeignFile) -> tuple[list[Signal], list[str]]:
             signals.append(Signal(tuple(row.sources[0] for row in rows), tuple(labels), named, values))
         else:
             signals += rows
+    signals = [_labelled(signal, names_of_columns, file) for signal in signals]
+    text = [key for key in text if key not in names_of_columns]
     return signals, [*notes, *([f"skipped, as they hold no numbers: {', '.join(text)}"] if text else [])]
+
+
+def _names(file: ForeignFile, key: str) -> dict[str, list[str]]:
+    """Return a list of the names of joints, by its key; empty if a signal of words is no such list."""
+    words = set(_WORD.findall(key.lower()))
+    if not words & {"names", "joints", "name"} or words & {"body", "bodies", "link", "links", "foot", "feet"}:
+        return {}
+    values = np.asarray(file.load(key)).astype(str)
+    return {key: values.tolist()} if values.ndim == 1 and len(set(values.tolist())) == len(values) else {}
+
+
+def _labelled(signal: Signal, names: dict[str, list[str]], file: ForeignFile) -> Signal:
+    """Return a signal with the labels of a list of names in its file, if its columns have none.
+
+    Raises:
+        UsageError: When lists with different orders fit.
+    """
+    if signal.whole is None or any(signal.labels):
+        return signal
+    fitting = {key: listed for key, listed in names.items() if len(listed) == signal.width}
+    # Of several lists, take the one that shares most words with the signal's name.
+    shared = {key: len(set(_WORD.findall(key.lower())) & set(_WORD.findall(signal.whole.lower()))) for key in fitting}
+    best = [key for key in fitting if shared[key] == max(shared.values())]
+    if len({tuple(fitting[key]) for key in best}) > 1 and signal.meaning.quantity in ("", "position"):
+        raise UsageError(
+            f"{', '.join(best)} in {file.path} name the columns of {signal.whole!r} in different orders",
+            hint="remove the list that does not belong to it, or write a mapping with the columns",
+        )
+    return replace(signal, labels=tuple(meaning(n).label or n.lower() for n in fitting[best[0]])) if best else signal
 
 
 def find_stamps(signals: Sequence[Signal], of: Signal, side: str, path: str, rate_hz: float | None) -> Stamps:
