@@ -40,9 +40,9 @@ def follows(relation: Following, command: Signal, path: str) -> bool:
     best, moved = np.abs(relation.r).max(axis=1), relation.moved.any(axis=1)
     slopes = _slopes(relation)[moved & (best > _MIN_GOAL_R)]
     ratio = evidence.unit_ratio(slopes)
-    own = float(np.median(np.abs(slopes))) / (ratio or 1.0) if slopes.size else 1.0
+    size = float(np.median(np.abs(slopes))) / (ratio or 1.0) if slopes.size else 1.0
     # Positions that follow closely, at another size, follow a scaled quantity.
-    if len(slopes) > 0.5 * moved.sum() and (ratio is None or not _SCALED[0] < own < _SCALED[1]):
+    if len(slopes) > 0.5 * moved.sum() and (ratio is None or not _SCALED[0] < size < _SCALED[1]):
         raise UsageError(
             f"positions in {path} follow {command.name!r} (r {np.median(best[moved]):.2f}), but with slopes of "
             f"{', '.join(f'{x:.3g}' for x in slopes[:3])}: it is scaled, or commands no position",
