@@ -19,7 +19,7 @@ _LINEAR = 1
 
 @dataclass(frozen=True)
 class Late:
-    """What of a robot's timing the model's text does not hold.
+    """The timing of a robot that the text of its model does not hold.
 
     Attributes:
         lead_s: Time that is added to the delay of commands [s], for the integrator's sake.
@@ -71,7 +71,7 @@ def _delay(element: Any, delay_s: float, step_s: float) -> None:
 
 
 def _keep(spec: Any, terms: Terms, about: Sequence[tuple[str, str]]) -> None:
-    """Write the intervals, three numbers each: the estimate and both ends, and what else is known about the file."""
+    """Write the intervals, three numbers each: the estimate and both ends, and further facts about the file."""
 
     def number(name: str, term: Term | None) -> None:
         if term is not None and not term.known:
