@@ -14,7 +14,7 @@ LIMITS = {
     "docstring lines [%]": 20.0,
     "Any in 1,000 lines": 4.7,
     "words of the dialect": 11,
-    "other words of the dialect": 181,
+    "other words of the dialect": 182,
     "largest number of project imports": 18,
     "levels of robot classes": 2,
     "public members of SO101Robot": 19,

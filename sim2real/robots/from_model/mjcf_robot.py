@@ -21,6 +21,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.log.toml_text import toml_value
+from sim2real.robots.from_model.couplings import open_loops
 from sim2real.robots.from_model.holding import Holding
 from sim2real.robots.from_model.mjcf import (
     NO_LIMIT,
@@ -54,8 +55,6 @@ from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
 
-_CHECKED, _OPEN = 100, 5e-3
-"""Number of recorded positions at which loops must close, and the largest error of a closed one [m or rad]."""
 ROBOT_FILE = "robot.toml"
 COMMANDS = tuple(f.name for f in fields(DriveCommand))
 DRIVING = ("goal", "goal_velocity", "torque", "duty")
@@ -255,15 +254,7 @@ class MjcfRobot(LoggedRobot):
     def doubts(self, episode: Episode) -> list[str]:
         """Return a sentence on recorded positions at which a loop of the model cannot close."""
         position = np.asarray(episode.outputs[self.roles.sensor]["position"], np.float64)
-        some = position[:: max(len(position) // _CHECKED, 1)]
-        gaps = self.make_nodes()[2].gaps(some)
-        if not (open_ := gaps > _OPEN).any():
-            return []
-        worst = ", ".join(f"{n} {x:.3g}" for n, x in zip(self.config.joints, some[gaps.argmax()], strict=True))
-        return [
-            f"the loops of {self.config.model.name} cannot close at {open_.mean():.0%} of the recorded positions; the "
-            f"largest gap is {gaps.max():.3g} (m or rad), at {worst}: check order, signs, units and zeros of the joints"
-        ]
+        return open_loops(self.make_nodes()[2].gaps, position, self.config.joints, self.config.model.name)
 
     def with_optional_terms(self, wanted: str = "all") -> MjcfRobot:
         """Return the robot with optional terms to choose from; a step of its simulation then takes longer.
