@@ -309,6 +309,6 @@ def test_recorded_positions_at_which_a_loop_cannot_close_are_reported(tmp_path, 
     (tmp_path / "bar.xml").write_text(FOUR_BAR.replace('"rocker" pos=".2 0 0"', '"rocker" pos=".2 0 .06"'))
     robot = MjcfRobot(RobotConfig(tmp_path / "bar.xml", ("crank",), ("torque",)))
     episode = Episode(steps={}, messages={}, outputs={"sensor": {"position": np.linspace(-0.1, to, 100)[:, None]}})
-    doubts = robot.doubts(episode)
+    doubts = robot.doubts(episode.outputs)
     assert bool(doubts) == (share is not None)
     assert share is None or f"loops of bar.xml cannot close at {share} of the recorded positions" in doubts[0]

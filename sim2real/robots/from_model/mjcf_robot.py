@@ -16,7 +16,6 @@ from sim2real.artifacts.files import check
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState
-from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
@@ -251,9 +250,9 @@ class MjcfRobot(LoggedRobot):
         sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
         return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
 
-    def doubts(self, episode: Episode) -> list[str]:
+    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
         """Return a sentence on recorded positions at which a loop of the model cannot close."""
-        position = np.asarray(episode.outputs[self.roles.sensor]["position"], np.float64)
+        position = np.asarray(outputs[self.roles.sensor]["position"], np.float64)
         return open_loops(self.make_nodes()[2].gaps, position, self.config.joints, self.config.model.name)
 
     def with_optional_terms(self, wanted: str = "all") -> MjcfRobot:

@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 import jax
 
 from sim2real.graph.delays import TrainableDist
-from sim2real.graph.episode import Episode, named_leaves
+from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
@@ -57,9 +57,9 @@ class LoggedRobot(ABC):
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
         """Return sensor, actuator and world, not connected yet; their names are those of the roles."""
 
-    def doubts(self, episode: Episode) -> list[str]:
+    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
         """Return sentences on positions of a log that the model cannot have; default: none."""
-        del episode
+        del outputs
         return []
 
     def started(self, params: Mapping[str, PyTree], start: PyTree) -> dict[str, PyTree]:

@@ -51,7 +51,7 @@ def open_recording(path: Path, pipeline: Pipeline, robot: RecordedRobot | None =
 
 def _require_fitting(recording: Recording, robot: RecordedRobot) -> None:
     require_units(recording, robot)
-    for line in robot.doubts(recording.episode):
+    for line in robot.doubts(recording.episode.outputs):
         note(f"warning: {recording.path.name}: {line}")
 
 
