@@ -107,6 +107,11 @@ class RecordedRobot(Protocol):
         del values
         return None
 
+    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
+        """Return sentences on positions of a log that the model cannot have; default: none."""
+        del outputs
+        return []
+
 
 class Robot:
     """A robot that can be recorded, trained for and deployed to. It has five parts, which its ``__init__`` sets.
@@ -168,6 +173,11 @@ class Robot:
         """Return the robot: its model has all of its optional terms."""
         del wanted
         return self
+
+    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
+        """Return sentences on positions of a log that the model cannot have: none."""
+        del outputs
+        return []
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
         """Return the model with identified values, as MJCF; None: there is none."""

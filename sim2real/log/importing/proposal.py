@@ -77,7 +77,7 @@ def propose(file: ForeignFile, hints: ImportHints) -> Proposal:
     circle = TURN_RAD * checked.to_rad if checked.hinges.any() else 0.0
     relation = replace(following(held, joined, period_s), turn=circle)
     # Map commands, further commands and velocity to fields.
-    extra, others = extras(signals, command, measured, places, path, (np.abs(relation.r) > SURE).any(axis=1))
+    extra, others = extras(signals, command, measured, places, path, np.any(np.abs(relation.r) > SURE, axis=1))
     command, goals, more = _commanded(pair, command, checked, turn, relation, (clocks, rows), places, path, hints)
     velocity, on_velocity, lacking = velocity_of(signals, measured, clocks[0], checked.to_rad, places)
     position = field_of(measured, "rad", [1 / checked.to_rad] * measured.width, checked.turn)
