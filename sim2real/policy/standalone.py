@@ -11,7 +11,6 @@ class BarePolicy:
     """Observation ``(O,)`` -> action ``(A,)``, of the bundle in a folder. Send no action that is not finite."""
 
     def __init__(self, folder: Path) -> None:
-        # Check the hashes of both files.
         about, raw = json.loads((folder / "policy.json").read_text()), (folder / "policy.safetensors").read_bytes()
         entries = {name: value for name, value in about.items() if name != "sha256"}
         seal = hashlib.sha256(json.dumps(entries, sort_keys=True).encode()).hexdigest()
@@ -19,7 +18,6 @@ class BarePolicy:
             raise ValueError("policy.json was changed: its hash differs from its sha256")
         if hashlib.sha256(raw).hexdigest() != about["files"]["policy.safetensors"]:
             raise ValueError("policy.safetensors was changed: its hash differs from the one in policy.json")
-        # Read the arrays: a header of JSON, then little-endian floats.
         begin, self.clip = 8 + int.from_bytes(raw[:8], "little"), about["normaliser"]["clip"]
         tensors = {n: (t["shape"], t["data_offsets"]) for n, t in json.loads(raw[8:begin]).items() if n[0] != "_"}
         self.w = {n: np.frombuffer(raw[begin + a : begin + b], "<f4").reshape(s) for n, (s, (a, b)) in tensors.items()}
