@@ -19,7 +19,7 @@ from sim2real.stages.pipeline.open_parameters import open_identification
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ROOT = Path(__file__).parents[2]
-LOG = next((ROOT / "datasets" / "pendulum").glob("*.mcap"))
+LOG = ROOT / "datasets" / "pendulum" / "chirp.mcap"
 
 
 @pytest.fixture
