@@ -8,7 +8,7 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 62_900,
+    "lines without composer": 62_830,
     "lines of composer": 12_295,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.0,
