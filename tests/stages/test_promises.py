@@ -216,3 +216,10 @@ def test_the_bound_of_a_free_run_is_wider_where_drawn_trajectories_part():
     plain, apart = promises.on_later_logs(replace(doc, free={**doc.free, "th_spread": spread}), [p], names, limit)[1:]
     assert (plain.source, plain.bound) == ("a.mcap", pytest.approx(0.03))
     assert (apart.source, apart.bound) == ("b.mcap", pytest.approx(0.05))
+
+
+def test_where_a_part_diverged_no_bound_is_promised():
+    parts = [left("a", 0.01), left("b", 0.01), left("c", float("nan"))]
+    doc = with_ledger(document(parts, [0.01]), ["log"], 1)
+    assert doc.bounds == ()
+    assert promises.of(doc) == {}

@@ -98,6 +98,9 @@ def bounds(document: Identification, recordings: Sequence[Predicted], blocks: bo
         groups.setdefault((row.column, row.reach), []).append(row)
     result = []
     for (column, reach), rows in groups.items():
+        # Where a prediction diverged, no bound on later errors is known.
+        if any(row.error is None for row in rows):
+            continue
         inside = _finite([row.error for row in rows if not row.fresh])
         after = [row for row in rows if row.fresh and row.source in later]
         after = _finite([None if row.error is None else row.error / row.stretch for row in after])
@@ -114,7 +117,7 @@ def of(document: Identification) -> dict[tuple[str, Reach], Bound]:
 
     A file of version 0.1 has the errors on held-out parts only: from these follow its bounds.
     """
-    if document.bounds:
+    if document.bounds or document.promises:
         return {(b.column, b.reach): b for b in document.bounds}
     result, horizon_s = {}, max((r.horizon_s for r in document.held_out), default=0.0)
     for row in document.held_out:
