@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from benches.catalogue import measures
 from benches.provenance import ROOT, why_stale
+from page_tables.league import evidence, league, league_promises
 
 TABLES = {
     "evidence": ("randomise", "league"),
@@ -27,30 +28,13 @@ TABLES = {
     "so101_time": ("so101_cpu",),
     "real": ("identify_disk", "identify_xl330", "identify_so101"),
     "league": ("league",),
+    "league_promises": ("league",),
     "randomise": ("randomise", "randomise_worn"),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
 PAGES = ("README.md", "docs/results.md", "docs/getting_started.md", "docs/guides/so101.md")
 """Pages with tables, or with a sentence of figures."""
 FIGURE = "docs/images/what_training_knows.svg"
-LEAGUE_SETS = {
-    "disk": "motor with eccentric mass, RMSE",
-    "xl330": "DYNAMIXEL XL330, MAE",
-    "so101": "SO-101 arm, joints that move, RMSE",
-    "go2": "Unitree Go2 in the air, RMSE",
-    "sts3250": "Feetech STS3250, MAE",
-    "emps": "EMPS linear axis, RMSE",
-}
-"""Sets of a report with these names; others have their folder's name."""
-LEAGUE_ENTRANTS = {
-    "sysid": "mujoco.sysid",
-    "sysid_delay": "mujoco.sysid with a delay",
-    "pace": "PACE",
-    "bam_m1": "BAM M1",
-    "bam_m6": "BAM M6",
-    "textbook": "textbook servo",
-    "published": "best published set",
-}
 TRAINED_ON = {
     "data_sheet": "the data sheet, without delays",
     "uniform": "the data sheet, parameters 30 % up and down",
@@ -111,7 +95,10 @@ def run_time(report: Mapping[str, Any], subject: str) -> str:
 
 
 def real_motors(reports: Mapping[str, dict[str, Any]]) -> str:
-    """Return the table of recordings of real motors: ours, mujoco.sysid in the same run, ours without delay."""
+    """Return the table of recordings of real motors: ours, mujoco.sysid in the same run, ours without delay.
+
+    The bound that was promised stands beside our error if the report has it.
+    """
     v = {r["name"].removeprefix("identify/"): r["value"] for report in reports.values() for r in report["rows"]}
     moved = [n for n in v if n.startswith("so101/") and n.endswith("_sysid_rmse_mrad")]
     joints = [n.replace("_sysid_rmse_mrad", "") for n in moved]
@@ -119,52 +106,24 @@ def real_motors(reports: Mapping[str, dict[str, Any]]) -> str:
     arm, worst = ([of(v[j + kind] for j in joints) for kind in kinds] for of in (statistics.mean, max))
     disk = [1e3 * v[f"disk/{n}free_run_rmse_rad"] for n in ("", "sysid_", "no_delay_")]
     servo = [v[f"xl330/{n}test_mae_mrad"] for n in ("", "sysid_", "no_delay_")]
+    bounds = {kind: [v[n] for n in v if n.startswith(f"{kind}/promised/")] for kind in ("disk", "xl330")}
+    bounds["so101"] = [v[n] for j in joints if (n := f"so101/promised/{j.rpartition('/')[2]}_mrad") in v]
+
+    def line(about: str, errors: Sequence[float], promised: Sequence[float], digits: int = 0) -> tuple[str, ...]:
+        first, *others = (f"{x:.{digits}f} mrad" for x in errors)
+        return about, first, f"{statistics.mean(promised):.{digits}f} mrad" if promised else "-", *others
+
     lines = [
-        ("held-out data, whole recordings", "sim2real", "mujoco.sysid", "sim2real without delay"),
-        ("---", "---:", "---:", "---:"),
-        ("motor with eccentric mass, 125 s free run, RMSE", *(f"{x:.0f} mrad" for x in disk)),
-        ("DYNAMIXEL XL330, a gain that was not fitted, MAE", *(f"{x:.0f} mrad" for x in servo)),
-        ("SO-101 arm, joints that move, mean RMSE", *(f"{x:.1f} mrad" for x in arm)),
-        ("SO-101 arm, worst joint of a motion, RMSE", *(f"{x:.0f} mrad" for x in worst)),
+        ("held-out data, whole recordings", "sim2real", "promised, RMSE", "mujoco.sysid", "sim2real without delay"),
+        ("---", "---:", "---:", "---:", "---:"),
+        line("motor with eccentric mass, 125 s free run, RMSE", disk, bounds["disk"]),
+        line("DYNAMIXEL XL330, a gain that was not fitted, MAE", servo, bounds["xl330"]),
+        line("SO-101 arm, joints that move, mean RMSE", arm, bounds["so101"], digits=1),
+        line("SO-101 arm, worst joint of a motion, RMSE", worst, sorted(bounds["so101"])[-1:]),
     ]
+    if not any(bounds.values()):  # a report of an earlier version has no bounds
+        lines = [(about, first, *others) for about, first, _, *others in lines]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
-def league(report: Mapping[str, Any]) -> str:
-    """Return the table of the league, one line for each set, and a sentence for each that another entrant wins."""
-    unit = {r["name"].split("/")[1]: "mm" if r["unit"] == "mm" else "mrad" for r in report["rows"]}
-    lines = [
-        ("held out, mean", "sim2real", "its worst fold", "its worst joint", "its time", *LEAGUE_ENTRANTS.values()),
-        ("---", *["---:"] * (4 + len(LEAGUE_ENTRANTS))),
-    ]
-    lost = []
-    for name in _league_sets(report):
-        folds = {f["fold"] for f in report["folds"] if f["set"] == name}
-        seconds = [f["seconds"] for f in report["folds"] if (f["set"], f["entrant"]) == (name, "ours") and f["seconds"]]
-        means, worst, joint = (_errors(report, name, what) for what in ("mean", "worst", "worst_joint"))
-        took = f"{statistics.median(seconds):.0f} s" if seconds else "-"
-        others = (_short(means.get(entrant)) for entrant in LEAGUE_ENTRANTS)
-        ours = (_short(e.get("ours")) for e in (means, worst, joint))
-        count = f"{len(folds)} fold{'s' * (len(folds) > 1)}"
-        lines.append((f"{LEAGUE_SETS.get(name, name)}, {count} [{unit[name]}]", *ours, took, *others))
-        better = [
-            f"{LEAGUE_ENTRANTS[e]} ({_short(means[e])} {unit[name]})"
-            for e in sorted(means, key=lambda e: means[e])
-            if "ours" in means and means[e] < means["ours"]
-        ]
-        if better:
-            lost.append(f"\nBetter than sim2real on the set {LEAGUE_SETS.get(name, name)}: {', '.join(better)}.\n")
-    return "".join("| " + " | ".join(line) + " |\n" for line in lines) + "".join(lost)
-
-
-def _short(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}" if value < 100 else f"{value:.0f}"
-
-
-def _league_sets(report: Mapping[str, Any]) -> list[str]:
-    """Return the sets of a report, those of the list first."""
-    there = dict.fromkeys(f["set"] for f in report["folds"])
-    return [*(n for n in LEAGUE_SETS if n in there), *(n for n in there if n not in LEAGUE_SETS)]
 
 
 def randomise(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
@@ -187,48 +146,6 @@ def randomise(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
             line += [f"{share:.0f} %", f"{low:.0f} to {high:.0f} %"]
         lines.append(tuple(line))
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
-
-
-def evidence(ideal: Mapping[str, Any], judged: Mapping[str, Any]) -> str:
-    """Return README's table: what sim2real reaches beside the best of the others, then the set that it loses."""
-    share = {r["name"].removeprefix("randomise/"): 100 * r["value"] for r in ideal["rows"] if r["value"] is not None}
-    count, trials = len(ideal["robots"]), ideal["flags"]["trials"]
-    lines = [
-        ("measured on", "sim2real", "compared with"),
-        ("---", "---:", "---:"),
-        (
-            f"success of policies on {count} robots with hidden parameters and delays, {trials} deployments each",
-            f"{share['all/success']:.0f} %",
-            f"{share['data_sheet/success']:.0f} % trained on the data sheet",
-        ),
-    ]
-    sets = {name: _errors(judged, name, "mean") for name in LEAGUE_SETS}
-    lost = []
-    for name, errors in sets.items():
-        if len(errors) < 2 or "ours" not in errors:
-            continue
-        unit = "mm" if name == "emps" else "mrad"
-        best = min((e for e in errors if e != "ours"), key=lambda e: errors[e])
-        line = (
-            f"{LEAGUE_SETS[name]}, mean over held-out parts",
-            f"{errors['ours']:.1f} {unit}",
-            f"{errors[best]:.1f} {unit} by {LEAGUE_ENTRANTS[best]}",
-        )
-        (lines if errors["ours"] < errors[best] else lost).append(line)
-    text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
-    return text + "".join(f"\nsim2real loses on {what}: {ours} against {other}.\n" for what, ours, other in lost)
-
-
-def _errors(judged: Mapping[str, Any], name: str, what: str) -> dict[str, float]:
-    """Return entrant -> error on a set of the league [mrad, mm]; the published sets are one entrant, with the least."""
-    errors: dict[str, float] = {}
-    for row in judged["rows"]:
-        _, of, entrant, kind = row["name"].split("/")
-        if (of, kind) == (name, what) and row["value"] is not None:
-            entrant = entrant.partition("_")[0] if entrant.startswith("published") else entrant
-            value = (1e3 if row["unit"] == "rad" else 1.0) * row["value"]
-            errors[entrant] = min(value, errors.get(entrant, value))
-    return errors
 
 
 def what_training_knows(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
@@ -318,6 +235,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "so101_time": lambda own: run_time(own["so101_cpu"], "the run"),
         "real": real_motors,
         "league": lambda chosen: league(chosen["league"]),
+        "league_promises": lambda chosen: league_promises(chosen["league"]),
         "randomise": lambda chosen: randomise(chosen["randomise"], chosen["randomise_worn"]),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}

@@ -6,7 +6,10 @@ import re
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from sim2real.stages.estimation import promises
 
 ROOT = Path(__file__).parents[1]
 
@@ -47,7 +50,7 @@ def test_the_evidence_names_the_sets_that_are_lost(script):
     for row in worse["rows"]:
         if row["name"] == "league/go2/ours/mean":
             row["value"] = 7.0
-    assert "Unitree Go2 in the air, RMSE, mean over held-out parts | 5.8 mrad | 5.9 mrad" in text
+    assert "Unitree Go2 in the air, RMSE, mean over held-out parts | 5.8 mrad | 6.0 (11.1) | 5.9 mrad" in text
     lost = script.evidence(reports["randomise"], worse)
     assert "loses on Unitree Go2 in the air, RMSE, mean over held-out parts: 7.0 mrad against 5.9 mrad" in lost
 
@@ -90,7 +93,10 @@ def league():
         for what, value in zip(("mean", "worst", "worst_joint"), both, strict=False)
     ]
     folds = [
-        {"set": name, "fold": f"block {i}", "entrant": entrant, "seconds": 10.0 * (i + 1)}
+        {
+            **{"set": name, "fold": f"block {i}", "entrant": entrant, "seconds": 10.0 * (i + 1)},
+            **{"value": 20.0 + 10.0 * (i == 4) if name == "disk" else None, "unit": units[name]},
+        }
         for name, count in (("disk", 5), ("go2", 3), ("an_axis", 1))
         for i in range(count)
         for entrant in values[name]
@@ -100,16 +106,40 @@ def league():
 
 def test_the_league_has_a_line_a_set_in_one_unit(script, league):
     text = script.tables({"league": league})["league"]
-    assert "eccentric mass, RMSE, 5 folds [mrad] | 25.1 | 30.2 | - | 30 s | 100 | 35.0 | - | - | - | - | - |\n" in text
-    assert "Go2 in the air, RMSE, 3 folds [mrad] | 4.1 | 5.0 | - | 20 s | - | - | 123 | - | - | - | - |\n" in text
+    assert (
+        "eccentric mass, RMSE, 5 folds [mrad] | 25.1 | 30.0 (32.3) | - | 30 s | 100 | 35.0 | - | - | - | - | - |\n"
+        in text
+    )
+    assert "Go2 in the air, RMSE, 3 folds [mrad] | 4.1 | - | - | 20 s | - | - | 123 | - | - | - | - |\n" in text
     assert "XL330" not in text
-    assert "| an_axis, 1 fold [mm] | 2.0 | 2.5 | 4.0 | 10 s | - | - | - | - | - | 1.5 | 1.7 |\n" in text, "no code"
+    assert "| an_axis, 1 fold [mm] | 2.0 | - | 4.0 | 10 s | - | - | - | - | - | 1.5 | 1.7 |\n" in text, "no code"
     better = "Better than sim2real on the set an_axis: textbook servo (1.5 mm), best published set (1.7 mm).\n"
     assert text.count("Better than sim2real") == 1
     assert better in text
     assert text.endswith("Commit that was measured: `0123456` (league).\n")
     widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
     assert len(widths) == 1
+
+
+def test_a_bound_of_the_report_stands_beside_the_error_on_a_real_motor(script):
+    reports = {name: script.read_reports()[name] for name in script.TABLES["real"]}
+    bounds = {"identify_disk": {"disk/promised/th": 31.4}, "identify_so101": {"so101/promised/elbow": 12.5}}
+    for name, rows in bounds.items():
+        rest = [r for r in reports[name]["rows"] if "/promised/" not in r["name"]]
+        reports[name] = {"rows": rest + [{"name": f"identify/{n}_mrad", "value": v} for n, v in rows.items()]}
+    lines = [line.split(" | ") for line in script.real_motors(reports).splitlines()]
+    assert lines[0][2] == "promised, RMSE"
+    assert [line[2] for line in lines[2:]] == ["31 mrad", "-", "12.5 mrad", "12 mrad"]
+    assert len({len(line) for line in lines}) == 1
+
+
+def test_each_fold_of_the_league_stands_beside_the_bound_from_the_others(script, league):
+    text = script.tables({"league": league})["league_promises"]
+    bound = promises.further(np.full(4, 20.0))
+    worst, *others = [line.split(" | ") for line in text.splitlines() if "block" in line]
+    assert worst[1:] == ["block 4", f"{bound:.1f} mrad", "30.0 mrad", f"{30.0 / bound:.2f}", "yes |"]
+    assert len(others) == 4
+    assert "5 of 5 errors are below their bounds, 0 above 1.25 times the bound." in text
 
 
 def test_a_table_whose_reports_are_not_all_there_is_left_as_it_is(script):

@@ -12,6 +12,8 @@ from sim2real.artifacts.identification import HeldOut, HeldOutPart, Identificati
 from sim2real.identify.validation.verdict import Position
 from sim2real.stages.estimation import estimate, predicted_logs, promises
 from sim2real.stages.estimation.free_run import Lack
+from sim2real.stages.identify.show import show
+from sim2real.view.identification.section import _promises
 
 ANGLE = Position("th", "tilt", "rad", 0.001)
 
@@ -144,9 +146,24 @@ def test_the_ledger_is_written_and_read(tmp_path):
     assert (back.promises, back.bounds) == (doc.promises, doc.bounds)
     assert isinstance(back.promises[0], Promise)
     assert isinstance(back.bounds[0], Bound)
-    rows = back.promises_table().rows
-    assert rows[0][3] == "the held-out end"
-    assert rows[0][-1] == "broken"
+    rows = back.promises_table().records()
+    assert [rows[0][name] for name in ("predicted", "shown", "kept")] == ["the held-out end", pytest.approx(0.04), "no"]
+    assert rows[0]["promised"] == pytest.approx(promises.further(np.full(3, 0.01)))
+    assert {row["kept"] for row in rows[1:]} == {"yes"}
+
+
+def test_console_and_page_show_the_ledger_with_ratio_and_what_became_of_the_promise(capsys):
+    parts = [left("a", 0.01), left("b", 0.01), left("c", 0.022)]
+    doc = replace(with_ledger(document(parts, [0.05]), ["log"], 1), samples={}, free={})
+    show(doc)
+    end, *_ = (line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("tilt"))
+    bound = promises.further(np.array([0.01, 0.01, 0.022]))
+    assert end[-5:] == [f"{bound:.4g}", "0.05", "rad", f"{0.05 / bound:.2f}", "no"]
+    (table,) = _promises(doc)
+    assert table.columns[3:] == ["promised", "shown", "unit", "ratio", "kept"]
+    assert [(row[1], row[-1], tone) for row, tone in zip(table.rows, table.tones, strict=True)] == [
+        ("the held-out end", "no", "bad"), ("c", "within 1.25", "doubt"), ("a", "yes", "good"), ("b", "yes", "good"),
+    ]  # fmt: skip
 
 
 SLOW = {"'th' of 'sensor'": (-1.0, 1.0), "the speed of 'th' of 'sensor'": (-2.0, 3.0)}

@@ -53,7 +53,9 @@ def test_a_free_run_that_breaks_its_promise_does_not_hold(capsys):
     assert (row["free run"], row["promised, free run"], row["over_promised"]) == (0.031, 0.02, pytest.approx(1.55))
     beyond = ["'position' of 'sensor' reaches [-2, 2], fitted was [-1, 1]"]
     show({**RESULT, "positions": {"elbow": row}, "ledger": rows, "promise_kept": False, "beyond": beyond})
-    err = capsys.readouterr().err
+    out, err = capsys.readouterr()
+    rows = [line.split()[-5:] for line in out.splitlines() if "b.mcap" in line]
+    assert rows == [["0.02", "0.031", "rad", "1.55", "no"], ["0.02", "0.004", "rad", "0.20", "yes"]]
     assert "elbow is off by 0.031 rad in a free run of 20 s on b.mcap; promised was 0.02 rad: 1.55 times" in err
     assert "beyond the fitted data, so bounds are wider" in err
     assert "holds on this log" not in err

@@ -27,6 +27,8 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation import prediction
 from sim2real.stages.config import IdentifyConfig
+from sim2real.stages.estimation import held_out_parts, promises
+from sim2real.stages.estimation.predicted_logs import LEAST_PARTS
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SETTLE_S = 0.3
@@ -92,8 +94,24 @@ def fit_and_judge(
         label = f"/seed_{seed}" if len(seeds) > 1 else ""
         goal = "< 60" if case.name == "disk" else ""
         rows.append(row(f"{case.name}/fit_s{label}", time.monotonic() - begin, "s", goal=goal))
+    rows += promised_rows(case, fits[0], list(fitted))
     results = [predict(case, {"identified": f.values}, test) for f in fits]
     return fits, rows + error_rows(case, fits[0], results, test, seeds)
+
+
+def promised_rows(case: Case, first: Fit, names: Sequence[str]) -> list[Row]:
+    """Return the bound on the RMSE of each position in later free runs, from fits without one part of the recordings.
+
+    The bound is computed before the test part is predicted.
+    """
+    parts, rows = held_out_parts.examined(first, case.config, names), []
+    for channel, field in zip(case.model.channels, case.fields, strict=True):
+        errors = np.array([e for part in parts if (e := part.free.get(field)) is not None and np.isfinite(e)])
+        if errors.size >= LEAST_PARTS:
+            about = f"95 % of later free runs, from {errors.size} held-out parts"
+            name = f"{case.name.removesuffix('_log')}/promised/{channel.name or field}_mrad"
+            rows.append(row(name, 1e3 * promises.further(errors), "mrad", about))
+    return rows
 
 
 def make_case(options: argparse.Namespace) -> Case:

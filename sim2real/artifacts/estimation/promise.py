@@ -76,6 +76,20 @@ class Promise:
         """Whether the error exceeds its bound by more than ``MAX_ERROR_RATIO``."""
         return self.ratio is not None and self.ratio > MAX_ERROR_RATIO
 
+    @property
+    def kept(self) -> str:
+        """Whether the promise is kept, as text; an error above its bound by less is ``within`` the ratio."""
+        if self.ratio is None:
+            return "none was made"
+        return "no" if self.broken else "yes" if self.ratio <= 1.0 else f"within {MAX_ERROR_RATIO:g}"
+
+    @property
+    def horizon(self) -> str:
+        """How far the prediction reaches, as text."""
+        if not self.seconds:
+            return self.reach
+        return f"{self.seconds:.3g} s ahead" if self.reach == AHEAD else f"free run of {self.seconds:.3g} s"
+
     def sentence(self) -> str:
         """Return the error and its bound as text."""
         unit, where = f" {self.unit}".rstrip(), self.source
@@ -88,11 +102,10 @@ class Promise:
 
 
 def promises_table(rows: Sequence[Promise]) -> ArtifactTable:
-    """Return a row for each error and its bound, the largest ratio first."""
-    ordered = sorted(rows, key=lambda row: -(row.ratio or 0.0))
-    cells = [
-        [r.name, r.reach, r.seconds or None, r.source, r.error, r.bound, r.unit, "broken" if r.broken else "kept"]
-        for r in ordered
-        if r.bound is not None
-    ]
-    return ArtifactTable(("position", "reach", "s", "predicted", "off", "promised", "unit", "promise"), cells)
+    """Return a row for each error with a bound, the largest ratio first."""
+    cells = []
+    for r in sorted(rows, key=lambda row: -(row.ratio or 0.0)):
+        if r.ratio is not None:
+            error = math.inf if r.error is None else r.error
+            cells.append([r.name, r.source, r.horizon, r.bound, error, r.unit, f"{r.ratio:.2f}", r.kept])
+    return ArtifactTable(("position", "predicted", "horizon", "promised", "shown", "unit", "ratio", "kept"), cells)

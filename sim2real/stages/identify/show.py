@@ -19,6 +19,8 @@ def show(identification: Identification) -> None:
         print(artifact_table(identification.alternatives_table()))
     if identification.held_out:
         print(artifact_table(identification.held_out_table().without("no better than")))
+    if (promises := identification.promises_table()).rows:
+        print(artifact_table(promises))
     if identification.links:
         print(artifact_table(links_table(identification.links)))
     note(f"verdict: {identification.verdict.status}")

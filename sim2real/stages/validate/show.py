@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from sim2real.artifacts.estimation.promise import FREE_RUN, MAX_ERROR_RATIO
+from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO, promises_table
 from sim2real.stages.estimation.promises import broken_sentences
-from sim2real.stages.terminal.console import note, table
+from sim2real.stages.terminal.console import artifact_table, note, table
 from sim2real.stages.validate.result import ACCEPTED
 from sim2real.types import Json
 
@@ -14,11 +14,10 @@ from sim2real.types import Json
 def show(result: Mapping[str, Json]) -> None:
     """Print the errors as a table, then the verdict."""
     models = list(dict.fromkeys(m for row in result["positions"].values() for m in row["rmse"]))
-    cells = [
-        [n, *(row["rmse"].get(m) for m in models), row["promised"], row[FREE_RUN], row[_PROMISED], row["unit"]]
-        for n, row in result["positions"].items()
-    ]
-    print(table(cells, [f"off {result['horizon_s']:g} s ahead", *models, "promised", FREE_RUN, _PROMISED, "unit"]))
+    cells = [[n, *(row["rmse"].get(m) for m in models), row["unit"]] for n, row in result["positions"].items()]
+    print(table(cells, [f"off {result['horizon_s']:g} s ahead", *models, "unit"]))
+    if (promises := promises_table(result["ledger"])).rows:
+        print(artifact_table(promises))
     print(
         f"all positions: {result['rmse']:.4g} {result['horizon_s']:g} s ahead, "
         f"{result['free_run_rmse']:.4g} in free runs"
@@ -46,6 +45,3 @@ def show(result: Mapping[str, Json]) -> None:
         note("verdict: holds on this log")
     if result["identified"] != ACCEPTED:
         note(f"the identification itself was not accepted: {result['identified']}: {'; '.join(result['why'][:1])}")
-
-
-_PROMISED = f"promised, {FREE_RUN}"

@@ -42,7 +42,8 @@ def run(config: ValidateConfig) -> bool:
     result = score(identification, pipeline, logs, config)
     result = {"parameters": shown(config.parameters), "logs": list(config.log), **result}
     if config.json:
-        print(json.dumps(plain(result), indent=1))
+        ledger = [{**plain(row), "ratio": plain(row.ratio), "kept": row.kept} for row in result["ledger"]]
+        print(json.dumps({**plain(result), "ledger": ledger}, indent=1))
     else:
         show(result)
     return bool(result["better"])

@@ -43,6 +43,9 @@ _TITLES: dict[str, tuple[Tone, str]] = {
     "promise broken": ("doubt", "Promise broken: an error on held-out data is above its bound"),
     "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
 }
+_KEPT: dict[str, Tone] = {"yes": "good", "no": "bad"}
+_MOST_PROMISES = 12
+"""Rows of the ledger that are not folded."""
 _STRONG = 0.9
 """Correlations above this are listed."""
 _NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower", "upper", "truth")
@@ -55,6 +58,7 @@ def identify_section(artifact: StageFolder) -> PageSection:
     # Order the blocks from the results to the details.
     blocks = [
         *_joints(result),
+        *_promises(result),
         *_parameters(result),
         *_aggregate(result),
         *_parts(result),
@@ -96,6 +100,16 @@ def _joints(result: Identification) -> list[Block]:
         return []
     tones: list[Tone] = ["bad" if r.errors.beaten_by else "doubt" if r.doubts else "good" for r in rows]
     return [replace(TableBlock.of("Joints, the worst first", joints_table(result)), tones=tones)]
+
+
+def _promises(result: Identification) -> list[Block]:
+    """Return the ledger, the largest ratios first; further rows are folded."""
+    table = TableBlock.of("Promises: each error on held-out parts beside the bound before it", result.promises_table())
+    tones = [_KEPT.get(row[-1], "doubt") for row in table.rows]
+    first = replace(table, rows=table.rows[:_MOST_PROMISES], tones=tones[:_MOST_PROMISES])
+    more = replace(table, rows=table.rows[_MOST_PROMISES:], tones=tones[_MOST_PROMISES:], folded=True)
+    more = replace(more, caption=f"Promises with smaller ratios ({len(more.rows)})")
+    return [block for block in (first, more) if block.rows]
 
 
 def _parameters(result: Identification) -> list[Block]:
@@ -223,7 +237,7 @@ def _parts(result: Identification) -> list[Block]:
         table.append([name, *([terms] if with_terms else []), *(number(e, 3) for e in values)])
     caption = "Root mean square errors on each held-out part, of a fit without it"
     columns = ["held-out part", *(["terms"] if with_terms else []), *heads]
-    return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,))]
+    return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,), folded=True)]
 
 
 def _alternatives(result: Identification) -> list[Block]:
