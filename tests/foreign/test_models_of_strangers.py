@@ -17,6 +17,7 @@ from sim2real.robots.from_model import model_file
 from sim2real.robots.from_model.mjcf import driven, read_model
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.from_model.usual_parameters import usual_terms
 from sim2real.stages.import_logs import stage as import_logs_stage
 from sim2real.stages.pipeline import from_model
 
@@ -226,7 +227,7 @@ def test_models_within_the_budget_are_read(tmp_path, text):
 
 def test_a_name_with_a_line_break_matches_a_pattern(tmp_path):
     (tmp_path / "robot.xml").write_text(model(joint="a&#10;[[terms]]"))
-    config = RobotConfig(tmp_path / "robot.xml", ("a\n[[terms]]",), ("goal",), terms=from_model.usual_terms(("goal",)))
+    config = RobotConfig(tmp_path / "robot.xml", ("a\n[[terms]]",), ("goal",), terms=usual_terms(("goal",)))
     assert len(MjcfRobot(config).dynamics()) == 4
 
 

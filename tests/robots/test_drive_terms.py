@@ -27,7 +27,8 @@ from sim2real.robots.from_model.mjcf_parameters import (
     optional,
     tilted,
 )  # fmt: skip
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig, usual_terms
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.from_model.usual_parameters import usual_terms
 from sim2real.stages.estimation import held_out_parts
 from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
 

@@ -11,7 +11,8 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.robots.from_model.mjcf import driven, gains_of, joints_of, limit_of, read_model
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern, expand, place
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig, usual_terms
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.from_model.usual_parameters import usual_terms
 from sim2real.worlds.driven import DriveCommand
 
 XML = """<mujoco>

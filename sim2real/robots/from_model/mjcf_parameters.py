@@ -206,6 +206,9 @@ def expand(
 ) -> list[Placed]:
     """Return the parameters of a model."""
     placed: list[Placed] = []
+    # Without a damping of the drive, the joint's damping includes that of the file's servo.
+    quantities = {term.what for term in terms}
+    whole_damping = "kp" in quantities and "kd" not in quantities
     for term in terms:
         # The joints or bodies that match the pattern.
         names = [model.body(i).name for i in range(1, model.nbody)] if term.what == "payload" else list(joints)
@@ -224,7 +227,7 @@ def expand(
         else:
             groups = [(part, term.label() + suffix) for part, suffix in _by_unit(term.what, at, names, sliding)]
         for group, name in groups:
-            nominal = _nominal(term, [names[i] for i in group], file_model)
+            nominal = _nominal(term, [names[i] for i in group], file_model, whole_damping)
             unit = unit_for(_ABOUT[term.what][0], term.what not in WHOLE and names[group[0]] in sliding)
             p = replace(_parameter(term, name, nominal, _size(term, [names[i] for i in group], file_model)), unit=unit)
             placed.append(Placed(p, term.what, tuple(i + offset for i in group)))
@@ -354,8 +357,12 @@ def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: floa
     )  # fmt: skip
 
 
-def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel) -> float:
-    """Return the nominal value: the median of the joints' values in the file."""
+def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel, whole_damping: bool = False) -> float:
+    """Return the nominal value: the median of the joints' values in the file.
+
+    Args:
+        whole_damping: Whether a joint's damping includes that of the file's servo.
+    """
     if term.nominal is not None:
         return term.nominal
     if term.what == "gravcomp" and np.any(file_model.body_gravcomp > 0.0):
@@ -368,7 +375,9 @@ def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel) 
     values: list[float] = []
     for name in names:
         if term.what in ON_DOF:
-            values.append(float(getattr(file_model, ON_DOF[term.what])[file_model.joint(name).dofadr[0]]))
+            value = float(getattr(file_model, ON_DOF[term.what])[file_model.joint(name).dofadr[0]])
+            gains = gains_of(file_model, name) if whole_damping and term.what == "damping" else None
+            values.append(value + (gains[1] if gains else 0.0))
         elif term.what in ("kp", "kd") and (gains := gains_of(file_model, name)):
             values.append(gains[term.what == "kd"])
         elif term.what == "torque" and (limit := limit_of(file_model, name)):

@@ -371,27 +371,3 @@ class IdentifiableMjcf(IdentifiableRecording):
             "world": self._world.started(world, angle, speed),
             "sensor": EncoderParams(world.zero, world.terms),
         }
-
-
-def usual_terms(commands: Sequence[str], physical: bool = False) -> tuple[ParameterPattern, ...]:
-    """Return the default parameters to identify.
-
-    Stiffness or gain, damping and inertia are one value for all joints, dry friction is each joint's own. The drive's
-    damping and the joint's can be separated only where torque is switched off or the log has gains of its own: else
-    there is one.
-
-    Args:
-        commands: Fields of the log that drive.
-        physical: Whether the log's own gains are in N m/rad and N m s/rad: then factors of them are identified.
-    """
-    if "goal" in commands:
-        factor: dict[str, PyTree] = {"nominal": 1.0, "low": 0.3, "high": 3.0} if physical else {}
-        first: tuple[ParameterPattern, ...] = (
-            ParameterPattern("kp", **factor),
-            *([ParameterPattern("kd", **factor)] if physical else []),
-        )
-        first += (ParameterPattern("kd"),) if "enabled" in commands and not physical else ()
-    else:
-        first = (ParameterPattern("kd"),) if "goal_velocity" in commands else (ParameterPattern("gain"),)
-    rest = () if "goal_velocity" in commands and "goal" not in commands else (ParameterPattern("damping"),)
-    return (*first, *rest, ParameterPattern("armature"), ParameterPattern("frictionloss", each=True))

@@ -20,8 +20,8 @@ from sim2real.log.importing.proposal import pipeline_name
 from sim2real.log.reader import read_log
 from sim2real.robots.from_model import model_file
 from sim2real.robots.from_model.mjcf import joints_of, read_model, read_spec
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig, usual_terms
+from sim2real.robots.from_model.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig
+from sim2real.robots.from_model.usual_parameters import named_terms, usual_terms
 from sim2real.stages.import_logs import stage as import_logs_stage
 from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
 from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY, RobotFlags
@@ -219,7 +219,6 @@ def describe(
         step_s: Time step of the simulation [s].
         physical: Whether the gains are those of a torque loop, in SI units.
     """
-    named = tuple(ParameterPattern.parse(p) for p in flags.parameter)
     return RobotConfig(
         Path(str(flags.mjcf)),
         tuple(joints),
@@ -230,5 +229,6 @@ def describe(
         fix_base=flags.fix_base,
         contacts=flags.contacts,
         hold=flags.hold,
-        terms=named or usual_terms(commands, physical=physical),
+        terms=named_terms(flags.parameter)
+        or usual_terms(commands, physical, read_model(Path(str(flags.mjcf))), joints),
     )
