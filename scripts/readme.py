@@ -134,7 +134,7 @@ def randomise(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> str:
         worn: That of robots that are not.
     """
     count, trials = len(ideal["robots"]), ideal["flags"]["trials"]
-    lines = [
+    lines: list[tuple[str, ...]] = [
         (f"trained on, {count} hidden robots with {trials} deployments each", "nearly ideal", "95 %", "worn", "95 %"),
         ("---", "---:", "---:", "---:", "---:"),
     ]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.estimation.promise import FREE_RUN, Promise, promises_table
+from sim2real.artifacts.estimation.promise import FREE_RUN, Promise
 from sim2real.stages.estimation.predicted_logs import LEAST_PARTS
 from sim2real.stages.estimation.promises import further
 
@@ -63,10 +63,14 @@ def league_promises(report: Mapping[str, Any]) -> str:
     rows = [row for name in _sets(report) for row in promises(report, name)]
     kept = [sum(row.kept == how for row in rows) for how in ("yes", "no")]
     bounded = sum(row.bound is not None for row in rows)
-    lines = [("held out", "part", "promised", "shown", "ratio", "kept"), ("---", "---", *["---:"] * 3, "---")]
-    for row in promises_table(rows).records():
-        sizes = (f"{_short(row[what])} {row['unit']}" for what in ("promised", "shown"))
-        lines.append((str(row["position"]), str(row["predicted"]), *sizes, str(row["ratio"]), str(row["kept"])))
+    lines: list[tuple[str, ...]] = [
+        ("held out", "part", "promised", "shown", "ratio", "kept"),
+        ("---", "---", *["---:"] * 3, "---"),
+    ]
+    for row in sorted(rows, key=lambda row: -(row.ratio or 0.0)):
+        if row.ratio is not None:
+            sizes = (f"{_short(size)} {row.unit}" for size in (row.bound, row.error))
+            lines.append((row.name, row.source, *sizes, f"{row.ratio:.2f}", row.kept))
     text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
     return f"{text}\n{kept[0]} of {bounded} errors are below their bounds, {kept[1]} above 1.25 times the bound.\n"
 

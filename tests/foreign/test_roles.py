@@ -9,6 +9,8 @@ from mcap_ros2.writer import Writer
 
 from sim2real.errors import UsageError
 from sim2real.log.importing import evidence
+from sim2real.stages.check.config import CheckConfig
+from sim2real.stages.check.stage import check
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
@@ -157,3 +159,60 @@ def test_a_mapping_with_a_gain_of_zero_describes_a_robot_without_it(tmp_path, mo
     )
     told = RobotFlags(mjcf=Path("robot.xml"), mapping=Path("map.toml"))
     assert from_model.from_flags(told, ["run.npz"]).description.commands == ("goal",)
+
+
+SECOND = {
+    "a command in degrees": (
+        lambda g, q: {"goal": g, "q": q, "target_deg": np.degrees(g)},
+        "commands that are not imported: goal (instead: target_deg)",
+    ),
+    "a voltage beside a goal": (
+        lambda g, q: {"goal_a": g[:, 0], "goal_b": g[:, 1], "q_a": q[:, 0], "q_b": q[:, 1], "cmd_pwm_a": g[:, 0]},
+        "commands that are not imported: cmd_pwm_a (joint a has goal_a)",
+    ),
+    "a second encoder": (
+        lambda g, q: {"goal_rad": g, "q_rad": q, "encoder": q + 0.1},
+        "measurements that are not imported: encoder (instead: q_rad)",
+    ),
+    "an encoder of one joint": (
+        lambda g, q: {"goal_rad": g, "q_rad": q, "motor_angle": q[:, :1]},
+        "measurements that are not imported: motor_angle (instead: q_rad)",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SECOND)
+def test_a_second_command_or_measurement_of_a_joint_is_named(tmp_path, recorded, case):
+    columns, note = SECOND[case]
+    t, goal, q = recorded
+    np.savez(tmp_path / "run.npz", t_s=t, **columns(goal, q))
+    assert note in imported(tmp_path / "run.npz")[1].evidence
+
+
+def test_a_log_whose_columns_are_all_imported_has_no_such_note(tmp_path, recorded):
+    t, goal, q = recorded
+    more = {"dq_des": np.gradient(goal, t, axis=0), "tau_cmd": goal, "dq": np.gradient(q, t, axis=0), "effort": q}
+    np.savez(tmp_path / "run.npz", t_s=t, goal=goal, q=q, **more)
+    assert not any(
+        "not imported" in line or "no command" in line for line in imported(tmp_path / "run.npz")[1].evidence
+    )
+
+
+@pytest.mark.parametrize(("name", "doubtful"), [("effort", True), ("tau", True), ("cmd_torque", False)])
+def test_import_and_check_name_a_measured_torque_that_is_taken_as_the_command(tmp_path, recorded, name, doubtful):
+    t, goal, q = recorded
+    (tmp_path / "robot.xml").write_text(XML)
+    np.savez(log := tmp_path / "run.npz", t_s=t, q_rad=q, **{name: goal})
+    evidence_lines = imported(log)[1].evidence
+    pipeline = from_model.from_flags(RobotFlags(mjcf=tmp_path / "robot.xml"), [str(log)])
+    assert pipeline.description.commands == ("torque",)
+    recommendation = check(pipeline, None, CheckConfig(record=pipeline.record, log=(str(log),))).recommendation
+    for lines in (evidence_lines, recommendation):
+        assert any(f"'{name}' is taken as the commanded torque" in line for line in lines) == doubtful
+
+
+def test_a_torque_that_is_measured_by_its_name_is_no_command(tmp_path, recorded):
+    t, goal, q = recorded
+    np.savez(tmp_path / "run.npz", t_s=t, q_rad=q, measured_effort=goal)
+    with pytest.raises(UsageError, match=r"A measured torque is no command: 'measured_effort'"):
+        imported(tmp_path / "run.npz")

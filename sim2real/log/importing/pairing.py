@@ -68,13 +68,7 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None, joint
             )
     if measured is not None and command is not None:
         names = f"{measured.name!r} is measured and {command.name!r} commanded, by their names"
-        chosen = measured, command
-        others = [s.name for group in (positions, goals or commands) for s in group if all(s is not c for c in chosen)]
-        notes = (
-            names,
-            *([f"other positions and commands are skipped: {', '.join(others[:_MAX_LISTED])}"] if others else []),
-        )
-        return Pair(measured, command, _kind(command), notes)
+        return Pair(measured, command, _kind(command), (names,))
     unnamed = [s for s in series if s.meaning == Meaning(label=s.meaning.label) and s is not measured and _moves(s)]
     if measured is None and command is None:
         return _by_data(_together(unnamed), path, rate_hz, signals)
@@ -89,8 +83,10 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None, joint
         named = [s for s in series if s.meaning.quantity in ("torque", "duty") and s.meaning.side == ""]
         other = _one(named, side, path) if measured is not None else None
     if other is None:
+        torques = [s for s in series if (s.meaning.side, s.meaning.quantity) == ("measured", "torque")]
+        no_command = f". A measured torque is no command: {_names(torques)}" if torques and side == "command" else ""
         raise UsageError(
-            f"no signal of {path} is a {side} by its name or by the data. Available: {_names(signals)}",
+            f"no signal of {path} is a {side} by its name or by the data{no_command}. Available: {_names(signals)}",
             hint="write quantity and side into the names of columns, as in q_rad and goal_rad, or write a mapping",
         )
     r, _ = _link(other, named_signal, signals, path, rate_hz)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +18,8 @@ from sim2real.log.importing.mapping import FieldMapping, ImportMapping, NodeMapp
 from sim2real.log.importing.pairing import Pair, find_pair
 from sim2real.log.importing.plausibility import TURN_RAD
 from sim2real.log.importing.positions import CheckedPositions, checked_positions, turned_commands
-from sim2real.log.importing.quantities import ImportHints, clean, extras, field_of, matched, taken, velocity_of
-from sim2real.log.importing.signal_names import meaning, same_joint
+from sim2real.log.importing.quantities import ImportHints, clean, extras, field_of, matched, taken, unused, velocity_of
+from sim2real.log.importing.signal_names import about_torque, meaning, same_joint
 from sim2real.log.importing.signals import Signal, Stamps, collect, find_stamps
 
 _FIELDS = {"position": "goal", "velocity": "goal_velocity", "torque": "torque", "duty": "duty", "voltage": "duty"}
@@ -90,7 +90,9 @@ def propose(file: ForeignFile, hints: ImportHints) -> Proposal:
     ):  # fmt: skip
         nodes[name], policy = _node(name, fields, at, lacks, offset, leapt)
         notes += policy
+    notes += about_torque({name: asdict(node) for name, node in nodes.items()})
     notes += [*on_velocity, *others, *unread, *file.notes]
+    notes += unused(signals, nodes.values(), notes)
     return Proposal(ImportMapping(hints.pipeline, nodes), labels, tuple(notes))
 
 
@@ -144,7 +146,7 @@ def _commanded(
         if not pair.kind:
             refuse_rates(command.values[rows[1]], measured.values[rows[0]], clocks, rows, command.name, path)
         unit = {"velocity": "rad/s", "torque": "N m"}.get(kind, "")
-        notes = f"its name decides, as no position follows it (|r| at most {np.abs(relation.r).max():.2f})"
+        notes = f"by its name; the largest correlation with a position is {np.abs(relation.r).max():.2f}"
         fields = {_FIELDS[kind]: field_of(command, unit, [1.0] * command.width)}
         return command, fields, [f"{command.name!r} commands {kind}: {notes}"]
     command, scales, more = goal(measured, command, relation, checked.to_rad, path, hints.as_told)

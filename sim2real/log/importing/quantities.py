@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from sim2real.errors import UsageError
 from sim2real.log.importing import evidence
 from sim2real.log.importing.command_response import following
 from sim2real.log.importing.evidence import SURE
-from sim2real.log.importing.mapping import FieldMapping
+from sim2real.log.importing.mapping import FieldMapping, NodeMapping
 from sim2real.log.importing.signals import Signal
 
 _EXTRA = {
@@ -22,6 +22,8 @@ _EXTRA = {
     "torque": ("torque", "command", "N m"),
 }
 """Commands beside a goal: field -> quantity, side or None for any, and unit."""
+_MOTION, _OTHER_COMMANDS = ("position", "velocity"), ("torque", "duty", "voltage", "kp", "kd")
+_MAX_LISTED = 20
 _GAINS = ("kp", "kd", "enabled")
 """Factors of a drive: one that is 0 throughout contradicts a position that follows its goal."""
 
@@ -70,6 +72,43 @@ def matched(signal: Signal, measured: Signal, places: np.ndarray) -> Signal:
     if all(labels) and set(labels) <= set(signal.labels):
         return taken(signal, np.array([signal.labels.index(label) for label in labels]))
     return taken(signal, places)
+
+
+def unused(signals: Sequence[Signal], nodes: Iterable[NodeMapping], notes: Sequence[str]) -> list[str]:
+    """Return notes on columns of commands, and of measured positions and velocities, that no field of a node takes.
+
+    Args:
+        notes: Sentences so far; a column that they name needs no further one.
+    """
+    sources = {source for node in nodes for field in node.fields.values() for source in field.source}
+    taken_names: dict[tuple[str, str], str] = {}
+    left: dict[str, list[tuple[str, str]]] = {"commands": [], "measurements": []}
+    # Distribute the columns: those that a field takes, and those that no field takes.
+    for signal in signals:
+        side = "commands" if signal.meaning.side == "command" else "measurements"
+        known = _MOTION + (_OTHER_COMMANDS if side == "commands" else ())
+        if signal.meaning.quantity not in known and not (signal.meaning.side and not signal.meaning.quantity):
+            continue
+        columns = list(zip(signal.sources, signal.labels, strict=True))
+        in_use = [signal.whole in sources or source in sources for source, _ in columns]
+        taken_names |= {
+            (side, label): signal.whole or source for (source, label), used in zip(columns, in_use, strict=True) if used
+        }
+        if not any(f"'{signal.name}'" in note or f" {signal.sources[0]}" in note for note in notes):
+            whole = [(signal.whole, signal.labels[0])] if signal.whole and not any(in_use) else None
+            left[side] += whole or [column for column, used in zip(columns, in_use, strict=True) if not used]
+    # Name the column of the same joint that is taken instead.
+    texts = []
+    for side, columns in left.items():
+        names = [
+            f"{name} ({f'joint {label} has ' if label else 'instead: '}{taken_names[side, label]})"
+            if (side, label) in taken_names
+            else name
+            for name, label in columns
+        ]
+        more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
+        texts += [f"{side} that are not imported: {', '.join(names[:_MAX_LISTED])}{more}"] if names else []
+    return texts
 
 
 def clean(t_s: np.ndarray, signal: Signal) -> np.ndarray:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+
+from sim2real.types import Json
 
 _SIDES = {
     "command": (
@@ -118,6 +121,24 @@ def _side(name: str) -> str:
         if strong:
             return _SIDE[strong[0]]
     return ""
+
+
+def about_torque(mapping: Mapping[str, Mapping[str, Json]]) -> list[str]:
+    """Return a sentence if a log's commanded torque has a name that does not mark a command.
+
+    Args:
+        mapping: Node -> its mapping, as in the metadata of an imported log.
+    """
+    fields = [node["fields"].get("torque") for node in mapping.values()]
+    sources = [name for field in fields if field for name in field["source"] if meaning(name).side != "command"]
+    if not sources:
+        return []
+    listed = ", ".join(f"'{name}'" for name in sources[:3]) + (" ..." if len(sources) > 3 else "")
+    return [
+        f"{listed} is taken as the commanded torque, although its name does not mark a command: a measured joint "
+        "torque is no command, as the robot's controller makes it from goals that the model then lacks; import the "
+        "goals, or name a commanded torque cmd_torque"
+    ]
 
 
 def same_joint(label: str, joint: str) -> bool:

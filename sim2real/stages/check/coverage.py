@@ -13,12 +13,13 @@ from sim2real.graph.node import TICKS_PER_S
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.uncertainty import recording_coverage
 from sim2real.identify.validation.prediction import position_of
+from sim2real.log.importing.signal_names import about_torque
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
 
 
 def coverage(episode: Episode, model: IdentifiableModel, units: Mapping[str, str]) -> dict[str, Json]:
-    """Return the sampling, the joints and the commands of a recording, as JSON.
+    """Return the sampling, the joints and the commands of a recording, and doubts about its torque, as JSON.
 
     Args:
         model: Names the nodes and fields that are compared.
@@ -29,6 +30,7 @@ def coverage(episode: Episode, model: IdentifiableModel, units: Mapping[str, str
         "sampling": asdict(recording_coverage.sampling(begun_s)),
         "joints": _joints(episode, model, units, begun_s),
         "commands": _commands(episode, model, units),
+        "about_torque": about_torque(episode.metadata.get("mapping") or {}),
     }
 
 

@@ -108,6 +108,7 @@ def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
         if j["position"]["covered"] < _COVERED:
             share = j["position"]["covered"]
             yield f"{which}{j['name']} stays in {share:.0%} of its range: vary the level of the excitation"
+    yield from (f"{which}{sentence}" for sentence in recording["about_torque"])
     if recording["commands"] and all(c["low_hz"] is None for c in recording["commands"]):
         yield f"{which}no command changes: gains and delays of the actuator are not determined"
 
