@@ -20,7 +20,10 @@ class PPOConfig:
     num_seeds: int = 1
     """Number of policies that are trained in parallel with different random numbers; the best one is saved."""
     num_envs: int = 256
-    """Number of copies of the environment per seed; in an evaluation each plays one episode."""
+    """Number of copies of the environment per seed."""
+    eval_envs: int | None = None
+    """Number of copies that play one episode each in an evaluation; default: num_envs, which needs no further
+    compilation. With thousands of copies on a GPU, 256 save most of the evaluations' time."""
     rollout_steps: int = 32
     """Number of rows (environment steps) that each copy plays between two updates."""
     total_steps: int = 1_000_000
@@ -28,6 +31,9 @@ class PPOConfig:
     target: float | None = None
     """Success, 0 to 1, at which training ends: at the first evaluation in which the best seed reaches it; default:
     train to the end."""
+    minutes: float | None = None
+    """Time after which training ends, compilation included: at the first evaluation behind it [min]; default: no limit.
+    The schedule of the step size stays that of total_steps."""
     epochs: int = 4
     """Number of passes over the rows of a rollout in one update."""
     minibatches: int = 32
@@ -100,6 +106,10 @@ class PPOConfig:
             raise UsageError(f"schedule must be 'linear' or 'adaptive', got {self.schedule!r}")
         if self.target is not None and not 0 < self.target <= 1:
             raise UsageError(f"target must lie in (0, 1], got {self.target}", hint="it is a share of success")
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
+            raise UsageError(f"minutes must be above 0, got {self.minutes}", hint="the budget of a training [min]")
+        if self.eval_envs is not None and not 1 <= self.eval_envs <= self.num_envs:
+            raise UsageError(f"eval_envs must lie in 1 to num_envs={self.num_envs}, got {self.eval_envs}")
         for name in ("entropy_coef", "value_coef"):
             if getattr(self, name) < 0:
                 raise UsageError(f"{name} must be at least 0, got {getattr(self, name)}")

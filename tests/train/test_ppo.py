@@ -171,6 +171,9 @@ def test_a_broken_environment_is_refused_before_compiling(env, message):
         ({"schedule": "cosine"}, "schedule must be 'linear' or 'adaptive'"),
         ({"target_kl": 0.0}, "target_kl must be above 0"),
         ({"target": 95.0}, r"target must lie in \(0, 1\], got 95"),
+        ({"minutes": 0.0}, "minutes must be above 0, got 0"),
+        ({"eval_envs": 65}, "eval_envs must lie in 1 to num_envs=64, got 65"),
+        ({"eval_envs": 0}, "eval_envs must lie in 1 to num_envs=64, got 0"),
     ],
 )
 def test_impossible_settings_are_refused(change, message):
@@ -197,6 +200,33 @@ def test_training_ends_where_the_best_seed_reaches_the_target(bandit):
     found = train(Bandit(), dataclasses.replace(config, target=0.5), jax.random.key(0))
     assert found.env_steps.tolist() == full.env_steps[: at + 1].tolist()
     np.testing.assert_array_equal(found.history["success"], full.history["success"][: at + 1])
+
+
+def test_training_ends_at_the_first_evaluation_behind_its_time():
+    found = train(Bandit(), dataclasses.replace(SMALL, minutes=1e-6), jax.random.key(0))
+    assert len(found.env_steps) == 1
+
+
+def test_evaluations_of_few_copies_judge_the_same_policies(bandit):
+    full, _, config = bandit
+    found = train(Bandit(), dataclasses.replace(config, eval_envs=16), jax.random.key(0))
+    # The training is the same; each evaluation plays 16 episodes, so its success is a multiple of 1/16.
+    np.testing.assert_array_equal(found.policies.log_std, full.policies.log_std)
+    np.testing.assert_array_equal(found.history["policy_loss"], full.history["policy_loss"])
+    assert np.allclose(found.history["success"] * 16 % 1, 0.0)
+    assert found.history["success"][-1].min() > 0.9
+
+
+def test_a_caller_that_ends_the_training_keeps_the_best_policy():
+    kept = []
+
+    def stop(progress):
+        kept.append(progress.best)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(Bandit(), SMALL, jax.random.key(0), stop)
+    assert kept[0].get_action(jnp.zeros(2)).shape == (2,)
 
 
 def test_a_target_without_a_success_is_refused():

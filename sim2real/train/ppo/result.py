@@ -18,6 +18,7 @@ class Progress:
         env_steps: Number of rows so far, per seed.
         elapsed_s: Time that training took so far, compilation included [s].
         values: Name -> shape ``(num_seeds,)``: ``return``, the environment's metrics, losses.
+        best: The best policy so far, see ``TrainResult``; None in checkpoints, which hold it once.
     """
 
     evaluation: int
@@ -25,6 +26,7 @@ class Progress:
     env_steps: int
     elapsed_s: float
     values: dict[str, np.ndarray]
+    best: Policy | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +40,7 @@ class TrainResult:
         members: Swept settings of each place on the seed axis, empty without a sweep; all seeds of the first settings
             come first.
         history: Name -> shape ``(evaluations, num_seeds)``: the values of ``Progress``; shorter than
-            ``config.evaluations`` if the target was reached.
+            ``config.evaluations`` if training ended earlier: at the target, or after ``config.minutes``.
         env_steps: Shape ``(evaluations,)``: number of rows per seed at each evaluation.
         elapsed_s: Shape ``(evaluations,)``: time that training took so far [s].
         observations: Shape ``(N, O)``: the copies' last observations, of the best policy's place on the seed axis.

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.runtime.program_arguments import data_of, with_data
 from sim2real.train.config import PPOConfig as PPOConfig
 from sim2real.train.environment.protocol import TrainingEnvironment, check_environment, get_width
@@ -26,7 +28,16 @@ from sim2real.train.ppo.initial_state import make_initial_state, make_networks, 
 from sim2real.train.ppo.result import Progress as Progress
 from sim2real.train.ppo.result import TrainResult as TrainResult
 from sim2real.train.ppo.result import find_best, history_of
-from sim2real.train.ppo.rollout import Copies, PolicyEvaluation, add_rows, averages, choose, collect, new_evaluation
+from sim2real.train.ppo.rollout import (
+    Copies,
+    PolicyEvaluation,
+    add_rows,
+    averages,
+    choose,
+    collect,
+    evaluate,
+    new_evaluation,
+)
 from sim2real.train.ppo.teacher import TeacherEnvironment
 from sim2real.train.ppo.update import TrainState, keys, make_policy, update
 from sim2real.train.scale.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
@@ -59,8 +70,9 @@ def train(
 
     Args:
         key: From ``jax.random.key`` or ``PRNGKey``; seed i depends on it and on i alone.
-        on_progress: Called after every evaluation, those before a resumption too; an exception that it raises ends the
-            training.
+        on_progress: Called after every evaluation, those before a resumption too. Each ``Progress`` of this process
+            has the best policy so far, so that a caller that raises an exception, which ends the training, loses
+            nothing.
         checkpoint: File that receives the whole training after each evaluation. Of several processes all have to name
             one, and the first writes it.
         resume: A checkpoint to continue from. The result equals that of an uninterrupted training, bit for bit on one
@@ -70,11 +82,13 @@ def train(
         teacher: A policy to imitate, in place of learning from rewards; it may observe the simulation's true state.
 
     Raises:
-        UsageError: The environment breaks its protocol, no evaluation episode ended within ``eval_steps``, or
-            ``resume`` is a checkpoint of another training.
+        UsageError: The environment breaks its protocol, several processes have a time budget, no evaluation episode
+            ended within ``eval_steps``, or ``resume`` is a checkpoint of another training.
         Sim2RealError: An observation, a reward or a loss is not finite, or the checkpoint cannot be read.
     """
     start = time.perf_counter()
+    if config.minutes is not None and jax.process_count() > 1:
+        raise UsageError("minutes: several processes have several clocks", hint="use a target, or total_steps")
     key = key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
     session = _Session.of(env, config, key, sweep or Sweep({}), (actor, critic, teacher))
 
@@ -100,7 +114,7 @@ def train(
         training = _advance(program, session, training, earlier_s - start)
         if checkpoint and identity:
             _save(checkpoint, identity, training, session.layout)
-        report(training.log[-1])
+        report(replace(training.log[-1], best=training.best))
     return _result(session, training, first, compiled - start, time.perf_counter() - compiled)
 
 
@@ -163,7 +177,7 @@ def _train_until_evaluation(
     Training and evaluation are iterations of one scan: the environment's step, most of the program, is compiled once
     instead of twice (docs/reference/choices.md).
     """
-    count = config.updates_per_evaluation
+    count, apart = config.updates_per_evaluation, config.eval_envs is not None and config.eval_envs < config.num_envs
 
     def iteration(
         now: tuple[TrainState, Copies, PolicyEvaluation], i: jax.Array
@@ -184,16 +198,17 @@ def _train_until_evaluation(
             state_after, figures = update(env, config, networks, state, copies, rows)
             return state_after, evaluation, figures
 
-        def evaluate() -> tuple[TrainState, PolicyEvaluation, _Figures]:
+        def judge() -> tuple[TrainState, PolicyEvaluation, _Figures]:
             blank = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
             return state, add_rows(evaluation, rows, config), blank
 
         shapes = jax.eval_shape(learn)[2]
-        state, evaluation, figures = jax.lax.cond(evaluating, evaluate, learn)
+        state, evaluation, figures = jax.lax.cond(evaluating, judge, learn)
         return (state, choose(evaluating, copies, evaluated_copies), evaluation), figures
 
     start = (state, state.copies, new_evaluation(env, config))
-    (state, _, evaluation), stats = jax.lax.scan(iteration, start, jnp.arange(count + config.rollouts_per_evaluation))
+    rollouts = 0 if apart else config.rollouts_per_evaluation
+    (state, _, evaluation), stats = jax.lax.scan(iteration, start, jnp.arange(count + rollouts))
 
     # Average the figures over the updates; an entry counts as finite if it was so in each of them.
     stats = jax.tree.map(lambda leaf: leaf[:count], stats)
@@ -202,6 +217,10 @@ def _train_until_evaluation(
     width = get_width(env, config, state.update - 1)
     values |= {} if width is None else {"width": width}
     policy = make_policy(env, config, networks, state.params, state.normaliser)
+    if apart:
+        # Few copies play the evaluation in a loop of their own.
+        few = with_numbers(config, {"num_envs": cast(int, config.eval_envs)})
+        return state, policy, values | evaluate(env, few, policy, keys(state)[2])
     return state, policy, values | averages(evaluation)
 
 
@@ -263,6 +282,7 @@ def _result(session: _Session, training: Checkpoint, first: int, compile_s: floa
 
 
 def _is_over(config: PPOConfig, log: list[Progress]) -> bool:
-    """Return whether all evaluations were made, or the best seed has reached the target."""
+    """Return whether all evaluations were made, the time is over, or the best seed has reached the target."""
     reached = bool(log) and config.target is not None and log[-1].values["success"].max() >= config.target
-    return reached or len(log) == config.evaluations
+    late = bool(log) and config.minutes is not None and log[-1].elapsed_s >= 60.0 * config.minutes
+    return reached or late or len(log) == config.evaluations

@@ -29,7 +29,7 @@ from sim2real.train.sweep import Sweep
 from sim2real.types import Array, Json, PyTree
 
 _METADATA = "training"
-_MAY_DIFFER = ("target",)
+_MAY_DIFFER = ("target", "minutes")
 """Settings that change when training ends, but not its numbers."""
 
 
