@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from benches.catalogue import measures
 from benches.provenance import ROOT, why_stale
+from page_tables import sentences
 from page_tables.league import evidence, league, league_promises
 
 TABLES = {
@@ -30,9 +31,25 @@ TABLES = {
     "league": ("league",),
     "league_promises": ("league",),
     "randomise": ("randomise", "randomise_worn"),
+    "more_time": ("league_so101_210s", "league"),
+    "wall": ("randomise_wall",),
+    "compiled": ("graph_h200", "graph_h100"),
+    "on_a_gpu": ("arm_h200", "train_h200"),
+    "faults": ("faults",),
+    "warp": ("compose_warp_h200",),
+    "drift": tuple(f"drift_{name}" for name in ("pendulum", "arm", "arm_more", "so101", "so101_more", "so101_none")),
+    "restored": (
+        *("drift_restore", "drift_pendulum_restore_delay", "drift_pendulum_restore_friction", "drift_arm_restore"),
+        *("drift_arm_restore_friction", "drift_so101_restore", "drift_so101_restore_delay"),
+        "drift_so101_restore_payload",
+    ),
+    "two_devices": ("scaling_h200",),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
-PAGES = ("README.md", "docs/results.md", "docs/getting_started.md", "docs/guides/so101.md")
+PAGES = (
+    *("README.md", "docs/results.md", "docs/getting_started.md"),
+    *(f"docs/guides/{name}.md" for name in ("so101", "train", "safety", "compose", "deploy", "scale")),
+)
 """Pages with tables, or with a sentence of figures."""
 FIGURE = "docs/images/what_training_knows.svg"
 TRAINED_ON = {
@@ -237,6 +254,15 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "league": lambda chosen: league(chosen["league"]),
         "league_promises": lambda chosen: league_promises(chosen["league"]),
         "randomise": lambda chosen: randomise(chosen["randomise"], chosen["randomise_worn"]),
+        "more_time": lambda chosen: sentences.more_time(*chosen.values()),
+        "wall": lambda chosen: sentences.on_the_wall_clock(*chosen.values()),
+        "compiled": lambda chosen: sentences.compiled_graph(*chosen.values()),
+        "on_a_gpu": lambda chosen: sentences.on_a_gpu(*chosen.values()),
+        "faults": lambda chosen: sentences.faults(*chosen.values()),
+        "warp": lambda chosen: sentences.on_warp(*chosen.values()),
+        "drift": lambda chosen: sentences.drift(*chosen.values()),
+        "restored": lambda chosen: sentences.restored(*chosen.values()),
+        "two_devices": lambda chosen: sentences.on_two_devices(*chosen.values()),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}
     chosen = {table: {name: reports[name] for name in names} for table, names in there.items()}

@@ -61,7 +61,7 @@ def league(report: Mapping[str, Any]) -> str:
 def league_promises(report: Mapping[str, Any]) -> str:
     """Return the ledger of the league's folds: each error of sim2real beside its bound, the largest ratio first."""
     rows = [row for name in _sets(report) for row in promises(report, name)]
-    kept = [sum(row.kept == how for row in rows) for how in ("yes", "no")]
+    counts = [sum(row.kept == how for row in rows) for how in ("yes", "no")]
     bounded = sum(row.bound is not None for row in rows)
     lines: list[tuple[str, ...]] = [
         ("held out", "part", "promised", "shown", "ratio", "kept"),
@@ -72,7 +72,7 @@ def league_promises(report: Mapping[str, Any]) -> str:
             sizes = (f"{_short(size)} {row.unit}" for size in (row.bound, row.error))
             lines.append((row.name, row.source, *sizes, f"{row.ratio:.2f}", row.kept))
     text = "".join("| " + " | ".join(line) + " |\n" for line in lines)
-    return f"{text}\n{kept[0]} of {bounded} errors are below their bounds, {kept[1]} above 1.25 times the bound.\n"
+    return f"{text}\n{counts[0]} of {bounded} errors are below their bounds, {counts[1]} above 1.25 times the bound.\n"
 
 
 def promises(report: Mapping[str, Any], name: str) -> list[Promise]:

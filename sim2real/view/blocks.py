@@ -14,6 +14,9 @@ MISSING = "–"  # noqa: RUF001 - a dash, as is usual in tables
 
 Tone = Literal["good", "doubt", "bad"]
 MARKS: Mapping[Tone, str] = {"good": "✓", "doubt": "!", "bad": "✗"}
+_SVG_WIDTH = re.compile(r'<svg[^>]* width="([\d.]+)pt"')
+_WIDE_PT = 400.0
+"""A figure up to this width has letters of at least 7 px on a screen of 390 px."""
 _NUMBER = re.compile(r"[+-]?\d+(\.\d+)? ?%?")
 
 
@@ -31,6 +34,13 @@ class FigureBlock:
     caption: str
     narrow: bool = False
     kind: str = "figure"
+
+    @property
+    def layout(self) -> str:
+        """Class for the style: a ``wide`` figure scrolls on a telephone, where any other one is scaled to fit."""
+        drawn = _SVG_WIDTH.search(self.svg)
+        wide = drawn is not None and float(drawn[1]) > _WIDE_PT
+        return "narrow" if self.narrow else "wide" if wide else ""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from sim2real.artifacts.estimation.worst_second import WorstSecond
 from sim2real.artifacts.identification import HeldOutPart, Identification, Judgement
 from sim2real.artifacts.summary import ArtifactTable, words_and_unit
 from sim2real.errors import Sim2RealError
-from sim2real.view.blocks import MISSING, TableBlock, decimals_for, fixed, number
+from sim2real.view.blocks import MISSING, FigureBlock, TableBlock, decimals_for, fixed, number
 from sim2real.view.identification.section import _alternatives, _banner, _parts
 from sim2real.view.page.page import deploy_page, identify_page, report
 
@@ -121,6 +121,15 @@ def test_each_verdict_has_a_tone(status, tone):
     assert found is not None
     assert found.tone == tone
     assert found.title.lower().startswith(status)
+
+
+def test_the_next_command_stands_in_the_first_box_after_the_first_reason():
+    verdict = Judgement(
+        "hit a bound", ("gain is at its bound", "friction is not determined"), next="sim2real identify x"
+    )
+    found = _banner(Identification("robot", (), verdict, ()))
+    assert found is not None
+    assert found.reasons == ["Gain is at its bound.", "next: sim2real identify x", "Friction is not determined."]
 
 
 def test_an_unexplained_second_makes_an_accepted_identification_doubtful():
@@ -329,6 +338,14 @@ def test_a_quantity_says_its_unit():
     assert words_and_unit("angle_rms_rad") == ("angle rms", "rad")
     assert words_and_unit("speed_rms_rad_s") == ("speed rms", "rad/s")
     assert words_and_unit("success") == ("success", "1")
+
+
+@pytest.mark.parametrize(
+    ("width_pt", "narrow", "layout"), [(360, False, ""), (756, False, "wide"), (756, True, "narrow")]
+)
+def test_only_a_wide_figure_scrolls_on_a_telephone(width_pt, narrow, layout):
+    svg = f'<svg role="img" aria-label="gain" width="{width_pt}pt" height="90pt"></svg>'
+    assert FigureBlock(svg, "caption", narrow).layout == layout
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")

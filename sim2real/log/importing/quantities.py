@@ -86,8 +86,8 @@ def unused(signals: Sequence[Signal], nodes: Iterable[NodeMapping], notes: Seque
     # Distribute the columns: those that a field takes, and those that no field takes.
     for signal in signals:
         side = "commands" if signal.meaning.side == "command" else "measurements"
-        known = _MOTION + (_OTHER_COMMANDS if side == "commands" else ())
-        if signal.meaning.quantity not in known and not (signal.meaning.side and not signal.meaning.quantity):
+        quantities = _MOTION + (_OTHER_COMMANDS if side == "commands" else ())
+        if signal.meaning.quantity not in quantities and not (signal.meaning.side and not signal.meaning.quantity):
             continue
         columns = list(zip(signal.sources, signal.labels, strict=True))
         in_use = [signal.whole in sources or source in sources for source, _ in columns]

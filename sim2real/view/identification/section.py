@@ -90,7 +90,9 @@ def _banner(result: Identification) -> Banner | None:
     tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
     if status == "accepted" and result.worst is not None and result.worst.unexplained:
         tone, title = "doubt", "Accepted, but the model does not explain one second"
-    return Banner(tone, title, [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons])
+    reasons = [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons]
+    reasons[1:1] = [f"next: {result.verdict.next}"] if result.verdict.next else []
+    return Banner(tone, title, reasons)
 
 
 def _joints(result: Identification) -> list[Block]:

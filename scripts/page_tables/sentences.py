@@ -1,0 +1,154 @@
+"""Sentences and tables of measured figures for the pages of docs/, each from the reports that have the figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+_JOINT = "worst_joint"
+
+
+def values(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the rows of a report: name -> value."""
+    return {row["name"]: row["value"] for row in report["rows"]}
+
+
+def on_a_gpu(arm: Mapping[str, Any], pendulum: Mapping[str, Any]) -> str:
+    """Return how long a training takes on an accelerator."""
+    a, p = values(arm), values(pendulum)
+    base = next(name for name in p if name.endswith("compile_s")).rpartition("/")[0]
+    device, _, flags = arm["rows"][0]["yardstick"].partition(" --")
+    return (
+        f"On one {device} the arm's policy succeeds in 95 % of episodes after {a['arm/train/time_to_0.95_s']:.0f} s,\n"
+        f"{a['arm/train/compile_s']:.0f} s of them compilation, with `--{flags}`.\n"
+        f"{pendulum['flags']['seeds']} seeds of the pendulum are all above 85 % after "
+        f"{p[f'{base}/time_to_0.85_all_s']:.1f} s, {p[f'{base}/compile_s']:.1f} s of them compilation.\n"
+    )
+
+
+def faults(report: Mapping[str, Any]) -> str:
+    """Return the number of runs that were safe, and how late the latest one was."""
+    v, kinds = values(report), report["flags"]["faults"]
+    runs = len(kinds) * report["flags"]["runs"]
+    latest_s = max(v[f"faults/{kind}/safe_s"][1] for kind in kinds)
+    safe, readable, right = (
+        sum(v[f"faults/{kind}/{what}"] for kind in kinds) for what in ("safe", "log_readable", "code_and_reason")
+    )
+    return (
+        f"Of {runs} runs, {report['flags']['jobs']} at a time, {safe} were safe, the latest after {latest_s:.3f} s. "
+        f"{readable} left a readable log,\nand {right} ended with the correct exit code and reason.\n"
+    )
+
+
+def on_warp(report: Mapping[str, Any]) -> str:
+    """Return the table of tasks on MuJoCo Warp against bare steps."""
+    v = {name.removeprefix("compose/gpu/warp/"): value for name, value in values(report).items()}
+    copies = dict.fromkeys(int(name.partition("/")[0]) for name in v)
+    lines = [
+        "| copies | physics steps per second, `mjx.step` alone | time of the task with late observables | time of the "
+        "task in a graph with delays |",
+        "|---:|---:|---:|---:|",
+        *(
+            f"| {n:,} | {v[f'{n}/bare_steps_per_s'] / 1e6:.1f} million | {v[f'{n}/env_over_bare']:.3f} times as long | "
+            f"{v[f'{n}/graph_over_bare']:.3f} times |"
+            for n in copies
+        ),
+    ]
+    compiled = [v[f"{n}/{kind}_compile_s"] for n in copies for kind in ("env", "graph")]
+    kernels_s = max(v[f"{n}/first_reset_s"] for n in copies)
+    return "\n".join(lines) + (
+        f"\n\nA program takes {min(compiled):.0f} to {max(compiled):.0f} s to compile; building Warp's kernels takes "
+        f"{kernels_s:.0f} s more, once for a machine.\n"
+    )
+
+
+def compiled_graph(*reports: Mapping[str, Any]) -> str:
+    """Return how long the compiled pendulum takes against a simulation written by hand, for each accelerator."""
+    texts = []
+    for report in reports:
+        v = values(report)
+        hand, unrolled, divided = (
+            _between(
+                value for name, value in v.items() if name.endswith(f"/{what}") and ("30_over_100_hz" in name) == uneven
+            )
+            for what, uneven in (("over_hand", False), ("over_hand_unrolled", False), ("over_hand", True))
+        )
+        texts.append(
+            f"The compiled pendulum takes {hand} times as long on an {report['flags']['name'].upper()} as a simulation "
+            f"written by hand,\n{unrolled} times as long if that simulation has an unrolled loop too, and {divided} "
+            "times as long\nif rates do not divide.\n"
+        )
+    return "\n".join(texts)
+
+
+def _between(numbers: Iterable[float]) -> str:
+    listed = sorted(numbers)
+    return f"{listed[0]:.2f} to {listed[-1]:.2f}"
+
+
+def on_the_wall_clock(report: Mapping[str, Any]) -> str:
+    """Return the success of worn robots that were deployed as emulated servos."""
+    v, flags = values(report), report["flags"]
+    runs = flags["robots"] * flags["trials"]
+
+    def of(way: str) -> str:
+        upright, still = (round(runs * v[f"randomise/wall/{way}/{what}"]) for what in ("success", "still"))
+        return f"{upright} of {runs} were upright, {still} of these slower than 0.5 rad/s"
+
+    return (
+        f"{flags['robots']} of the worn robots were also deployed on the wall clock, as emulated servos, "
+        f"{flags['trials']} deployments each. After training on the\nestimate alone {of('point')};\nafter training on "
+        f"posterior, misfit, timing and noise {of('all')}.\n"
+    )
+
+
+def more_time(report: Mapping[str, Any], league: Mapping[str, Any]) -> str:
+    """Return the errors of the others with more time, and the range of the worst joint over all entrants."""
+    v, now = values(report), values(league)
+    joints = [x for name, x in now.items() if name.startswith("league/so101/") and name.endswith(_JOINT) and x]
+    return (
+        f"The worst joint of the SO-101 is off by {min(joints):.0f} to {max(joints):.0f} mrad with every tool. With "
+        f"{report['flags']['budget_s']:.0f} s instead of {league['flags']['budget_s']:.0f} s, on\n"
+        f"{report['flags']['folds']} folds of an earlier split, `mujoco.sysid` with a delay is off by "
+        f"{v['league/so101/sysid_delay/mean']:.1f} mrad, BAM M1 by {v['league/so101/bam_m1/mean']:.1f} "
+        "(median over joints).\n"
+    )
+
+
+def drift(*reports: Mapping[str, Any]) -> str:
+    """Return the table of robots for which the verdict was to identify again, by change."""
+    kinds = {"none": "false_alarms", **dict.fromkeys(("friction", "payload", "delay"), "detected")}
+    heads = "| robots | unchanged | friction doubled | payload +30 % | 15 ms more |\n|---|---|---|---|---|\n"
+    return heads + _by_robot(reports, kinds)
+
+
+def restored(*reports: Mapping[str, Any]) -> str:
+    """Return the table of successful deployments after one iteration of the loop, by change."""
+    kinds = dict.fromkeys(("friction", "payload", "delay"), "restored")
+    return "| robots | friction doubled | payload +30 % | 15 ms more |\n|---|---|---|---|\n" + _by_robot(reports, kinds)
+
+
+def _by_robot(reports: Iterable[Mapping[str, Any]], kinds: Mapping[str, str]) -> str:
+    """Return a line for each robot: how often it happened, and how often it could, over its reports."""
+    counts: dict[tuple[str, str], tuple[int, int]] = {}
+    for report in reports:
+        for row in report["rows"]:
+            robot, change, what = (*row["name"].split("/")[1:], "", "")[:3]
+            of = int(row["unit"].removeprefix("of ")) if row["unit"].startswith("of ") else 0
+            if kinds.get(change) == what and row["name"].count("/") == 3 and of:
+                happened, could = counts.get((robot, change), (0, 0))
+                counts[robot, change] = happened + round(of * row["value"]), could + of
+    names = {"pendulum": "pendulums", "arm": "arms", "so101": "SO-101s"}
+    lines = [[label, *(counts.get((robot, change), (0, 0)) for change in kinds)] for robot, label in names.items()]
+    return "".join(
+        "| " + " | ".join(c if isinstance(c, str) else f"{c[0]} of {c[1]}" for c in line) + " |\n" for line in lines
+    )
+
+
+def on_two_devices(report: Mapping[str, Any]) -> str:
+    """Return the speed of a training on two devices against one."""
+    v = {name.rpartition("train/")[2]: value for name, value in values(report).items()}
+    return (
+        f"Two {report['flags']['name'].upper()}s of one host make {v['2_over_1']:.2f} times the steps of one, "
+        f"{v['2_devices/env_steps_per_s'] / 1e6:.1f} million policy steps per second\nof a single policy.\n"
+    )
