@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-_JOINT = "worst_joint"
+_JOINT = "/worst_joint"
 
 
 def values(report: Mapping[str, Any]) -> dict[str, Any]:
@@ -102,17 +102,14 @@ def on_the_wall_clock(report: Mapping[str, Any]) -> str:
     )
 
 
-def more_time(report: Mapping[str, Any], league: Mapping[str, Any]) -> str:
-    """Return the errors of the others with more time, and the range of the worst joint over all entrants."""
-    v, now = values(report), values(league)
-    joints = [x for name, x in now.items() if name.startswith("league/so101/") and name.endswith(_JOINT) and x]
-    return (
-        f"The worst joint of the SO-101 is off by {min(joints):.0f} to {max(joints):.0f} mrad with every tool. With "
-        f"{report['flags']['budget_s']:.0f} s instead of {league['flags']['budget_s']:.0f} s, on\n"
-        f"{report['flags']['folds']} folds of an earlier split, `mujoco.sysid` with a delay is off by "
-        f"{v['league/so101/sysid_delay/mean']:.1f} mrad, BAM M1 by {v['league/so101/bam_m1/mean']:.1f} "
-        "(median over joints).\n"
-    )
+def worst_joint(league: Mapping[str, Any]) -> str:
+    """Return the range over all entrants of the worst joint of the SO-101."""
+    joints = [
+        x for name, x in values(league).items() if name.startswith("league/so101/") and name.endswith(_JOINT) and x
+    ]
+    if not joints:
+        return ""
+    return f"The worst joint of the SO-101 is off by {min(joints):.0f} to {max(joints):.0f} mrad with every tool.\n"
 
 
 def drift(*reports: Mapping[str, Any]) -> str:

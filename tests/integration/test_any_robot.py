@@ -62,7 +62,10 @@ def test_a_model_and_a_log_give_parameters_that_hold_on_a_later_log(workplace, c
     assert rows["delay"] == pytest.approx(DELAY_S, abs=1e-3)
     model = mujoco.MjModel.from_xml_path(str(folder / "identified.xml"))
     assert model.dof_damping[0] == pytest.approx(rows["damping"], rel=1e-5)
-    assert cli.main(["validate", str(folder / "parameters.json"), "--log", "later.npz"]) == 0
+    assert cli.main(["validate", str(folder / "parameters.json"), "--log", "later.npz", "--json"]) == 0
+    (ahead,) = json.loads(capsys.readouterr().out)["ledger"]
+    assert (ahead["reach"], ahead["kept"]) == ("ahead", "yes")
+    assert ahead["ratio"] == pytest.approx(ahead["error"] / ahead["bound"])
     assert cli.main(["export", "identified", str(folder / "parameters.json"), "--out", "exported.xml"]) == 0
     assert "not expressed" not in capsys.readouterr().err
     t, goal, q = simulated(1)
