@@ -142,6 +142,19 @@ def test_each_fold_of_the_league_stands_beside_the_bound_from_the_others(script,
     assert "5 of 5 errors are below their bounds, 0 above 1.25 times the bound." in text
 
 
+def test_the_robots_of_several_reports_are_counted_together(script):
+    def report(**counts):
+        rows = [{"name": f"drift/arm/{change}", "value": v, "unit": f"of {n}"} for change, (v, n) in counts.items()]
+        return {"rows": rows}
+
+    first = report(
+        **{"none/false_alarms": (0.25, 4), "friction/detected": (0.5, 8), "friction/detected/low95": (0.2, 8)}
+    )
+    second = report(**{"friction/detected": (1.0, 2), "payload/detected": ("nan", 0)})
+    line = script.sentences.drift(first, second).splitlines()[3]
+    assert line == "| arms | 1 of 4 | 6 of 10 | - | - |"
+
+
 def test_a_table_whose_reports_are_not_all_there_is_left_as_it_is(script):
     reports = script.read_reports()
     assert set(script.tables(reports)) >= {"demo", "arm", "real"}

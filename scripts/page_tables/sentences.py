@@ -136,10 +136,14 @@ def _by_robot(reports: Iterable[Mapping[str, Any]], kinds: Mapping[str, str]) ->
                 happened, could = counts.get((robot, change), (0, 0))
                 counts[robot, change] = happened + round(of * row["value"]), could + of
     names = {"pendulum": "pendulums", "arm": "arms", "so101": "SO-101s"}
-    lines = [[label, *(counts.get((robot, change), (0, 0)) for change in kinds)] for robot, label in names.items()]
-    return "".join(
-        "| " + " | ".join(c if isinstance(c, str) else f"{c[0]} of {c[1]}" for c in line) + " |\n" for line in lines
-    )
+    lines = [
+        [label, *(_of(*counts.get((robot, change), (0, 0))) for change in kinds)] for robot, label in names.items()
+    ]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def _of(happened: int, could: int) -> str:
+    return f"{happened} of {could}" if could else "-"
 
 
 def on_two_devices(report: Mapping[str, Any]) -> str:
