@@ -88,6 +88,7 @@ def demo(report: dict[str, Any]) -> str:
             "prediction, 1 s ahead",
             f"{max(s['prediction_over_true_model'] for s in seeds):.2f} times the error of the true model at most",
         ),
+        *about_promises(seeds),
         ("upright on the robot", f"in {good} of {len(ours)} deployments at least 90 % of the last 5 s"),
         (
             "the same without identification",
@@ -96,6 +97,16 @@ def demo(report: dict[str, Any]) -> str:
         ("time", f"{max(s['total_s'] for s in seeds):.0f} s at most on two CPU cores ({stages} s)"),
     ]
     return "".join(f"| {a} | {b} |\n" for a, b in lines)
+
+
+def about_promises(seeds: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """Return the line on the bounds of errors on held-out data; empty for a report without them."""
+    rows = [row for seed in seeds for row in seed.get("promises", ())]
+    if not rows:
+        return []
+    below, worst = sum(row["kept"] == "yes" for row in rows), max(float(row["ratio"]) for row in rows)
+    text = f"{below} of {len(rows)} below the bound that was promised; the worst is {worst:.2f} times its bound"
+    return [("errors on held-out data", text)]
 
 
 def run_time(report: Mapping[str, Any], subject: str) -> str:
@@ -205,6 +216,7 @@ def arm(what: str, cpu: dict[str, Any], gpu: dict[str, Any] | None = None) -> st
         ("", what),
         ("---", "---"),
         ("held-out motion, 1 s ahead", f"{seed['mae_mrad']:.1f} mrad mean absolute error"),
+        *about_promises(cpu["seeds"][:1]),
         ("round-trip delay", f"{abs(seed['round_trip_error_ms']):.1f} ms off the true {truth:.0f} ms"),
         ("within 2 cm of the target", reached("distances_m")),
         ("the same without identification", reached("nominal_distances_m")),

@@ -133,6 +133,17 @@ def test_a_bound_of_the_report_stands_beside_the_error_on_a_real_motor(script):
     assert len({len(line) for line in lines}) == 1
 
 
+def test_a_run_has_a_line_on_its_promises_if_its_report_has_them(script):
+    report = script.read_reports()["so101_cpu"]
+    rows = [{"ratio": ratio, "kept": how} for ratio, how in (("0.50", "yes"), ("1.10", "within 1.25"), ("0.90", "yes"))]
+    (seed, *_) = report["seeds"]
+    text = script.arm("the arm", {"seeds": [{**seed, "promises": rows}]})
+    line = "| errors on held-out data | 2 of 3 below the bound that was promised; the worst is 1.10 times its bound |\n"
+    assert line in text
+    bare = {name: value for name, value in seed.items() if name != "promises"}
+    assert script.arm("the arm", {"seeds": [bare]}) == text.replace(line, "")
+
+
 def test_each_fold_of_the_league_stands_beside_the_bound_from_the_others(script, league):
     text = script.tables({"league": league})["league_promises"]
     bound = promises.further(np.full(4, 20.0))

@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from benches.figures import Row, row
+from sim2real.artifacts.estimation.promise import promises_table
+from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.run.manifest import plain
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, finished
 
 
@@ -67,7 +70,8 @@ def nominal_run(pipeline: str, seed: int, runs: Path, run_dir: Path) -> Path:
 
 
 def estimates(identify: StageFolder) -> dict[str, Any]:
-    """Return the errors of the identified dynamics and of the round trip, for parameters with a true value."""
+    """Return the errors of the dynamics and of the round trip with a true value, and those on held-out data with bounds."""
+    fresh = [promise for promise in Identification.load(identify.folder).promises if promise.fresh]
     document = json.loads(identify.output("parameters").read_text())
     by_name = {p["name"]: p for p in document["parameters"]}
     trip = by_name["round_trip_delay"]
@@ -76,6 +80,7 @@ def estimates(identify: StageFolder) -> dict[str, Any]:
         "errors": {n: p["estimate"] / p["truth"] - 1 for n, p in dynamics.items()},
         "round_trip_ms": 1e3 * trip["estimate"],
         "round_trip_error_ms": 1e3 * (trip["estimate"] - trip["truth"]),
+        "promises": plain(promises_table(fresh).records()),
     }
 
 
