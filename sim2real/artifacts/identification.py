@@ -15,6 +15,7 @@ from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.estimation.promise import Bound, Promise, promises_table
 from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.estimation.search import Search
+from sim2real.artifacts.estimation.tried_term import TriedTerm
 from sim2real.artifacts.estimation.worst_second import WorstSecond
 from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.run.run_folder import Source
@@ -197,6 +198,7 @@ class Identification(Shown):
         promises: The ledger: each error on a held-out part or on held-out data, beside the bound that was given before.
         bounds: Bounds on the errors of later logs.
         ranges: Signal -> its range in the fitted segments; see ``segments.ranges``.
+        tried: What optional terms gain on held-out parts; empty if none was tried.
         terms: Optional terms of the model in the fit; None if the model has no optional terms.
         noise: Noise of the sensor; empty in older files.
         widening: Factor on the posterior's deviations that covers errors of the model; None in older files.
@@ -231,6 +233,7 @@ class Identification(Shown):
     promises: tuple[Promise, ...] = ()
     bounds: tuple[Bound, ...] = ()
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    tried: tuple[TriedTerm, ...] = ()
     terms: tuple[str, ...] | None = None
     links: tuple[Link, ...] = ()
     noise: tuple[Noise, ...] = ()

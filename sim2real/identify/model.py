@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import jax
 import numpy as np
 
+from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.export.card.plain import PlainSimulation as PlainSimulation
 from sim2real.identify.parameters import ParameterTable
@@ -76,6 +77,10 @@ class IdentifiableModel(Protocol):
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, given nodes and world, connected with trainable delays up to ``max_delay_s``."""
+        ...
+
+    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
+        """Return limit -> the largest value that recordings reach, of limits among the optional terms."""
         ...
 
     def params(self, values: Mapping[str, Array], start: Array) -> dict[str, PyTree]:

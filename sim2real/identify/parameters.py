@@ -17,6 +17,9 @@ from sim2real.errors import UsageError
 from sim2real.identify.parameter_paths import set_leaf
 from sim2real.types import Array, PyTree
 
+_BELOW, _BEYOND = 4.0, 50.0
+"""Factors of the bounds of a limit below and above the largest value that recordings reach. Inertia and friction that
+the model does not know add to a torque, and commands may ask for much more than the joint does."""
 _ABOVE = 0.1
 """Start of a search above a lower bound, as a share of the bounds' width."""
 
@@ -196,7 +199,8 @@ class ParameterTable:
         for name, (low, high) in bounds.items():
             before = self[name]
             p = replace(before, low=float(low), high=float(high), narrowed=float(low) > before.low)
-            if p.kind != "delay" and not p.low <= p.nominal <= p.high:
+            absent_limit = p.limits and p.off is not None
+            if p.kind != "delay" and not absent_limit and not p.low <= p.nominal <= p.high:
                 raise UsageError(
                     f"the bounds [{low:g}, {high:g}] {p.unit} of {name!r} exclude its nominal value {p.nominal:.4g}",
                     hint="widen the bounds, or correct the nominal value in the pipeline",
@@ -208,6 +212,18 @@ class ParameterTable:
                 )
             changed[name] = p
         return ParameterTable(changed.values(), self.recordings)
+
+    def with_reached(self, reached: Mapping[str, float]) -> ParameterTable:
+        """Return the table with bounds for absent limits, and starts of their search, by what recordings reach.
+
+        Args:
+            reached: Limit -> the largest value that recordings reach; bounds that a user gave stay.
+        """
+        rows = (
+            replace(p, low=most / _BELOW, high=most * _BEYOND, begin=most) if most > 0.0 and p.high >= p.without else p
+            for p, most in ((p, reached.get(p.name, 0.0)) for p in self.parameters)
+        )
+        return ParameterTable(rows, self.recordings)
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -238,6 +254,10 @@ class ParameterTable:
         """
         chosen = dict(zip(self.terms, present, strict=True)) | {"": True}
         return np.array([chosen[c.parameter.term] for c in self.columns], bool)
+
+    def of_limits(self) -> np.ndarray:
+        """Return which of ``terms`` are limits, ``(T,)``, bool."""
+        return np.array([any(p.limits for p in self if p.term == name) for name in self.terms], bool)
 
     def decode(self, z: Array, present: Array | None = None) -> dict[str, jax.Array]:
         """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` if each has its own; traceable.

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from sim2real.graph.base import Value
 
 
+NO_LIMIT = 1e6
+"""Value of a limit that is absent, in its unit: no robot reaches it."""
+
+
 @struct.dataclass
 class DriveTerms(Base):
     """Coefficients, each of shape ``(joints,)``; with 0 a term adds nothing.
@@ -32,6 +36,8 @@ class DriveTerms(Base):
         bias: By how much dry friction is larger upwards than on average, and smaller downwards [N m].
         back_emf: What the motor's voltage takes off its torque per speed, with torque on, beyond its limit [N m s/rad].
         play: Error of the angle up to which the drive does not push: a servo's dead zone, play of its gears [rad].
+        top_speed: Largest speed at which the drive tries to correct an error, against its damping and the joint's
+            [rad/s].
         cogging_cos: Torque that pulls the joint back, by the cosine of its angle times ``cogging_per_turn`` [N m].
         cogging_sin: The same, by the sine [N m].
         cogging_per_turn: How often that torque repeats in a turn of the joint [1].
@@ -46,6 +52,7 @@ class DriveTerms(Base):
     bias: Value = 0.0
     back_emf: Value = 0.0
     play: Value = 0.0
+    top_speed: Value = NO_LIMIT
     cogging_cos: Value = 0.0
     cogging_sin: Value = 0.0
     cogging_per_turn: Value = 1.0
@@ -103,8 +110,12 @@ class DriveLaw:
         fast = xp.abs(speed)
         beyond = v["eccentric_cos"] * xp.cos(angle) + v["eccentric_sin"] * xp.sin(angle)
         # A servo's error is that of its encoder; it does not correct an error within its dead zone.
-        force = force - kp * (beyond + xp.clip(goal - angle - beyond, -v["play"], v["play"]))
-        braked = on * v["back_emf"]
+        braked, error = on * v["back_emf"], goal - angle - beyond
+        dead = xp.clip(error, -v["play"], v["play"])
+        # A push beyond that of the largest speed is cut off: at that speed damping takes all of it.
+        top = v["top_speed"]
+        push, most = kp * (error - dead), xp.where(top < NO_LIMIT, top * (kd + v["damping"] + braked), xp.inf)
+        force = force - kp * (beyond + dead) - push + xp.clip(push, -most, most)
         drive = xp.clip(force - kp * angle - kd * speed, -v["limit"], v["limit"]) - braked * speed
         # Friction and damping of each joint.
         stuck = v["static"] * xp.exp(-fast / v["stribeck_rad_s"])

@@ -1,5 +1,6 @@
 """Leaving parts out: the same as never having recorded them, and the choice of terms never sees them."""
 
+import json
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -19,8 +20,10 @@ from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.search.refine import refine
+from sim2real.identify.validation import folds
 from sim2real.identify.validation.folds import Fold, folds_of, leave_out, moving
 from sim2real.identify.validation.optional_terms import select
+from sim2real.identify.validation.refits import REFITS, Refits
 from sim2real.identify.validation.term_trials import Trials
 
 TICK_S, PERIOD_S, DURATION_S, LENGTH_S = 0.01, 0.02, 10.0, 1.0
@@ -169,6 +172,24 @@ def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one):
             assert float(row.values[name]) == pytest.approx(alone[name], abs=0.02 * spread + 2e-5)
 
 
+def test_a_judgement_that_was_ended_continues_with_its_finished_refits(one, tmp_path, monkeypatch):
+    """The second part is not finished: a judgement computes it alone, and all errors are those of one run."""
+    first = Refits(tmp_path / REFITS, "same")
+    leave_out(one.fit, one.parts, 0.2, refits=first)
+    document = json.loads((tmp_path / REFITS).read_text())
+    ends = document["sets"][",".join(one.fit.problem.table.terms)]["ends"]
+    del ends[list(ends)[1]]
+    (tmp_path / REFITS).write_text(json.dumps(document))
+    computed = []
+    monkeypatch.setattr(folds, "refine", lambda *a, **k: computed.append(1) or refine(*a, **k))
+    again = Refits(tmp_path / "again.json", "same", [tmp_path / REFITS])
+    rows = leave_out(one.fit, one.parts, 0.2, refits=again)
+    assert (len(computed), again.reused) == (1, len(one.parts) - 1)
+    for row, whole in zip(rows, one.rows, strict=True):
+        assert row.ahead == pytest.approx(whole.ahead, rel=1e-6)
+    assert len(json.loads((tmp_path / "again.json").read_text())["sets"].popitem()[1]["ends"]) == len(one.parts)
+
+
 def test_fewer_parameters_are_estimated_as_by_a_table_that_holds_the_others(one):
     problem, names = one.fit.problem, one.fit.problem.table.names
     present = np.array([n in ("gain", "tau") for n in names])
@@ -221,7 +242,7 @@ def three():
     episodes = [lag_log(1), lag_log(2), lag_log(3, 10 * BIAS / 4)]
     whole = fit(Model(), episodes, [s for r in range(3) for s in spans(r)], LENGTH_S, CONFIG)
     parts = folds_of(whole.problem, 3)
-    found = select(Trials(whole, parts, 0.2, 0.0).grown())
+    found = select(Trials(whole, parts, 0.2, 0.0, Refits()).grown())
     return whole, [trial.rows[k] for k, trial in enumerate(found.by_part)]
 
 

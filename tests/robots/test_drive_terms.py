@@ -20,6 +20,7 @@ from sim2real.identify.uncertainty.uncertainty import linearise
 from sim2real.robots.from_model.mjcf import driven
 from sim2real.robots.from_model.mjcf_parameters import (
     LAWS,
+    LIMITS,
     ONLY_NAMED,
     OPTIONAL,
     ParameterPattern,
@@ -30,7 +31,7 @@ from sim2real.robots.from_model.mjcf_parameters import (
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.from_model.usual_parameters import usual_terms
 from sim2real.stages.estimation import held_out_parts
-from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
+from sim2real.worlds.drive_terms import NO_LIMIT, DriveLaw, DriveTerms
 
 MASS, LENGTH, STEP_S = 0.5, 0.12, 0.001
 XML = f"""<mujoco><option timestep="{STEP_S}"/><worldbody><body>
@@ -40,8 +41,8 @@ XML = f"""<mujoco><option timestep="{STEP_S}"/><worldbody><body>
 OWN = {"damping": 0.02, "armature": 0.004, "frictionloss": 0.03, "kp": 9.0, "kd": 0.3, "limit": 3.0}
 ON = {"load": 0.25, "static": 0.25, "stribeck_rad_s": 0.3, "drag": 0.02, "bias": 0.05, "back_emf": 0.12, "play": 0.04,
       "cogging_cos": 0.1, "cogging_sin": -0.2, "cogging_per_turn": 9.0, "eccentric_cos": 0.05, "eccentric_sin": 0.08,
-      "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7}  # fmt: skip
-OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1, "cogging_per_turn": 9.0}
+      "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7, "torque": 1.2, "top_speed": 1.5}  # fmt: skip
+OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1, "cogging_per_turn": 9.0} | dict.fromkeys(LIMITS, NO_LIMIT)
 PER_TURN = ParameterPattern("cogging_per_turn", nominal=9.0, free=False)
 
 
@@ -66,14 +67,16 @@ def by_hand(terms, goals, on, start):
     for goal, enabled in zip(goals, on, strict=True):
         error = goal - q - p["eccentric_cos"] * math.cos(q) - p["eccentric_sin"] * math.sin(q)
         answered = math.copysign(max(abs(error) - p["play"], 0.0), error)
-        servo = enabled * (p["kp"] * answered - p["kd"] * w)
+        most = p["top_speed"] * (p["kd"] + p["damping"] + p["back_emf"])
+        servo = enabled * (max(-most, min(most, p["kp"] * answered)) - p["kd"] * w)
+        limit = min(p["limit"], p["torque"])
         cogging = p["cogging_cos"] * math.cos(9.0 * q) + p["cogging_sin"] * math.sin(9.0 * q)
         # Gravity, turned about x and then about y, in the plane of a joint about y.
         down, aside = 9.81 * math.cos(p["tilt_x"]), math.sin(p["tilt_y"])
         lever = (
             (1.0 - p["gravcomp"]) * MASS * LENGTH * down * (math.cos(p["tilt_y"]) * math.sin(q) - aside * math.cos(q))
         )
-        drive = max(-p["limit"], min(p["limit"], servo)) - enabled * p["back_emf"] * w
+        drive = max(-limit, min(limit, servo)) - enabled * p["back_emf"] * w
         dry = p["frictionloss"] + p["static"] * math.exp(-abs(w) / p["stribeck_rad_s"]) + p["load"] * abs(drive)
         inside = drive + enabled * p["back_emf"] * w
         brake = p["damping"] + p["drag"] * abs(w) + enabled * p["back_emf"]
@@ -90,12 +93,14 @@ def in_c(model_file, terms, goals, on, start):
     law = DriveLaw(np.array([0]), np.array([0]), np.zeros(0, int))
     kp = OWN["kp"] * on
     control = np.stack([kp * goals, kp, OWN["kd"] * on, on, goals], axis=1)[:, None]
-    values = {n: np.array([v]) for n, v in {**OWN, **terms}.items()}
+    limit = min(OWN["limit"], terms["torque"])
+    values = {n: np.array([v]) for n, v in {**OWN, **terms, "limit": limit}.items()}
     values |= {"other_damping": np.zeros(0), "other_frictionloss": np.zeros(0)}  # no joint is without a drive
     state = Start(np.array([start[0]]), np.array([start[1]]), np.zeros(1))
     tilt = expand([ParameterPattern("tilt_x"), ParameterPattern("tilt_y")], ["servo"], model, model)
     fields = {"opt.gravity": np.asarray(tilted(tilt, terms, model.opt.gravity))}
     fields["body_gravcomp"] = np.array([0.0, terms["gravcomp"]])
+    fields["jnt_actfrcrange"] = np.array([[-limit, limit]])
     return Rollouts(model, 1, tuple(fields), law=law)(fields, state, control, values)[0][1:, 0]
 
 
@@ -217,7 +222,7 @@ def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
     every = held_out_parts.widest(held_out_parts.offering(robot, "all").identifiable(0.02).parameters, "all")
     assert set(every.terms) == set(OPTIONAL)
     off = {p.name: p.without for p in every if p.term}
-    assert off == dict.fromkeys(set(ON) - {"cogging_per_turn"}, 0.0) | {"stribeck_rad_s": 0.1}
+    assert off == {name: OFF[name] for name in set(ON) - {"cogging_per_turn"}}
     values = every.decode(every.start())
     either = {"bias", "cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin", "tilt_x", "tilt_y"}
     assert all(values[what] > 0.0 for what in set(off) - either)  # at a bound nothing would move
@@ -262,7 +267,7 @@ def test_a_term_of_the_users_own_is_one_of_those_to_choose_from():
     own = optional((ParameterPattern("load", each=True, high=0.5),))
     assert own[0] == ParameterPattern("load", each=True, high=0.5, term="load")
     assert sorted(t.what for t in own) == sorted(
-        {*LAWS, "tilt_x", "tilt_y", "gravcomp"} - {w for w in LAWS if "cogging" in w}
+        {*LAWS, "torque", "tilt_x", "tilt_y", "gravcomp"} - {w for w in LAWS if "cogging" in w}
     )
 
 

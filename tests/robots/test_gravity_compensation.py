@@ -11,6 +11,7 @@ from sim2real.identify.fit import fit
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.folds import folds_of
 from sim2real.identify.validation.optional_terms import select
+from sim2real.identify.validation.refits import Refits
 from sim2real.identify.validation.term_trials import Trials
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
@@ -61,7 +62,7 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded):
     table = model.parameters.with_terms(["gravcomp"])
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     widest = fit(model, [episode], spans, 0.6, config, table)
-    every = Trials(widest, folds_of(widest.problem, 3), config.settle_s, config.free_run_s).grown()
+    every = Trials(widest, folds_of(widest.problem, 3), config.settle_s, config.free_run_s, Refits()).grown()
     chosen = select(every)
     assert chosen.names(table) == ("gravcomp",)
     values = table.decode(chosen.near[0].z, table.of_terms(chosen.near[0].present))

@@ -5,7 +5,7 @@ import time
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.robots.from_model.joint_patterns import require_quick
+from sim2real.robots.from_model.joints.joint_patterns import require_quick
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 
 LONG = "a" * 60

@@ -14,11 +14,12 @@ from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
 from sim2real.identify.fit import Fit
 from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
+from sim2real.identify.problem.segments import Data, Span
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.uncertainty import linearise
 from sim2real.identify.validation import optional_terms
 from sim2real.identify.validation.prediction import labels
+from sim2real.identify.validation.refits import Refits
 
 MOVES = 10.0
 """Range of a joint's positions in motion, in deviations of a measurement."""
@@ -89,7 +90,9 @@ def masks(problem: Problem, parts: Sequence[Fold]) -> np.ndarray:
     return np.array([p.touches(spans, problem.segment_s) for p in parts])
 
 
-def leave_out(estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s: float = 0.0) -> list[HeldOutPart]:
+def leave_out(
+    estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s: float = 0.0, refits: Refits | None = None
+) -> list[HeldOutPart]:
     """Identify without each part, and predict that part.
 
     No descent begins at the estimate of all parts, which includes this part: a refinement may end where it begins. It
@@ -99,15 +102,39 @@ def leave_out(estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s:
         parts: Held out one at a time.
         settle_s: First part of a prediction, to which its initial state is fitted [s].
         free_run_s: Longest free run [s]; 0 skips the free runs.
+        refits: Finished refits, which are not computed again.
     """
+    refits = refits or Refits()
+    refits.begin(estimate.problem.table.terms, estimate.z, estimate.loss)
     problem, table, touched = estimate.problem, estimate.problem.table, masks(estimate.problem, parts)
     every = np.ones(len(table.terms), bool)
     stats = optional_terms.statistics(problem, linearise(problem, estimate.z), touched)
     ends = []
     for k in range(len(parts)):
         start = table.at_scale(stats.x + stats.step(table, every, k, bounded=True))
-        ends.append(refine(problem, start[None], problem.part(problem.train[touched[k]]), settle=False).z)
+        rest = problem.part(problem.train[touched[k]])
+        ends.append(refitted(refits, table.terms, parts[k], problem, start, rest))
     return predicted(estimate, parts, stats, [every] * len(parts), ends, settle_s, free_run_s)
+
+
+def refitted(
+    refits: Refits,
+    terms: Sequence[str],
+    part: Fold,
+    problem: Problem,
+    start: np.ndarray,
+    rest: Data,
+    gain: float | None = None,
+) -> np.ndarray:
+    """Return the estimate without a part, ``(P,)``: a finished refit, or one from a start, which is then stored.
+
+    Args:
+        rest: The segments of the other parts.
+    """
+    name = f"{part.name} {part.parts}"
+    if (stored := refits.end(terms, name)) is not None:
+        return stored
+    return refits.store(terms, name, refine(problem, start[None], rest, settle=False, gain=gain).z)
 
 
 def predicted(

@@ -125,11 +125,13 @@ class Selection:
         near: The selected set, then other sets within a standard error of the best.
         weight: Shape ``(M,)``: share of resampled recordings that select each of them; the sum is 1.
         by_part: For each part the set that the errors on the other parts select among the subsets of the selected one.
+        trials: All sets that were fitted.
     """
 
     near: tuple[Trial, ...]
     weight: np.ndarray
     by_part: tuple[Trial, ...]
+    trials: tuple[Trial, ...] = ()
 
     def names(self, table: ParameterTable) -> tuple[str, ...]:
         """Return the names of the selected terms."""
@@ -175,7 +177,7 @@ def select(trials: Sequence[Trial]) -> Selection:
     share = votes(scores, np.array([t.present.sum() for t in possible])) * _as_good(scores, best)
     near = np.flatnonzero((share >= _RARE) | (np.arange(len(share)) == 0))
     weight = np.maximum(share[near], _RARE)
-    return Selection(tuple(possible[i] for i in near), weight / weight.sum(), by_part)
+    return Selection(tuple(possible[i] for i in near), weight / weight.sum(), by_part, tuple(trials))
 
 
 def selected(trials: Sequence[Trial], parts: np.ndarray | None = None) -> Trial:

@@ -13,6 +13,7 @@ import numpy as np
 
 from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem.segments import Data
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.uncertainty import Linearised, linearise
 from sim2real.identify.validation import folds
@@ -25,6 +26,7 @@ from sim2real.identify.validation.optional_terms import (
     statistics,
 )
 from sim2real.identify.validation.prediction import labels
+from sim2real.identify.validation.refits import Refits
 
 _SHARES = (1.0, 0.25, 0.06)
 """Shares of the linear step without a part that are simulated; the best begins the descent without that part."""
@@ -34,16 +36,27 @@ _CLEAR = 2.0
 """Ratio of a set's loss to the least loss from which the set is clearly worse: descents without parts are skipped."""
 _INSIDE = 0.01
 """Distance from a bound at which the fit of a parameter begins [widths of the bounds]."""
+LITTLE = 0.01
+"""Share of the loss below which a further term gains too little for refits without parts: they could not gain 5 %."""
+_LEVELS, _ACTS, _LOWER = 16, 1e-4, 2
+"""Levels of a limit that are simulated; relative change of the loss from which it acts; the second start's number of
+levels below the first."""
 _TRIED = 3
 """Most larger sets that are fitted in a round."""
 _WORSE = 0.02
 """Relative excess of the loss over that of a smaller set above which a fit did not converge."""
 Attempt = Callable[[np.ndarray, Sequence[np.ndarray], float], Trial]
 """Fits a set of terms ``(T,)`` from starts ``(P,)``; a converged fit has at most the loss of a smaller set."""
+Limited = Callable[[Trial, np.ndarray], Sequence[np.ndarray]]
+"""Returns starts ``(P,)`` at which the limit that a set has beyond a trial's acts."""
 
 
 def grown(
-    attempt: Attempt, wider: Callable[[Trial], Statistics], table: ParameterTable, starts: Sequence[np.ndarray]
+    attempt: Attempt,
+    wider: Callable[[Trial], Statistics],
+    table: ParameterTable,
+    starts: Sequence[np.ndarray],
+    limited: Limited = lambda trial, present: (),
 ) -> list[Trial]:
     """Return the fits of sets of terms: none, then larger ones as long as held-out parts are predicted better.
 
@@ -53,10 +66,11 @@ def grown(
     Args:
         wider: Returns the loss of each part around a fit, by the parameters of all terms.
         starts: Starts of the fit without terms, ``(P,)`` each.
+        limited: A limit that does not act has no derivative, so no approximation proposes it: it gets its own starts.
     """
     none = np.zeros(len(table.terms), bool)
     base = attempt(none, starts, np.inf)
-    trials = [base]
+    trials, limits = [base], table.of_limits()
     # Add terms until the errors on held-out parts stay.
     while not base.present.all():
         stats, level = wider(base), list[Trial]()
@@ -65,8 +79,12 @@ def grown(
                 break
             begins = [_begin(stats, table, present), opened(table, base.z, present), *starts]
             level.append(attempt(present, begins, base.loss))
+        for i in np.flatnonzero(limits & ~base.present):
+            present = base.present | (np.arange(len(none)) == i)
+            level.append(attempt(present, limited(base, present), base.loss))
+            limits[i] = level[-1].loss < (1.0 - LITTLE) * base.loss
         trials += level
-        if not better(_best(level).ahead, base.ahead):
+        if not level or not better(_best(level).ahead, base.ahead):
             break
         base = _best(level)
     # Fit the selected set without each of its terms, until no subset is left.
@@ -82,12 +100,14 @@ def grown(
             trials.append(attempt(present, begins, below.loss))
 
 
-def _proposed(stats: Statistics, table: ParameterTable, present: np.ndarray) -> list[np.ndarray]:
+def _proposed(stats: Statistics, table: ParameterTable, present: np.ndarray, pairs: bool = True) -> list[np.ndarray]:
     """Return larger sets in the order in which they are fitted, ``(T,)`` each, by their predicted errors.
 
     The first has one further term. The others have two, if that is better, or another one, if it is better than none.
     """
-    absent, place = np.flatnonzero(~present), np.arange(len(present))
+    absent, place = np.flatnonzero(~present & ~table.of_limits()), np.arange(len(present))
+    if not len(absent):
+        return []
 
     def ordered(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
         sets = [present | np.isin(place, more) for more in combinations(absent, count)]
@@ -96,7 +116,7 @@ def _proposed(stats: Statistics, table: ParameterTable, present: np.ndarray) -> 
 
     (first, score), *ones = ordered(1)
     none = on_held_out_parts(stats, table, present)
-    twos = [pair for pair in ordered(2)[:1] if better(pair[1], score)]
+    twos = [pair for pair in (ordered(2)[:1] if pairs else []) if better(pair[1], score)]
     return [first, *(one for one, error in (*twos, *ones) if better(error, none))][:_TRIED]
 
 
@@ -132,18 +152,62 @@ class Trials:
         parts: Held out one at a time.
         settle_s: First part of a prediction, to which its initial state is fitted [s].
         free_run_s: Longest free run [s]; 0 skips the free runs.
+        refits: Finished refits; None: estimates without a part are linear steps, which suffices to rank terms.
     """
 
-    def __init__(self, estimate: Fit, parts: Sequence[folds.Fold], settle_s: float, free_run_s: float) -> None:
+    def __init__(
+        self,
+        estimate: Fit,
+        parts: Sequence[folds.Fold],
+        settle_s: float,
+        free_run_s: float,
+        refits: Refits | None = None,
+    ) -> None:
         self._estimate, self._parts, self._times = estimate, parts, (settle_s, free_run_s)
+        self._refits = refits
         self._problem, self._masks = estimate.problem, folds.masks(estimate.problem, parts)
         self._least = estimate.loss
         self._sigma = dict(zip(labels(self._problem), (s for _, s, _ in self._problem.fields), strict=True))
 
+    def singles(self, z: np.ndarray, present: np.ndarray) -> list[Trial]:
+        """Return the fit of a set of terms, and those with the further terms that may help most, one each.
+
+        Args:
+            z: Shape ``(P,)``: an estimate with the set, where its fit begins.
+            present: Shape ``(T,)``, bool: the terms of the set.
+        """
+        table = self._problem.table
+        base, limits = self.attempt(present, [z], np.inf), table.of_limits()
+        stats = self.wider(base)
+        trials = [base]
+        trials += [
+            self.attempt(one, [_begin(stats, table, one), opened(table, base.z, one)], base.loss)
+            for one in _proposed(stats, table, present, pairs=False)
+        ]
+        for i in np.flatnonzero(limits & ~present):
+            one = present | (np.arange(len(present)) == i)
+            trials.append(self.attempt(one, self.limited(base, one), base.loss))
+        return trials
+
     def grown(self) -> list[Trial]:
         """Return the fits of ``grown``."""
         table = self._problem.table
-        return grown(self.attempt, self.wider, table, [self._estimate.z, *table.starts()])
+        return grown(self.attempt, self.wider, table, [self._estimate.z, *table.starts()], self.limited)
+
+    def limited(self, trial: Trial, present: np.ndarray) -> list[np.ndarray]:
+        """Return starts for a set with one more limit: the widest fit, the best level that acts, and a lower one."""
+        problem, table = self._problem, self._problem.table
+        new = table.of_terms(present) & ~table.of_terms(trial.present)
+        x = np.repeat(table.scale(opened(table, trial.z, present))[0][None], _LEVELS + 1, axis=0)
+        shares = np.linspace(1.0, _INSIDE, _LEVELS + 1)[:, None]
+        x[:, new] = (table.low + shares * table.span)[:, new]
+        losses = problem.losses(table.at_scale(x), trial.z, problem.part(present=table.of_terms(present)))
+        losses = np.nan_to_num(losses, nan=np.inf)
+        acts = np.flatnonzero(np.abs(losses / losses[0] - 1.0) > _ACTS)
+        if not len(acts):
+            return [self._estimate.z]
+        best = int(acts[np.argmin(losses[acts])])
+        return [self._estimate.z, *(table.at_scale(x[i]) for i in (best, min(best + _LOWER, _LEVELS)))]
 
     def wider(self, trial: Trial) -> Statistics:
         """Return the loss of each part around a trial, by the parameters of all terms."""
@@ -157,27 +221,43 @@ class Trials:
         """
         problem, table = self._problem, self._problem.table
         columns = table.of_terms(present)
-        data = problem.part(present=columns)
-        starts = [opened(table, z, present) for z in starts]
-        order = np.argsort(np.nan_to_num([problem.loss(z, data) for z in starts], nan=np.inf))
-        ended = refine(problem, starts[order[0]][None], data, coarse=True)
-        if ended.loss > (1.0 + _WORSE) * most:
-            others = refine(problem, np.stack([starts[i] for i in order[1:3]]), data, coarse=True)
-            ended = min(ended, others, key=lambda end: end.loss)
-        at = linearise(problem, ended.z, data)
+        data, names = problem.part(present=columns), self._names(present)
+        stored = self._refits.whole(names, problem, data) if self._refits else None
+        z, loss = stored or self._descended(present, starts, most, data)
+        at = linearise(problem, z, data)
         stats = statistics(problem, at, self._masks)
-        ends = self._without_each(ended.z, at, stats, present)
-        # Descend without each part, unless the set is clearly worse: the linear steps are still near the whole fit.
-        self._least = min(self._least, ended.loss)
-        if ended.loss <= _CLEAR * self._least:
+        ends = self._without_each(z, at, stats, present)
+        # Descend without each part, unless the set is clearly worse, or hardly better than a smaller one: then the
+        # linear steps are near enough to the whole fit.
+        self._least = min(self._least, loss)
+        if self._refits and loss <= min(_CLEAR * self._least, (1.0 - LITTLE) * most):
+            self._refits.begin(names, z, loss)
             rest = [problem.part(problem.train[touched], columns) for touched in self._masks]
             ends = [
-                refine(problem, z[None], one, settle=False, gain=_GAIN).z for z, one in zip(ends, rest, strict=True)
+                folds.refitted(self._refits, names, part, problem, end, one, gain=_GAIN)
+                for part, end, one in zip(self._parts, ends, rest, strict=True)
             ]
         rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(ends), list(ends), *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
-        return Trial(present, ended.z, ended.loss, stats, tuple(rows), ahead, free)
+        return Trial(present, z, loss, stats, tuple(rows), ahead, free)
+
+    def _names(self, present: np.ndarray) -> tuple[str, ...]:
+        return tuple(n for n, there in zip(self._problem.table.terms, present, strict=True) if there)
+
+    def _descended(
+        self, present: np.ndarray, starts: Sequence[np.ndarray], most: float, data: Data
+    ) -> tuple[np.ndarray, float]:
+        """Return the end of the descent from the best of some starts, and its loss; see ``attempt``."""
+        problem, table = self._problem, self._problem.table
+        starts = [opened(table, z, present) for z in starts]
+        order = np.argsort(np.nan_to_num([problem.loss(z, data) for z in starts], nan=np.inf))
+        ended = refine(problem, starts[order[0]][None], data, coarse=True)
+        limit = bool(np.any(present & table.of_limits()))
+        if len(order) > 1 and ended.loss > (1.0 - LITTLE if limit else 1.0 + _WORSE) * most:
+            others = refine(problem, np.stack([starts[i] for i in order[1:3]]), data, coarse=True)
+            ended = min(ended, others, key=lambda end: end.loss)
+        return ended.z, ended.loss
 
     def _without_each(self, z: np.ndarray, at: Linearised, stats: Statistics, present: np.ndarray) -> np.ndarray:
         """Return the estimates without each part, ``(K, P)``: linear steps, shorter where a full one does not help."""

@@ -14,8 +14,8 @@ from sim2real.errors import UsageError
 from sim2real.robots.from_model import model_file
 from sim2real.robots.from_model.holding import Holding, apply, plan
 from sim2real.types import MjModel, MjSpec, PyTree
+from sim2real.worlds.drive_terms import NO_LIMIT
 
-NO_LIMIT = 1e6
 _LEAST_FRICTION, _LEAST_GRAVCOMP = 1e-9, 1e-9
 _OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
               "N m s^2/rad^2": "N s^2/m^2"}  # fmt: skip

@@ -5,185 +5,78 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, cast
 
+import distrax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, Transform
-from sim2real.robots.from_model.joint_patterns import require_quick
+from sim2real.robots.from_model.joints.joint_patterns import require_quick
+from sim2real.robots.from_model.joints.quantities import (
+    ABOUT as ABOUT,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    ALIKE as ALIKE,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    BOTH_WAYS as BOTH_WAYS,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    EXCITE as EXCITE,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    FACTORS as FACTORS,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    FALLBACK as FALLBACK,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    FIXED as FIXED,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    LAWS as LAWS,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    LIMITS as LIMITS,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    OF_MODEL as OF_MODEL,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    ON_DOF as ON_DOF,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    ON_DRIVE as ON_DRIVE,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    ONLY_NAMED as ONLY_NAMED,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    OPTIONAL as OPTIONAL,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    TILT as TILT,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    VANISHING as VANISHING,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    WHOLE as WHOLE,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    WIDE as WIDE,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    ParameterPattern as ParameterPattern,
+)
+from sim2real.robots.from_model.joints.quantities import (
+    letters as letters,
+)
+from sim2real.robots.from_model.joints.sharing import sharing
 from sim2real.robots.from_model.mjcf import gains_of, limit_of, slides_of, unit_for
 from sim2real.types import Array, MjModel, PyTree, Scalar
-
-What = Literal[
-    "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
-    "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf", "play", "tilt_x", "tilt_y", "gravcomp",
-    "eccentric_cos", "eccentric_sin", "cogging_cos", "cogging_sin", "cogging_per_turn",
-]  # fmt: skip
-ALL = ".*"
-_WIDE = {"kp": (10, 10), "kd": (30, 30), "gain": (20, 20), "torque": (5, 5), "speed": (5, 5), "damping": (30, 30),
-         "armature": (30, 30), "frictionloss": (50, 20), "stribeck_rad_s": (10, 20)}  # fmt: skip
-"""Factors of the lower bound below, and of the upper bound above the nominal value."""
-FALLBACK = {"kp": 20.0, "kd": 0.5, "gain": 1.0, "torque": 10.0, "speed": 20.0, "damping": 0.1, "armature": 0.01,
-             "frictionloss": 0.1, "stribeck_rad_s": 0.1}  # fmt: skip
-"""Nominal values where the model has none."""
-_ABOUT = {
-    "kp": ("N m/rad", "stiffness of the drive"),
-    "kd": ("N m s/rad", "damping of the drive"),
-    "gain": ("N m", "torque for each unit of the command"),
-    "torque": ("N m", "largest torque of the drive"),
-    "speed": ("rad/s", "speed without load under the largest torque: the damping is that torque over it"),
-    "released": ("1", "share of the drive's damping with torque off"),
-    "damping": ("N m s/rad", "viscous friction"),
-    "armature": ("kg m^2", "rotor behind the gears"),
-    "frictionloss": ("N m", "dry friction"),
-    "zero": ("rad", "encoder at the model's zero"),
-    "payload": ("kg", "mass added at the body's centre of mass"),
-    "load": ("1", "dry friction of gears, as a share of the drive's torque"),
-    "static": ("N m", "dry friction at rest beyond that in motion"),
-    "stribeck_rad_s": ("rad/s", "speed at which 1/e of that is left"),
-    "drag": ("N m s^2/rad^2", "friction by the square of the speed"),
-    "bias": ("N m", "dry friction upwards beyond the mean of both directions"),
-    "back_emf": ("N m s/rad", "damping by the motor's voltage, with torque on, beyond its limit"),
-    "play": ("rad", "error of the angle that the drive leaves alone: dead zone, play of gears"),
-    "tilt_x": ("rad", "turn of the direction of gravity about the model's x axis"),
-    "tilt_y": ("rad", "turn of the direction of gravity about the model's y axis"),
-    "gravcomp": ("1", "share of the bodies' weight that the robot's own controller carries"),
-    "eccentric_cos": ("rad", "reading of an encoder off its axis beyond the angle, by the angle's cosine"),
-    "eccentric_sin": ("rad", "reading of an encoder off its axis beyond the angle, by the angle's sine"),
-    "cogging_cos": ("N m", "torque that repeats with the angle, by the cosine"),
-    "cogging_sin": ("N m", "torque that repeats with the angle, by the sine"),
-    "cogging_per_turn": ("1", "how often that torque repeats in a turn"),
-}
-_EXCITE = {
-    "kp": "goals that change while the joint bears a load",
-    "kd": "motion with torque off (`enabled`) besides that with torque on, to separate the joint's damping from it",
-    "gain": "torques or duties that change",
-    "torque": "commands that the drive cannot follow, so that it is at its limit",
-    "speed": "commands that the drive cannot follow, so that it is at its limit",
-    "released": "motion with torque off (`enabled`)",
-    "damping": "fast motion of each joint, at several speeds",
-    "armature": "fast changes of the command, up to a few hertz",
-    "frictionloss": "slow motion of each joint, with reversals",
-    "zero": "motion of each joint against gravity, up and down",
-    "payload": "motion of each joint against gravity, up and down",
-    "load": "the same motion with and without a load",
-    "static": "slow motion of each joint, with reversals",
-    "stribeck_rad_s": "motion of each joint at many speeds, from slow to fast, with reversals",
-    "drag": "fast motion of each joint, at several speeds",
-    "bias": "slow motion of each joint, with reversals",
-    "back_emf": "commands that the drive cannot follow, so that it is at its limit",
-    "play": "slow motion of each joint, with reversals, and goals that change little",
-    "tilt_x": "motion of joints whose axes are not upright, against gravity, up and down",
-    "tilt_y": "motion of joints whose axes are not upright, against gravity, up and down",
-    "gravcomp": "motion of each joint against gravity, up and down, over a wide range of angles",
-    "eccentric_cos": "motion of each joint over most of a turn",
-    "eccentric_sin": "motion of each joint over most of a turn",
-    "cogging_cos": "slow motion of each joint over many of its repeats, both ways",
-    "cogging_sin": "slow motion of each joint over many of its repeats, both ways",
-    "cogging_per_turn": "slow motion of each joint over many of its repeats, both ways",
-}
-"""Motion that determines each quantity."""
-_VANISHING = ("kd", "damping", "armature", "frictionloss")
-"""Quantities that may be 0."""
-_FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0),
-          "load": (0.0, 0.0, 1.0), "play": (0.0, 0.0, 0.1), "tilt_x": (0.0, -0.3, 0.3), "tilt_y": (0.0, -0.3, 0.3),
-          "gravcomp": (0.0, 0.0, 1.5),          "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
-          "cogging_per_turn": (1.0, 0.0, 10_000.0)}  # fmt: skip
-_OF_MODEL = {
-    "static": ("frictionloss", 5.0),
-    "bias": ("frictionloss", 5.0),
-    "drag": ("damping", 5.0),
-    "back_emf": ("damping", 30.0),
-    "cogging_cos": ("frictionloss", 5.0),
-    "cogging_sin": ("frictionloss", 5.0),
-}
-"""Terms without a usual size: their bound is a factor times another quantity of the model."""
-_BOTH_WAYS = ("bias", "cogging_cos", "cogging_sin")
-"""Those that may be negative."""
-OPTIONAL = {
-    "load": ("load",),
-    "stribeck": ("static", "stribeck_rad_s"),
-    "drag": ("drag",),
-    "direction": ("bias",),
-    "back_emf": ("back_emf",),
-    "play": ("play",),
-    "gravcomp": ("gravcomp",),
-    "tilt": ("tilt_x", "tilt_y"),
-    "eccentricity": ("eccentric_cos", "eccentric_sin"),
-    "cogging": ("cogging_cos", "cogging_sin"),
-}
-"""Optional terms, and the quantities that each has."""
-TILT = OPTIONAL["tilt"]
-WHOLE = (*TILT, *OPTIONAL["gravcomp"])
-"""Quantities of the whole robot, without effect in a model without gravity."""
-ONLY_NAMED = ("tilt", "eccentricity", "cogging")
-"""Terms that ``auto`` omits unless a parameter names them: in few robots they differ from a zero or a stiffness."""
-LAWS = (*(q for term in OPTIONAL.values() for q in term if q not in WHOLE), "cogging_per_turn")
-"""Quantities that are set before every step."""
-_ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
-ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
-
-
-@dataclass(frozen=True)
-class ParameterPattern:
-    """One quantity of some joints, identified as one value or as one for each.
-
-    Attributes:
-        what: The quantity; ``payload`` is of a body.
-        joints: Regular expression that a whole name must match.
-        each: Whether each joint has a value of its own.
-        nominal: The value to start from; None: the model's own, or a usual one.
-        low: Lower bound; None: a factor below the nominal value.
-        high: Upper bound; None: a factor above.
-        name: Name of the parameter; default: the quantity, for a group with the letters of its pattern.
-        free: Whether it is identified; otherwise it is held at ``nominal``.
-        term: Optional term of the model that it belongs to; "": none.
-    """
-
-    what: What
-    joints: str = ALL
-    each: bool = False
-    nominal: float | None = None
-    low: float | None = None
-    high: float | None = None
-    name: str = ""
-    free: bool = True
-    term: str = ""
-
-    def __post_init__(self) -> None:
-        """Check what can be checked without a model."""
-        if self.what not in _ABOUT:
-            raise UsageError(f"unknown parameter {self.what!r} of a joint. Available: {', '.join(_ABOUT)}")
-        try:
-            re.compile(self.joints)
-        except re.error as error:
-            raise UsageError(
-                f"{self.joints!r} is no pattern for joints: {error}", hint="such as .*_hip_joint"
-            ) from None
-        require_quick(self.joints, ())
-        if self.what == "cogging_per_turn" and self.free:
-            raise UsageError(
-                "cogging_per_turn is counted, not identified",
-                hint="write cogging_per_turn=N: of a motor the least common multiple of poles and slots, times gears",
-            )
-        if self.what in WHOLE and (self.each or self.joints != ALL):
-            raise UsageError(f"{self.what} is the whole robot's", hint=f"write {self.what}")
-
-    @staticmethod
-    def parse(text: str) -> ParameterPattern:
-        """Return the term of ``WHAT[:each][@PATTERN][=VALUE]``, e.g. ``frictionloss:each`` or ``kp@.*_calf_joint``."""
-        match = re.fullmatch(r"(\w+)(:each)?(?:@([^=]+))?(?:=([-+.\deE]+))?", text)
-        if not match:
-            raise UsageError(f"{text!r} is no parameter", hint="write WHAT, WHAT:each, WHAT@PATTERN or WHAT=VALUE")
-        what = cast(What, match[1])
-        value = float(match[4]) if match[4] else None
-        return ParameterPattern(what, match[3] or ALL, bool(match[2]), value, free=value is None)
-
-    def label(self) -> str:
-        """Return the name of a value that several joints share."""
-        return self.name or (self.what if self.joints == ALL else f"{self.what}_{_letters(self.joints)}")
+from sim2real.worlds.drive_terms import NO_LIMIT
 
 
 @dataclass(frozen=True)
@@ -199,6 +92,11 @@ class Placed:
     parameter: Parameter
     what: str
     at: tuple[int, ...]
+
+    @property
+    def among_limits(self) -> bool:
+        """Whether it is a limit that no pattern names: the file's own limits hold, too."""
+        return self.what in LIMITS and bool(self.parameter.term) and not self.parameter.free
 
 
 def expand(
@@ -223,12 +121,12 @@ def expand(
         # Joints with one value form a group.
         sliding = set() if term.what == "payload" else set(slides_of(file_model, names))
         if term.each:
-            groups = [([i], f"{term.name or term.what}_{_letters(names[i])}") for i in at]
+            groups = [([i], f"{term.name or term.what}_{letters(names[i])}") for i in at]
         else:
             groups = [(part, term.label() + suffix) for part, suffix in _by_unit(term.what, at, names, sliding)]
         for group, name in groups:
             nominal = _nominal(term, [names[i] for i in group], file_model, whole_damping)
-            unit = unit_for(_ABOUT[term.what][0], term.what not in WHOLE and names[group[0]] in sliding)
+            unit = unit_for(ABOUT[term.what][0], term.what not in WHOLE and names[group[0]] in sliding)
             p = replace(_parameter(term, name, nominal, _size(term, [names[i] for i in group], file_model)), unit=unit)
             placed.append(Placed(p, term.what, tuple(i + offset for i in group)))
     return placed
@@ -238,12 +136,14 @@ def _by_unit(what: str, at: list[int], names: Sequence[str], sliding: set[str]) 
     """Return the groups of joints that may share a value, and the suffix of its name: slides have other units."""
     slides = [i for i in at if names[i] in sliding]
     hinges = [i for i in at if names[i] not in sliding]
-    if what in WHOLE or unit_for(_ABOUT[what][0], True) == _ABOUT[what][0] or not (slides and hinges):
+    if what in WHOLE or unit_for(ABOUT[what][0], True) == ABOUT[what][0] or not (slides and hinges):
         return [(at, "")]
     return [(hinges, ""), (slides, "_slide")]
 
 
-def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[ParameterPattern, ...]:
+def optional(
+    terms: Sequence[ParameterPattern], wanted: str = "all", joints: Sequence[str] = ()
+) -> tuple[ParameterPattern, ...]:
     """Return the patterns, and one for all joints for each further quantity of the optional terms.
 
     These quantities are 0 unless ``--terms`` chooses their terms.
@@ -269,6 +169,7 @@ def optional(terms: Sequence[ParameterPattern], wanted: str = "all") -> tuple[Pa
             for what in quantities
             if what not in quantities_named
         ),
+        *sharing(terms, joints, wanted),
     )
 
 
@@ -298,15 +199,19 @@ def place(
             carried = base.model.body_gravcomp
             model["body_gravcomp"] = jnp.where(carried > 0.0, values[p.parameter.name], carried)
             continue
-        value, at = jnp.asarray(values[p.parameter.name], float), np.array(p.at)
-        if p.what in _ON_DRIVE:
+        if p.what in FACTORS:
+            continue
+        value, at = of_each(p, placed, values), np.array(p.at)
+        if p.what in ON_DRIVE:
             drive[p.what] = drive.get(p.what, getattr(base, p.what)).at[at].set(value)
         elif p.what in LAWS:
             terms = terms.replace(**{p.what: getattr(terms, p.what).at[at].set(value)})
         elif p.what in ("torque", "speed"):
             limits = model.get("jnt_actfrcrange", jnp.asarray(base.model.jnt_actfrcrange))
             if p.what == "torque":
-                model["jnt_actfrcrange"] = limits.at[joints[at]].set(value * jnp.array([-1.0, 1.0]))
+                own = limits[joints[at], 1]
+                most = jnp.minimum(own, value) if p.among_limits else value
+                model["jnt_actfrcrange"] = limits.at[joints[at]].set(most[:, None] * jnp.array([-1.0, 1.0]))
             else:
                 damping = model.get("dof_damping", base.model.dof_damping)
                 model["dof_damping"] = damping.at[dofs[at]].set(limits[joints[at], 1] / value)
@@ -320,6 +225,16 @@ def place(
     if any(p.what in TILT for p in placed):
         model["opt.gravity"] = tilted(placed, values, base.model.opt.gravity)
     return base.replace(model=base.model.tree_replace(model), terms=terms, **drive)
+
+
+def of_each(p: Placed, placed: Sequence[Placed], values: Mapping[str, Scalar]) -> Array:
+    """Return the value of a parameter at each of its joints, ``(joints,)``, times the factors that they have."""
+    value = jnp.full(len(p.at), jnp.asarray(values[p.parameter.name], float))
+    for factor in placed:
+        if factor.what == f"{p.what}_factor":
+            own = jnp.asarray(values[factor.parameter.name], float)
+            value = jnp.where(np.isin(p.at, factor.at), own * value, value)
+    return value
 
 
 def tilted(placed: Sequence[Placed], values: Mapping[str, Scalar], gravity: Array) -> PyTree:
@@ -339,21 +254,27 @@ def tilted(placed: Sequence[Placed], values: Mapping[str, Scalar], gravity: Arra
 
 def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: float) -> Parameter:
     # Bounds: fixed ones, a factor of another quantity, or factors of the nominal value.
-    unit, about = _ABOUT[term.what]
+    unit, about = ABOUT[term.what]
     transform: Transform = "log"
     kind = "measurement" if term.what == "zero" else "dynamics"
-    if term.what in _FIXED:
-        _, low, high = _FIXED[term.what]
+    absent = NO_LIMIT if term.what in LIMITS else nominal
+    if term.what in LIMITS and not term.free:
+        low, high = NO_LIMIT / 1e9, NO_LIMIT
+    elif term.what in FACTORS:
+        low, high = 0.2, 5.0
+    elif term.what in FIXED:
+        _, low, high = FIXED[term.what]
         transform = "linear"
-    elif term.what in _OF_MODEL:
-        low, high, transform = -own_size if term.what in _BOTH_WAYS else 0.0, own_size, "linear"
+    elif term.what in OF_MODEL:
+        low, high, transform = -own_size if term.what in BOTH_WAYS else 0.0, own_size, "linear"
     else:
-        below, above = _WIDE[term.what]
+        below, above = WIDE[term.what]
         low, high = nominal / below, nominal * above
     low, high = (bound if bound is not None else usual for bound, usual in ((term.low, low), (term.high, high)))
-    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=_EXCITE[term.what],
-        vanishes=term.what in _VANISHING, limits=term.what == "torque", term=term.term,
-        off=nominal if term.term and not term.free else None,
+    return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=EXCITE[term.what],
+        vanishes=term.what in VANISHING, limits=term.what in LIMITS, term=term.term,
+        prior=distrax.Normal(1.0, ALIKE) if term.what in FACTORS else None,
+        off=absent if term.term and (not term.free or term.what in LIMITS) else None,
     )  # fmt: skip
 
 
@@ -365,11 +286,15 @@ def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel, 
     """
     if term.nominal is not None:
         return term.nominal
+    if term.what in LIMITS and term.term and not term.free:
+        return NO_LIMIT
     if term.what == "gravcomp" and np.any(file_model.body_gravcomp > 0.0):
         return float(np.median(file_model.body_gravcomp[file_model.body_gravcomp > 0.0]))
-    if term.what in _FIXED:
-        return _FIXED[term.what][0]
-    if term.what in _OF_MODEL:
+    if term.what in FACTORS:
+        return 1.0
+    if term.what in FIXED:
+        return FIXED[term.what][0]
+    if term.what in OF_MODEL:
         return 0.0
     # The file's values, of joints that have one.
     values: list[float] = []
@@ -388,12 +313,7 @@ def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel, 
 
 def _size(term: ParameterPattern, names: Sequence[str], file_model: MjModel) -> float:
     """Return the bound of a term without a usual size; 0 for other terms."""
-    if term.what not in _OF_MODEL:
+    if term.what not in OF_MODEL:
         return 0.0
-    quantity, factor = _OF_MODEL[term.what]
+    quantity, factor = OF_MODEL[term.what]
     return factor * _nominal(replace(term, what=quantity, nominal=None), names, file_model)
-
-
-def _letters(pattern: str) -> str:
-    """Return the letters and digits of a name or a pattern, words apart."""
-    return re.sub(r"\W+", "_", pattern.replace(".*", "")).strip("_") or "all"

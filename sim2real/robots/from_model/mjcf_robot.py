@@ -10,17 +10,16 @@ from pathlib import Path
 import jax.numpy as jnp
 import msgspec
 import numpy as np
-from flax import struct
 
 from sim2real.artifacts.files import check
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
-from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.log.toml_text import toml_value
 from sim2real.robots.from_model.couplings import open_loops
+from sim2real.robots.from_model.encoders import EncoderParams, Encoders
 from sim2real.robots.from_model.holding import Holding
 from sim2real.robots.from_model.mjcf import (
     NO_LIMIT,
@@ -38,19 +37,21 @@ from sim2real.robots.from_model.mjcf import (
 from sim2real.robots.from_model.mjcf_parameters import (
     FALLBACK,
     LAWS,
+    LIMITS,
     ON_DOF,
     WHOLE,
     ParameterPattern,
     Placed,
     expand,
+    of_each,
     optional,
     place,
     tilted,
 )
 from sim2real.robots.from_model.plain import driven_simulation
+from sim2real.robots.from_model.reached import Recordings, reached
 from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
-from sim2real.types import Array, Key, PyTree, Scalar
-from sim2real.worlds.drive_terms import DriveTerms
+from sim2real.types import PyTree, Scalar
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
 
@@ -141,58 +142,6 @@ class RobotConfig:
             raise UsageError(f"{path} describes no robot: {error}", hint=f"keys: {', '.join(keys)}") from None
 
 
-@struct.dataclass
-class Measured(Base):
-    """Readings of the encoders, each of shape ``(joints,)`` [rad, rad/s]; None without a velocity."""
-
-    position: Array
-    velocity: Array | None = None
-
-
-class Encoders(BaseNode):
-    """Reads the joints of a ``DrivenWorld``.
-
-    Args:
-        rate: Samples per second [Hz].
-    """
-
-    def __init__(self, name: str, rate: float, world: DrivenWorld, velocity: bool) -> None:
-        super().__init__(name, rate)
-        self._world, self._velocity = world, velocity
-
-    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> EncoderParams:
-        """Return encoders that read 0 at the model's zero."""
-        world = self._world.init_params(rng, graph_state)
-        return EncoderParams(jnp.zeros(len(self._world.qpos_at)), world.terms)
-
-    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Measured:
-        """Return zeros."""
-        del rng, graph_state
-        still = jnp.zeros(len(self._world.qpos_at))
-        return Measured(still, still if self._velocity else None)
-
-    def step(self, step_state: StepState) -> tuple[StepState, Measured]:
-        """Read."""
-        message, params = step_state.inputs[self._world.name][-1].data, step_state.params
-        angle, speed = message.qpos[self._world.qpos_at], message.qvel[self._world.qvel_at]
-        if params.terms is not None:
-            angle, speed = params.terms.read(angle), params.terms.rate(angle, speed)
-        return step_state, Measured(angle + params.zero, speed if self._velocity else None)
-
-
-@struct.dataclass
-class EncoderParams(Base):
-    """Parameters of the encoders.
-
-    Attributes:
-        zero: Readings at the model's zero, ``(joints,)`` [rad].
-        terms: The drives' own, which say how far each is off its axis; None: not at all.
-    """
-
-    zero: Array
-    terms: DriveTerms | None = None
-
-
 class MjcfRobot(LoggedRobot):
     """A robot that consists of a model and recordings.
 
@@ -262,7 +211,8 @@ class MjcfRobot(LoggedRobot):
             wanted: ``auto``, ``all``, or names with commas between.
         """
         heavy = bool(np.any(self.model.opt.gravity))
-        terms = (t for t in optional(self.config.terms, wanted) if heavy or t.free or t.what not in WHOLE)
+        offered = optional(self.config.terms, wanted, self.config.joints)
+        terms = (t for t in offered if heavy or t.free or t.what not in WHOLE)
         return MjcfRobot(replace(self.config, terms=tuple(terms)))
 
     def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
@@ -300,8 +250,8 @@ class MjcfRobot(LoggedRobot):
         dofs = [model.joint(name).dofadr[0] for name in config.joints]
         # A speed without load makes a damping of the torque limit, after a damping that was identified.
         for p in sorted(self.placed, key=lambda p: p.what == "speed"):
-            value = float(values[p.parameter.name])
-            for i in p.at[:1] if p.what in WHOLE else p.at:
+            each = np.asarray(of_each(p, self.placed, values)).tolist()
+            for i, value in list(zip(p.at, each, strict=True))[: 1 if p.what in WHOLE else None]:
                 if p.what == "gravcomp":
                     compensated = model.body_gravcomp > 0.0
                     model.body_gravcomp[1:] = np.where(compensated.any() & ~compensated, 0.0, value)[1:]
@@ -329,8 +279,12 @@ class MjcfRobot(LoggedRobot):
         drives = [{**usual, "most": most} for most in self._limits]
         names = {"kp": "stiffness", "kd": "damping", "gain": "gain", "torque": "most"}
         for p in self.placed:
-            for i in p.at if p.what in names else ():
-                drives[i][names[p.what]] = float(values[p.parameter.name])
+            each = np.asarray(of_each(p, self.placed, values)).tolist() if p.what in names else ()
+            for i, value in zip(p.at, each, strict=bool(each)):
+                own = drives[i]["most"] or NO_LIMIT
+                if p.what == "torque":
+                    value = min(value, own) if p.among_limits else value
+                drives[i][names[p.what]] = None if p.what == "torque" and value >= NO_LIMIT else value
         return [JointDrive(control, **drive) for drive in drives]
 
 
@@ -351,6 +305,15 @@ class IdentifiableMjcf(IdentifiableRecording):
         self._placed: Sequence[Placed] = robot.placed
         self._joints, self._dofs = world.joints, world.qvel_at
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
+        self._model = robot.model
+
+    def reached(self, recordings: Recordings) -> Mapping[str, float]:
+        """Return limit -> the largest torque or speed that recordings reach, of limits that no pattern names."""
+        limits = [p for p in self._placed if p.among_limits]
+        if not limits:
+            return {}
+        most = dict(zip(LIMITS, reached(self._model, self._joints, recordings), strict=True))
+        return {p.parameter.name: float(most[p.what][list(p.at)].max()) for p in limits}
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.

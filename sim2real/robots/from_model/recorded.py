@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import ClassVar, Self
@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 import jax
 
 from sim2real.graph.delays import TrainableDist
-from sim2real.graph.episode import named_leaves
+from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
@@ -127,6 +127,11 @@ class IdentifiableRecording:
         tick_s = self._robot.tick_s
         sensor.connect(world, delay_dist=TrainableDist.create(tick_s, 0.0, 2 * tick_s, "linear") if tick_s else None)
         return {n.name: n for n in (sensor, actuator, world)}
+
+    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
+        """Return an empty dict: there are no limits among the optional terms."""
+        del recordings
+        return {}
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.

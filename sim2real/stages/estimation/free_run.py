@@ -110,12 +110,15 @@ def far_off(document: Identification, positions: Sequence[Position]) -> list[tup
 
 
 def lacking(
-    document: Identification, positions: Sequence[Position], attempt: Callable[[], Sequence[FreeRun]] | None
+    document: Identification,
+    positions: Sequence[Position],
+    attempt: Callable[[], Sequence[FreeRun]] | None,
+    term: str = TERM,
 ) -> Lack:
     """Return the result of the free runs; if their error is large, the model is fitted with one further term.
 
     Args:
-        attempt: Fits the model with ``TERM`` and returns its free runs; None if the robot has no such term.
+        attempt: Fits the model with the term and returns its free runs; None if the robot has no such term.
     """
     rows = far_off(document, positions)
     if not rows:
@@ -132,24 +135,25 @@ def lacking(
     errors = [number(r.rmse) for r in attempt() if _is(r, worst) and r.model == "identified"]
     mended = float(np.mean(errors)) if errors else math.inf
     if not mended < _MENDS * error:
-        return Lack((message, f"the term {TERM} does not mend that"))
-    why = f"with the term {TERM}, such as a constant force, it would be off by {mended:.2g}{unit}: the model lacks it"
-    return Lack((message, why), f"--terms {','.join([*(document.terms or ()), TERM])}")
+        return Lack((message, f"the term {term} does not mend that"))
+    such = ", such as a constant force," if term == TERM else ""
+    why = f"with the term {term}{such} it would be off by {mended:.2g}{unit}: the model lacks it"
+    return Lack((message, why), f"--terms {','.join([*(document.terms or ()), term])}")
 
 
 def with_one_more(
-    robot: RecordedRobot, terms: Sequence[str] | None, config: IdentifyConfig
+    robot: RecordedRobot, terms: Sequence[str] | None, config: IdentifyConfig, term: str = TERM
 ) -> tuple[RecordedRobot, IdentifyConfig] | None:
-    """Return the robot and the configuration to fit it with ``TERM``; None if the term is chosen already, or held.
+    """Return the robot and the configuration to fit it with a further term; None if it is chosen already, or held.
 
     Args:
         terms: The identified terms; None if the model has none.
     """
-    if config.terms == "auto" or TERM in (terms or ()):
+    if config.terms == "auto" or term in (terms or ()):
         return None
-    wider = held_out_parts.offering(robot, wanted := ",".join([*(terms or ()), TERM]))
+    wider = held_out_parts.offering(robot, wanted := ",".join([*(terms or ()), term]))
     table = wider.identifiable(config.max_delay_s).parameters
-    held = {p.name for p in table if p.term == TERM} <= set(config.fix)
+    held = {p.name for p in table if p.term == term} <= set(config.fix)
     return None if held else (wider, replace(config, terms=wanted, generations=0))
 
 

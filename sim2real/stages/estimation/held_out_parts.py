@@ -13,12 +13,13 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.uncertainty.uncertainty import Uncertainty, between_parts
 from sim2real.identify.validation import optional_terms
 from sim2real.identify.validation.folds import Fold, folds_of, leave_out
+from sim2real.identify.validation.refits import Refits
 from sim2real.identify.validation.term_trials import Trials
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.terminal.console import note
 
-_LEAST = 4
+LEAST = 4
 """Fewest segments from which parts are held out."""
 _LEAST_TO_CHOOSE = 3
 """Fewest parts for a selection of terms: one is held out, and the others predict each other."""
@@ -68,19 +69,27 @@ def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:
     return offering(robot, ",".join(lacking)) if lacking else robot
 
 
-def chosen(estimate: Fit, config: IdentifyConfig, names: Sequence[str]) -> optional_terms.Selection:
+def chosen(
+    estimate: Fit, config: IdentifyConfig, names: Sequence[str], refits: Refits | None = None
+) -> optional_terms.Selection:
     """Return the optional terms without which held-out parts are predicted worse.
 
     Args:
         estimate: The fit with all optional terms.
         names: A name for each recording; recordings of different names are different parts.
+        refits: Finished refits, which are not computed again.
     """
-    parts = _parts(estimate, config, names, _LEAST_TO_CHOOSE)
-    return optional_terms.select(Trials(estimate, parts, config.settle_s, config.free_run_s).grown())
+    parts = parts_of(estimate, config, names, _LEAST_TO_CHOOSE)
+    trials = Trials(estimate, parts, config.settle_s, config.free_run_s, refits or Refits())
+    return optional_terms.select(trials.grown())
 
 
 def examined(
-    estimate: Fit, config: IdentifyConfig, names: Sequence[str], selection: optional_terms.Selection | None = None
+    estimate: Fit,
+    config: IdentifyConfig,
+    names: Sequence[str],
+    selection: optional_terms.Selection | None = None,
+    refits: Refits | None = None,
 ) -> tuple[HeldOutPart, ...]:
     """Return the estimates without each part of the recordings, and their errors on that part.
 
@@ -88,17 +97,19 @@ def examined(
         estimate: The fit; with ``--terms auto`` the fit with all optional terms.
         names: A name for each recording; recordings of different names are different parts.
         selection: The selection of terms; None if there was none.
+        refits: Finished refits, which are not computed again.
     """
     segments = len(estimate.problem.train)
-    if segments < _LEAST:
+    if segments < LEAST:
         note(f"{segments} segments are too few to hold parts out of the fit")
         return ()
     if selection is not None:  # the trials have these errors
         return tuple(trial.rows[k] for k, trial in enumerate(selection.by_part))
-    return tuple(leave_out(estimate, _parts(estimate, config, names, 2), config.settle_s, config.free_run_s))
+    return tuple(leave_out(estimate, parts_of(estimate, config, names), config.settle_s, config.free_run_s, refits))
 
 
-def _parts(estimate: Fit, config: IdentifyConfig, names: Sequence[str], least: int) -> list[Fold]:
+def parts_of(estimate: Fit, config: IdentifyConfig, names: Sequence[str], least: int = 2) -> list[Fold]:
+    """Return the parts to hold out: recordings of different names, or blocks if there are fewer than ``least``."""
     return folds_of(estimate.problem, max(2, min(config.folds, len(estimate.problem.train) // 2)), names, least)
 
 

@@ -65,7 +65,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
         return Fits(widest, widest, None)
     # Select the terms without which held-out parts are predicted worse.
     with progress(None, "identify: sets of terms"):
-        selection = patiently(lambda: held_out_parts.chosen(widest, config, inputs.names))
+        selection = patiently(lambda: held_out_parts.chosen(widest, config, inputs.names, inputs.refits))
     terms: Sequence[str] = selection.names(widest.problem.table)
     # Refine the model with the selected terms. A value fixed by a flag stays fixed, in whichever term the parameter is;
     # the parameters of all other terms have their values without the term.

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 
+import sim2real
 from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run.manifest import sha256
 from sim2real.graph.episode import Episode
 from sim2real.identify.delays.links import measured
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import Span
+from sim2real.identify.validation.refits import REFITS, Refits
 from sim2real.robots.contract import RecordedRobot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts
@@ -19,6 +24,9 @@ from sim2real.stages.estimation.segment_split import spans
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.open_log import require_units
 from sim2real.stages.pipeline.pipeline import Pipeline
+
+_WITHOUT_EFFECT = ("log", "hold_out", "begin", "force", "each", "links", "reveal", "devices")
+"""Settings on which no refit depends; logs count by their content."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +38,7 @@ class Inputs:
         table: The parameters, with the bounds and fixed values of the configuration.
         logs: The fitted recordings, then those that are held out whole.
         windows: Segments to fit, and segments to predict.
+        refits: Finished refits without parts of the recordings.
     """
 
     pipeline: Pipeline
@@ -40,6 +49,29 @@ class Inputs:
     logs: tuple[Recording, ...]
     fitted: int
     windows: list[Span]
+    refits: Refits = field(default_factory=Refits)
+
+    @property
+    def digest(self) -> str:
+        """Digest of all that the estimates depend on: logs, robot, parameters, settings and this version."""
+        config = {k: v for k, v in asdict(self.config).items() if k not in _WITHOUT_EFFECT}
+        rows = [
+            (replace(p, prior=None, begin=None), p.prior and [float(p.prior.log_prob(v)) for v in (p.low, p.high)])
+            for p in self.table
+        ]
+        logs = [sha256(log.path) for log in self.logs]
+        whole = (config, rows, logs, self.fitted, sorted(self.pipeline.texts().items()), sim2real.__version__)
+        return hashlib.sha256(repr(whole).encode()).hexdigest()
+
+    def storing_refits(self, folder: Path, root: Path) -> Inputs:
+        """Return the inputs with finished refits in a stage's folder, and those of earlier folders of the same inputs.
+
+        Args:
+            root: Folder of all runs.
+        """
+        files = (root / self.pipeline.name).glob(f"*/identify*/{REFITS}")
+        earlier = sorted(files, key=lambda file: file.stat().st_mtime, reverse=True)
+        return replace(self, refits=Refits(folder / REFITS, self.digest, earlier))
 
     @property
     def episodes(self) -> list[Episode]:
@@ -79,7 +111,8 @@ def prepare(
         require_units(log, robot)
     model = robot.identifiable(config.max_delay_s)
     require_apart(fitted, held_out, model, config.force)
-    table = table_of(model, config).with_begin(begin or {})
+    episodes = [log.episode for log in fitted]
+    table = table_of(model, config, episodes).with_begin(begin or {})
     windows = spans([log.episode for log in logs], len(fitted), config, config.settle_s + config.horizon_s)
     return Inputs(pipeline, config, robot, model, table, logs, len(fitted), windows)
 
@@ -89,9 +122,16 @@ def robot_of(pipeline: Pipeline, config: IdentifyConfig) -> RecordedRobot:
     return held_out_parts.offering(in_world(pipeline.load(), config.world), config.terms)
 
 
-def table_of(model: IdentifiableModel, config: IdentifyConfig) -> ParameterTable:
-    """Return the model's parameters with the configured terms, bounds and fixed values."""
-    table = held_out_parts.widest(model.parameters.with_bounds(config.bounds), config.terms).with_fixed(config.fix)
+def table_of(model: IdentifiableModel, config: IdentifyConfig, episodes: Sequence[Episode]) -> ParameterTable:
+    """Return the model's parameters with the configured terms, bounds and fixed values.
+
+    Args:
+        episodes: The fitted recordings: bounds of limits among the terms follow from what they reach.
+    """
+    bounded = model.parameters.with_bounds(config.bounds)
+    if config.terms not in ("own", "none"):
+        bounded = bounded.with_reached(model.reached(episodes))
+    table = held_out_parts.widest(bounded, config.terms).with_fixed(config.fix)
     if config.links:
         measured(table)  # raises an error before the search if the model has no such delay
     return table

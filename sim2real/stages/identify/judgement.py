@@ -8,22 +8,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.identification import FreeRun, Identification
+from sim2real.artifacts.identification import Identification
 from sim2real.identify.delays.links import links
 from sim2real.identify.fit import Fit, Value, as_numbers, refit
 from sim2real.identify.uncertainty import ensemble
 from sim2real.identify.uncertainty.per_recording import compare_recordings
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.replays import replays
-from sim2real.identify.validation.verdict import NO_DELAY, positions
-from sim2real.robots.worlds import in_world
+from sim2real.identify.validation.verdict import NO_DELAY
 from sim2real.stages.estimation import estimate, held_out_parts
-from sim2real.stages.estimation.free_run import Lack, fitted_to, free_runs, lacking, with_one_more
+from sim2real.stages.estimation.free_run import free_runs
 from sim2real.stages.identify.fitting import Fits, determined
-from sim2real.stages.identify.inputs import Inputs, table_of
+from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.identify.ledger import with_promises
+from sim2real.stages.identify.missing_terms import lack, of_selection
 from sim2real.stages.identify.true_values import true_values
-from sim2real.stages.terminal.console import progress
+from sim2real.stages.terminal.console import note, progress, shown
 from sim2real.stages.terminal.interruption import patiently
 
 _NO_DELAY_S = 1e-4
@@ -43,10 +43,13 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         # Refit without each part of the recordings. The errors of a fit that did not converge bound no later error.
         examine = config.folds and fits.estimate.converged
         parts = (
-            patiently(lambda: held_out_parts.examined(fits.widest, config, inputs.names, fits.selection))
+            patiently(lambda: held_out_parts.examined(fits.widest, config, inputs.names, fits.selection, inputs.refits))
             if examine
             else ()
         )
+        if inputs.refits.source and inputs.refits.reused:
+            same = "logs, parameters and settings are the same"
+            note(f"{inputs.refits.reused} refits are from {shown(inputs.refits.source)}: {same}")
         # Compute intervals; they widen where estimates without one part differ.
         bar.set_description_str("identify: intervals")
         findings, held = patiently(lambda: estimate.Findings.of(fits.estimate, parts)), list[str]()
@@ -70,11 +73,13 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         aggregate = patiently(lambda: compare_recordings(fit)) if several else ()
         links_ = patiently(lambda: links(fit.problem, fit.z)) if config.links else ()
         document = replace(document, left_out=parts, terms=fits.terms, links=links_, aggregate=aggregate)
-        # Try one further term where free runs are far off.
-        bar.set_description_str("identify: free runs")
-        lack = patiently(lambda: _lack(document, inputs, fit))
+        # Try further terms where residuals are far above the noise.
+        bar.set_description_str("identify: terms that may be missing")
+        if fits.selection is not None:
+            document = replace(document, tried=of_selection(fits.selection, fits.widest.problem.table))
+        document, lacks = patiently(lambda: lack(document, inputs, fit))
     document, outside = with_promises(document, inputs, fit, parts)
-    return estimate.judged(document, findings, inputs.units, config.max_delay_s, [*outside, *held], lack)
+    return estimate.judged(document, findings, inputs.units, config.max_delay_s, [*outside, *held], lacks)
 
 
 def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identification:
@@ -112,21 +117,3 @@ def _without_delays(fit: Fit) -> dict[str, Mapping[str, Value]]:
     if largest_s < _NO_DELAY_S:
         return {NO_DELAY: as_numbers(table, fit.z, kept)}
     return {NO_DELAY: refit(fit.problem, kept, fit.z)}
-
-
-def _lack(document: Identification, inputs: Inputs, fit: Fit) -> Lack:
-    """Return what free runs lack, after a fit with one further term if the robot offers one."""
-    config = inputs.config
-    wider = with_one_more(in_world(inputs.pipeline.load(), config.world), document.terms, config)
-    if not fit.converged or wider is None:
-        return lacking(document, positions(inputs.model, inputs.robot.units), None)
-    robot, more_terms = wider
-
-    def attempt() -> list[FreeRun]:
-        model, episodes = robot.identifiable(config.max_delay_s), inputs.episodes
-        # Search from the start, as the printed command does: a fit without the term has distorted other parameters.
-        table = table_of(model, more_terms)
-        refitted = fitted_to(model, episodes, inputs.fitted, inputs.windows, more_terms, table)
-        return free_runs(refitted, episodes, inputs.fitted, more_terms, {"identified": refitted.values})[0]
-
-    return lacking(document, positions(inputs.model, inputs.robot.units), attempt)

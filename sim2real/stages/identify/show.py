@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sim2real.artifacts.estimation.links import links_table
+from sim2real.artifacts.estimation.tried_term import tried_table
 from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.stages.terminal.console import artifact_table, note
@@ -17,6 +18,8 @@ def show(identification: Identification) -> None:
         print(artifact_table(identification.recordings_table().without("s.e.")))
     if identification.posterior is not None and identification.posterior.others:
         print(artifact_table(identification.alternatives_table()))
+    if identification.tried:
+        print(artifact_table(tried_table(identification.tried)))
     if identification.held_out:
         print(artifact_table(identification.held_out_table().without("no better than")))
     if (promises := identification.promises_table()).rows:

@@ -13,6 +13,7 @@ from sim2real.artifacts.run.manifest import sha256
 from sim2real.artifacts.run.run_folder import OpenStage, Source, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
 from sim2real.identify.uncertainty.noise import noises
+from sim2real.identify.validation.refits import REFITS
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.estimation import recording_advice
 from sim2real.stages.identify.config import IdentifyConfig
@@ -95,7 +96,10 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
             stage, pipeline.name, paths, lambda file: recording_advice.onward(pipeline, config, root, file)
         ) as best,
     ):
+        inputs = inputs.storing_refits(stage.folder, root)
         identification = _identify(inputs, best)
+        if inputs.refits.stored:
+            stage.output("refits", REFITS)
         # Complete the verdict's flags to a command, and name the logs by their paths in the run folder.
         again = recording_advice.again(pipeline, config, root, identification.verdict.next)
         if identification.verdict.status == "not converged":

@@ -25,6 +25,7 @@ EQUATIONS: Mapping[str, tuple[str, ...]] = {
         "dry friction = frictionloss + static exp(-|velocity| / stribeck_rad_s) + load |torque|",
         "applied torque = -bias - cogging_cos cos(n angle) - cogging_sin sin(n angle), n = cogging_per_turn",
         "an error of the angle within +-play has no torque",
+        "the torque by the error of the angle stays within +-top_speed (kd + damping + back_emf), if top_speed < 1e6",
         "the encoder reads angle + zero + eccentric_cos cos(angle) + eccentric_sin sin(angle)",
     ),
 }

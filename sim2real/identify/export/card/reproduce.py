@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-FAR_S = 1e3
+FAR_S, NO_LIMIT = 1e3, 1e6
 Arrays = Mapping[str, np.ndarray]
 Untyped = Any
 """Objects of mujoco, which has no types, and of JSON."""
@@ -78,7 +78,11 @@ def drive(model: Untyped, data: Untyped, numbers: Untyped, command: Arrays, memo
         angle, speed, limit = data.qpos[at], data.qvel[dof], model.jnt_actfrcrange[n["joints_at"], 1]
         fast, braked = np.abs(speed), on * n["back_emf"]
         beyond = n["eccentric_cos"] * np.cos(angle) + n["eccentric_sin"] * np.sin(angle)
-        force = force - kp * (beyond + np.clip(goal - angle - beyond, -n["play"], n["play"]))
+        error = goal - angle - beyond
+        dead = np.clip(error, -n["play"], n["play"])
+        most = np.where(n["top_speed"] < NO_LIMIT, n["top_speed"] * (kd + usual[0] + braked), np.inf)
+        push = kp * (error - dead)
+        force = force - kp * (beyond + dead) - push + np.clip(push, -most, most)
         torque = np.clip(force - kp * angle - kd * speed, -limit, limit) - braked * speed
         model.dof_damping[dof] = usual[0] + n["drag"] * fast + braked
         stuck = n["static"] * np.exp(-fast / n["stribeck_rad_s"])

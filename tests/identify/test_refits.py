@@ -1,0 +1,95 @@
+"""Finished refits are used again for the same inputs only."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim2real.identify.validation.refits import REFITS, Refits
+from sim2real.stages.identify.inputs import prepare
+from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+ROOT = Path(__file__).parents[2]
+TERMS, PART = ("load",), "log 1, 0 to 3 s"
+Z, END = np.array([0.3, -1.25]), np.array([0.5, 1e-9])
+
+
+def problem(loss):
+    return SimpleNamespace(loss=lambda z, data: loss, table=range(2))
+
+
+def filled(path):
+    refits = Refits(path, "same")
+    refits.begin(TERMS, Z, 2.0)
+    refits.store(TERMS, PART, END)
+    return refits
+
+
+def test_a_refit_is_used_again_from_the_file(tmp_path):
+    filled(tmp_path / REFITS)
+    again = Refits(tmp_path / "other.json", "same", [tmp_path / "absent.json", tmp_path / REFITS])
+    z, loss = again.whole(TERMS, problem(2.0), None)
+    assert (z.tolist(), loss) == (Z.tolist(), 2.0)
+    assert again.end(TERMS, PART).tolist() == END.tolist()
+    assert again.end(TERMS, "another part") is None
+    assert again.end(("load", "drag"), PART) is None
+    assert again.reused == 1
+    assert again.source == tmp_path / REFITS
+
+
+def test_other_inputs_have_no_refits(tmp_path):
+    filled(tmp_path / REFITS)
+    other = Refits(None, "another", [tmp_path / REFITS])
+    assert other.whole(TERMS, problem(2.0), None) is None
+    assert other.end(TERMS, PART) is None
+
+
+@pytest.mark.parametrize("loss", [2.1, 1.9, float("nan")])
+def test_a_model_with_another_loss_has_no_refits(tmp_path, loss):
+    filled(tmp_path / REFITS)
+    changed = Refits(None, "same", [tmp_path / REFITS])
+    assert changed.whole(TERMS, problem(loss), None) is None
+    assert changed.end(TERMS, PART) is None
+
+
+def test_a_fit_that_ended_in_another_minimum_has_no_refits(tmp_path):
+    filled(tmp_path / REFITS)
+    again = Refits(None, "same", [tmp_path / REFITS])
+    again.begin(TERMS, Z + 1.0, 1.5)
+    assert again.end(TERMS, PART) is None
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"sets": {"a": {"z"', '{"digest": "same", "sets": 3}'])
+def test_a_damaged_file_is_computed_again(tmp_path, text):
+    (tmp_path / REFITS).write_text(text)
+    assert Refits(None, "same", [tmp_path / REFITS]).end(TERMS, PART) is None
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    pipeline = load_pipeline("pendulum")
+    logs = [open_recording(ROOT / "datasets" / "pendulum" / f"{n}.mcap", pipeline) for n in ("chirp", "multisine")]
+    return pipeline, logs
+
+
+def test_the_digest_covers_logs_bounds_terms_and_settings_but_no_start(pendulum):
+    pipeline, (log, other) = pendulum
+    config = replace(pipeline.identify, log=(str(log.path),))
+    digest = prepare(pipeline, config, [log], []).digest
+    assert prepare(pipeline, config, [log], [], {"gain": 20.0}).digest == digest
+    assert prepare(pipeline, replace(config, reveal=False, log=()), [log], []).digest == digest
+    low, high = 5.0, 60.0
+    changed = (
+        prepare(pipeline, config, [other], []),
+        prepare(pipeline, config, [log, other], []),
+        prepare(pipeline, config, [log], [other]),
+        prepare(pipeline, replace(config, bounds={"gain": (low, high)}), [log], []),
+        prepare(pipeline, replace(config, fix={"gain": 20.0}), [log], []),
+        prepare(pipeline, replace(config, terms="none"), [log], []),
+        prepare(pipeline, replace(config, horizon_s=0.8), [log], []),
+        prepare(pipeline, replace(config, folds=4), [log], []),
+    )
+    assert len({digest, *(inputs.digest for inputs in changed)}) == 1 + len(changed)

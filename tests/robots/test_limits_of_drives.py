@@ -1,0 +1,104 @@
+"""Servos with a limit of torque or speed: C MuJoCo records, and ``auto`` has to find the limit, or none."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.identify.config import FitConfig
+from sim2real.identify.fit import fit
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.uncertainty.negligible import NOT_REACHED
+from sim2real.identify.validation.folds import folds_of
+from sim2real.identify.validation.optional_terms import select
+from sim2real.identify.validation.refits import Refits
+from sim2real.identify.validation.term_trials import Trials
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation.estimate import Findings
+from sim2real.worlds.drive_terms import NO_LIMIT
+
+STEP_S, PERIOD, SECONDS, NOISE = 0.002, 5, 5.0, 5e-4
+XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="link">
+  <joint name="elbow" axis="0 1 0" damping="0.05" armature="0.01"/>
+  <inertial pos="0 0 -0.15" mass="0.6" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody></mujoco>"""
+KP, KD, DAMPING, TORQUE, SPEED = 12.0, 0.5, 0.05, 2.0, 2.5
+
+
+def recorded(tmp_path, torque=np.inf, speed=np.inf):
+    """Return the robot from its MJCF, and an episode of steps of a cascade of position and speed with two limits."""
+    path = tmp_path / "arm.xml"
+    path.write_text(XML)
+    model = mujoco.MjModel.from_xml_string(XML)
+    data = mujoco.MjData(model)
+    count = round(SECONDS / STEP_S / PERIOD)
+    goals = np.repeat(np.random.default_rng(3).uniform(-1.2, 1.2, 1 + count // 50), 50)[:count, None]
+    data.qpos[:], angles = goals[0], []
+    for goal in goals:
+        angles.append(data.qpos.copy())
+        for _ in range(PERIOD):
+            wanted = np.clip(KP / KD * (goal - data.qpos), -speed, speed)
+            data.qfrc_applied[:] = np.clip(KD * (wanted - data.qvel), -torque, torque)
+            mujoco.mj_step(model, data)
+    at = np.arange(count) * round(1e6 * STEP_S * PERIOD)
+    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
+    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
+    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals}}
+    terms = tuple(map(ParameterPattern, ("kp", "kd", "armature")))
+    config = RobotConfig(path, ("elbow",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=terms, sigma_rad=NOISE)
+    return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+
+
+def fitted(robot, episode, terms):
+    """Return the fit with optional terms, whose bounds are from the recording."""
+    model = held_out_parts.offering(robot, terms).identifiable(0.02)
+    table = held_out_parts.widest(model.parameters.with_reached(model.reached([episode])), terms)
+    spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
+    return fit(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02), table)
+
+
+@pytest.mark.parametrize(
+    ("limits", "chosen", "name", "truth"),
+    [
+        ({"torque": TORQUE}, "torque_limit", "torque", TORQUE),
+        # The damping of the joint takes a part of the torque that the cascade has for its speed.
+        pytest.param({"speed": SPEED}, "speed_limit", "top_speed", SPEED * KD / (KD + DAMPING), marks=pytest.mark.full),
+        ({}, None, "", 0.0),
+    ],
+)
+def test_auto_finds_a_limit_that_was_reached(tmp_path, limits, chosen, name, truth):
+    robot, episode = recorded(tmp_path, **limits)
+    widest = fitted(robot, episode, "torque_limit,speed_limit")
+    every = Trials(widest, folds_of(widest.problem, 3), 0.3, 0.0, Refits()).grown()
+    found, table = select(every), widest.problem.table
+    assert found.names(table) == ((chosen,) if chosen else ())
+    values = table.decode(found.near[0].z, table.of_terms(found.near[0].present))
+    assert all(float(values[n]) == NO_LIMIT for n in {"torque", "top_speed"} - {name})
+    assert float(values["kp"]) == pytest.approx(KP, rel=0.05)
+    if chosen:
+        assert float(values[name]) == pytest.approx(truth, rel=0.05)
+        errors = {t.names(table): float(np.sqrt(t.ahead.mean())) for t in every}
+        assert errors[chosen,] < 0.5 * errors[()]
+
+
+def test_a_limit_that_is_named_and_was_not_reached_has_no_number(tmp_path):
+    robot, episode = recorded(tmp_path)
+    findings = Findings.of(fitted(robot, episode, "torque_limit"))
+    table = findings.fit.problem.table
+    verdicts = dict(zip(table.names, findings.spread.verdict, strict=True))
+    assert verdicts["torque"] == NOT_REACHED
+    assert findings.spread.low[table.names.index("torque")] > 1.0
+
+
+def test_bounds_of_a_limit_are_around_what_the_recording_reaches(tmp_path):
+    robot, episode = recorded(tmp_path, torque=TORQUE)
+    model = held_out_parts.offering(robot, "auto").identifiable(0.02)
+    reached = model.reached([episode])
+    assert reached["torque"] == pytest.approx(TORQUE, rel=0.5)
+    fastest = np.abs(np.gradient(episode.outputs["sensor"]["position"][:, 0], 0.01)).max()
+    assert 0.5 * fastest < reached["top_speed"] <= fastest
+    table = model.parameters.with_reached(reached)
+    assert table["torque"].low < reached["torque"] == table["torque"].begin < table["torque"].high
+    given = model.parameters.with_bounds({"torque": (0.5, 3.0)}).with_reached(reached)
+    assert (given["torque"].low, given["torque"].high) == (0.5, 3.0)

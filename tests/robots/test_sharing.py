@@ -1,0 +1,84 @@
+"""Groups of joints with values other than the shared one, on a robot of two servos that C MuJoCo records."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.identify.config import FitConfig
+from sim2real.identify.fit import fit
+from sim2real.identify.problem.segments import Span
+from sim2real.robots.from_model.joints.sharing import like_joints, sharing
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.from_model.usual_parameters import usual_terms
+from sim2real.stages.estimation import held_out_parts
+
+GO2 = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
+ARM = ["shoulder_pan", "shoulder_lift", "elbow_flex", "gripper"]
+STEP_S, PERIOD, SECONDS, NOISE, KP, DAMPING = 0.002, 5, 4.0, 2e-4, (12.0, 24.0), 0.4
+XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
+  <body><joint name="pan" axis="0 1 0" damping="0.4" armature="0.02"/>
+  <inertial pos="0 0 -0.1" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/></body>
+  <body pos="0 1 0"><joint name="lift" axis="0 1 0" damping="0.4" armature="0.02"/>
+  <inertial pos="0 0 -0.1" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody></mujoco>"""
+
+
+def test_joints_with_like_names_form_a_group():
+    assert like_joints(GO2) == [GO2[0::3], GO2[1::3], GO2[2::3]]
+    assert like_joints(["leftKnee", "left_ankle", "rightKnee", "right_ankle"])[0] == ["leftKnee", "rightKnee"]
+    assert like_joints(ARM) == [[name] for name in ARM]
+    assert like_joints(["joint1", "joint2", "joint3"]) == [["joint1", "joint2", "joint3"]]
+
+
+def test_groups_are_offered_where_there_are_some_and_single_joints_where_there_are_few():
+    usual = (*usual_terms(("goal",)), ParameterPattern("kd", free=False))
+    names = {t.term for t in sharing(usual, GO2, "auto")}
+    assert names == {"kp_by_group", "damping_by_group", "armature_by_group"}
+    calves = next(t for t in sharing(usual, GO2, "auto") if t.name == "kp_of_calf_joint")
+    assert calves.joints.count("|") == 3
+    assert {t.term for t in sharing(usual, ARM, "auto")} == {"kp_by_joint", "damping_by_joint", "armature_by_joint"}
+    assert {t.term for t in sharing(usual, GO2, "load,kp_by_joint")} == {"kp_by_joint"}
+    assert sharing(usual, ["joint1"], "auto") == []
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "arm.xml"
+    path.write_text(XML)
+    model = mujoco.MjModel.from_xml_string(XML)
+    data = mujoco.MjData(model)
+    t = STEP_S * PERIOD * np.arange(round(SECONDS / STEP_S / PERIOD))
+    goals = np.stack([0.8 * np.sin(3.1 * t) + 0.3 * np.sin(9.3 * t), 0.7 * np.sin(4.0 * t + 1.0)], axis=1)
+    data.qpos[:], angles = goals[0], []
+    for goal in goals:
+        angles.append(data.qpos.copy())
+        for _ in range(PERIOD):
+            data.qfrc_applied[:] = np.array(KP) * (goal - data.qpos)
+            mujoco.mj_step(model, data)
+    at = np.arange(len(t)) * round(1e6 * STEP_S * PERIOD)
+    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
+    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
+    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals}}
+    terms = (ParameterPattern("kp"), ParameterPattern("damping"))
+    config = RobotConfig(path, ("pan", "lift"), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=terms, sigma_rad=NOISE)
+    return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+
+
+def test_a_joint_with_another_stiffness_gets_a_factor(recorded):
+    robot, episode = recorded
+    robot = held_out_parts.offering(robot, "kp_by_joint")
+    model = robot.identifiable(0.02)
+    spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
+    losses = {}
+    for terms in ("none", "kp_by_joint"):
+        table = held_out_parts.widest(model.parameters, terms)
+        found = fit(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02), table)
+        losses[terms] = found.loss
+    assert losses["kp_by_joint"] < 0.01 * losses["none"]
+    assert found.values["kp"] == pytest.approx(KP[0], rel=0.03)
+    assert found.values["kp_of_lift_alone"] == pytest.approx(KP[1] / KP[0], rel=0.03)
+    assert found.values["damping"] == pytest.approx(DAMPING, rel=0.05)
+    # The model with these values has both stiffnesses.
+    made = mujoco.MjModel.from_xml_string(robot.identified_mjcf(found.values))
+    assert made.actuator_gainprm[:, 0] == pytest.approx(KP, rel=0.03)
