@@ -1,4 +1,4 @@
-"""An optional term that an identification tried, and what it gained."""
+"""An optional term that an identification tried, with its gain."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class Stored:
 
 
 @dataclass
-class Document:
+class StoredRefits:
     """What the file holds: the digest of the inputs, and by set of terms the fits."""
 
     digest: str
@@ -55,12 +55,12 @@ class Refits:
     """
 
     def __init__(self, path: Path | None = None, digest: str = "", earlier: Iterable[Path] = ()) -> None:
-        self._path, self._document, self.reused = path, Document(digest), 0
+        self._path, self._document, self.reused = path, StoredRefits(digest), 0
         self.source: Path | None = None
         self.stored = False
         for file in earlier:
             try:
-                document = read_json(file, Document)
+                document = read_json(file, StoredRefits)
             except (Sim2RealError, ValueError, OSError, msgspec.MsgspecError):
                 continue  # an unreadable file costs time only: the refits are computed
             if document.digest == digest and document.sets:

@@ -209,8 +209,8 @@ def place(
         elif p.what in ("torque", "speed"):
             limits = model.get("jnt_actfrcrange", jnp.asarray(base.model.jnt_actfrcrange))
             if p.what == "torque":
-                own = limits[joints[at], 1]
-                most = jnp.minimum(own, value) if p.among_limits else value
+                of_file = limits[joints[at], 1]
+                most = jnp.minimum(of_file, value) if p.among_limits else value
                 model["jnt_actfrcrange"] = limits.at[joints[at]].set(most[:, None] * jnp.array([-1.0, 1.0]))
             else:
                 damping = model.get("dof_damping", base.model.dof_damping)
@@ -232,8 +232,8 @@ def of_each(p: Placed, placed: Sequence[Placed], values: Mapping[str, Scalar]) -
     value = jnp.full(len(p.at), jnp.asarray(values[p.parameter.name], float))
     for factor in placed:
         if factor.what == f"{p.what}_factor":
-            own = jnp.asarray(values[factor.parameter.name], float)
-            value = jnp.where(np.isin(p.at, factor.at), own * value, value)
+            times = jnp.asarray(values[factor.parameter.name], float)
+            value = jnp.where(np.isin(p.at, factor.at), times * value, value)
     return value
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from sim2real.robots.from_model.joints.quantities import ON_DOF, ParameterPattern, What
 from sim2real.robots.from_model.mjcf import gains_of, limit_of
-from sim2real.robots.from_model.mjcf_parameters import ON_DOF, ParameterPattern, What
 from sim2real.types import MjModel, PyTree
 
 _MOST_NAMES = 3

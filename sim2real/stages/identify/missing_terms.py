@@ -1,4 +1,4 @@
-"""Optional terms of which a model lacks one, if its residuals are far above the noise of the sensor."""
+"""The optional term that a model may lack, if its residuals are far above the noise of the sensor."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Misfit:
         ratio: Root mean square of the residuals, in deviations of the noise.
         noise: Deviation of the noise [unit of the position].
         tried: What the optional terms gain; empty if none was tried.
-        own: The terms of the model.
+        chosen: The terms of the model.
         seconds: Duration of the trials [s].
     """
 
@@ -46,7 +46,7 @@ class Misfit:
     ratio: float
     noise: float
     tried: tuple[TriedTerm, ...] = ()
-    own: tuple[str, ...] = ()
+    chosen: tuple[str, ...] = ()
     seconds: float = 0.0
 
     @property
@@ -60,7 +60,7 @@ class Misfit:
         return next((t.term for t in self.tried if t.outcome == "mends"), "")
 
     def reasons(self, automatic: bool) -> tuple[str, ...]:
-        """Return sentences: the ratio, and what was tried; none if the residuals are near the noise.
+        """Return sentences: the ratio, and the trials; none if the residuals are near the noise.
 
         Args:
             automatic: Whether the terms of the model were chosen on held-out parts.
@@ -76,7 +76,7 @@ class Misfit:
         tried = f"tried{took}, with errors on held-out parts in deviations of a measurement: {fitted or 'no term'}"
         if automatic:
             return (f"{sentence}; {tried}",)
-        flag = f"--terms {','.join([*self.own, self.best])}"
+        flag = f"--terms {','.join([*self.chosen, self.best])}"
         mends = f"the term {self.best} mends most of it: {flag}" if self.best else "none of them mends that"
         return (f"{sentence}; {tried}; {mends}",)
 
@@ -101,12 +101,12 @@ def with_trials(of: Misfit, inputs: Inputs, fit: Fit) -> Misfit:
 
     The three most promising ones by linear algebra and the limits are fitted, without refits: about as long as the fit.
     """
-    config, own, began_s = inputs.config, fit.problem.table.terms, time.monotonic()
-    robot = held_out_parts.offering(in_world(inputs.pipeline.load(), config.world), ",".join(["auto", *own]))
+    config, chosen, began_s = inputs.config, fit.problem.table.terms, time.monotonic()
+    robot = held_out_parts.offering(in_world(inputs.pipeline.load(), config.world), ",".join(["auto", *chosen]))
     model, episodes = robot.identifiable(config.max_delay_s), inputs.episodes
     bounded = model.parameters.with_bounds(config.bounds).with_reached(model.reached(episodes[: inputs.fitted]))
     table = held_out_parts.widest(bounded, "all").with_fixed(config.fix)
-    further = set(table.terms) - set(own)
+    further = set(table.terms) - set(chosen)
     if not further or not set(fit.values) <= {p.name for p in table}:
         return of
     # Put the estimate into the model with all terms, and compare single terms.
@@ -116,10 +116,10 @@ def with_trials(of: Misfit, inputs: Inputs, fit: Fit) -> Misfit:
     z = problem.table.encode(values)
     whole = replace(fit, problem=problem, windows=problem, z=z, refined=(), search=None)
     parts = held_out_parts.parts_of(whole, config, inputs.names)
-    present = np.array([name in own for name in problem.table.terms])
+    present = np.array([name in chosen for name in problem.table.terms])
     trials = Trials(whole, parts, config.settle_s, 0.0).singles(z, present)
     rows = tuple(r for r in gains(trials, trials[0], problem.table) if r.term in further)
-    return replace(of, tried=rows, own=own, seconds=time.monotonic() - began_s)
+    return replace(of, tried=rows, chosen=chosen, seconds=time.monotonic() - began_s)
 
 
 def of_selection(selection: Selection, table: ParameterTable) -> tuple[TriedTerm, ...]:

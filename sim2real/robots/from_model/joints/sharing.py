@@ -19,8 +19,8 @@ def like_joints(joints: Sequence[str]) -> list[list[str]]:
     """Return groups of joints with like names: names that are equal apart from sides and numbers."""
     groups: dict[tuple[str, ...], list[str]] = {}
     for name in joints:
-        words = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
-        groups.setdefault(tuple(word for word in words if word not in _SIDES), []).append(name)
+        letters = re.findall(r"[a-z]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower())
+        groups.setdefault(tuple(part for part in letters if part not in _SIDES), []).append(name)
     return list(groups.values())
 
 
@@ -55,5 +55,5 @@ def _factor(what: str, part: Sequence[str], name: str, term: str) -> ParameterPa
 
 def _label(part: Sequence[str]) -> str:
     """Return the name of a joint, or the words that the names of a group share."""
-    words = [re.split(r"\W+|_", name) for name in part]
-    return "_".join(w for w in words[0] if len(part) == 1 or all(w in other for other in words))
+    names = [re.split(r"\W+|_", name) for name in part]
+    return "_".join(piece for piece in names[0] if all(piece in other for other in names))
