@@ -12,6 +12,7 @@ from sim2real.identify.validation.optional_terms import Trial
 from sim2real.identify.validation.term_gains import gains
 from sim2real.identify.validation.verdict import Position
 from sim2real.stages.identify.missing_terms import Misfit, misfit
+from sim2real.view.identification.tried import tried_blocks
 
 TABLE = ParameterTable(
     [
@@ -81,3 +82,10 @@ def test_residuals_are_compared_with_the_noise_of_the_worst_position():
     # A noise of zero, as in a simulation, counts as a tenth of the assumed deviation.
     silent = misfit(document, (Noise("r", "rad", 0.0, 0.0, 0.0),), [Position("r", "wrist", "rad", 1e-3)])
     assert silent.noise == pytest.approx(1e-4)
+
+
+def test_the_page_has_a_table_of_the_tried_terms():
+    rows = (TriedTerm("load", 8.0, 4.0, "chosen"), TriedTerm("torque_limit", 4.0, 4.0, "not reached"))
+    (block,) = tried_blocks(SimpleNamespace(tried=rows))
+    assert [row[0] for row in block.rows] == ["load", "torque_limit"]
+    assert tried_blocks(SimpleNamespace(tried=())) == []

@@ -32,6 +32,7 @@ from sim2real.view.blocks import (
 )
 from sim2real.view.identification import figures, intervals, residuals
 from sim2real.view.identification.links import link_blocks
+from sim2real.view.identification.tried import tried_blocks
 from sim2real.view.identification.worst import worst_figure
 from sim2real.view.provenance import about
 
@@ -243,9 +244,9 @@ def _parts(result: Identification) -> list[Block]:
 
 
 def _alternatives(result: Identification) -> list[Block]:
-    """Return the models that fit the recordings as well as the estimate, with their parameters and shares."""
+    """Return the tried terms, and the models that fit the recordings as well as the estimate, with their shares."""
     if result.posterior is None or not result.posterior.others:
-        return []
+        return tried_blocks(result)
     named = [("estimate", result.posterior), *((o.about, o.posterior) for o in result.posterior.others)]
     left = 1.0 - sum(o.weight for o in result.posterior.others)
     shares = [left, *(o.weight for o in result.posterior.others)]
@@ -258,7 +259,7 @@ def _alternatives(result: Identification) -> list[Block]:
     ]
     rows.insert(0, ["share of the draws", *(f"{100 * s:.0f} %" for s in shares)])
     caption = "Models that fit the recordings equally well; training draws robots from all of them"
-    return [TableBlock(caption, ("parameter", *(name for name, _ in named)), rows)]
+    return [*tried_blocks(result), TableBlock(caption, ("parameter", *(name for name, _ in named)), rows)]
 
 
 def _predictions(result: Identification) -> list[Block]:

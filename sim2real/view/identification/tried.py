@@ -1,0 +1,15 @@
+"""The block of an identification's page with the optional terms that were tried."""
+
+from __future__ import annotations
+
+from sim2real.artifacts.estimation.tried_term import tried_table
+from sim2real.artifacts.identification import Identification
+from sim2real.view.blocks import Block, TableBlock
+
+
+def tried_blocks(result: Identification) -> list[Block]:
+    """Return the table of the tried terms; nothing if none was tried."""
+    if not result.tried:
+        return []
+    caption = "Optional terms: root mean square error on held-out parts, in deviations of a measurement"
+    return [TableBlock.of(caption, tried_table(result.tried))]
