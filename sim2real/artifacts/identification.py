@@ -31,6 +31,8 @@ ROUND_TRIP = "round_trip_delay"
 MODELS = ("identified", "no delay", "nominal")
 """Models that predict: with the estimates, fitted without delays, and with the nominal values."""
 _COLUMNS = ("t", "into", "segment", "recording", "held_out")
+_NO_LIMIT = 1e6
+"""Value of an absent limit: ``worlds.drive_terms.NO_LIMIT``, whose module takes a second to import."""
 _AGAIN = "run `sim2real identify` again"
 
 
@@ -66,6 +68,11 @@ class Estimate:
     lower: float | None = None
     upper: float | None = None
     truth: float | None = None
+
+    @property
+    def absent(self) -> bool:
+        """Whether it is a limit that the model does not have, as no motion reaches one; tables omit it."""
+        return self.verdict == "fixed" and self.estimate == self.nominal == _NO_LIMIT
 
 
 @dataclass(frozen=True)
@@ -263,6 +270,7 @@ class Identification(Shown):
         rows = [
             [p.name, p.estimate, Interval(p.low95, p.high95), p.unit, p.nominal, p.truth, _off(p), p.verdict]
             for p in self.parameters
+            if not p.absent
         ]
         headers = ("parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict")
         return ArtifactTable(headers, rows)

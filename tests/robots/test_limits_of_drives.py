@@ -1,9 +1,12 @@
 """Servos with a limit of torque or speed: C MuJoCo records, and ``auto`` has to find the limit, or none."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
+from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
@@ -89,6 +92,14 @@ def test_a_limit_that_is_named_and_was_not_reached_has_no_number(tmp_path):
     verdicts = dict(zip(table.names, findings.spread.verdict, strict=True))
     assert verdicts["torque"] == NOT_REACHED
     assert findings.spread.low[table.names.index("torque")] > 1.0
+
+
+def test_tables_omit_a_limit_that_the_model_does_not_have():
+    torque = Estimate("torque", "N m", "dynamics", "", NO_LIMIT, NO_LIMIT, "fixed")
+    held = replace(torque, nominal=2.0, estimate=2.0)
+    found = Identification("arm", (), Judgement("accepted", ()), (torque, replace(held, name="limit")))
+    assert "limit" in str(found.rows())
+    assert "torque" not in str(found.rows())
 
 
 def test_bounds_of_a_limit_are_around_what_the_recording_reaches(tmp_path):

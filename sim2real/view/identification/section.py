@@ -158,6 +158,7 @@ def _at_bound(e: Estimate) -> str:
 
 
 def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
+    estimates = [e for e in estimates if not e.absent]
     with_truth = any(e.truth is not None for e in estimates)
     columns = ["parameter", "estimate", "s.e.", "95 % interval", "unit", "nominal", "bounds"]
     columns += ["truth", "error", "verdict"] if with_truth else ["verdict"]
