@@ -61,7 +61,7 @@ def test_a_term_that_was_not_chosen_but_helps_mends():
 
 def test_nothing_is_said_up_to_three_times_the_noise():
     assert Misfit(ARM, 3.0, 1e-3).reasons(automatic=False) == ()
-    assert "no optional term" in Misfit(ARM, 3.1, 1e-3).reasons(automatic=False)[0]
+    assert "no optional term was tried" in Misfit(ARM, 3.1, 1e-3).reasons(automatic=False)[0]
 
 
 def test_residuals_are_compared_with_the_noise_of_the_worst_position():

@@ -70,7 +70,7 @@ class Misfit:
         p, unit = self.position, f" {self.position.unit}".rstrip()
         sentence = f"residuals of {p.name} are {self.ratio:.2g} times its noise of {self.noise:.2g}{unit}"
         if not self.tried:
-            return (f"{sentence}: the model lacks something, and has no optional term to try",)
+            return (f"{sentence}: the model lacks something; no optional term was tried",)
         fitted = ", ".join(str(t) for t in self.tried if t.outcome != "not fitted")
         took = f" in {self.seconds:.0f} s" if self.seconds else ""
         tried = f"tried{took}, with errors on held-out parts in deviations of a measurement: {fitted or 'no term'}"
