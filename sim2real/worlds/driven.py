@@ -33,6 +33,7 @@ class DriveCommand(Base):
         kp: Stiffness, in the log's unit.
         kd: Damping, in the log's unit.
         enabled: 1 with torque on, 0 with torque off.
+        volts: Measured supply voltage [V]; 0: unknown.
     """
 
     goal: Value | None = None
@@ -42,6 +43,7 @@ class DriveCommand(Base):
     kp: Value | None = None
     kd: Value | None = None
     enabled: Value | None = None
+    volts: Value | None = None
 
 
 @struct.dataclass
@@ -57,6 +59,7 @@ class DriveParams(MjxParams):
         gain: Torque for each unit of torque or duty.
         released: Share of the drive's damping with torque off, by short-circuited windings.
         zero: Reading of the encoders at the model's zero [rad].
+        voltage: Share of stiffness and gain that is proportional to the supply voltage.
         terms: What friction and drive add to that; None: nothing, which costs nothing.
     """
 
@@ -65,6 +68,7 @@ class DriveParams(MjxParams):
     gain: Value = 1.0
     released: Value = 0.0
     zero: Value = 0.0
+    voltage: Value = 0.0
     terms: DriveTerms | None = None
 
 
@@ -77,7 +81,7 @@ class DrivenWorld(MjxWorld):
 
     Args:
         rate: Ticks per second [Hz].
-        units: The values of 1 in the log's units of ``kp`` and ``kd``.
+        units: The values of 1 in the log's units of ``kp`` and ``kd``, and the usual supply voltage [V].
         terms: Whether there are ``DriveTerms``: they are evaluated before every physics step.
         **options: Options of ``MjxWorld``.
     """
@@ -87,7 +91,7 @@ class DrivenWorld(MjxWorld):
         name: str,
         rate: float,
         model: MjModel,
-        units: tuple[float, float] = (1.0, 1.0),
+        units: tuple[float, float, float] = (1.0, 1.0, 1.0),
         terms: bool = False,
         **options: Any,
     ) -> None:
@@ -160,14 +164,17 @@ class DrivenWorld(MjxWorld):
         command: DriveCommand = step_state.inputs[self.input_name][-1].data
         still = jnp.zeros(len(self.joints))
         on = still + 1.0 if command.enabled is None else jnp.asarray(command.enabled) + still
-        kp = still if command.goal is None else on * p.kp * _of_log(command.kp, self.units[0])
+        # A motor's torque at a duty is proportional to its supply voltage.
+        usual = jnp.ones(1) if command.volts is None else jnp.asarray(command.volts) / self.units[2]
+        strength = 1.0 + p.voltage * (jnp.where(usual > 0.0, usual, 1.0) - 1.0)
+        kp = still if command.goal is None else on * strength * p.kp * _of_log(command.kp, self.units[0])
         kd = p.kd * _of_log(command.kd, self.units[1]) * (on + (1.0 - on) * p.released) + still
         # The force without the parts that depend on the state.
         goal = still if command.goal is None else command.goal - p.zero + still
         force = kp * goal
         force += still if command.goal_velocity is None else on * kd * command.goal_velocity
         for pushed in (command.torque, command.duty):
-            force += still if pushed is None else on * p.gain * pushed
+            force += still if pushed is None else on * strength * p.gain * pushed
         return jnp.concatenate([force, kp, kd, *([on, goal] if self.law else [])])
 
 

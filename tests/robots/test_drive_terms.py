@@ -43,6 +43,8 @@ ON = {"load": 0.25, "static": 0.25, "stribeck_rad_s": 0.3, "drag": 0.02, "bias":
       "cogging_cos": 0.1, "cogging_sin": -0.2, "cogging_per_turn": 9.0, "eccentric_cos": 0.05, "eccentric_sin": 0.08,
       "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7, "torque": 1.2, "top_speed": 1.5}  # fmt: skip
 OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1, "cogging_per_turn": 9.0} | dict.fromkeys(LIMITS, NO_LIMIT)
+MECHANICAL = [name for name in OPTIONAL if name != "voltage"]
+"""Those that need no column of the log."""
 PER_TURN = ParameterPattern("cogging_per_turn", nominal=9.0, free=False)
 
 
@@ -104,7 +106,7 @@ def in_c(model_file, terms, goals, on, start):
     return Rollouts(model, 1, tuple(fields), law=law)(fields, state, control, values)[0][1:, 0]
 
 
-@pytest.mark.parametrize("one", [*OPTIONAL, "all"])
+@pytest.mark.parametrize("one", [*MECHANICAL, "all"])
 def test_terms_move_a_joint_as_a_simulation_by_hand(model_file, one):
     goals, on = commands(1500)
     own = ON if one == "all" else OFF | {what: ON[what] for what in OPTIONAL[one]}
@@ -153,7 +155,7 @@ def played(program, terms):
     return np.asarray(program({n: jnp.asarray(v) for n, v in values.items()}))
 
 
-@pytest.mark.parametrize("one", [*OPTIONAL, "all"])
+@pytest.mark.parametrize("one", [*MECHANICAL, "all"])
 def test_both_engines_say_the_same(engines, one):
     own = ON if one == "all" else OFF | {what: ON[what] for what in OPTIONAL[one]}
     found = played(engines.c, own)
@@ -216,11 +218,11 @@ def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
     assert held_out_parts.offering(robot, "own") is robot
     assert robot.make_nodes()[2].law is None
     table = held_out_parts.offering(robot, "auto").identifiable(0.02).parameters
-    assert {p.term for p in table} - {""} == set(OPTIONAL) - set(ONLY_NAMED)
+    assert {p.term for p in table} - {""} == set(MECHANICAL) - set(ONLY_NAMED)
     assert table.terms == ()  # none is free by itself
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms))
     every = held_out_parts.widest(held_out_parts.offering(robot, "all").identifiable(0.02).parameters, "all")
-    assert set(every.terms) == set(OPTIONAL)
+    assert set(every.terms) == set(MECHANICAL)
     off = {p.name: p.without for p in every if p.term}
     assert off == {name: OFF[name] for name in set(ON) - {"cogging_per_turn"}}
     values = every.decode(every.start())
@@ -267,7 +269,7 @@ def test_a_term_of_the_users_own_is_one_of_those_to_choose_from():
     own = optional((ParameterPattern("load", each=True, high=0.5),))
     assert own[0] == ParameterPattern("load", each=True, high=0.5, term="load")
     assert sorted(t.what for t in own) == sorted(
-        {*LAWS, "torque", "tilt_x", "tilt_y", "gravcomp"} - {w for w in LAWS if "cogging" in w}
+        {*LAWS, "torque", "voltage", "tilt_x", "tilt_y", "gravcomp"} - {w for w in LAWS if "cogging" in w}
     )
 
 

@@ -77,6 +77,7 @@ class RobotConfig:
         sigma_rad_s: Deviation of a measured velocity [rad/s].
         kp_unit: The value of 1 in the log's unit of stiffness.
         kd_unit: The value of 1 in the log's unit of damping.
+        volts_unit: Supply voltage at which the drive has the identified strength [V].
         fix_base: Whether a floating base is held.
         hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
     """
@@ -92,6 +93,7 @@ class RobotConfig:
     sigma_rad_s: float = 0.1
     kp_unit: float = 1.0
     kd_unit: float = 1.0
+    volts_unit: float = 1.0
     fix_base: bool = False
     contacts: bool = False
     hold: tuple[str, ...] = ()
@@ -194,7 +196,7 @@ class MjcfRobot(LoggedRobot):
         """Return sensor, actuator and world."""
         config = self.config
         still = {n: jnp.zeros(1 if n in config.shared else len(config.joints)) for n in config.commands}
-        units = config.kp_unit, config.kd_unit
+        units = config.kp_unit, config.kd_unit, config.volts_unit
         world = DrivenWorld("world", 1 / config.step_s, self.model, units, terms=self.lawful)
         sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
         return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
@@ -212,7 +214,8 @@ class MjcfRobot(LoggedRobot):
         """
         heavy = bool(np.any(self.model.opt.gravity))
         offered = optional(self.config.terms, wanted, self.config.joints)
-        terms = (t for t in offered if heavy or t.free or t.what not in WHOLE)
+        without = {*(() if heavy else WHOLE), *(() if "volts" in self.config.commands else ("voltage",))}
+        terms = (t for t in offered if t.free or t.what not in without)
         return MjcfRobot(replace(self.config, terms=tuple(terms)))
 
     def identifiable(self, max_delay_s: float) -> IdentifiableMjcf:
@@ -224,7 +227,12 @@ class MjcfRobot(LoggedRobot):
         n, driving = len(self.config.joints), set(self.config.commands)
         zero, one = jnp.zeros(n), jnp.ones(n)
         return params.replace(
-            kp=FALLBACK["kp"] * one if "goal" in driving else zero, kd=zero, gain=one, released=zero, zero=zero
+            kp=FALLBACK["kp"] * one if "goal" in driving else zero,
+            kd=zero,
+            gain=one,
+            released=zero,
+            zero=zero,
+            voltage=zero,
         )
 
     @property

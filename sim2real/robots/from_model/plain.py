@@ -44,8 +44,12 @@ def driven_simulation(
         if not np.allclose(*pair, rtol=1e-4, atol=1e-9):
             raise UsageError(f"MJCF does not keep the identified {name} of this model", hint="export to json")
     # Collect the numbers of the drives.
-    numbers = {f: np.asarray(getattr(params, f)) + np.zeros(n) for f in ("kp", "kd", "gain", "released", "zero")}
-    numbers |= {"kp_unit": np.array(world.units[0]), "kd_unit": np.array(world.units[1])}
+    numbers = {
+        f: np.asarray(getattr(params, f)) + np.zeros(n) for f in ("kp", "kd", "gain", "released", "zero", "voltage")
+    }
+    numbers |= {
+        name: np.array(unit) for name, unit in zip(("kp_unit", "kd_unit", "volts_unit"), world.units, strict=True)
+    }
     numbers |= {"joints_at": world.joints, "qpos_at": world.qpos_at, "qvel_at": world.qvel_at}
     if params.terms is not None:
         numbers |= {f.name: np.asarray(getattr(params.terms, f.name)) + np.zeros(n) for f in fields(DriveTerms)}

@@ -175,7 +175,8 @@ def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotCo
     # The commands that drive the joints.
     joints = flags.joints or joints_of(model)
     commands, sensed = episode.outputs.get("actuator", {}), episode.outputs.get("sensor", {})
-    driving = tuple(n for n in COMMANDS if n in commands)
+    shaped = [(len(joints),), (1,)]
+    driving = tuple(n for n in COMMANDS if n in commands and (n != "volts" or commands[n].shape[1:] in shaped))
     # A factor of 0 does not determine its parameter: a recorder without the gain writes 0.
     if "goal" in driving and (idle := [n for n in driving if n in _FACTORS and not commands[n].any()]):
         note(f"{', '.join(idle)} is 0 in all of the log: omitted")
@@ -205,7 +206,9 @@ def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotCo
     units = {n: float(np.median(commands[n][commands[n] > 0])) for n in ("kp", "kd") if n in commands}
     description = describe(flags, joints, driving, round(1.0 / fastest, 3), step_s, set(units) == {"kp", "kd"})
     kp_unit = units["kp"] if set(units) == {"kp"} else 1.0
-    return replace(description, shared=tuple(name for name in driving if shapes[name] != n), kp_unit=kp_unit)
+    shared = tuple(name for name in driving if shapes[name] != n)
+    volts = commands["volts"] if "volts" in driving else np.ones(1)
+    return replace(description, shared=shared, kp_unit=kp_unit, volts_unit=float(np.median(volts)) or 1.0)
 
 
 def describe(

@@ -68,10 +68,16 @@ def drive(model: Untyped, data: Untyped, numbers: Untyped, command: Arrays, memo
     # The control: gains of the log count in the log's units; with torque off a share of the damping is left.
     on = command.get("enabled", one) + zero
     goal = command["goal"] - n["zero"] if "goal" in command else zero
-    kp = on * n["kp"] * (command["kp"] / n["kp_unit"] if "kp" in command else one) if "goal" in command else zero
+    usual = command.get("volts", n["volts_unit"]) / n["volts_unit"]
+    strength = 1.0 + n["voltage"] * (np.where(usual > 0.0, usual, 1.0) - 1.0)
+    kp = (
+        on * strength * n["kp"] * (command["kp"] / n["kp_unit"] if "kp" in command else one)
+        if "goal" in command
+        else zero
+    )
     kd = n["kd"] * (command["kd"] / n["kd_unit"] if "kd" in command else one) * (on + (one - on) * n["released"])
     force = kp * goal + on * kd * command.get("goal_velocity", zero)
-    force = force + on * n["gain"] * (command.get("torque", zero) + command.get("duty", zero))
+    force = force + on * strength * n["gain"] * (command.get("torque", zero) + command.get("duty", zero))
     # The terms of friction, dead zone, back-EMF and cogging, which are 0 unless they were identified.
     if "load" in n:
         usual = memory.setdefault("usual", np.stack([model.dof_damping[dof], model.dof_frictionloss[dof]]))

@@ -13,7 +13,7 @@ What = Literal[
     "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
     "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf", "play", "top_speed", "tilt_x", "tilt_y", "gravcomp",
     "eccentric_cos", "eccentric_sin", "cogging_cos", "cogging_sin", "cogging_per_turn",
-    "kp_factor", "kd_factor", "gain_factor", "damping_factor", "armature_factor",
+    "kp_factor", "kd_factor", "gain_factor", "damping_factor", "armature_factor", "voltage",
 ]  # fmt: skip
 FACTORS = ("kp_factor", "kd_factor", "gain_factor", "damping_factor", "armature_factor")
 """Factors of some joints on the quantity that all joints share."""
@@ -56,6 +56,7 @@ ABOUT = {
     "cogging_cos": ("N m", "torque that repeats with the angle, by the cosine"),
     "cogging_sin": ("N m", "torque that repeats with the angle, by the sine"),
     "cogging_per_turn": ("1", "how often that torque repeats in a turn"),
+    "voltage": ("1", "share of the drive's strength that is proportional to the supply voltage"),
     **{f: ("1", f"{f.removesuffix('_factor')}, beside that of the first joints") for f in FACTORS},
 }
 EXCITE = {
@@ -75,6 +76,7 @@ EXCITE = {
     **dict.fromkeys(("zero", "payload"), "motion of each joint against gravity, up and down"),
     **dict.fromkeys(TILT, "motion of joints whose axes are not upright, against gravity, up and down"),
     **dict.fromkeys(("eccentric_cos", "eccentric_sin"), "motion of each joint over most of a turn"),
+    "voltage": "motion against a load while the supply voltage changes",
     **dict.fromkeys(FACTORS, "motion of each joint, as of the first ones"),
     **dict.fromkeys(COGGING, "slow motion of each joint over many of its repeats, both ways"),
 }
@@ -83,7 +85,8 @@ VANISHING = ("kd", "damping", "armature", "frictionloss")
 """Quantities that may be 0."""
 FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.0, 0.0, 5.0),
           "load": (0.0, 0.0, 1.0), "play": (0.0, 0.0, 0.1), "tilt_x": (0.0, -0.3, 0.3), "tilt_y": (0.0, -0.3, 0.3),
-          "gravcomp": (0.0, 0.0, 1.5), "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
+          "gravcomp": (0.0, 0.0, 1.5), "voltage": (0.0, 0.0, 1.5),
+          "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
           "cogging_per_turn": (1.0, 0.0, 10_000.0)}  # fmt: skip
 OF_MODEL = {"static": ("frictionloss", 5.0), "bias": ("frictionloss", 5.0), "drag": ("damping", 5.0),
              "back_emf": ("damping", 30.0), "cogging_cos": ("frictionloss", 5.0),
@@ -100,6 +103,7 @@ OPTIONAL = {
     "play": ("play",),
     "torque_limit": ("torque",),
     "speed_limit": ("top_speed",),
+    "voltage": ("voltage",),
     "gravcomp": ("gravcomp",),
     "tilt": TILT,
     "eccentricity": ("eccentric_cos", "eccentric_sin"),
@@ -112,9 +116,9 @@ ONLY_NAMED = ("tilt", "eccentricity", "cogging")
 """Terms that ``auto`` omits unless a parameter names them: in few robots they differ from a zero or a stiffness."""
 LIMITS = (*OPTIONAL["torque_limit"], *OPTIONAL["speed_limit"])
 """Limits of what a drive does, absent at ``NO_LIMIT``. As optional terms they get their bounds from the recordings."""
-LAWS = (*(q for term in OPTIONAL.values() for q in term if q not in (*WHOLE, "torque")), "cogging_per_turn")
+LAWS = (*(q for term in OPTIONAL.values() for q in term if q not in (*WHOLE, "torque", "voltage")), "cogging_per_turn")
 """Quantities that are set before every step."""
-ON_DRIVE = ("kp", "kd", "gain", "released", "zero")
+ON_DRIVE = ("kp", "kd", "gain", "released", "zero", "voltage")
 ON_DOF = {"damping": "dof_damping", "armature": "dof_armature", "frictionloss": "dof_frictionloss"}
 
 

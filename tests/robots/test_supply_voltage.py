@@ -1,0 +1,58 @@
+"""A servo whose strength follows its supply voltage: C MuJoCo records, and the share has to be found."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from sim2real.graph.episode import Episode, Steps
+from sim2real.identify.config import FitConfig
+from sim2real.identify.fit import fit
+from sim2real.identify.problem.segments import Span
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
+from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.stages.estimation import held_out_parts
+
+STEP_S, PERIOD, SECONDS, NOISE, KP, VOLTS = 0.002, 5, 4.0, 2e-4, 12.0, 7.4
+XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
+  <joint name="servo" axis="0 1 0" damping="0.4" armature="0.02"/>
+  <inertial pos="0 0 -0.2" mass="1" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("share", [1.0, 0.0])
+def test_the_share_that_follows_the_voltage_is_found(tmp_path, share):
+    path = tmp_path / "arm.xml"
+    path.write_text(XML)
+    model = mujoco.MjModel.from_xml_string(XML)
+    data = mujoco.MjData(model)
+    t = STEP_S * PERIOD * np.arange(round(SECONDS / STEP_S / PERIOD))
+    goals = (0.8 * np.sin(3.1 * t) + 0.3 * np.sin(9.3 * t))[:, None]
+    volts = (VOLTS * (1.0 - 0.15 * np.sin(1.9 * t) ** 2))[:, None]
+    data.qpos[:], angles = goals[0], []
+    for goal, supply in zip(goals, volts, strict=True):
+        angles.append(data.qpos.copy())
+        for _ in range(PERIOD):
+            data.qfrc_applied[:] = KP * (1.0 + share * (supply / VOLTS - 1.0)) * (goal - data.qpos)
+            mujoco.mj_step(model, data)
+    at = np.arange(len(t)) * round(1e6 * STEP_S * PERIOD)
+    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
+    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
+    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals, "volts": volts}}
+    episode = Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+    terms = tuple(map(ParameterPattern, ("kp", "damping", "voltage")))
+    config = RobotConfig(path, ("servo",), ("goal", "volts"), step_s=STEP_S, rate_hz=100.0, terms=terms)
+    model = MjcfRobot(replace(config, sigma_rad=NOISE, volts_unit=VOLTS)).identifiable(0.02)
+    spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
+    found = fit(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02)).values
+    assert found["voltage"] == pytest.approx(share, abs=0.05)
+    assert found["kp"] == pytest.approx(KP, rel=0.02)
+
+
+def test_the_term_is_offered_for_a_log_with_a_voltage_alone(tmp_path):
+    path = tmp_path / "arm.xml"
+    path.write_text(XML)
+    for commands, there in ((("goal",), False), (("goal", "volts"), True)):
+        robot = MjcfRobot(RobotConfig(path, ("servo",), commands, terms=(ParameterPattern("kp"),)))
+        offered = held_out_parts.offering(robot, "auto").identifiable(0.02).parameters
+        assert ("voltage" in {p.term for p in offered}) == there
