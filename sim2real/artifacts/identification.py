@@ -34,8 +34,6 @@ _COLUMNS = ("t", "into", "segment", "recording", "held_out")
 _NO_LIMIT = 1e6
 """Value of an absent limit: ``worlds.drive_terms.NO_LIMIT``, whose module takes a second to import."""
 _AGAIN = "run `sim2real identify` again"
-
-
 UNFINISHED = {"interrupted": "was interrupted", "not converged": "did not converge"}
 """Verdict on an identification without intervals -> the reason as text."""
 

@@ -289,9 +289,9 @@ class MjcfRobot(LoggedRobot):
         for p in self.placed:
             each = np.asarray(of_each(p, self.placed, values)).tolist() if p.what in names else ()
             for i, value in zip(p.at, each, strict=bool(each)):
-                own = drives[i]["most"] or NO_LIMIT
+                of_file = drives[i]["most"] or NO_LIMIT
                 if p.what == "torque":
-                    value = min(value, own) if p.among_limits else value
+                    value = min(value, of_file) if p.among_limits else value
                 drives[i][names[p.what]] = None if p.what == "torque" and value >= NO_LIMIT else value
         return [JointDrive(control, **drive) for drive in drives]
 
