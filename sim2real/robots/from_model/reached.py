@@ -47,8 +47,12 @@ def _derivatives(t_s: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.
     even_s = np.arange(t_s[0], t_s[-1], period_s)
     even = np.stack([np.interp(even_s, t_s, column) for column in position.T], axis=1)
     window = min(max(5, 2 * round(_WINDOW_S / period_s / 2) + 1), len(even) - 1 + len(even) % 2)
-    first, second = (savgol_filter(even, window, 2, deriv=k, delta=period_s, axis=0) for k in (1, 2))
-    return tuple(np.stack([np.interp(t_s, even_s, c) for c in d.T], axis=1) for d in (first, second))  # pyright: ignore[reportReturnType]
+
+    def derivative(order: int) -> np.ndarray:
+        columns = np.asarray(savgol_filter(even, window, 2, deriv=order, delta=period_s, axis=0)).T
+        return np.stack([np.interp(t_s, even_s, column) for column in columns], axis=1)
+
+    return derivative(1), derivative(2)
 
 
 def _torques(
