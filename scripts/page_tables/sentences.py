@@ -121,7 +121,7 @@ def drift(*reports: Mapping[str, Any]) -> str:
 
 def restored(*reports: Mapping[str, Any]) -> str:
     """Return the table of successful deployments after one iteration of the loop, by change."""
-    kinds = dict.fromkeys(("friction", "payload", "delay"), "restored")
+    kinds: dict[str, str] = dict.fromkeys(("friction", "payload", "delay"), "restored")
     return "| robots | friction doubled | payload +30 % | 15 ms more |\n|---|---|---|---|\n" + _by_robot(reports, kinds)
 
 
