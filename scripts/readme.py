@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from benches.catalogue import measures
 from benches.provenance import ROOT, why_stale
-from page_tables import sentences
+from page_tables import recordings, sentences
 from page_tables.league import evidence, league, league_promises
 
 TABLES = {
@@ -44,11 +44,16 @@ TABLES = {
         "drift_so101_restore_payload",
     ),
     "two_devices": ("scaling_h200",),
+    "view": ("view",),
+    "excitation": ("excitation",),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
 PAGES = (
     *("README.md", "docs/results.md", "docs/getting_started.md"),
-    *(f"docs/guides/{name}.md" for name in ("so101", "train", "safety", "compose", "deploy", "scale")),
+    *(
+        f"docs/guides/{name}.md"
+        for name in ("so101", "train", "safety", "compose", "deploy", "scale", "view", "record")
+    ),
 )
 """Pages with tables, or with a sentence of figures."""
 FIGURE = "docs/images/what_training_knows.svg"
@@ -275,6 +280,8 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "drift": lambda chosen: sentences.drift(*chosen.values()),
         "restored": lambda chosen: sentences.restored(*chosen.values()),
         "two_devices": lambda chosen: sentences.on_two_devices(*chosen.values()),
+        "view": lambda chosen: recordings.view(*chosen.values()),
+        "excitation": lambda chosen: recordings.excitation(*chosen.values()),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}
     chosen = {table: {name: reports[name] for name in names} for table, names in there.items()}

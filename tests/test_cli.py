@@ -222,7 +222,8 @@ def test_resume_runs_everything_after_the_first_unfinished_stage(calls):
 def test_view_and_report_find_the_newest_run(monkeypatch, calls, capsys, tmp_path):
     recording, page = ModuleType("sim2real.view.rerun_recording"), ModuleType("sim2real.view.page.page")
     seen = []
-    recording.view = lambda run_dir, save, draw=None: seen.append((run_dir, save))
+    recording.view = lambda run_dir, save, scene, serve: seen.append((run_dir, save))
+    recording.Scene = recording.blueprint_of = recording.send_curve = None
     page.report = lambda run_dir: run_dir / "report.html"
     monkeypatch.setitem(sys.modules, recording.__name__, recording)
     monkeypatch.setitem(sys.modules, page.__name__, page)

@@ -18,7 +18,10 @@ IMPORTED_AS = {
     "pyserial": "serial", "rerun-sdk": "rerun", "scikit-learn": "sklearn",
 }  # fmt: skip
 MAY_IMPORT = {
-    "view": {"sim2real.view.rerun_recording", "pipelines.arm.scene", "pipelines.pendulum.scene"},
+    "view": {
+        *("sim2real.view.rerun_recording", "sim2real.view.rerun_viewer", "sim2real.view.model_scene"),
+        *("pipelines.arm.scene", "pipelines.pendulum.scene"),
+    },
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax_adapter", "sim2real.interop.gymnasium_adapter"},
     "mixture": {"sim2real.graph.fitting"},

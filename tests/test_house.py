@@ -17,8 +17,9 @@ ROOMS = [
 ]  # fmt: skip
 EVERYWHERE = {"arrays", "errors", "leaps", "moved", "callable_package", "types"}
 STAGES = {path.parent.name for path in (PACKAGE / "stages").glob("*/stage.py")}
-COMPOSED = {"latency": {"record", "identify"}}
-"""Stages that call other stages: latency records steps and identifies the delay from them."""
+COMPOSED = {"latency": {"record", "identify"}, "record": {"check"}}
+"""Stages that call other stages: latency records steps and identifies the delay from them, and record checks a motion
+from a file before it plays it."""
 MOST_FILES = 15
 """Modules in a folder."""
 MAX_LINES = 400

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
+import numpy as np
 from mujoco import MjData, MjModel, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
 from sim2real.hardware.feetech.registers import RAD_PER_COUNT
@@ -39,6 +40,7 @@ _STRIBECK_RAD_S = (0.336, 0.451, 0.334, 0.320, 0.264, 0.0534)
 _SATURATION_RAD = (0.450, 0.450, 0.450, 0.450, 0.170, 0.0615)  # of those that were not identified, rotation's
 _BIAS_RAD = (-0.0008, 0.0098, 0.0061, 0.0070, -0.0011, -0.0002)
 _OFF_DAMPING: Final = 0.1  # assumed: what brakes an open winding [N m s/rad]
+_HAND_NM_RAD, _HAND_DAMPING, _HAND_MOST_NM = 12.0, 0.5, 4.0  # assumed: a person's hand [N m/rad, N m s/rad, N m]
 
 _MODEL = """
 <mujoco model="so101">
@@ -101,6 +103,9 @@ class SO101Plant:
         step_s: MuJoCo's time step [s].
         gain: Factor on the servos' gain.
         friction: Factor on dry friction.
+        carried_kg: Mass between the jaws [kg].
+        hand: File (npz) of a person's motion, ``t_s`` ``(N,)`` [s] and ``position`` ``(N, 6)`` [rad]: a hand pulls each
+            joint without torque towards it, as a spring with a damper; None: there is no hand.
     """
 
     servo_ids = (1, 2, 3, 4, 5, 6)
@@ -112,7 +117,9 @@ class SO101Plant:
         gain: float = 1.0,
         friction: float = 1.0,
         carried_kg: float = 0.0,
+        hand: str | None = None,
     ) -> None:
+        self._hand = None if hand is None else dict(np.load(hand))
         # Friction with the stiffest impedance of the solver: at the default, a joint that should stick creeps.
         carried = _CARRIED.format(carried_kg) if carried_kg else ""
         sizes = {"armature": _ARMATURE, "damping": _OFF_DAMPING, "carried": carried}
@@ -136,7 +143,8 @@ class SO101Plant:
         model, data = self.model, self.data
         for _ in range(round((t_s - data.time) / model.opt.timestep)):
             angles, speeds = self._qpos.tolist(), self._qvel.tolist()
-            self._applied[:] = self._torques = [self._torque(i, angle) for i, angle in enumerate(angles)]
+            self._torques = [self._torque(i, angle) for i, angle in enumerate(angles)]
+            self._applied[:] = self._torques if self._hand is None else self._with_hand(angles, speeds)
             self._friction[:] = [
                 level * math.exp(-abs(speed) / width)
                 for level, speed, width in zip(self._levels, speeds, _STRIBECK_RAD_S, strict=True)
@@ -186,6 +194,16 @@ class SO101Plant:
             **{f"saturation_{j}": _SATURATION_RAD[joints.index(j)] for j in ("wrist_roll", "gripper")},
             "payload": self._carried_kg,
         }
+
+    def _with_hand(self, angles: list[float], speeds: list[float]) -> list[float]:
+        """Return the torques on the joints: of the motors, and of the hand on joints without a motor's torque [N m]."""
+        hand, torques = self._hand or {}, list(self._torques)
+        for i, goal in enumerate(self._goals):
+            if goal is None:
+                there = float(np.interp(self.data.time, hand["t_s"], hand["position"][:, i]))
+                pull = _HAND_NM_RAD * (there - angles[i]) - _HAND_DAMPING * speeds[i]
+                torques[i] += min(max(pull, -_HAND_MOST_NM), _HAND_MOST_NM)
+        return torques
 
     def _torque(self, joint: int, angle: float) -> float:
         """Return what the motor's duty makes of the error, without back-EMF [N m]."""

@@ -53,6 +53,11 @@ BENCHES = {
             *("scripts/benches/hidden", "pipelines/arm", "pipelines/so101"),
         ),
     ),
+    "excitation": Bench(
+        "excitation",
+        "friction and zeros of the SO-101 from a multisine, from a teleoperated motion and from one shown by hand",
+        (*_STAGES, "pipelines/so101"),
+    ),
     "faults": Bench(
         "faults",
         "faults while a policy runs: time until the motor is safe, the log, exit code and message",
@@ -103,6 +108,14 @@ BENCHES = {
         ("sim2real", "pipelines", "datasets", "tests", "scripts/bench.py", "scripts/benches", "pyproject.toml"),
     ),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),
+    "view": Bench(
+        "live_view",
+        "the cost of a live viewer for the control loop of twelve joints at 200 Hz",
+        (
+            *("sim2real/stages/live", "sim2real/view/live", "sim2real/view/rerun_recording.py", "sim2real/log"),
+            *("sim2real/runtime", "sim2real/hardware", "scripts/benches/runner.py", "scripts/benches/twelve_joints.py"),
+        ),
+    ),
 }
 
 

@@ -19,6 +19,7 @@ import tyro
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.live.config import WINDOW
 from sim2real.stages.record.config import RecordConfig
 from sim2real.stages.train.config import TrainConfig
 
@@ -121,6 +122,10 @@ class ViewFlags(TargetFlags):
 
     save: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
     """Write a recording for the Rerun viewer instead of opening the viewer."""
+    web: bool = False
+    """Serve a page for browsers, until Ctrl-C, instead of opening the viewer."""
+    follow: bool = False
+    """Join a run whose stages are still running, and show their new rows, until Ctrl-C."""
 
 
 def parse(
@@ -144,7 +149,7 @@ def parse(
             parsed, unknown = tyro.cli(
                 kind or type(default),
                 default=default,
-                args=list(arguments),
+                args=_with_viewer(arguments),
                 prog=prog,
                 description=description,
                 return_unknown_args=True,
@@ -157,6 +162,16 @@ def parse(
     if unknown:
         raise _unknown(unknown, default, prog)
     return parsed
+
+
+def _with_viewer(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments with a value for each flag ``--view`` that has none: a window."""
+    words = []
+    for word, following in zip(arguments, [*arguments[1:], "-"], strict=False):
+        words.append(word)
+        if re.fullmatch(r"--(\w+\.)?view", word) and following.startswith("-"):
+            words.append(WINDOW)
+    return words
 
 
 def flag_names(config: Any, prefix: str = "") -> list[str]:

@@ -62,18 +62,26 @@ def demo(command: str, arguments: list[str]) -> None:
 
 
 def view(command: str, arguments: list[str]) -> None:
-    """``sim2real view RUN|PIPELINE [--save FILE.rrd]``."""
+    """``sim2real view RUN|PIPELINE [--save FILE.rrd | --web] [--follow]``."""
     from sim2real.commands import flags
 
     description = "Open a run in the Rerun viewer: a run folder, or a pipeline's newest run."
     run_dir, parsed = _find_target(command, arguments, flags.ViewFlags(), description)
     from sim2real.artifacts.run.run_folder import pipeline_of
+    from sim2real.stages.live.follow import follow, serve
+    from sim2real.stages.live.scene import drawn, scene_of
     from sim2real.stages.pipeline.pipeline import load_pipeline
     from sim2real.stages.terminal.console import wrote
     from sim2real.view.rerun_recording import view as view_run
 
+    if parsed.save is not None and (parsed.web or parsed.follow):
+        raise UsageError("--save writes a file: it excludes --web and --follow")
     pipeline = load_pipeline(pipeline_of(run_dir))
-    view_run(run_dir, parsed.save, pipeline.load(pipeline.scene).log_scene if pipeline.scene else None)
+    scene = drawn(scene_of(pipeline, None if pipeline.scene else pipeline.load()))
+    if parsed.follow:
+        follow(run_dir, pipeline.name, "web" if parsed.web else "window", scene)
+        return
+    view_run(run_dir, parsed.save, scene, serve if parsed.web else None)
     if parsed.save is not None:
         wrote(parsed.save)
 

@@ -147,10 +147,8 @@ def walk(path: str | Path, span: Range | None = None) -> Contents:
             if record.opcode == Opcode.MESSAGE_INDEX:
                 channel = data[record.start] | data[record.start + 1] << 8
                 contents.indexed[channel] = contents.indexed.get(channel, 0) + (record.end - record.start - 6) // 16
-            elif record.opcode == Opcode.CHUNK:
-                _take_chunk(contents, data, record, span)
             else:
-                _take_other(contents, data, record)
+                take(contents, data, record, span)
     # Without the session's metadata, find the reason.
     if contents.session is None:
         if contents.library not in ("", LIBRARY):
@@ -182,7 +180,15 @@ def readable_errors(path: str | Path) -> Iterator[None]:
         ) from error
 
 
-def _take_chunk(contents: Contents, data: mmap.mmap, record: Record, span: Range | None) -> None:
+def take(contents: Contents, data: mmap.mmap | bytes, record: Record, span: Range | None) -> None:
+    """Add a record to the contents; of a chunk in the range its messages."""
+    if record.opcode == Opcode.CHUNK:
+        _take_chunk(contents, data, record, span)
+    else:
+        _take_other(contents, data, record)
+
+
+def _take_chunk(contents: Contents, data: mmap.mmap | bytes, record: Record, span: Range | None) -> None:
     contents.chunks += 1
     first, last = chunk_times(data, record)
     contents.last_log_time = max(contents.last_log_time, last)
@@ -215,7 +221,7 @@ def _take_channel(contents: Contents, channel: Channel | None) -> None:
             contents.messages.setdefault(channel.id, [])
 
 
-def _take_other(contents: Contents, data: mmap.mmap, record: Record) -> None:
+def _take_other(contents: Contents, data: mmap.mmap | bytes, record: Record) -> None:
     if record.opcode == Opcode.CHANNEL:
         _take_channel(contents, parsed(Channel, data, record, contents.damage))
     elif record.opcode == Opcode.HEADER and (header := parsed(Header, data, record, contents.damage)) is not None:

@@ -53,9 +53,9 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
     span = Range(start_s, end_s)
     contents = walk(path, span)
     with readable_errors(path):
-        steps, outputs, sequences = _steps_and_outputs(contents, span)
+        steps, outputs, sequences = steps_and_outputs(contents, span)
         messages, events = _connections(contents, span, sequences), _events(contents, span)
-        units = _units(contents)
+        units = output_units(contents)
     # Steps before the first one count as lost, unless the range starts later.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
     missing = {
@@ -132,14 +132,14 @@ def summary(path: str | Path) -> dict[str, Json]:
     }
 
 
-def _units(contents: Contents) -> dict[str, dict[str, str]]:
+def output_units(contents: Contents) -> dict[str, dict[str, str]]:
     """Return node -> field -> unit, for the nodes whose channels have units."""
     channels = contents.with_role("output").values()
     by_node = {c.metadata["node"]: units_of_fields(json.loads(c.metadata["fields"])) for c in channels}
     return {node: units for node, units in by_node.items() if units}
 
 
-def _steps_and_outputs(
+def steps_and_outputs(
     contents: Contents, span: Range
 ) -> tuple[dict[str, Steps], dict[str, dict[str, np.ndarray]], dict[str, np.ndarray]]:
     """Return steps, outputs, and the number of each step, by node."""

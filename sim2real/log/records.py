@@ -163,13 +163,23 @@ def records(data: mmap.mmap, damage: Damage) -> Iterator[Record]:
     damage.cut = True
 
 
-def chunk_times(data: mmap.mmap, record: Record) -> tuple[int, int]:
+def whole_records(data: bytes, position: int) -> Iterator[Record]:
+    """Yield the records of the end of a growing file from a position on, up to the first one that is not whole yet."""
+    while position + _PREFIX.size <= len(data):
+        opcode, length = _PREFIX.unpack_from(data, position)
+        start, position = position + _PREFIX.size, position + _PREFIX.size + length
+        if position > len(data) or opcode == _DATA_END:
+            return
+        yield Record(opcode, start, position)
+
+
+def chunk_times(data: mmap.mmap | bytes, record: Record) -> tuple[int, int]:
     """Return the first and the last log time in a chunk [ns]."""
     first, last = _CHUNK_TIMES.unpack_from(data, record.start)
     return first, last
 
 
-def chunk_content(data: mmap.mmap, record: Record, damage: Damage) -> bytes:
+def chunk_content(data: mmap.mmap | bytes, record: Record, damage: Damage) -> bytes:
     """Return the content of a chunk, decompressed and checked; empty if it is damaged."""
     try:
         return _decompressed(Chunk.read(stream_of(data, record)))

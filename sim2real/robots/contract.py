@@ -189,8 +189,13 @@ class Robot:
 
     # -- graphs on hardware
 
-    def recording_nodes(self, session: Session, signal: np.ndarray) -> dict[str, BaseNode]:
-        """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step."""
+    def recording_nodes(self, session: Session, signal: np.ndarray | None) -> dict[str, BaseNode]:
+        """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step.
+
+        Without an excitation it only measures: it has the sensor alone, and no node sends a command.
+        """
+        if signal is None:
+            return {self.roles.sensor: self._sensor(session)}
         rows = np.asarray(signal, np.float64).reshape(-1, len(self.agent.action))
         rows, drive = self.drive.approach(session, rows), self.drive
         delay_s = drive.expected_delay_s[1]
@@ -211,13 +216,16 @@ class Robot:
         return self._on_hardware(session, PolicyNode(node, policy)), params
 
     def _on_hardware(self, session: Session, agent: BaseNode) -> dict[str, BaseNode]:
-        rate, rig, (sensing_s, _, acting_s) = self.rate_hz, session.rig, self.drive.expected_delay_s
+        rate, rig, acting_s = self.rate_hz, session.rig, self.drive.expected_delay_s[2]
         roles, drive = self.roles, self.drive
-        sensor = ServoSensor(roles.sensor, rate, rig, self.sensor.read, self.sensor.at_rest, delay=sensing_s)
         actuator = ServoActuator(
             roles.actuator, rate, rig, drive.command, drive.message, roles.supervisor, delay=acting_s
         )
-        return control_nodes(sensor, agent, actuator)
+        return control_nodes(self._sensor(session), agent, actuator)
+
+    def _sensor(self, session: Session) -> ServoSensor:
+        read, rest, delay_s = self.sensor.read, self.sensor.at_rest, self.drive.expected_delay_s[0]
+        return ServoSensor(self.roles.sensor, self.rate_hz, session.rig, read, rest, delay=delay_s)
 
     # -- graphs in simulation
 

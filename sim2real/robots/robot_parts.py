@@ -32,7 +32,7 @@ from sim2real.types import Array, Key, PyTree, Scalar
 if TYPE_CHECKING:
     from sim2real.hardware.device import Reading
     from sim2real.hardware.emulation.embedded import EmbeddedRobot
-    from sim2real.hardware.safety.rig import Rig
+    from sim2real.hardware.safety.rig import GateConfig, Rig
     from sim2real.robots.gate_limits import GateLimits
 
 
@@ -113,6 +113,10 @@ class RobotDrive(_Part, Protocol):
         Args:
             settle_s: Longest time to wait for rest, for each attempt [s].
         """
+
+    def gate(self, limits: GateLimits) -> GateConfig:
+        """Return the limits of commands and measurements; default: the same for each command."""
+        return limits.gate(limits.limit)
 
     def around(self, signal: np.ndarray) -> np.ndarray:
         """Return the commands ``(N, actions)`` of an excitation; default: the signal itself, around 0."""

@@ -25,7 +25,7 @@ class Curve:
     Attributes:
         entity: Path of the curve in the recording.
         label: Name in the legend.
-        look: Style, which is the same in every plot: measured, identified, nominal, truth, command.
+        look: Style, which is the same in every plot: measured, identified, nominal, truth, command; empty: Rerun's.
         t_s: Times ``(N,)`` [s]; a NaN among the values interrupts the line.
         values: Values ``(N,)``.
     """
@@ -56,6 +56,8 @@ class Tab:
         plots: Title -> curves, from top to bottom.
         motions: Motions in the 3-D view.
         episode: Source of the schedule; None without a schedule.
+        recent_s: Part before the time cursor that the plots of a live view show [s], infinite for all of it; None: the
+            tab is not live.
     """
 
     title: str
@@ -63,6 +65,7 @@ class Tab:
     plots: Mapping[str, list[Curve]]
     motions: list[SceneMotion]
     episode: Episode | None = None
+    recent_s: float | None = None
 
 
 def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
@@ -74,7 +77,7 @@ def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
     tabs = []
     if "record" in artifacts:
         log = signals_of(Recording.load(artifacts["record"].folder))
-        tabs.append(_episode_tab(_dry("Record", log), "record", log, []))
+        tabs.append(episode_tab(_dry("Record", log), "record", log, []))
     if "identify" in artifacts:
         identification = Identification.load(artifacts["identify"].folder)
         several = len(identification.recordings) > 1
@@ -84,7 +87,7 @@ def tabs_of(artifacts: Mapping[str, StageFolder]) -> list[Tab]:
         for i, (recording, simulated) in enumerate(zip(deployed.recordings, deployed.simulated, strict=True)):
             log = signals_of(recording)
             beside = simulated_beside(simulated, log, deployed.units)
-            tabs.append(_episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, beside))
+            tabs.append(episode_tab(_dry(f"Deploy {i}", log), f"deploy/{i}", log, beside))
     return [tab for tab in tabs if tab.plots]
 
 
@@ -92,7 +95,7 @@ def _dry(title: str, log: Signals) -> str:
     return f"{title} (dry run)" if log.dry else title
 
 
-def _episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) -> Tab:
+def episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) -> Tab:
     """Return the tab of a log: measured, true and simulated states, what nodes command, and the schedule."""
     plots: dict[str, list[Curve]] = {}
     models = {s.name: s for s in simulated}
@@ -130,7 +133,7 @@ def _identify_tab(identification: Identification, recording: int, which: str) ->
         for model in ("measured", *(m for m in identification.models(quantity) if m != "no delay")):
             values = samples[f"{quantity}_{model}"].astype(np.float64)
             columns.setdefault(model, {})[quantity] = values
-            series = Series(quantity, model, *_interrupted(t_s, values, segment))
+            series = Series(quantity, model, *interrupted(t_s, values, segment))
             curves.append(_curve(f"{entity}/{model}", series, model, model))
         plots[_titled(quantity, identification.units)] = curves
     motions = [SceneMotion(f"{entity}/scene/robot", t_s, columns["measured"], ghost=False)] if columns else []
@@ -172,7 +175,7 @@ def _titled(name: str, units: Mapping[str, str]) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _interrupted(t_s: np.ndarray, values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Insert a NaN after the end of each segment, as the next one starts from another state."""
+def interrupted(t_s: np.ndarray, values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and values with a NaN after the end of each segment, as the next one starts from another state."""
     cuts = np.flatnonzero(np.diff(segment)) + 1
     return np.insert(t_s, cuts, t_s[cuts - 1] + 1e-6), np.insert(values, cuts, np.nan)

@@ -5,6 +5,7 @@ The data is sent after the run, so that no control loop waits for a viewer, and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from sim2real.artifacts.run.run_folder import finished_stages, pipeline_of
-from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import TICKS_PER_S, Episode
 from sim2real.log.ages import input_ages
 from sim2real.view.rerun_content import IDLE, Curve, Tab, states_of, tabs_of
+from sim2real.view.rerun_viewer import open_viewer, rerun_module
 from sim2real.view.timing import color_of, in_order, slowest_period_s
 
 TIMELINE = "time"
@@ -36,35 +37,34 @@ _COLORS = {
 }  # fmt: skip
 _WIDTHS = {"measured": 2.0, "identified": 1.6, "nominal": 1.4, "truth": 1.2, "command": 1.6}
 _STATES = {"waiting": (110, 120, 132), "late": (226, 138, 48), "computing": (66, 150, 230)}
+_ROWS = 7
+"""Largest number of plots below each other."""
 _PERIODS = 1.5
 """Visible part of the schedule on either side of the time cursor [periods of the slowest node]."""
 
 
-def view(run_dir: Path, save: Path | None = None, scene: Scene | None = None) -> None:
-    """Open a run in the Rerun viewer, or save it as a recording.
+def view(
+    run_dir: Path, save: Path | None = None, scene: Scene | None = None, serve: Callable[[str], None] | None = None
+) -> None:
+    """Open a run in the Rerun viewer, or save it as a recording, or serve it on a page for browsers.
 
     Args:
         save: Write this file (``.rrd``) instead of opening the viewer.
         scene: Draws the robot in 3-D; None: no 3-D view.
+        serve: Called with the address of the page, which is served until it returns; None: a window.
 
     Raises:
         Sim2RealError: When Rerun is not installed, no stage is finished, or what a stage wrote is malformed.
     """
-    rr = _rerun()
+    rr = rerun_module()
     tabs = tabs_of(finished_stages(run_dir))  # before a viewer opens
     name = f"{pipeline_of(run_dir)} {Path(run_dir).resolve().name}"
     # Use one application for each run, as the viewer stores one arrangement per application.
     recording = rr.RecordingStream(f"sim2real {name}")
-    try:
-        if save is None:
-            recording.spawn()
-        else:
-            Path(save).parent.mkdir(parents=True, exist_ok=True)
-            recording.save(save)
-    except (OSError, RuntimeError) as error:
-        reason = f"cannot write {save}" if save else "cannot open the Rerun viewer"
-        raise Sim2RealError(f"{reason}: {error}", hint="save it with --save FILE.rrd and open that") from error
+    line = open_viewer(recording, str(save) if save else "web" if serve else "window")
     build(recording, tabs, name, scene)
+    if serve:
+        serve(line)
     recording.disconnect()
 
 
@@ -79,26 +79,27 @@ def build(recording: Any, tabs: Sequence[Tab], name: str, scene: Scene | None = 
     recording.send_recording_name(name)
     for tab in tabs:
         for curve in (c for curves in tab.plots.values() for c in curves):
-            _send_curve(recording, curve)
+            send_curve(recording, curve)
         if tab.episode is not None:
             _send_timing(recording, tab.entity, tab.episode)
         for motion in tab.motions if scene else ():
             if scene and len(motion.t_s):
                 scene(recording, motion.t_s, motion.columns, motion.entity, motion.ghost)
-    recording.send_blueprint(_blueprint(tabs, scene is not None))
+    recording.send_blueprint(blueprint_of(tabs, scene is not None))
     recording.flush()
 
 
-def _send_curve(recording: Any, curve: Curve) -> None:
-    rr = _rerun()
-    looks = rr.SeriesLines(names=curve.label, colors=_COLORS[curve.look], widths=_WIDTHS[curve.look])
+def send_curve(recording: Any, curve: Curve) -> None:
+    """Send a curve and its style."""
+    rr = rerun_module()
+    looks = rr.SeriesLines(names=curve.label, colors=_COLORS.get(curve.look), widths=_WIDTHS.get(curve.look, 1.4))
     recording.log(curve.entity, looks, static=True)
     recording.send_columns(curve.entity, [_time(curve.t_s)], rr.Scalars.columns(scalars=curve.values))
 
 
 def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
     """Send each node's states as lanes, and its lateness and age of inputs as curves."""
-    rr = _rerun()
+    rr = rerun_module()
     for node in in_order(episode):
         steps = episode.steps[node]
         if not len(steps):
@@ -132,17 +133,23 @@ def _own_color(episode: Episode, node: str) -> tuple[int, int, int] | None:
     return (int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)) if color else None
 
 
-def _blueprint(tabs: Sequence[Tab], with_scene: bool) -> Any:
+def blueprint_of(tabs: Sequence[Tab], with_scene: bool) -> Any:
+    """Return the arrangement of the tabs; of live ones the newest is open."""
     import rerun.blueprint as rrb
 
+    # The time cursor stays at the newest data of a live view, which opens its newest tab.
+    live = tabs[-1].recent_s is not None
     panels = [
         rrb.TopPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, playback_speed=1.0),
+        rrb.TimePanel(
+            state="collapsed", timeline=TIMELINE, playback_speed=1.0, play_state="following" if live else None
+        ),
     ]
     pages = [_page(tab, with_scene) for tab in tabs]
-    return rrb.Blueprint(rrb.Tabs(*pages) if len(pages) > 1 else pages[0], *panels)
+    newest = len(pages) - 1 if live else 0
+    return rrb.Blueprint(rrb.Tabs(*pages, active_tab=newest) if len(pages) > 1 else pages[0], *panels)
 
 
 def _page(tab: Tab, with_scene: bool) -> Any:
@@ -150,13 +157,15 @@ def _page(tab: Tab, with_scene: bool) -> Any:
     import rerun.blueprint as rrb
 
     legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop)
-    last = max(float(c.t_s[-1]) for curves in tab.plots.values() for c in curves if len(c.t_s))
-    # The timeline is as long as the longest episode; each tab shows its own.
-    whole = rrb.TimeAxis(
-        view_range=rrb.TimeRange(
-            start=rrb.TimeRangeBoundary.absolute(seconds=0.0), end=rrb.TimeRangeBoundary.absolute(seconds=last)
-        )
-    )
+    if tab.recent_s is None:
+        # The timeline is as long as the longest episode; each tab shows its own.
+        last = max(float(c.t_s[-1]) for curves in tab.plots.values() for c in curves if len(c.t_s))
+        begin, end = (rrb.TimeRangeBoundary.absolute(seconds=t_s) for t_s in (0.0, last))
+    elif math.isinf(tab.recent_s):
+        begin, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite()
+    else:
+        begin, end = (rrb.TimeRangeBoundary.cursor_relative(seconds=t_s) for t_s in (-tab.recent_s, 0.0))
+    whole = rrb.TimeAxis(view_range=rrb.TimeRange(start=begin, end=end))
     plots = [
         rrb.TimeSeriesView(name=title, contents=[c.entity for c in curves], plot_legend=legend, axis_x=whole)
         for title, curves in tab.plots.items()
@@ -181,7 +190,11 @@ def _page(tab: Tab, with_scene: bool) -> Any:
                 name="Age of inputs [ms]", origin=f"/{tab.entity}/age", plot_legend=legend, axis_x=whole
             ),
         ]
-    left = rrb.Vertical(*plots, name=tab.title)
+    # Many plots, such as those of several joints, stand in columns.
+    columns = -(-len(plots) // _ROWS)
+    left = (
+        rrb.Grid(*plots, grid_columns=columns, name=tab.title) if columns > 1 else rrb.Vertical(*plots, name=tab.title)
+    )
     if not side:
         return left
     shares = [3, *([2, 2, 2] if len(side) > 1 else [])][-len(side) :] if with_scene else None
@@ -189,13 +202,4 @@ def _page(tab: Tab, with_scene: bool) -> Any:
 
 
 def _time(t_s: np.ndarray) -> Any:
-    return _rerun().TimeColumn(TIMELINE, duration=t_s)
-
-
-def _rerun() -> Any:
-    """Import Rerun, which is an extra."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise Sim2RealError("the Rerun viewer is not installed", hint="pip install 'sim2real[view]'") from error
-    return rerun
+    return rerun_module().TimeColumn(TIMELINE, duration=t_s)

@@ -107,6 +107,14 @@ def signals_of(recording: Recording) -> Signals:
     episode = recording.episode
     if not episode.duration_s:
         raise Sim2RealError(f"the log {recording.path} holds no step", hint="record for longer")
+    log = outputs_of(episode)
+    t_s, states = recording.true_states() or (np.zeros(0), {})
+    truth = {n: Series(n, "truth", t_s, values) for n, values in states.items()}
+    return replace(log, truth=truth, units=recording.units, warnings=recording.warnings)
+
+
+def outputs_of(episode: Episode) -> Signals:
+    """Return the time series of all nodes of an episode, without true states."""
     graph = episode.metadata.get("graph", {})
     measured, commanded = [], []
     # Nodes with inputs command, nodes without inputs measure.
@@ -117,9 +125,8 @@ def signals_of(recording: Recording) -> Signals:
             commanded += _node_series(node, steps.end / TICKS_PER_S, outputs)
         else:
             measured += _node_series(node, steps.begun_s, outputs)
-    t_s, states = recording.true_states() or (np.zeros(0), {})
-    truth = {n: Series(n, "truth", t_s, values) for n, values in states.items()}
-    return Signals(episode, measured, commanded, truth, recording.units, recording.warnings)
+    units = {field: unit for by_field in episode.units.values() for field, unit in by_field.items()}
+    return Signals(episode, measured, commanded, {}, units)
 
 
 def simulated_series(columns: Mapping[str, np.ndarray]) -> list[Series]:

@@ -182,7 +182,12 @@ def _later(timeline: Timeline, node: str, ticks: int) -> Timeline:
 
 
 def require_moved(episode: Episode, name: str = "the log") -> None:
-    """Raise an error if a log is of a dry run, whose commands did not reach the motors."""
+    """Raise an error if no motor moved the robot: in a dry run, or in a recording by hand."""
+    if episode.metadata.get("config", {}).get("excitation") == "hand":
+        raise Sim2RealError(
+            f"{name} was guided by hand: torque was off, and the torque of the hand was not measured",
+            hint="play it and record that: `sim2real record PIPELINE --excitation LOG`",
+        )
     if episode.metadata.get("dry_run") is True:
         raise Sim2RealError(
             f"{name} is of a dry run: torque was off, and none of its commands was sent",

@@ -12,7 +12,7 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.robots.contract import Robot
 from sim2real.stages.check.config import CheckConfig
-from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.excitation.played import played
 from sim2real.stages.excitation.simulated_log import simulate
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.load_robot import moving_robot
@@ -66,8 +66,12 @@ def find_source(
         )
     # Simulate the planned commands with the nominal parameters.
     moving = moving_robot(pipeline)
-    commands = len(moving.agent.action)
-    signal = moving.drive.around(excitation(config.record, moving.rate_hz, commands).reshape(-1, commands))
+    if config.record.by_hand:
+        raise UsageError(
+            "a recording by hand determines no parameter: torque is off, and the hand's torque is not measured",
+            hint="record it, play it with `sim2real record PIPELINE --excitation LOG`, and check that",
+        )
+    signal = moving.drive.around(played(config.record, pipeline, moving))
     table = parameters.for_recordings(1)
     values = table.of_recording(table.decode(table.start()), 0)
     return JudgedLogs([PLANNED], [simulate(model, moving, signal, values, fitting, config.record.seed)], True)

@@ -8,6 +8,7 @@ from typing import Literal
 
 from sim2real.errors import UsageError
 from sim2real.robots.gate_limits import GateLimits
+from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed
 
 
@@ -43,6 +44,8 @@ class DeployConfig:
     """Do everything except moving the robot: no torque, no goals; the withheld commands are logged and summed up."""
     strict_timing: bool = False
     """End with code 5 when more than 1 % of the steps miss their deadline."""
+    view: ViewFlag = None
+    """Show the robot live in the Rerun viewer; 'web': on a page for browsers."""
     max_tilt_rad: float | None = None
     """Largest tilt [rad]; a robot that measures its tilt stops above it. Default: no limit."""
     gate: GateLimits = field(default_factory=GateLimits)
@@ -51,6 +54,7 @@ class DeployConfig:
     def __post_init__(self) -> None:
         """Check the fields, before the robot moves."""
         check_seed(self.seed)
+        check_view(self.view)
         if self.max_tilt_rad is not None and not 0.0 < self.max_tilt_rad <= math.pi:
             raise UsageError(f"max_tilt_rad must lie in (0, pi] rad, got {self.max_tilt_rad}")
         if not (0.0 <= self.blend_s <= 60.0 and 0.0 < self.delay_tolerance_s <= 1.0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from sim2real.artifacts.bundle import Bundle
@@ -15,6 +16,8 @@ from sim2real.robots.probe import Witness
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.preflight import check_delay
 from sim2real.stages.deploy.probe_log import write_probe
+from sim2real.stages.live.scene import scene_of
+from sim2real.stages.live.viewer import live_view
 from sim2real.stages.on_robot.episode import check_deadlines, run_episode
 from sim2real.stages.on_robot.open_robot import opened
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -36,7 +39,8 @@ def run_episodes(
         Sim2RealError: The cause that stopped the robot.
     """
     policy, folder = _policy_runner(bundle, robot, config), logs[0].parent
-    with opened(robot, config, folder / TRUTH) as session:
+    scene = partial(scene_of, pipeline, robot)
+    with live_view(config.view, folder, pipeline.name, scene), opened(robot, config, folder / TRUTH) as session:
         if config.hold and session.rig.gate.config.stale != "hold":
             raise UsageError("this robot's motors hold no position", hint="run without --hold")
         # Measure the delay before the policy moves the robot: a policy trained for another delay may oscillate.

@@ -9,6 +9,7 @@ from tyro.conf import UseAppendAction
 
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
+from sim2real.stages.live.config import ViewFlag, check_view
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class IdentifyConfig(FitConfig):
     folds: int = 5
     """Parts that are held out of a refit, one at a time, to measure errors on new data: each of several logs, or this
     many blocks of a single log; 0 skips the refits."""
+    view: ViewFlag = None
+    """Show the best fit so far over the recording in the Rerun viewer while the search runs; 'web': for browsers."""
     terms: str = "own"
     """Optional terms: 'own' (the pipeline's), 'auto' (chosen on held-out parts), 'all', 'none', or names separated by
     commas."""
@@ -56,6 +59,7 @@ class IdentifyConfig(FitConfig):
     def __post_init__(self) -> None:
         """Check the values before a log is read."""
         super().__post_init__()
+        check_view(self.view)
         if not 0.0 <= self.held_out <= 0.8:
             raise UsageError(f"held_out must lie in [0, 0.8], got {self.held_out}")
         if self.held_out == 0.0 and not self.hold_out:

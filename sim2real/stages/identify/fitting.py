@@ -57,10 +57,15 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     """
     config, table = inputs.config, inputs.table
     data = (inputs.model, inputs.episodes, inputs.fitted, inputs.windows)
+
+    def on_begin(problem: Problem) -> None:
+        note(f"engine: {problem.engine}")
+        best.begin(problem)
+
     # Fit the model with all terms that the configuration allows.
     best.restart(table.for_recordings(len(inputs.episodes)))
     with _progress("identify", best) as report:
-        widest = patiently(lambda: fitted_to(*data, config, table, report, _show_engine))
+        widest = patiently(lambda: fitted_to(*data, config, table, report, on_begin))
     if config.terms != "auto":
         return Fits(widest, widest, None)
     # Select the terms without which held-out parts are predicted worse.
@@ -76,7 +81,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     )
     best.restart(narrow.for_recordings(len(inputs.episodes)))
     with _progress(f"identify with {', '.join(terms) or 'no term'}", best) as report:
-        estimate = patiently(lambda: fitted_to(*data, replace(config, generations=0), narrow, report))
+        estimate = patiently(lambda: fitted_to(*data, replace(config, generations=0), narrow, report, best.begin))
     return Fits(widest, estimate, selection)
 
 
@@ -112,10 +117,6 @@ def determined(inputs: Inputs, fits: Fits, findings: Findings) -> tuple[Fits, li
 
 def _may_be_held(table: ParameterTable, name: str) -> bool:
     return any(p.name == name and p.kind == "dynamics" and not p.term and not p.per_recording for p in table)
-
-
-def _show_engine(problem: Problem) -> None:
-    note(f"engine: {problem.engine}")
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from sim2real.artifacts.identification import Estimate, Identification, Judgemen
 from sim2real.artifacts.run.run_folder import OpenStage, Source
 from sim2real.identify.fit import Value, as_numbers
 from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem.problem import Problem
 from sim2real.stages.terminal.console import note, shown
 
 PARTIAL = "partial.json"
@@ -27,6 +28,8 @@ class Best:
         z: Shape ``(P,)``; None before the first evaluation.
         done: Phase -> completed share.
         on_fit: Called after the fit, before it is judged.
+        on_begin: Called with each problem, before its search.
+        on_advance: Called after each advance.
     """
 
     table: ParameterTable | None = None
@@ -34,6 +37,8 @@ class Best:
     loss: float = float("inf")
     done: dict[str, float] = field(default_factory=lambda: {"search": 0.0, "refine": 0.0})
     on_fit: Callable[[], object] | None = None
+    on_begin: Callable[[Problem], object] | None = None
+    on_advance: Callable[[Best], object] | None = None
 
     def restart(self, table: ParameterTable) -> None:
         """Begin a search of other parameters."""
@@ -50,6 +55,13 @@ class Best:
         if loss < self.loss or (stage == "refine" and not self.done["refine"]):
             self.z, self.loss = np.array(z), loss
         self.done[stage] = min(1.0, self.done[stage] + share)
+        if self.on_advance:
+            self.on_advance(self)
+
+    def begin(self, problem: Problem) -> None:
+        """Announce the problem of the next search."""
+        if self.on_begin:
+            self.on_begin(problem)
 
     def fitted(self, z: np.ndarray, loss: float) -> None:
         """Record the finished fit, which is written before the longer judgement begins.

@@ -82,7 +82,8 @@ def run_episode(
     Raises:
         Sim2RealError: What stopped the robot.
     """
-    graph = AsyncGraph(nodes, nodes[robot.roles.supervisor])
+    # Without an agent, as in a recording by hand, the sensor is the only node.
+    graph = AsyncGraph(nodes, nodes.get(robot.roles.supervisor) or nodes[robot.roles.sensor])
     state = graph.init(jax.random.key(0), params)
     graph.warmup(state)  # every program is compiled before torque goes on
     # Start the log, and run; an interrupted episode comes to rest before torque goes off.
@@ -195,7 +196,9 @@ def _recorder(
     joints, units = {robot.roles.sensor: robot.sensor.joints}, dict.fromkeys(graph.nodes, robot.units)
     recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
     if dry:
-        recorder.write_event("dry run", "torque was withheld: no command in this log was sent, and no joint was moved")
+        recorder.write_event(
+            "dry run", "torque was withheld: no command in this log was sent, and no motor moved a joint"
+        )
     return recorder
 
 

@@ -110,6 +110,8 @@ def sent_rows(gate: SafetyGate, field: str, unit: str) -> list[dict[str, Any]]:
         ``cut``: commands that a limit of the gate had changed.
     """
     counts, names = gate.counts, gate.config.joints
+    if not counts.passed:
+        return []
     several = len(counts.total) > 1
     return [
         {

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from sim2real.errors import UsageError
 from sim2real.robots.gate_limits import GateLimits
+from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed
+
+GENERATED, HAND = ("multisine", "chirp", "steps"), "hand"
+_FILES = (".mcap", ".csv", ".npz", ".json", ".parquet")
 
 
 @dataclass(frozen=True)
@@ -18,8 +25,9 @@ class RecordConfig:
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
     duration_s: float = 40.0
     """Length of the recording [s]."""
-    excitation: Literal["multisine", "chirp", "steps"] = "multisine"
-    """Command signal."""
+    excitation: Annotated[str, tyro.conf.arg(metavar="multisine|chirp|steps|hand|FILE")] = "multisine"
+    """Command signal; a file has a motion to play: a log, or csv, npz or parquet columns named by joint; 'hand': torque
+    stays off, a person moves the robot."""
     amplitude: float = 1.8
     """Largest command of the excitation [the actuator's unit; V for the pendulum]."""
     low_hz: float = 0.2
@@ -32,17 +40,35 @@ class RecordConfig:
     """Do everything but move the robot: no torque, no goals; what would have been sent is logged and summed up."""
     strict_timing: bool = False
     """End with code 5 when more than 1 % of the steps miss their deadline."""
+    view: ViewFlag = None
+    """Show the robot live in the Rerun viewer; 'web': on a page for browsers."""
     gate: GateLimits = field(default_factory=GateLimits)
     """Limits on every command."""
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether torque stays off and a person moves the robot."""
+        return self.excitation == HAND
+
+    @property
+    def motion(self) -> Path | None:
+        """The file whose motion is played; None for a generated excitation."""
+        return Path(self.excitation) if Path(self.excitation).suffix in _FILES else None
 
     def __post_init__(self) -> None:
         """Check what can be checked before anything moves."""
         check_seed(self.seed)
+        check_view(self.view)
+        if self.excitation not in (*GENERATED, HAND) and self.motion is None:
+            raise UsageError(
+                f"--excitation {self.excitation} is neither {', '.join(GENERATED)} nor {HAND}, nor a file",
+                hint="a motion is a log (.mcap), or a .csv, .npz, .json or .parquet file",
+            )
         if not 1.0 <= self.duration_s <= 3600.0:
             raise UsageError(f"duration_s must lie in [1, 3600] s, got {self.duration_s}")
         if not 0.0 < self.low_hz < self.high_hz:
             raise UsageError(f"the excitation needs 0 < low_hz < high_hz, got {self.low_hz} and {self.high_hz} Hz")
-        if not 0.0 < self.amplitude <= self.gate.limit:
+        if self.excitation in GENERATED and not 0.0 < self.amplitude <= self.gate.limit:
             raise UsageError(
                 f"the amplitude must lie in (0, {self.gate.limit}], got {self.amplitude}",
                 hint="raise --gate.limit only if the robot bears it",

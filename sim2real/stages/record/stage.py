@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
 from sim2real.robots.contract import Robot
-from sim2real.stages.excitation.signals import excitation
+from sim2real.stages.check.config import CheckConfig
+from sim2real.stages.excitation.played import played
+from sim2real.stages.live.scene import scene_of
+from sim2real.stages.live.viewer import live_view
 from sim2real.stages.on_robot.episode import check_deadlines, run_episode
 from sim2real.stages.on_robot.open_robot import opened
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyPath, config_of, folder_of
 from sim2real.stages.record.config import RecordConfig
-from sim2real.stages.record.show import show
+from sim2real.stages.record.show import show, show_by_hand, show_open
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json
 
@@ -39,13 +45,28 @@ def record(
     pipeline, folder = pipeline_of(robot), folder_of(folder)
     config = config_of(config, pipeline.record)
     robot = moving_robot(pipeline)
-    signal = excitation(config, robot.rate_hz, len(robot.agent.action))
-    note(f"recording {config.duration_s:g} s of {config.excitation} on {config.port}")
     log, truth = folder / LOG, folder / TRUTH
-    with opened(robot, config, truth) as session:
+    scene = partial(scene_of, pipeline, robot)
+    signal = None if config.by_hand else _planned(config, pipeline, robot)
+    duration_s = config.duration_s if signal is None else len(signal) / robot.rate_hz
+    note(f"recording {duration_s:g} s of {config.excitation} on {config.port}")
+    with live_view(config.view, folder, pipeline.name, scene), opened(robot, config, truth) as session:
+        if signal is None:
+            session.rig.withhold_torque()
+            note("torque is off: move the robot by hand", urgent=True)
         nodes = robot.recording_nodes(session, signal)
-        run_episode(pipeline, robot, session, nodes, {}, log, config.duration_s, config, "record")
+        run_episode(pipeline, robot, session, nodes, {}, log, duration_s, config, "record")
     return Recording.load(log, truth)
+
+
+def _planned(config: RecordConfig, pipeline: Pipeline, robot: Robot) -> np.ndarray:
+    """Return the commands to play; of a motion from a file, print first what its recording cannot determine."""
+    signal = played(config, pipeline, robot, announce=True)
+    if config.motion is not None and not config.dry_run:
+        from sim2real.stages.check.stage import check  # JAX programs take seconds to compile
+
+        show_open(check(pipeline, None, CheckConfig(plan=True, record=config)))
+    return signal
 
 
 def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | None) -> StageFolder:
@@ -56,8 +77,9 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
     """
     # Refuse an excitation that the robot cannot play, before a folder is made.
     robot = moving_robot(pipeline)
-    excitation(config, robot.rate_hz, len(robot.agent.action))
-    with open_stage(root, pipeline.name, "record", config, {}, run_dir, config.dry_run) as stage:
+    if not config.by_hand:
+        played(config, pipeline, robot)
+    with open_stage(root, pipeline.name, "record", config, {}, run_dir, config.dry_run or config.by_hand) as stage:
         stage.output("log", LOG)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
@@ -66,6 +88,8 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
         for name, path in recording.timing.save(stage.folder).items():
             stage.output(name, path)
         show(summary, config.dry_run)
+        if config.by_hand:
+            show_by_hand(recording, robot, pipeline.name)
         stage.summary(
             {
                 "seconds": config.duration_s,

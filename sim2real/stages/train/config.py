@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from tyro.conf import UseAppendAction
 
 from sim2real.errors import UsageError
+from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed
 from sim2real.train.config import PPOConfig
 from sim2real.train.environment.variation import VariationConfig
@@ -29,6 +30,8 @@ class LearningConfig:
     bundle."""
     checkpoint: bool = True
     """Write the whole training into a file after each evaluation, to continue from with --resume."""
+    view: ViewFlag = None
+    """Show the curves in the Rerun viewer while the training runs; 'web': on a page for browsers."""
     tensorboard: bool = False
     """Write the curves for TensorBoard during the training, into the stage's folder 'tensorboard'."""
     hosts: HostsConfig = field(default_factory=HostsConfig)
@@ -37,7 +40,8 @@ class LearningConfig:
     """The learning algorithm."""
 
     def __post_init__(self) -> None:
-        """Check the sweep and the teacher."""
+        """Check the viewer, the sweep and the teacher."""
+        check_view(self.view)
         Sweep.parse(self.sweep).configs(self.ppo)
         if self.distil is not None and self.ppo.teacher:
             raise UsageError(

@@ -1,14 +1,16 @@
-"""Curves of a training for TensorBoard, written during the training."""
+"""Curves of a training, written during the training: for a live view, and for TensorBoard."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.run.run_folder import OpenStage
 from sim2real.errors import Sim2RealError
+from sim2real.stages.live.viewer import live_view
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.show import Watch
 from sim2real.train.ppo.result import Progress
@@ -18,12 +20,21 @@ if TYPE_CHECKING:
     from tensorboardX import SummaryWriter
 
 
-def watching(stage: OpenStage, config: TrainConfig) -> AbstractContextManager[Watch | None]:
-    """Yield the function that receives each evaluation: the writer of TensorBoard's files, or None."""
-    if not config.tensorboard:
-        return nullcontext()
+@contextmanager
+def watching(stage: OpenStage, config: TrainConfig) -> Iterator[Watch]:
+    """Yield the function that receives each evaluation: it writes the curves for viewers, and for TensorBoard."""
     names = Sweep.parse(config.sweep).names(config.ppo.num_seeds)
-    return event_files(stage.output("tensorboard", "tensorboard"), names)
+    with ExitStack() as stack:
+        stack.enter_context(live_view(config.view, stage.folder, f"train {stage.run_dir.name}", dict))
+        folder = stage.output("tensorboard", "tensorboard") if config.tensorboard else None
+        write_events = stack.enter_context(event_files(folder, names)) if folder else None
+
+        def watch(progress: Progress) -> None:
+            write_progress(stage.folder, progress.values)
+            if write_events is not None:
+                write_events(progress)
+
+        yield watch
 
 
 @contextmanager

@@ -1,0 +1,136 @@
+"""A motion from a file as an excitation: a recorded, teleoperated or hand-guided one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.graph.episode import TICKS_PER_S
+from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.importer import import_opened
+from sim2real.log.importing.positions import radian
+from sim2real.log.importing.quantities import ImportHints
+from sim2real.log.importing.signal_names import same_joint
+from sim2real.log.importing.signals import Signal, collect, find_stamps
+from sim2real.log.reader import read_log
+from sim2real.robots.contract import Robot
+from sim2real.stages.pipeline.pipeline import Pipeline
+
+_LEAST_S = 1.0
+"""Shortest motion [s]."""
+
+
+@dataclass(frozen=True)
+class FileMotion:
+    """Commands over time.
+
+    Attributes:
+        t_s: Times ``(N,)``, increasing [s].
+        commands: Shape ``(N, commands)`` [the command's unit].
+        source: What of the file it is, for the user.
+    """
+
+    t_s: np.ndarray
+    commands: np.ndarray
+    source: str
+
+
+def read_motion(path: Path, pipeline: Pipeline, robot: Robot, names: Sequence[str]) -> FileMotion:
+    """Return the motion in a file: goals if it has them, otherwise measured positions.
+
+    A log of this robot, a file that the pipeline's ``import.toml`` maps, or any file that ``sim2real import`` reads
+    whose columns have the names of the robot's joints.
+
+    Args:
+        names: The robot's commands.
+
+    Raises:
+        UsageError: The file has no such motion.
+    """
+    if not path.exists():
+        raise UsageError(f"there is no motion {path}", hint="--excitation FILE is a log, or a csv, npz or parquet file")
+    if path.suffix == ".mcap":
+        motion = _of_log(path, robot)
+    elif (mapping := pipeline.mapping_of(path)) is not None:
+        episode = import_opened(open_foreign(path), mapping)
+        rows = episode.outputs[robot.roles.actuator][robot.drive.command]
+        motion = FileMotion(episode.steps[robot.roles.actuator].begun_s, rows, f"{robot.drive.command} of {path.name}")
+    else:
+        motion = _of_columns(path, robot, names)
+    return _whole(motion, path, len(names))
+
+
+def _of_log(path: Path, robot: Robot) -> FileMotion:
+    """Return the commands of a log; of one that was guided by hand the measured positions."""
+    episode, roles = read_log(path), robot.roles
+    sent = episode.outputs.get(roles.actuator, {}).get(robot.drive.command)
+    if sent is not None and len(sent):
+        return FileMotion(
+            episode.steps[roles.actuator].end / TICKS_PER_S, sent, f"{robot.drive.command} of {path.name}"
+        )
+    field = next((c.position for c in robot.sensor.channels if c.goal == robot.drive.command), None)
+    measured = episode.outputs.get(roles.sensor, {}).get(field or "")
+    if measured is None:
+        raise UsageError(
+            f"{path} has no {robot.drive.command!r} of {roles.actuator!r}",
+            hint="is it a log of this robot? Measured positions are a motion only for position-controlled joints",
+        )
+    return FileMotion(episode.steps[roles.sensor].begun_s, measured, f"{field} of {path.name}")
+
+
+def _of_columns(path: Path, robot: Robot, names: Sequence[str]) -> FileMotion:
+    """Return the columns that have the names of the robot's commands: goals if there are some, otherwise positions."""
+    file = open_foreign(path)
+    signals, _ = collect(file)
+    motions = [(s, order) for s in signals if (order := _order(s, names)) is not None]
+    motions.sort(key=lambda s: (s[0].meaning.side != "command", s[0].meaning.quantity not in ("position", "")))
+    if not motions:
+        raise UsageError(
+            f"{path} has no columns for {', '.join(names)}. Columns: {', '.join(file.keys[:30]) or 'none'}",
+            hint=f"name them by joint, quantity and unit, such as {names[0]}_goal_rad, and the time t_s",
+        )
+    signal, order = motions[0]
+    side = "command" if signal.meaning.side == "command" else "measured"
+    stamps = find_stamps(signals, signal, side, str(path), None)
+    rows = np.flatnonzero(np.isfinite(stamps.t_s) & np.isfinite(signal.values[:, order]).all(axis=1))
+    values, t_s = signal.values[rows][:, order], stamps.t_s[rows]
+    if len(rows) < 2:
+        raise UsageError(f"{signal.name!r} in {path} has no rows that hold numbers for all joints")
+    scale, reason = 1.0, ""
+    if robot.units[robot.drive.command] == "rad":
+        hints = ImportHints("", joints=tuple(names))
+        scale, reason = radian(signal, values, t_s, hints, str(path), [], [])
+        reason = f"; {'radians' if scale == 1.0 else 'degrees'}, {reason}"
+    return FileMotion(t_s, values / scale, f"{signal.name} of {path.name}{reason}")
+
+
+def _order(signal: Signal, names: Sequence[str]) -> list[int] | None:
+    """Return the column of each name; None if the signal is no motion of these joints."""
+    if signal.values.ndim != 2 or signal.meaning.quantity not in ("position", ""):
+        return None
+    order = [next((i for i, label in enumerate(signal.labels) if same_joint(label, n)), None) for n in names]
+    if len(names) == 1 and signal.width == 1 and signal.meaning.side == "command":
+        return [0]
+    return None if None in order else [i for i in order if i is not None]
+
+
+def _whole(motion: FileMotion, path: Path, commands: int) -> FileMotion:
+    """Return a motion in the order of time, from time 0.
+
+    Raises:
+        UsageError: It is too short, or has another number of commands.
+    """
+    rows = np.asarray(motion.commands, np.float64).reshape(len(motion.commands), -1)
+    if rows.shape[1] != commands:
+        raise UsageError(f"{path} has {rows.shape[1]} commands for a robot with {commands}")
+    later = np.flatnonzero(np.diff(motion.t_s, prepend=-np.inf) > 0)
+    t_s, rows = motion.t_s[later], rows[later]
+    if len(later) < 2 or t_s[-1] - t_s[0] < _LEAST_S:
+        raise UsageError(f"the motion of {path} is shorter than {_LEAST_S:g} s")
+    if not np.isfinite(rows).all():
+        raise UsageError(f"the motion of {path} holds values that are no numbers")
+    return FileMotion(t_s - t_s[0], rows, motion.source)

@@ -1,0 +1,58 @@
+"""Progress of a search for a viewer that joins it: the loss, and the best fit so far over the recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.artifacts.progress import write_best_fit, write_progress
+from sim2real.artifacts.run.run_folder import OpenStage
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.validation.prediction import samples
+from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.identify.interrupted import Best
+from sim2real.stages.live.viewer import live_view
+
+_PERIOD_S = 5.0
+"""Least time between two best fits: each is a simulation of all segments [s]."""
+
+
+@contextmanager
+def watched(best: Best, stage: OpenStage, config: IdentifyConfig) -> Iterator[None]:
+    """Write the progress of the searches in the block, beside a viewer if one is configured."""
+    live = LiveFit(stage.folder, config.view is not None, config.settle_s)
+    best.on_begin, best.on_advance = live.begin, live.advance
+    with live_view(config.view, stage.folder, f"identify {stage.run_dir.name}", dict):
+        yield
+
+
+class LiveFit:
+    """Writes the progress of a search into its stage's folder.
+
+    Args:
+        fits: Whether it writes the best fit too, which takes a simulation of all segments each time.
+        settle_s: First part of a held-out segment, to which its initial state is fitted [s].
+    """
+
+    def __init__(self, folder: Path, fits: bool, settle_s: float) -> None:
+        self._folder, self._fits, self._settle_s = folder, fits, settle_s
+        self._problem: Problem | None = None
+        self._loss, self._next_s = np.inf, 0.0
+
+    def begin(self, problem: Problem) -> None:
+        """Take the problem of the next search."""
+        self._problem, self._loss = problem, np.inf
+
+    def advance(self, best: Best) -> None:
+        """Write the loss, and the best fit if it is better than the one before."""
+        if best.z is None or not np.isfinite(best.loss):
+            return
+        write_progress(self._folder, {"loss": best.loss})
+        if self._fits and self._problem is not None and best.loss < self._loss and time.monotonic() >= self._next_s:
+            values = self._problem.table.decode(best.z)
+            write_best_fit(self._folder, samples(self._problem, {"identified": values}, self._settle_s))
+            self._loss, self._next_s = best.loss, time.monotonic() + _PERIOD_S

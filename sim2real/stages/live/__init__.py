@@ -1,0 +1,1 @@
+"""``--view``: a viewer beside a stage shows the files that the stage writes."""

@@ -1,0 +1,117 @@
+"""Follows the files of one or more stages, and sends new rows to a Rerun recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Protocol
+
+from sim2real.artifacts.progress import BEST_FIT, PROGRESS
+from sim2real.view.live.log_source import LogSource
+from sim2real.view.live.stage_sources import FitSource, ProgressSource
+from sim2real.view.rerun_content import Tab
+from sim2real.view.rerun_recording import Scene, blueprint_of, send_curve
+
+_PATIENCE_S = 0.5
+"""The viewer is behind if it does not take the rows of one round within this time [s]; then rows are dropped."""
+
+
+class GrowingFile(Protocol):
+    """A file that grows."""
+
+    def read(self) -> Tab | None:
+        """Return a tab with the rows since the last call; None if there are none."""
+        ...
+
+
+class Follower:
+    """Sends the files of stages to a viewer as they grow.
+
+    A viewer that takes no data gets none until it has taken the last rows, so the memory of this process stays small.
+
+    Args:
+        recording: A ``rerun.RecordingStream`` with a viewer.
+        folders: Returns the folders of the stages to follow.
+        scene: Draws the robot in 3-D; None: no 3-D view.
+    """
+
+    def __init__(self, recording: Any, folders: Callable[[], list[Path]], scene: Scene | None) -> None:
+        self._recording, self._folders, self._scene = recording, folders, scene
+        self._once = _StaticOnce(recording)
+        self._sources: dict[Path, GrowingFile] = {}
+        self._tabs: dict[Path, Tab] = {}
+        self._curves: dict[Path, set[str]] = {}
+        self._first_ns: int | None = None
+        self._dropped = 0
+
+    def poll(self) -> None:
+        """Send the rows that are new since the last call."""
+        taken = self._flushed()
+        for path in (p for folder in self._folders() for p in sorted(folder.iterdir())):
+            if path not in self._sources and (source := self._source(path)) is not None:
+                self._sources[path] = source
+        for path, source in self._sources.items():
+            with suppress(OSError):
+                if (tab := source.read()) is not None:
+                    if taken:
+                        self._send(path, tab)
+                    self._dropped += not taken
+
+    def close(self) -> int:
+        """Wait for the viewer a last time; return the number of updates that it did not get."""
+        return self._dropped + (not self._flushed())
+
+    def _source(self, path: Path) -> GrowingFile | None:
+        """Return the source for a file; None for other files."""
+        folder = path.parent.name
+        if path.suffix == ".mcap":
+            return LogSource(path, f"{folder}/{path.stem}", self._offset_s)
+        if path.name == PROGRESS:
+            return ProgressSource(path, f"{folder}/curves", self._offset_s)
+        return FitSource(path, f"{folder}/fit") if path.name == BEST_FIT else None
+
+    def _send(self, path: Path, tab: Tab) -> None:
+        # Arrange the viewer for a tab with new curves.
+        curves = {c.entity for plot in tab.plots.values() for c in plot}
+        if not curves <= self._curves.get(path, set()):
+            self._curves[path], self._tabs[path] = curves, tab
+            self._recording.send_blueprint(blueprint_of(list(self._tabs.values()), self._scene is not None))
+        for curve in (c for curves in tab.plots.values() for c in curves):
+            send_curve(self._once, curve)
+        for motion in tab.motions if self._scene else ():
+            if self._scene and len(motion.t_s):
+                self._scene(self._once, motion.t_s, motion.columns, motion.entity, motion.ghost)
+
+    def _flushed(self) -> bool:
+        """Return whether the viewer has taken all rows."""
+        try:
+            self._recording.flush(timeout_sec=_PATIENCE_S)
+        except (RuntimeError, ValueError, OSError):
+            return False
+        return True
+
+    def _offset_s(self, epoch_ns: int) -> float:
+        """Return the begin of a log after that of the first one [s]."""
+        if self._first_ns is None:
+            self._first_ns = epoch_ns
+        return (epoch_ns - self._first_ns) / 1e9
+
+
+class _StaticOnce:
+    """A recording that gets static data of an entity once: shapes and styles are logged with each part of a motion."""
+
+    def __init__(self, recording: Any) -> None:
+        self._recording = recording
+        self._logged: set[tuple[str, type]] = set()
+
+    def log(self, entity: str, data: Any, static: bool = False) -> None:
+        """Log data; static data only if the entity has none of its kind."""
+        key = (entity, type(data))
+        if not (static and key in self._logged):
+            self._recording.log(entity, data, static=static)
+        self._logged.add(key)
+
+    def send_columns(self, *arguments: Any) -> None:
+        """Send columns."""
+        self._recording.send_columns(*arguments)

@@ -1,0 +1,102 @@
+"""A robot's MuJoCo model in the 3-D view: its geometries on bodies that move as the measured joints do."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+_GROUPS = (0, 1, 2)
+"""Groups of geometries that MuJoCo's viewer shows; by convention the others are for collisions."""
+_GHOST, _PLAIN = (66, 150, 230), (150, 162, 176)
+
+
+class ModelScene:
+    """Draws a model over time; a ``Scene``.
+
+    Args:
+        mjcf: The model.
+        columns: Joint -> field of its measured position (``"position[0]"``). A composed model names a joint by the path
+            of its parts, ``arm/elbow/joint``; then the name before ``joint`` counts.
+    """
+
+    def __init__(self, mjcf: str, columns: Mapping[str, str]) -> None:
+        self._mj: Any = importlib.import_module("mujoco")  # pyright does not see the names of its C extension
+        self._model = self._mj.MjModel.from_xml_string(mjcf)
+        self._data = self._mj.MjData(self._model)
+        if self._model.nkey:
+            self._mj.mj_resetDataKeyframe(self._model, self._data, 0)
+        self._places: dict[int, str] = {}
+        for i in range(self._model.njnt):
+            full = self._model.joint(i).name
+            name = full if full in columns else full.removesuffix("/joint").rsplit("/", 1)[-1]
+            if name in columns:
+                self._places[int(self._model.jnt_qposadr[i])] = columns[name]
+
+    def __call__(
+        self, rec: Any, t_s: np.ndarray, columns: Mapping[str, np.ndarray], entity: str, ghost: bool = False
+    ) -> None:
+        """Draw the robot at the times ``(N,)`` [s]; see ``Scene``."""
+        import rerun as rr  # the viewer is an extra
+
+        if not all(name in columns for name in self._places.values()):
+            return
+        rec.log(entity, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        # Shapes stand still on their bodies.
+        model = self._model
+        drawn = [g for g in range(model.ngeom) if model.geom_rgba[g, 3] > 0.0 and model.geom_group[g] in _GROUPS]
+        shapes = {g: shape for g in drawn if (shape := self._shape(g, ghost)) is not None}
+        for g, shape in shapes.items():
+            at = f"{entity}/body_{self._model.geom_bodyid[g]}/geom_{g}"
+            rec.log(at, rr.Transform3D(**_pose(self._model.geom_pos[g], self._model.geom_quat[g])), static=True)
+            rec.log(at, shape, static=True)
+        # Bodies move, each in the world's frame.
+        bodies = sorted({int(self._model.geom_bodyid[g]) for g in shapes} - {0})
+        at_m, turned = np.empty((len(t_s), len(bodies), 3)), np.empty((len(t_s), len(bodies), 4))
+        for row in range(len(t_s)):
+            for address, name in self._places.items():
+                self._data.qpos[address] = columns[name][row]
+            self._mj.mj_kinematics(self._model, self._data)
+            at_m[row], turned[row] = self._data.xpos[bodies], self._data.xquat[bodies][:, [1, 2, 3, 0]]
+        time = rr.TimeColumn("time", duration=t_s)
+        for i, body in enumerate(bodies):
+            moved = rr.Transform3D.columns(translation=at_m[:, i], quaternion=turned[:, i])
+            rec.send_columns(f"{entity}/body_{body}", [time], moved)
+
+    def _shape(self, geom: int, ghost: bool) -> Any:
+        """Return a geometry to log; None for planes, height fields and distance fields."""
+        import rerun as rr
+
+        kinds, model = self._mj.mjtGeom, self._model
+        kind, size = model.geom_type[geom], model.geom_size[geom]
+        rgb = (255 * model.geom_rgba[geom, :3]).astype(int).tolist() if model.geom_rgba[geom, :3].any() else _PLAIN
+        look = {"colors": [_GHOST if ghost else rgb]}
+        fill = {"fill_mode": "majorwireframe" if ghost else "solid"}
+        if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
+            radii = size if kind == kinds.mjGEOM_ELLIPSOID else np.repeat(size[0], 3)
+            return rr.Ellipsoids3D(half_sizes=[radii], **look, **fill)
+        if kind == kinds.mjGEOM_BOX:
+            return rr.Boxes3D(half_sizes=[size], **look, **fill)
+        if kind == kinds.mjGEOM_CAPSULE:
+            return rr.Capsules3D(
+                radii=[size[0]], lengths=[2 * size[1]], translations=[(0.0, 0.0, -size[1])], **look, **fill
+            )
+        if kind == kinds.mjGEOM_CYLINDER:
+            return rr.Cylinders3D(radii=[size[0]], lengths=[2 * size[1]], **look, **fill)
+        if kind == kinds.mjGEOM_MESH:
+            mesh = model.mesh(model.geom_dataid[geom])
+            points = slice(mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0])
+            faces = slice(mesh.faceadr[0], mesh.faceadr[0] + mesh.facenum[0])
+            return rr.Mesh3D(
+                vertex_positions=model.mesh_vert[points],
+                triangle_indices=model.mesh_face[faces],
+                albedo_factor=look["colors"][0],
+            )
+        return None
+
+
+def _pose(at_m: np.ndarray, quaternion: np.ndarray) -> dict[str, Any]:
+    """Return a pose as Rerun takes it; MuJoCo's quaternions begin with the real part."""
+    return {"translation": at_m, "quaternion": np.roll(quaternion, -1)}

@@ -1,0 +1,229 @@
+"""``record --excitation FILE`` plays a motion within the robot's limits, and ``--excitation hand`` records one."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from live_robots import PATIENT, manifest_of
+
+import sim2real
+from sim2real import cli
+from sim2real.artifacts.run.run_folder import newest
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.hardware.emulation.truth import Kind, read_truth
+from sim2real.hardware.plant import OperatingMode
+from sim2real.log.reader import read_log
+from sim2real.robots.servo.drive import ServoDrive
+from sim2real.stages.excitation.played import played
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+pytestmark = pytest.mark.realtime
+
+ARM = load_pipeline("so101")
+SERVOS = ARM.load().drive.servos
+LOW, HIGH = np.array(SERVOS.low), np.array(SERVOS.high)
+T_S = np.arange(0.0, 4.0, 1 / 30)
+
+
+def wave(reach=0.8):
+    """Return a motion around the middle of the limits, ``(N, 6)`` [rad]."""
+    phases = np.arange(6)
+    return (LOW + HIGH) / 2 + reach / 2 * (HIGH - LOW) * np.sin(2 * np.pi * 0.2 * T_S[:, None] + phases)
+
+
+def write(path, pose, order=range(6), unit="deg"):
+    """Write a motion as a table of columns in any order."""
+    scale = np.rad2deg(1.0) if unit == "deg" else 1.0
+    header = ",".join(["t_s", *(f"action_{SERVOS.names[i]}_{unit}" for i in order)])
+    rows = np.column_stack([T_S[: len(pose)], scale * pose[:, list(order)]])
+    np.savetxt(path, rows, delimiter=",", header=header, comments="")
+    return path
+
+
+def goals(path, **settings):
+    config = replace(ARM.record, excitation=str(path), **settings)
+    robot = ARM.load()
+    return robot.drive.around(played(config, ARM, robot, announce=True))
+
+
+def at_the_robots_rate(pose):
+    t_s = np.arange(0.0, T_S[-1], 1 / 50)
+    return np.stack([np.interp(t_s, T_S, joint) for joint in pose.T], axis=1)
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+def test_columns_are_found_by_joint_in_any_order_and_unit(tmp_path, unit):
+    path = write(tmp_path / "motion.csv", wave(), order=[3, 0, 5, 1, 2, 4], unit=unit)
+    np.testing.assert_allclose(goals(path), at_the_robots_rate(wave()), atol=1e-6)
+    assert len(goals(path, duration_s=2.0)) == 100
+
+
+def test_goals_of_a_teleoperation_come_before_measurements(tmp_path):
+    path = tmp_path / "teleoperated.npz"
+    names = np.array(SERVOS.names)
+    np.savez(path, t_s=T_S, names=names, position_rad=0.5 * wave(), goal_rad=wave())
+    np.testing.assert_allclose(goals(path), at_the_robots_rate(wave()), atol=1e-6)
+    np.savez(path, t_s=T_S, names=names, position_rad=wave(0.5))
+    np.testing.assert_allclose(goals(path), at_the_robots_rate(wave(0.5)), atol=1e-6)
+
+
+def test_an_episode_of_a_lerobot_data_set_is_a_motion(tmp_path):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    folder = tmp_path / "data" / "chunk-000"
+    folder.mkdir(parents=True)
+    (tmp_path / "meta").mkdir()
+    names = [f"{name}.pos" for name in SERVOS.names]
+    features = {key: {"dtype": "float32", "shape": [6], "names": names} for key in ("action", "observation.state")}
+    info = {"codebase_version": "v2.1", "fps": 30, "robot_type": "so101_follower", "features": features}
+    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
+    columns = {
+        "action": list(np.rad2deg(wave()).astype(np.float32)),
+        "observation.state": list(np.rad2deg(wave(0.7)).astype(np.float32)),
+        "timestamp": (np.arange(len(T_S)) / 30).astype(np.float32),
+        "frame_index": np.arange(len(T_S)),
+        "episode_index": np.zeros(len(T_S), np.int64),
+    }
+    parquet.write_table(pyarrow.table(columns), folder / "episode_000000.parquet")
+    rows = goals(folder / "episode_000000.parquet")
+    np.testing.assert_allclose(rows, at_the_robots_rate(wave())[: len(rows)], atol=1e-4)
+
+
+def test_the_ends_outside_of_the_limits_are_not_played(tmp_path, capsys):
+    pose = wave()
+    pose[:16, 1] = np.linspace(LOW[1] - 0.3, pose[15, 1], 16)
+    pose[-31:, 2] = np.linspace(pose[-31, 2], HIGH[2] + 1.0, 31)
+    rows = goals(write(tmp_path / "motion.csv", pose))
+    assert (rows >= LOW - 1e-5).all()
+    assert (rows <= HIGH + 1e-5).all()
+    assert 3.0 < len(rows) / 50 < 3.5
+    assert "s at its ends are outside of the limits, and are not played" in capsys.readouterr().err
+
+
+def wrong(tmp_path, change, unit="rad"):
+    pose = wave()
+    change(pose)
+    with pytest.raises(UsageError) as caught:
+        goals(write(tmp_path / "motion.csv", pose, unit=unit))
+    return str(caught.value)
+
+
+def test_a_motion_that_leaves_the_limits_or_is_too_fast_is_refused_by_joint_and_time(tmp_path):
+    def beyond(pose):
+        pose[60:66, 3] = HIGH[3] + 0.2
+
+    def leap(pose):
+        pose[60:, 0] = np.where(pose[60:, 0] > 0, LOW[0], HIGH[0])
+
+    assert "wrist_flex is -0.8 rad at 2." in wrong(tmp_path, beyond)
+    assert "too fast: shoulder_pan moves at" in wrong(tmp_path, leap)
+    with pytest.raises(UsageError, match=r"outside of the limits everywhere: .* must lie in"):
+        goals(write(tmp_path / "motion.csv", wave() + 3.0))
+    with pytest.raises(UsageError, match=r"shoulder_lift is -1.6. rad at 2.9. s, and must lie in \[-1.5, -0.3\]"):
+        goals(write(tmp_path / "motion.csv", wave(0.95)), gate=replace(ARM.record.gate, limit=1.5))
+
+
+def test_files_without_a_motion_are_refused(tmp_path):
+    (tmp_path / "other.csv").write_text("t_s,lift_rad,twist_rad\n" + "".join(f"{i},0.1,{i}\n" for i in range(9)))
+    with pytest.raises(UsageError, match=r"no columns for shoulder_pan, .*Columns: t_s, lift_rad, twist_rad"):
+        goals(tmp_path / "other.csv")
+    with pytest.raises(UsageError, match="there is no motion"):
+        goals(tmp_path / "none.csv")
+    with pytest.raises(UsageError, match="shorter than 1 s"):
+        goals(write(tmp_path / "short.csv", wave()[:20]))
+    with pytest.raises(UsageError, match="neither multisine, chirp, steps nor hand, nor a file"):
+        replace(ARM.record, excitation="wobble")
+
+
+def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsys):
+    t_s = np.arange(0.0, 3.0, 0.02)
+    volts = 1.2 * np.sin(2 * np.pi * 0.7 * t_s)
+    np.savetxt(tmp_path / "v.csv", np.column_stack([t_s, volts]), delimiter=",", header="t_s,command", comments="")
+    runs = ["--runs", str(tmp_path / "runs")]
+    assert (
+        cli.main(
+            [
+                "record",
+                "pendulum",
+                "--excitation",
+                str(tmp_path / "v.csv"),
+                *PATIENT,
+                "--gate.max-sample-age-s",
+                "3",
+                *runs,
+            ]
+        )
+        == 0
+    )
+    said = capsys.readouterr().err
+    assert "motion: its recording" in said
+    log = read_log(newest(tmp_path / "runs", "pendulum", "record").output("log"))
+    sent = log.outputs["agent"]["action"].ravel()
+    np.testing.assert_allclose(sent[: len(volts) - 2], volts[: len(sent)][: len(volts) - 2], atol=1e-6)
+    assert log.duration_s < 3.3
+
+
+@pytest.fixture(scope="module")
+def by_hand(tmp_path_factory):
+    """An arm that an emulated hand moves for 4 s, and the hand's path."""
+    folder = tmp_path_factory.mktemp("hand")
+    start = np.array(ARM.load("plant").SO101Plant().data.qpos)
+    t_s = np.concatenate([[0.0, 1.0], 2.5 + T_S])
+    pose = np.vstack([start, start, wave(0.7)])
+    np.savez(folder / "hand.npz", t_s=t_s, position=pose)
+    robot = type(ARM.load())()
+    embedded = replace(robot.drive.embedded, plant_args={"hand": str(folder / "hand.npz")})
+    robot.drive = ServoDrive(SERVOS, embedded=lambda: embedded, settings=ARM.load("robot").calibrated)
+    gate = replace(ARM.record.gate, servo_watchdog_s=0.6, max_sample_age_s=3.0)
+    recording = sim2real.record(robot, folder / "log", {"excitation": "hand", "duration_s": 6.0, "gate": gate})
+    return recording, pose
+
+
+def test_a_recording_by_hand_has_no_command_and_no_torque(by_hand):
+    recording, pose = by_hand
+    assert set(recording.episode.steps) == {"sensor"}
+    position = recording.episode.outputs["sensor"]["position"]
+    assert np.abs(np.ptp(position, axis=0) - np.ptp(pose, axis=0)).max() < 0.25, "the arm follows the hand"
+    effects = read_truth(recording.path.with_name("truth.bin")).of(Kind.EFFECT)
+    assert set(effects["values"][:, 0].astype(int)) <= {int(OperatingMode.OFF)}, "the gate sent nothing"
+    assert recording.episode.metadata["dry_run"] is True
+
+
+def test_no_stage_identifies_from_it_and_the_message_names_what_to_do(by_hand, capsys):
+    recording, _ = by_hand
+    robot = load_pipeline("so101")
+    with pytest.raises(Sim2RealError, match="guided by hand: torque was off") as caught:
+        sim2real.identify(replace(robot, name=recording.pipeline), recording)
+    assert "--excitation LOG" in caught.value.hint
+    assert cli.main(["check", "so101", "--plan", "--record.excitation", "hand"]) == 2
+    assert "a recording by hand determines no parameter" in capsys.readouterr().err
+
+
+def test_its_log_is_a_motion_that_the_arm_reaches_slowly(by_hand, tmp_path):
+    recording, _ = by_hand
+    rows = goals(recording.path)
+    assert len(rows) > 150
+    flags = [
+        "--excitation",
+        str(recording.path),
+        "--dry-run",
+        *PATIENT,
+        "--gate.max-sample-age-s",
+        "3",
+        "--runs",
+        str(tmp_path),
+    ]
+    assert cli.main(["record", "so101", *flags]) == 0
+    folder = newest_dry(tmp_path)
+    planned = read_log(folder / "session.mcap").outputs["agent"]["goal"]
+    start = np.array(ARM.load("plant").SO101Plant().data.qpos)
+    np.testing.assert_allclose(planned[0], start, atol=0.02)
+    assert np.abs(np.diff(planned, axis=0)).max() * 50 < 8.0
+    settled = int(np.ceil(np.abs(start - rows[0]).max() * 50)) + 1
+    np.testing.assert_allclose(planned[settled : len(rows) - 5], rows[settled : len(rows) - 5], atol=1e-6)
+
+
+def newest_dry(root):
+    (folder,) = root.glob("so101/*/record")
+    assert manifest_of(folder)["status"] == "dry run"
+    return folder

@@ -1,0 +1,130 @@
+"""What a live view shows: rows of growing files, each once, in time; and a model in 3-D."""
+
+import math
+
+import numpy as np
+import pytest
+
+from sim2real.artifacts.progress import BEST_FIT, PROGRESS, write_best_fit, write_progress
+from sim2real.graph.episode import Episode, Steps
+from sim2real.view.live.follower import Follower
+from sim2real.view.live.log_source import _thinned
+from sim2real.view.live.stage_sources import FitSource, ProgressSource
+from sim2real.view.model_scene import ModelScene
+
+rr = pytest.importorskip("rerun")
+from rerun.chunk import RrdReader  # noqa: E402
+
+
+def rows_of(path):
+    """Return entity -> rows, static ones apart."""
+    moving, static = {}, {}
+    for chunk in RrdReader(path).stream().to_chunks():
+        rows = static if chunk.is_static else moving
+        rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    return moving, static
+
+
+def test_of_each_group_of_steps_the_latest_is_shown():
+    n = 400
+    start = 5_000 * np.arange(n)
+    woken = start + 50
+    woken[[7, 123, 399]] += 2_000
+    steps = Steps(start, start, woken, np.full(n, -1), woken + 100, np.zeros(n, np.int64))
+    episode = Episode({"agent": steps}, {}, {"agent": {"goal": np.arange(n)}}, {"graph": {"agent": {"rate_hz": 200.0}}})
+    thinned, lateness = _thinned(episode)
+    assert len(thinned.steps["agent"]) == len(lateness["agent"]) == n / 4
+    assert {7, 123, 399} <= set(thinned.outputs["agent"]["goal"].tolist())
+    assert np.count_nonzero(lateness["agent"] > 2.0) == 3
+
+
+def test_curves_grow_by_whole_lines(tmp_path):
+    source = ProgressSource(tmp_path / PROGRESS, "train/curves", lambda ns: ns / 1e9)
+    write_progress(tmp_path, {"return": np.array([1.0, 2.0]), "loss": 0.5})
+    first = source.read()
+    assert {title: [c.values.tolist() for c in plot] for title, plot in first.plots.items()} == {
+        "return": [[1.0], [2.0]],
+        "loss": [[0.5]],
+    }
+    assert source.read() is None
+    with open(tmp_path / PROGRESS, "a") as stream:
+        stream.write('{"epoch_ns": 1, "values": {"re')
+    assert source.read() is None
+    with open(tmp_path / PROGRESS, "a") as stream:
+        stream.write('turn": [3.0, NaN]}}\n')
+    second = source.read()
+    assert second.plots["return"][0].values.tolist() == [3.0]
+    assert math.isnan(second.plots["return"][1].values[0])
+
+
+def fit(offset):
+    t_s = np.linspace(0.0, 4.0, 100)
+    columns = {"t": t_s, "segment": (t_s > 2.0).astype(int), "recording": np.zeros(100, int)}
+    return {**columns, "th_measured": np.sin(t_s), "th_identified": np.sin(t_s) + offset}
+
+
+def test_each_better_fit_replaces_the_one_before(tmp_path):
+    source = FitSource(tmp_path / BEST_FIT, "identify/fit")
+    write_best_fit(tmp_path, fit(0.3))
+    first = source.read()
+    assert source.read() is None
+    write_best_fit(tmp_path, fit(0.1))
+    second = source.read()
+    (a, b), (c, d) = first.plots["th"], second.plots["th"]
+    assert a.entity == c.entity
+    assert b.entity != d.entity
+    assert np.nanmax(np.abs(d.values - c.values)) == pytest.approx(0.1)
+    assert np.isnan(d.values).sum() == 1, "between the segments"
+    assert [p.name for p in tmp_path.iterdir()] == [BEST_FIT], "no part is left behind"
+
+
+def test_a_follower_sends_each_row_once_and_what_stands_still_once(tmp_path):
+    stage = tmp_path / "train"
+    stage.mkdir()
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "live.rrd")
+    follower = Follower(recording, lambda: [stage], None)
+    follower.poll()
+    for i in range(5):
+        write_progress(stage, {"return": float(i)})
+        follower.poll()
+        follower.poll()
+    assert follower.close() == 0
+    recording.disconnect()
+    moving, static = rows_of(tmp_path / "live.rrd")
+    assert moving["/train/curves/return/0"] == 5
+    assert static["/train/curves/return/0"] == 1
+
+
+MODEL = """
+<mujoco><asset><mesh name="tetra" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/></asset><worldbody>
+  <geom type="plane" size="1 1 1"/>
+  <body name="base" pos="0 0 1"><joint name="lift" type="slide" axis="0 0 1"/><geom type="box" size=".1 .2 .3"/>
+    <body name="link" pos="0 0 1"><joint name="arm/elbow/joint" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 1 0 0" size=".05"/><geom type="sphere" size=".1" group="3"/>
+      <geom type="mesh" mesh="tetra"/><geom type="cylinder" size=".1 .2"/>
+    </body></body></worldbody></mujoco>
+"""
+
+
+def test_a_model_moves_as_its_joints_do(tmp_path):
+    scene = ModelScene(MODEL, {"lift": "height", "elbow": "position[0]"})
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "model.rrd")
+    t_s = np.array([0.0, 1.0])
+    scene(recording, t_s, {"height": np.array([0.0, 0.5]), "position[0]": np.array([0.0, np.pi / 2])}, "robot")
+    scene(recording, t_s, {"height": np.zeros(2)}, "lacks")
+    recording.flush()
+    recording.disconnect()
+    moving, static = rows_of(tmp_path / "model.rrd")
+    assert moving == {"/robot/body_1": 2, "/robot/body_2": 2}
+    shapes = {entity for entity in static if "geom" in entity}
+    assert shapes == {f"/robot/body_{b}/geom_{g}" for b, g in ((1, 1), (2, 2), (2, 4), (2, 5))}, "no plane, no group 3"
+    chunks = RrdReader(tmp_path / "model.rrd").stream().to_chunks()
+    batch = next(c for c in chunks if c.entity_path == "/robot/body_2" and not c.is_static).to_record_batch()
+    at, turned = (
+        [row[0] for row in batch.column(next(n for n in batch.schema.names if part in n)).to_pylist()]
+        for part in ("translation", "quaternion")
+    )
+    np.testing.assert_allclose(at, [[0, 0, 2.0], [0, 0, 2.5]], atol=1e-6)
+    np.testing.assert_allclose(turned[1], [0, np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
