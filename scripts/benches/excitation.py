@@ -22,7 +22,7 @@ from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
 
 QUICK = {"seconds": 14.0, "generations": 1, "population": 4, "refine_steps": 1, "cases": ["teleoperated"]}
 FILE_HZ = 30.0
-_MOVES_S, _PAUSES_S, _MARGIN_RAD = (0.5, 1.4), (0.0, 0.4), 0.03
+_MOVES_S, _PAUSES_S, _MARGIN_RAD = (1.0, 2.2), (0.0, 0.4), 0.03
 """Durations of a person's moves and pauses, and distance from the ends of the goals' box."""
 
 
