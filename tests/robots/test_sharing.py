@@ -39,6 +39,7 @@ def test_groups_are_offered_where_there_are_some_and_single_joints_where_there_a
     assert calves.joints.count("|") == 3
     assert {t.term for t in sharing(usual, ARM, "auto")} == {"kp_by_joint", "damping_by_joint", "armature_by_joint"}
     assert {t.term for t in sharing(usual, GO2, "load,kp_by_joint")} == {"kp_by_joint"}
+    assert "kp_by_joint" in {t.term for t in sharing(usual, GO2, "all")}, "`validate` finds it again"
     assert sharing(usual, ["joint1"], "auto") == []
 
 

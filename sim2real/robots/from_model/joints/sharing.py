@@ -39,7 +39,7 @@ def sharing(terms: Sequence[ParameterPattern], joints: Sequence[str], wanted: st
         groups = like_joints(together)
         for kind, parts in (("by_group", groups), ("by_joint", [[j] for j in together])):
             name = f"{term.what}_{kind}"
-            usual = names & {"auto", "all"} and (kind == "by_group" or len(joints) <= _MOST_JOINTS)
+            usual = "all" in names or ("auto" in names and (kind == "by_group" or len(joints) <= _MOST_JOINTS))
             if not 1 < len(parts) < (len(together) if kind == "by_group" else len(together) + 1):
                 continue
             if usual or name in names:
