@@ -164,17 +164,22 @@ def simulated_beside(columns: Mapping[str, np.ndarray], log: Signals, units: Map
     return shifted
 
 
-def pairs_of(log: Signals, simulation: Sequence[Series], units: Mapping[str, str]) -> list[ComparedSeries]:
+def pairs_of(
+    log: Signals, simulation: Sequence[Series], units: Mapping[str, str], joints: Mapping[str, str]
+) -> list[ComparedSeries]:
     """Return each measurement and each command to the motors with its simulation.
 
     Args:
         simulation: Result of ``simulated_beside``; empty without a simulation.
         units: Field -> unit.
+        joints: Column of a position -> name of its joint, for labels; other columns have their own name.
     """
     by_name = {s.name: s for s in simulation}
     commands = [s for s in simulation if s.name.partition("[")[0] == "command"]
     pairs = [
-        ComparedSeries(s.name, s, by_name.get(s.name), angle=unit_of(s.name, {**log.units, **units}) == "rad")
+        ComparedSeries(
+            joints.get(s.name, s.name), s, by_name.get(s.name), angle=unit_of(s.name, {**log.units, **units}) == "rad"
+        )
         for s in log.measured
     ]
     for index, series in enumerate(log.last_command()):

@@ -5,7 +5,7 @@ import pytest
 
 from sim2real.artifacts.deployment import _of_episode
 from sim2real.graph.episode import Episode
-from sim2real.view.signals import Series, Signals, simulated_beside, simulated_series
+from sim2real.view.signals import Series, Signals, pairs_of, simulated_beside, simulated_series
 
 
 def test_the_entries_of_a_command_share_the_times_at_which_it_was_sent():
@@ -16,6 +16,20 @@ def test_the_entries_of_a_command_share_the_times_at_which_it_was_sent():
     np.testing.assert_array_equal(found["command[1]"].t_s, sent_s)
     np.testing.assert_array_equal(found["command[1]"].values, -sent_s)
     np.testing.assert_array_equal(found["position[0]"].t_s, t_s)
+
+
+def test_positions_have_the_names_of_their_joints_and_keep_their_simulation():
+    t_s = np.linspace(0.0, 1.0, 11)
+    measured = [Series(name, "sensor", t_s, t_s) for name in ("position[0]", "position[1]", "velocity[0]")]
+    simulation = [Series("position[1]", "world", t_s, 2 * t_s)]
+    pairs = pairs_of(
+        Signals(Episode({}, {}, {}, {"graph": {}}), measured, [], {}),
+        simulation,
+        {"position": "rad"},
+        {"position[1]": "elbow"},
+    )
+    assert [pair.label for pair in pairs] == ["position[0]", "elbow", "velocity[0]"]
+    assert pairs[1].simulation is simulation[0]
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,9 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
     # Draw each episode beside its simulation, then the robot.
     units = {**logs[0].units, **deployed.units}
+    joints = {row.column: row.name for row in deployed.replay}
     episodes = [
-        pairs_of(log, simulated_beside(columns, log, units), units)
+        pairs_of(log, simulated_beside(columns, log, units), units, joints)
         for log, columns in zip(logs, deployed.simulated, strict=True)
     ]
     for index, pairs in enumerate(episodes):

@@ -111,9 +111,8 @@ def largest_difference(
     line = Line(pair.robot.t_s, off, f"difference [{unit}]" if unit else "difference", "residual")
     label = with_unit(pair.label, units, pair.robot.name)
     svg = compared(_lines(pair), line, label, (begin_s, end_s), name)
-    caption = (
-        f"The largest difference: {pair.label} in episode {number}, {begin_s:.1f} s, {with_small_unit(error, unit)}."
-    )
+    where = f"{pair.label} in episode {number}, {begin_s:.1f} s, {with_small_unit(error, unit)}"
+    caption = f"The largest difference, as a share of the motion: {where}."
     return FigureBlock(svg, caption)
 
 
