@@ -18,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from benches.catalogue import measures
 from benches.provenance import ROOT, why_stale
 from page_tables import recordings, sentences
+from page_tables.latency import latency
 from page_tables.league import evidence, league, league_promises
 
 TABLES = {
@@ -30,6 +31,7 @@ TABLES = {
     "real": ("identify_disk", "identify_xl330", "identify_so101"),
     "league": ("league",),
     "league_promises": ("league",),
+    "latency": ("latency_league",),
     "randomise": ("randomise", "randomise_worn"),
     "worst_joint": ("league",),
     "wall": ("randomise_wall",),
@@ -270,6 +272,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "real": real_motors,
         "league": lambda chosen: league(chosen["league"]),
         "league_promises": lambda chosen: league_promises(chosen["league"]),
+        "latency": lambda chosen: latency(chosen["latency_league"]),
         "randomise": lambda chosen: randomise(chosen["randomise"], chosen["randomise_worn"]),
         "worst_joint": lambda chosen: sentences.worst_joint(*chosen.values()),
         "wall": lambda chosen: sentences.on_the_wall_clock(*chosen.values()),

@@ -74,6 +74,14 @@ BENCHES = {
         "the processor time of an identification whose programs are in the compilation cache",
         (*_STAGES, "datasets/pendulum", "pipelines"),
     ),
+    "latency-league": Bench(
+        "latency.bench",
+        "six emulated links, whose delays four methods estimate from a hidden servo's recordings",
+        (
+            *("sim2real/identify/delays", "scripts/benches/league/mujoco_joints.py", "scripts/benches/jobs.py"),
+            *("scripts/benches/league/cmaes.py", "scripts/benches/identify/sysid.py"),
+        ),
+    ),
     "league": Bench(
         "league.bench",
         "every recording, held out in parts, against mujoco.sysid, PACE, BAM, a textbook servo and published sets",

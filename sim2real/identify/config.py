@@ -40,8 +40,9 @@ class FitConfig:
     """Number of best candidates that Levenberg-Marquardt refines; 0 skips the refinement."""
     refine_steps: int = 25
     """Largest number of steps of Levenberg-Marquardt in a round; there are up to three rounds."""
-    long_s: float = 0.0
-    """Length of the segments of a last refinement [s]; 0 skips it."""
+    long_s: float | None = 0.0
+    """Length of the segments of a last refinement [s]; 0, or logs shorter than two of them, skip it. None: 5 s if no
+    goals of positions are commanded, as errors of a force add up in a free run, else 0."""
     engine: Literal["auto", "c", "compiled"] = "auto"
     """Simulator: C MuJoCo or the compiled graph; 'auto' takes C if the world is MuJoCo's."""
     jacobian: Literal["auto", "forward", "finite"] = "auto"
@@ -71,7 +72,7 @@ class FitConfig:
             raise UsageError(f"reach and std must be above 0, got {self.reach} and {self.std}")
         if not 0.0 <= self.skip_s <= 10.0:
             raise UsageError(f"skip_s must lie in [0, 10] s, got {self.skip_s}")
-        if min(self.batch, self.refine, self.refine_steps, self.long_s) < 0:
+        if min(self.batch, self.refine, self.refine_steps, self.long_s or 0.0) < 0:
             raise UsageError("batch, refine, refine_steps and long_s must not be negative")
         if self.devices < 1 or self.population % self.devices:
             raise UsageError(

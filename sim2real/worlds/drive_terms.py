@@ -34,6 +34,7 @@ class DriveTerms(Base):
         stribeck_rad_s: Speed at which 1/e of it is left [rad/s].
         drag: Friction proportional to the square of the speed [N m s^2/rad^2].
         bias: By how much dry friction is larger upwards than on average, and smaller downwards [N m].
+        damping_bias: The same of damping [N m s/rad].
         back_emf: What the motor's voltage takes off its torque per speed, with torque on, beyond its limit [N m s/rad].
         play: Error of the angle up to which the drive does not push: a servo's dead zone, play of its gears [rad].
         top_speed: Largest speed at which the drive tries to correct an error, against its damping and the joint's
@@ -50,6 +51,7 @@ class DriveTerms(Base):
     stribeck_rad_s: Value = 0.1
     drag: Value = 0.0
     bias: Value = 0.0
+    damping_bias: Value = 0.0
     back_emf: Value = 0.0
     play: Value = 0.0
     top_speed: Value = NO_LIMIT
@@ -119,7 +121,9 @@ class DriveLaw:
         drive = xp.clip(force - kp * angle - kd * speed, -v["limit"], v["limit"]) - braked * speed
         # Friction and damping of each joint.
         stuck = v["static"] * xp.exp(-fast / v["stribeck_rad_s"])
-        damping = v["damping"] + v["drag"] * fast + braked
+        # Damping that differs by direction stays 0 or more: a negative one would drive the joint.
+        viscous = xp.maximum(v["damping"] + v["damping_bias"] * xp.sign(speed), 0.0)
+        damping = viscous + v["drag"] * fast + braked
         friction = v["frictionloss"] + stuck + v["load"] * xp.abs(drive)
         phase = v["cogging_per_turn"] * angle
         cogging = v["cogging_cos"] * xp.cos(phase) + v["cogging_sin"] * xp.sin(phase)

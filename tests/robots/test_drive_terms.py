@@ -41,7 +41,7 @@ XML = f"""<mujoco><option timestep="{STEP_S}"/><worldbody><body>
 OWN = {"damping": 0.02, "armature": 0.004, "frictionloss": 0.03, "kp": 9.0, "kd": 0.3, "limit": 3.0}
 ON = {"load": 0.25, "static": 0.25, "stribeck_rad_s": 0.3, "drag": 0.02, "bias": 0.05, "back_emf": 0.12, "play": 0.04,
       "cogging_cos": 0.1, "cogging_sin": -0.2, "cogging_per_turn": 9.0, "eccentric_cos": 0.05, "eccentric_sin": 0.08,
-      "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7, "torque": 1.2, "top_speed": 1.5}  # fmt: skip
+      "damping_bias": -0.015, "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7, "torque": 1.2, "top_speed": 1.5}  # fmt: skip
 OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1, "cogging_per_turn": 9.0} | dict.fromkeys(LIMITS, NO_LIMIT)
 MECHANICAL = [name for name in OPTIONAL if name != "voltage"]
 """Those that need no column of the log."""
@@ -81,7 +81,8 @@ def by_hand(terms, goals, on, start):
         drive = max(-limit, min(limit, servo)) - enabled * p["back_emf"] * w
         dry = p["frictionloss"] + p["static"] * math.exp(-abs(w) / p["stribeck_rad_s"]) + p["load"] * abs(drive)
         inside = drive + enabled * p["back_emf"] * w
-        brake = p["damping"] + p["drag"] * abs(w) + enabled * p["back_emf"]
+        viscous = p["damping"] + math.copysign(1.0, w) * p["damping_bias"]
+        brake = viscous + p["drag"] * abs(w) + enabled * p["back_emf"]
         pushed = w + STEP_S / inertia * (inside - p["bias"] - cogging - lever)
         stopped = math.copysign(max(abs(pushed) - STEP_S * dry / inertia, 0.0), pushed)
         w = stopped / (1 + STEP_S * brake / inertia)
@@ -226,7 +227,8 @@ def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
     off = {p.name: p.without for p in every if p.term}
     assert off == {name: OFF[name] for name in set(ON) - {"cogging_per_turn"}}
     values = every.decode(every.start())
-    either = {"bias", "cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin", "tilt_x", "tilt_y"}
+    either = {"bias", "damping_bias", "tilt_x", "tilt_y"}
+    either |= {"cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin"}
     assert all(values[what] > 0.0 for what in set(off) - either)  # at a bound nothing would move
     assert held_out_parts.widest(table, "load").terms == ("load",)
 

@@ -67,6 +67,7 @@ def test_drives_push_as_mujocos_own_position_servos(model_file, kv, goal, most):
     model_file.write_text(model_file.read_text().replace('kv="0.7"', f'kv="{kv}"'))
     own = mujoco.MjModel.from_xml_path(str(model_file))
     made = driven(model_file, JOINTS, 0.002, False, False)
+    own.dof_solref[:], own.dof_solimp[:] = made.dof_solref[0], made.dof_solimp[0]  # friction that holds a joint
     assert [made.joint(i).name for i in range(made.njnt)] == ["left_hip", "left_knee"]  # the other one is held
     told, kp, kd = np.array(goal), np.array([8.0, 12.0]), np.array([0.0, kv])
     a, b = mujoco.MjData(own), mujoco.MjData(made)

@@ -122,8 +122,9 @@ XML = """<mujoco><worldbody><body name="upper"><joint name="lift" axis="0 1 0"/>
   <geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.2"/></body></body></worldbody></mujoco>"""
 PLAIN = {"kp": 9.0, "damping": 0.35, "armature": 0.012, "frictionloss": 0.05}
 TERMS = {"kd": 0.2, "load": 0.1, "static": 0.05, "stribeck_rad_s": 0.2, "drag": 0.02, "bias": 0.02, "back_emf": 0.05,
-         "play": 0.01, "zero": 0.03, "eccentric_cos": 0.02, "eccentric_sin": -0.01, "cogging_cos": 0.02,
-         "cogging_sin": 0.01, "cogging_per_turn": 8.0, "torque": 2.0, "released": 0.3, "gravcomp": 0.4}  # fmt: skip
+         "damping_bias": 0.1, "play": 0.01, "zero": 0.03, "eccentric_cos": 0.02, "eccentric_sin": -0.01,
+         "cogging_cos": 0.02, "cogging_sin": 0.01, "cogging_per_turn": 8.0,
+         "torque": 2.0, "released": 0.3, "gravcomp": 0.4}  # fmt: skip
 
 
 def two_links(folder, own, commands):

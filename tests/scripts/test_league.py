@@ -174,13 +174,22 @@ def test_a_textbook_axis_takes_forces_and_long_recordings_are_fitted_in_windows(
 
 def test_published_sets_hold_their_goals_and_differ():
     ends = {
-        name: published.predict(name, [replace(steps(), command=np.full((300, 1), 0.3))])[0] for name in published.SETS
+        name: published.predict(name, [replace(steps(), command=np.full((300, 1), 0.3))])[0]
+        for name in published.SERVOS
     }
     for name, q in ends.items():
         assert q.shape == (300, 1)
         assert q[0, 0] == 0.0
         assert q[-1, 0] == pytest.approx(0.3, abs=0.02), f"{name}: friction over stiffness"
     assert np.ptp([q[10, 0] for q in ends.values()]) > 0.01
+
+
+def test_a_published_axis_sticks_and_then_moves_as_its_equation_says():
+    """Friction of 20.4 N holds it under 15 + 3.2 N; 100 N end at (100 + 3.2 - 20.4) N / 203.5 N s/m."""
+    held, pushed = (replace(steps(6.0), command=np.full((600, 1), force)) for force in (15.0, 100.0))
+    (still,), (moving,) = published.predict("published_idim", [held]), published.predict("published_idim", [pushed])
+    assert abs(still[-1, 0]) < 1e-4
+    assert (moving[-1, 0] - moving[-101, 0]) / 1.0 == pytest.approx(0.4067, rel=2e-3)
 
 
 def described_set(folder, **changed):

@@ -55,7 +55,7 @@ ENTRANTS = {
     "bam_m1": "BAM M1: Coulomb and viscous friction; CMA-ES",
     "bam_m6": "BAM M6: Stribeck, load, direction, quadratic; CMA-ES",
     "textbook": "stiffness, damping, dry friction, delay, limit of the rate; scipy.optimize.least_squares",
-    **dict.fromkeys(published.SETS, "published parameters of the SO-101, not fitted"),
+    **dict.fromkeys(published.SETS, "published parameters of the SO-101 or the EMPS, not fitted"),
 }
 QUICK: dict[str, Any] = {"budget_s": 0.2, "folds": 1, "samples": 120, "entrants": [e for e in ENTRANTS if e != "ours"]}
 
@@ -102,7 +102,7 @@ def _tasks(options: argparse.Namespace) -> dict[tuple[Any, ...], tuple[LeagueSet
             raise UsageError(f"{options.data} has no set {name!r}", hint=f"available: {', '.join(there)}")
         for fold in there[name].folds(options.data)[: options.folds]:
             for entrant in options.entrants:
-                if name == "so101" or entrant not in published.SETS:
+                if published.SETS.get(entrant, name) == name:
                     tasks[name, fold.name, entrant, options.budget_s, options.seed] = (there[name], fold, entrant)
     return tasks
 

@@ -107,6 +107,14 @@ def fit_pace(
     rig: Rig, fitted: Sequence[Recording], budget_s: float, seed: int
 ) -> tuple[Callable[[Sequence[Recording]], list[np.ndarray]], str]:
     """Fit PACE's parameters with CMA-ES within a budget; return the predictor and a summary."""
+    parameters, count = pace_parameters(rig, fitted, budget_s, seed)
+    return lambda recordings: [predict(rig, parameters, r) for r in recordings], f"{count} evaluations"
+
+
+def pace_parameters(
+    rig: Rig, fitted: Sequence[Recording], budget_s: float, seed: int
+) -> tuple[sysid.ParameterDict, int]:
+    """Return PACE's parameters after CMA-ES within a budget, and the number of evaluations."""
     joints = fitted[0].position.shape[1]
     biases = {f"bias{j}": (0.0, -0.1, 0.1, _bias(rig, j)) for j in range(joints)}
     parameters, transform = _parameters({**rig.pace, **biases}, True)
@@ -131,7 +139,7 @@ def fit_pace(
         raise ValueError("the delay does not stand before the biases")
     u, _, count = minimise(losses, np.full(len(low), 0.5), deadline, seed, sigma=0.5)
     parameters.update_from_vector(values(u))
-    return lambda recordings: [predict(rig, parameters, r) for r in recordings], f"{count} evaluations"
+    return parameters, count
 
 
 def predict(rig: Rig, parameters: sysid.ParameterDict, recording: Recording) -> np.ndarray:

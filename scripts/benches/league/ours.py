@@ -24,7 +24,7 @@ from sim2real.identify.fit import fit as fit_model
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation import prediction
-from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation import held_out_parts, segment_split
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.robot_flags import RobotFlags
@@ -104,7 +104,8 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
         robot = held_out_parts.offering(pipeline.load(), wanted)
         fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
     config = replace(pipeline.identify, seed=seed)
-    case = identify.Case(name, config, robot, robot.identifiable(config.max_delay_s))
+    model = robot.identifiable(config.max_delay_s)
+    case = identify.Case(name, segment_split.with_length(config, model), robot, model)
     identified = _fit_with_terms(case, fitted) if wanted == "auto" else identify.identify(case, fitted)
 
     def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
@@ -128,7 +129,8 @@ def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
     selection = held_out_parts.chosen(every, c, list(fitted))
     fewer, values = table.with_terms(selection.names(table)), as_numbers(every.problem.table, selection.near[0].z)
     fewer = fewer.with_begin({p.name: float(np.squeeze(values[p.name])) for p in fewer if p.free})
-    return fit_model(model, episodes, spans, length, c, fewer)
+    longer = segment_split.long_spans(episodes, len(episodes), replace(c, held_out=0.0))
+    return fit_model(model, episodes, spans, length, c, fewer, longer)
 
 
 def _model(fitted: Sequence[Recording], folder: Path) -> Path:

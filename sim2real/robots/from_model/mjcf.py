@@ -17,6 +17,8 @@ from sim2real.types import MjModel, MjSpec, PyTree
 from sim2real.worlds.drive_terms import NO_LIMIT
 
 _LEAST_FRICTION, _LEAST_GRAVCOMP = 1e-9, 1e-9
+_SOFT, _HOLDS = (0.02, 1.0, 0.9, 0.95, 0.001, 0.5, 2.0), 0.9999
+"""MuJoCo's default solref and solimp of friction, and the impedance of friction that holds a joint."""
 _OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
               "N m s^2/rad^2": "N s^2/m^2"}  # fmt: skip
 """Units of hinges -> units of slides."""
@@ -91,6 +93,8 @@ def driven_spec(
         if rubbing:
             spec.joint(joint).frictionloss = max(float(np.ravel(spec.joint(joint).frictionloss)[0]), _LEAST_FRICTION)
 
+    stick(spec, joints, step_s)
+
     # Set the options that identification needs, and compile.
     if carried and not np.any(model.body_gravcomp > 0.0):
         for body in spec.bodies[1:]:
@@ -101,6 +105,17 @@ def driven_spec(
     if not contacts:
         option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
     return spec
+
+
+def stick(spec: MjSpec, joints: Sequence[str], step_s: float) -> None:
+    """Let dry friction hold joints, unless the file has an impedance of its own: at MuJoCo's default they creep.
+
+    Args:
+        step_s: Time step of the simulation [s].
+    """
+    for joint in (spec.joint(name) for name in joints):
+        if np.allclose(joint.solref_friction, _SOFT[:2]) and np.allclose(joint.solimp_friction, _SOFT[2:]):
+            joint.solref_friction, joint.solimp_friction[:2] = [2 * step_s, 1.0], _HOLDS
 
 
 def copy_back(spec: MjSpec, model: MjModel) -> None:

@@ -32,6 +32,7 @@ from sim2real.robots.from_model.mjcf import (
     read_spec,
     set_drives,
     slides_of,
+    stick,
     unit_for,
 )
 from sim2real.robots.from_model.mjcf_parameters import (
@@ -252,6 +253,7 @@ class MjcfRobot(LoggedRobot):
         spec.option.timestep, spec.option.integrator = config.step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
         spec.option.gravity = np.asarray(tilted(self.placed, values, spec.option.gravity))
         drives = self._drives(values)
+        stick(spec, config.joints, config.step_s)
         if not ("kp" in config.commands and config.kp_unit == 1.0):
             set_drives(spec, dict(zip(config.joints, drives, strict=True)))
         model = spec.compile()

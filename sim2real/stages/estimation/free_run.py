@@ -24,7 +24,7 @@ from sim2real.identify.validation.replays import replays
 from sim2real.identify.validation.verdict import Position
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.segment_split import reach, spans, split_of
+from sim2real.stages.estimation.segment_split import long_spans, reach, split_of
 from sim2real.stages.identify.config import IdentifyConfig
 
 TERM = "direction"
@@ -92,10 +92,8 @@ def fitted_to(
     Args:
         windows: Segments to fit, and segments to predict.
     """
-    longer = [s for s in spans(episodes, fitted, config, config.long_s) if s.fitted] if config.long_s else []
-    return fit(
-        model, list(episodes), windows, config.settle_s + config.horizon_s, config, table, longer, report, on_begin
-    )
+    longer, length_s = long_spans(episodes, fitted, config), config.settle_s + config.horizon_s
+    return fit(model, list(episodes), windows, length_s, config, table, longer, report, on_begin)
 
 
 def far_off(document: Identification, positions: Sequence[Position]) -> list[tuple[Position, float, float]]:

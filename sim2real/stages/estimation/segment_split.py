@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
+from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.segments import Span
 from sim2real.stages.identify.config import IdentifyConfig
 
 _WINDOW_SPACING_S = 0.5
+_LONG_S = 5.0
+"""Length of the segments of the last refinement of a robot that follows no goals [s]."""
 _EDGES_S = (0.3, 0.2)
 """Unused time at the beginning and at the end of a log whose initial states are estimated [s]."""
 
@@ -49,6 +54,30 @@ def spans(
             f"{len(segments) - fit_count} to hold out",
             hint="record for at least 12 s, or shorten --settle-s and --horizon-s",
         )
+    return segments
+
+
+def with_length(config: IdentifyConfig, model: IdentifiableModel) -> IdentifyConfig:
+    """Return the configuration with the length of the segments of the last refinement."""
+    follows_goals = any(channel.goal for channel in model.channels)
+    return replace(config, long_s=0.0 if follows_goals else _LONG_S) if config.long_s is None else config
+
+
+def long_spans(episodes: Sequence[Episode], fitted: int, config: IdentifyConfig) -> list[Span]:
+    """Return the segments of the last refinement, which together contain all fitted samples.
+
+    Args:
+        fitted: Number of fitted logs; the later ones are held out whole.
+
+    Returns:
+        Segments of ``config.long_s``; none if it is 0, or if no log has two of them.
+    """
+    segments: list[Span] = []
+    for r, episode in enumerate(episodes[:fitted] if config.long_s else ()):
+        begin, end = reach(episode, config)[0], split_of(episode, True, config)
+        # The last segment ends where the fitted part ends; the others are spread evenly, and may overlap.
+        if (count := math.ceil((end - begin) / config.long_s - 1e-6)) > 1:
+            segments += [Span(r, float(b)) for b in np.linspace(begin, end - config.long_s, count)]
     return segments
 
 

@@ -62,10 +62,11 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
         note(f"engine: {problem.engine}")
         best.begin(problem)
 
-    # Fit the model with all terms that the configuration allows.
+    # Fit the model with all terms that the configuration allows; terms are selected on windows, which takes less time.
+    wide = replace(config, long_s=0.0) if config.terms == "auto" else config
     best.restart(table.for_recordings(len(inputs.episodes)))
     with _progress("identify", best) as report:
-        widest = patiently(lambda: fitted_to(*data, config, table, report, on_begin))
+        widest = patiently(lambda: fitted_to(*data, wide, table, report, on_begin))
     if config.terms != "auto":
         return Fits(widest, widest, None)
     # Select the terms without which held-out parts are predicted worse.

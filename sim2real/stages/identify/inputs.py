@@ -20,7 +20,7 @@ from sim2real.robots.contract import RecordedRobot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.fitted_logs import require_apart
-from sim2real.stages.estimation.segment_split import spans
+from sim2real.stages.estimation.segment_split import spans, with_length
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.open_log import require_units
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -113,6 +113,7 @@ def prepare(
     require_apart(fitted, held_out, model, config.force)
     episodes = [log.episode for log in fitted]
     table = table_of(model, config, episodes).with_begin(begin or {})
+    config = with_length(config, model)
     windows = spans([log.episode for log in logs], len(fitted), config, config.settle_s + config.horizon_s)
     return Inputs(pipeline, config, robot, model, table, logs, len(fitted), windows)
 

@@ -48,5 +48,6 @@ MODEL_IDENTIFY = IdentifyConfig(
     refine=1,
     jacobian="finite",
     max_delay_s=0.05,
+    long_s=None,
 )
 """Defaults of identify for a model, which has rough values: no search, initial states from the measurements."""

@@ -22,7 +22,7 @@ EQUATIONS: Mapping[str, tuple[str, ...]] = {
         "torque = clip(kp (goal - zero - angle) + kd (goal_velocity - velocity) + gain (torque + duty), limit)",
         "with torque off: torque = -released kd velocity",
         "kp and gain times 1 + voltage (volts / volts_unit - 1), if the command has volts",
-        "damping = damping + drag |velocity| + back_emf",
+        "damping = max(damping + damping_bias sign(velocity), 0) + drag |velocity| + back_emf",
         "dry friction = frictionloss + static exp(-|velocity| / stribeck_rad_s) + load |torque|",
         "applied torque = -bias - cogging_cos cos(n angle) - cogging_sin sin(n angle), n = cogging_per_turn",
         "an error of the angle within +-play has no torque",

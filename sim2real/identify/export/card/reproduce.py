@@ -90,7 +90,8 @@ def drive(model: Untyped, data: Untyped, numbers: Untyped, command: Arrays, memo
         push = kp * (error - dead)
         force = force - kp * (beyond + dead) - push + np.clip(push, -most, most)
         torque = np.clip(force - kp * angle - kd * speed, -limit, limit) - braked * speed
-        model.dof_damping[dof] = usual[0] + n["drag"] * fast + braked
+        viscous = np.maximum(usual[0] + n["damping_bias"] * np.sign(speed), 0.0)
+        model.dof_damping[dof] = viscous + n["drag"] * fast + braked
         stuck = n["static"] * np.exp(-fast / n["stribeck_rad_s"])
         model.dof_frictionloss[dof] = usual[1] + stuck + n["load"] * np.abs(torque)
         turn = n["cogging_per_turn"] * angle

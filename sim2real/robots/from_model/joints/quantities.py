@@ -13,7 +13,7 @@ What = Literal[
     "kp", "kd", "gain", "torque", "speed", "released", "damping", "armature", "frictionloss", "zero", "payload",
     "load", "static", "stribeck_rad_s", "drag", "bias", "back_emf", "play", "top_speed", "tilt_x", "tilt_y", "gravcomp",
     "eccentric_cos", "eccentric_sin", "cogging_cos", "cogging_sin", "cogging_per_turn",
-    "kp_factor", "kd_factor", "gain_factor", "damping_factor", "armature_factor", "voltage",
+    "kp_factor", "kd_factor", "gain_factor", "damping_factor", "armature_factor", "voltage", "damping_bias",
 ]  # fmt: skip
 FACTORS = ("kp_factor", "kd_factor", "gain_factor", "damping_factor", "armature_factor")
 """Factors of some joints on the quantity that all joints share."""
@@ -45,6 +45,7 @@ ABOUT = {
     "stribeck_rad_s": ("rad/s", "speed at which 1/e of that is left"),
     "drag": ("N m s^2/rad^2", "friction by the square of the speed"),
     "bias": ("N m", "dry friction upwards beyond the mean of both directions"),
+    "damping_bias": ("N m s/rad", "viscous friction upwards beyond the mean of both directions"),
     "back_emf": ("N m s/rad", "damping by the motor's voltage, with torque on, beyond its limit"),
     "play": ("rad", "error of the angle that the drive leaves alone: dead zone, play of gears"),
     "top_speed": ("rad/s", "largest speed of the answer to a step of the goal"),
@@ -72,7 +73,7 @@ EXCITE = {
     "gravcomp": "motion of each joint against gravity, up and down, over a wide range of angles",
     **dict.fromkeys(("torque", "speed", "back_emf"), "commands that the drive cannot follow, at its limit"),
     **dict.fromkeys(("frictionloss", "static", "bias"), "slow motion of each joint, with reversals"),
-    **dict.fromkeys(("damping", "drag"), "fast motion of each joint, at several speeds"),
+    **dict.fromkeys(("damping", "damping_bias", "drag"), "fast motion of each joint, at several speeds"),
     **dict.fromkeys(("zero", "payload"), "motion of each joint against gravity, up and down"),
     **dict.fromkeys(TILT, "motion of joints whose axes are not upright, against gravity, up and down"),
     **dict.fromkeys(("eccentric_cos", "eccentric_sin"), "motion of each joint over most of a turn"),
@@ -89,16 +90,17 @@ FIXED = {"zero": (0.0, -0.15, 0.15), "released": (0.5, 0.0, 1.0), "payload": (0.
           "eccentric_cos": (0.0, -0.1, 0.1), "eccentric_sin": (0.0, -0.1, 0.1),
           "cogging_per_turn": (1.0, 0.0, 10_000.0)}  # fmt: skip
 OF_MODEL = {"static": ("frictionloss", 5.0), "bias": ("frictionloss", 5.0), "drag": ("damping", 5.0),
-             "back_emf": ("damping", 30.0), "cogging_cos": ("frictionloss", 5.0),
+             "damping_bias": ("damping", 1.0), "back_emf": ("damping", 30.0), "cogging_cos": ("frictionloss", 5.0),
              "cogging_sin": ("frictionloss", 5.0)}  # fmt: skip
 """Terms without a usual size: their bound is a factor times another quantity of the model."""
-BOTH_WAYS = ("bias", "cogging_cos", "cogging_sin")
+BOTH_WAYS = ("bias", "damping_bias", "cogging_cos", "cogging_sin")
 """Those that may be negative."""
 OPTIONAL = {
     "load": ("load",),
     "stribeck": ("static", "stribeck_rad_s"),
     "drag": ("drag",),
     "direction": ("bias",),
+    "viscous_direction": ("damping_bias",),
     "back_emf": ("back_emf",),
     "play": ("play",),
     "torque_limit": ("torque",),

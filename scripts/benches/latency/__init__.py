@@ -1,0 +1,1 @@
+"""Emulated links with known delays, and the methods that estimate them."""
