@@ -129,7 +129,7 @@ def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
     selection = held_out_parts.chosen(every, c, list(fitted))
     fewer, values = table.with_terms(selection.names(table)), as_numbers(every.problem.table, selection.near[0].z)
     fewer = fewer.with_begin({p.name: float(np.squeeze(values[p.name])) for p in fewer if p.free})
-    longer = segment_split.long_spans(episodes, len(episodes), replace(c, held_out=0.0))
+    longer = segment_split.covering([(0.0, e.duration_s) for e in episodes], c.long_s or 0.0)
     return fit_model(model, episodes, spans, length, c, fewer, longer)
 
 

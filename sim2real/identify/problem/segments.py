@@ -246,9 +246,15 @@ def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np
         data = [c.of(episode.outputs[model.sensor][f][near]) / s for f, s in c.fields]
         rows = [p / s for p, (_, s) in zip((powers, slopes), c.fields, strict=False)]
         fits.append(np.linalg.lstsq(np.concatenate(rows), np.concatenate(data), rcond=None)[0])
+        # A joint that never moves starts at rest: a speed made of noise would seem to determine its friction.
+        (name, sigma), *_ = c.fields
+        if np.ptp(c.of(episode.outputs[model.sensor][name])) < _RESTS * sigma:
+            fits[-1] = np.array([data[0].mean() * sigma, 0.0, 0.0, 0.0])
     return np.stack(fits)
 
 
+_RESTS = 10.0
+"""Range of the positions of a joint that never moves, in deviations of a measurement."""
 _RATE_S = 0.05
 """Time over which a speed is averaged for the range of a signal [s]: noise of 1 mrad makes 28 mrad/s."""
 Signal = tuple[float, float]

@@ -72,12 +72,17 @@ def long_spans(episodes: Sequence[Episode], fitted: int, config: IdentifyConfig)
     Returns:
         Segments of ``config.long_s``; none if it is 0, or if no log has two of them.
     """
+    ends = [(reach(e, config)[0], split_of(e, True, config)) for e in episodes[:fitted]]
+    return covering(ends, config.long_s or 0.0)
+
+
+def covering(ends: Sequence[tuple[float, float]], length_s: float) -> list[Span]:
+    """Return segments of a length that contain all samples between begin and end [s] of each recording."""
     segments: list[Span] = []
-    for r, episode in enumerate(episodes[:fitted] if config.long_s else ()):
-        begin, end = reach(episode, config)[0], split_of(episode, True, config)
-        # The last segment ends where the fitted part ends; the others are spread evenly, and may overlap.
-        if (count := math.ceil((end - begin) / config.long_s - 1e-6)) > 1:
-            segments += [Span(r, float(b)) for b in np.linspace(begin, end - config.long_s, count)]
+    for r, (begin, end) in enumerate(ends if length_s else ()):
+        # The last segment ends at the end; the others are spread evenly, and may overlap.
+        if (count := math.ceil((end - begin) / length_s - 1e-6)) > 1:
+            segments += [Span(r, float(b)) for b in np.linspace(begin, end - length_s, count)]
     return segments
 
 
