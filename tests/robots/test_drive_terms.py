@@ -41,7 +41,8 @@ XML = f"""<mujoco><option timestep="{STEP_S}"/><worldbody><body>
 OWN = {"damping": 0.02, "armature": 0.004, "frictionloss": 0.03, "kp": 9.0, "kd": 0.3, "limit": 3.0}
 ON = {"load": 0.25, "static": 0.25, "stribeck_rad_s": 0.3, "drag": 0.02, "bias": 0.05, "back_emf": 0.12, "play": 0.04,
       "cogging_cos": 0.1, "cogging_sin": -0.2, "cogging_per_turn": 9.0, "eccentric_cos": 0.05, "eccentric_sin": 0.08,
-      "damping_bias": -0.015, "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7, "torque": 1.2, "top_speed": 1.5}  # fmt: skip
+      "damping_bias": -0.015, "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7,
+      "torque": 1.2, "top_speed": 1.5}  # fmt: skip
 OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1, "cogging_per_turn": 9.0} | dict.fromkeys(LIMITS, NO_LIMIT)
 MECHANICAL = [name for name in OPTIONAL if name != "voltage"]
 """Those that need no column of the log."""
