@@ -1,5 +1,6 @@
 """Terms chosen by what is left out, on a linear model: there the statistics are exact, and numpy can do it all over."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -238,3 +239,19 @@ def test_a_subset_that_is_far_better_wins_whatever_the_order():
         trial(ONE, [0.04] * 3),
     ]
     assert selected(trials).names(TABLE) == selected(trials[::-1]).names(TABLE) == ONE
+
+
+def test_a_set_with_the_loss_of_a_smaller_one_has_its_errors(linear):
+    """Without refits its errors would be those of linear steps, which may be smaller by chance."""
+    fits = Fits(linear)
+    usual = fits.attempt
+    with_real = usual(terms("real"), [np.zeros(6)], np.inf)
+
+    def attempt(present, starts, most):
+        trial = usual(present, starts, most)
+        if trial.names(TABLE) == ("real", "idle"):
+            return replace(trial, loss=with_real.loss, ahead=0.1 * trial.ahead)
+        return trial
+
+    trials = grown(attempt, lambda trial: trial.stats, TABLE, [np.zeros(6)])
+    assert select(trials).names(TABLE) == ("real",)

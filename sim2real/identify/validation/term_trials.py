@@ -7,6 +7,7 @@ a larger loss, and the choice compares simulations of the sets, not approximatio
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -78,10 +79,10 @@ def grown(
             if len(level) > 1 and better(_best(level).ahead, base.ahead):
                 break
             begins = [_begin(stats, table, present), opened(table, base.z, present), *starts]
-            level.append(attempt(present, begins, base.loss))
+            level.append(_with_gain(attempt(present, begins, base.loss), base))
         for i in np.flatnonzero(limits & ~base.present):
             present = base.present | (np.arange(len(none)) == i)
-            level.append(attempt(present, limited(base, present), base.loss))
+            level.append(_with_gain(attempt(present, limited(base, present), base.loss), base))
             limits[i] = level[-1].loss < (1.0 - LITTLE) * base.loss
         trials += level
         if not level or not better(_best(level).ahead, base.ahead):
@@ -97,7 +98,17 @@ def grown(
         for present in lacking:
             below = min((t for t in trials if not np.any(t.present & ~present)), key=lambda t: t.loss)
             begins = [_begin(chosen.stats, table, present), opened(table, below.z, present)]
-            trials.append(attempt(present, begins, below.loss))
+            trials.append(_with_gain(attempt(present, begins, below.loss), below))
+
+
+def _with_gain(trial: Trial, below: Trial) -> Trial:
+    """Return a trial; with the errors of a smaller set if its loss is the same, as a limit that nothing reaches has.
+
+    Such a set gets no refits, and the errors of linear steps are not comparable with those of refits.
+    """
+    if (1.0 - LITTLE) * below.loss <= trial.loss <= (1.0 + _WORSE) * below.loss:
+        return replace(trial, rows=below.rows, ahead=below.ahead, free=below.free)
+    return trial
 
 
 def _proposed(stats: Statistics, table: ParameterTable, present: np.ndarray, pairs: bool = True) -> list[np.ndarray]:
@@ -181,12 +192,12 @@ class Trials:
         stats = self.wider(base)
         trials = [base]
         trials += [
-            self.attempt(one, [_begin(stats, table, one), opened(table, base.z, one)], base.loss)
+            _with_gain(self.attempt(one, [_begin(stats, table, one), opened(table, base.z, one)], base.loss), base)
             for one in _proposed(stats, table, present, pairs=False)
         ]
         for i in np.flatnonzero(limits & ~present):
             one = present | (np.arange(len(present)) == i)
-            trials.append(self.attempt(one, self.limited(base, one), base.loss))
+            trials.append(_with_gain(self.attempt(one, self.limited(base, one), base.loss), base))
         return trials
 
     def grown(self) -> list[Trial]:
