@@ -276,7 +276,8 @@ class Robot:
             angles = [self.sensor.units.get(channel.position) == "rad" for channel in self.sensor.channels]
             # Whole turns of a hinge without range are no offset.
             offset -= np.where(angles, 2 * np.pi * np.round(offset / (2 * np.pi)), 0.0)
-            start = self.task.moved(start, offset, np.zeros_like(offset))
+            # Not `moved`, which keeps drawn starts within the bounds of goals: a robot may rest beyond them, on a stop.
+            start = start.replace(position=start.position + offset)
         return self.node_parameters(values, start, policy)
 
     def node_parameters(

@@ -130,6 +130,14 @@ def test_a_simulation_starts_from_rest_and_each_trial_has_its_own_aim():
     assert aims[1] == float(robot.task.aim.draw(jax.random.key(1))[0])
 
 
+def test_a_simulation_starts_where_the_robot_rested_also_beyond_the_bounds_of_its_goals(pair):
+    """A folded SO-101 lies on its stop: a start within the bounds of goals was 90 mrad away from it."""
+    beyond = np.asarray(pair.drive.servos.high) + 0.09
+    params = pair.simulation_params(pair.nominal(), None, measured=beyond)
+    np.testing.assert_allclose(params["world"].qpos, beyond, rtol=1e-6)
+    assert params["world"].qpos.dtype == np.float32
+
+
 def test_a_recording_begins_where_the_joints_are(pair):
     reading = SimpleNamespace(position_rad=np.array([1.0, -0.3]))
     session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: reading))
