@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,8 +27,9 @@ def write_progress(folder: Path, values: Mapping[str, np.ndarray | float]) -> No
 
 def write_best_fit(folder: Path, columns: Mapping[str, np.ndarray]) -> None:
     """Replace the best fit so far, at once: a reader never sees a part of it."""
+    arrays: dict[str, Any] = dict(columns)
     unfinished = folder / f"{BEST_FIT}.part"
     with suppress(OSError):
         with open(unfinished, "wb") as stream:
-            np.savez(stream, **columns)
+            np.savez(stream, **arrays)
         os.replace(unfinished, folder / BEST_FIT)

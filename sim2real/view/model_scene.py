@@ -72,8 +72,8 @@ class ModelScene:
         kinds, model = self._mj.mjtGeom, self._model
         kind, size = model.geom_type[geom], model.geom_size[geom]
         rgb = (255 * model.geom_rgba[geom, :3]).astype(int).tolist() if model.geom_rgba[geom, :3].any() else _PLAIN
-        look = {"colors": [_GHOST if ghost else rgb]}
-        fill = {"fill_mode": "majorwireframe" if ghost else "solid"}
+        look: dict[str, Any] = {"colors": [_GHOST if ghost else rgb]}
+        fill: dict[str, Any] = {"fill_mode": "majorwireframe" if ghost else "solid"}
         if kind in (kinds.mjGEOM_SPHERE, kinds.mjGEOM_ELLIPSOID):
             radii = size if kind == kinds.mjGEOM_ELLIPSOID else np.repeat(size[0], 3)
             return rr.Ellipsoids3D(half_sizes=[radii], **look, **fill)

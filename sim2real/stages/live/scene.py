@@ -25,5 +25,5 @@ def drawn(scene: Mapping[str, Json]) -> Scene | None:
     """Return the scene that ``scene_of`` describes; None without one."""
     if scene.get("pipeline"):
         pipeline = load_pipeline(scene["pipeline"])
-        return pipeline.load(pipeline.scene).log_scene
+        return pipeline.load(pipeline.scene).log_scene if pipeline.scene else None
     return ModelScene(scene["mjcf"], scene["columns"]) if scene.get("mjcf") else None
