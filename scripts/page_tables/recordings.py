@@ -23,10 +23,10 @@ def view(report: Mapping[str, Any]) -> str:
             rows[f"{target}/{name}"]
             for name in ("loop_share", "lateness_p99_ms", "lateness_p99_added_ms", "viewer_cores")
         )
-        spread = share["yardstick"].rpartition("+-")[2]
+        spread, late_spread = (figure["yardstick"].rpartition("+-")[2] for figure in (share, added))
         lines.append(
-            f"| {target} | {share['value']:+.2f} (s.e. {spread}) | {late['value']:.3f} | {added['value']:+.3f} | "
-            f"{cores['value']:.2f} |"
+            f"| {target} | {share['value']:+.2f} (s.e. {spread}) | {late['value']:.3f} | "
+            f"{added['value']:+.3f} (s.e. {late_spread}) | {cores['value']:.2f} |"
         )
     return "\n".join([*lines, ""])
 

@@ -123,6 +123,20 @@ def test_drift(run):
     assert {c["name"] for c in tested["changes"]} >= {"friction", "payload", "round_trip_delay"}
 
 
+def test_view(run):
+    pytest.importorskip("rerun")
+    found = names(run("view"))
+    assert found == {f"view/file/{n}" for n in (
+        "loop_share", "lateness_p99_ms", "lateness_p99_added_ms", "viewer_cores"
+    )}  # fmt: skip
+
+
+@pytest.mark.full
+@pytest.mark.slow
+def test_excitation(run):
+    assert "excitation/teleoperated/friction_error" in names(run("excitation"))
+
+
 def test_async(run):
     assert {"graph/simulated/steps_per_s", "async/100_hz/agent/lateness_ms", "async/100_hz/cpu"} <= names(run("async"))
 
