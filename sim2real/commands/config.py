@@ -1,4 +1,4 @@
-"""The commands ``new``, ``log recover`` and ``export``; every field is a flag. Imports no JAX, for ``--help``."""
+"""The commands ``new``, ``log recover``, ``export``, ``play``; each field is a flag. No JAX, for ``--help``."""
 
 from __future__ import annotations
 
@@ -71,3 +71,31 @@ class ShipConfig:
     """The folder to write; default: one in the working directory."""
     runs: Path = Path("runs")
     """Folder of all runs."""
+
+
+@dataclass(frozen=True)
+class PlayConfig:
+    """Let a policy walk on a twin in C MuJoCo, with delays and noise: in a window, with keys, or into a picture."""
+
+    source: Annotated[Positional[str | None], arg(metavar="RUN|PIPELINE|BUNDLE")] = None
+    """A bundle's folder, a run folder, or a pipeline, whose newest training is taken, or its shipped bundle."""
+    command: tuple[float, float, float] = (0.6, 0.0, 0.0)
+    """Velocity at the start: forwards, to the left [m/s], yaw rate [rad/s]."""
+    seconds: float = 10.0
+    """Length of the episode [s]."""
+    push: float = 0.0
+    """Size of a push every 5 s [m/s]."""
+    seed: int | None = None
+    """Seed of a twin with other friction, load, motors and delays; default: the nominal twin."""
+    window: bool = False
+    """Show it in a window; the arrow keys change forward velocity and yaw rate, comma and full stop the sideways one,
+    the space bar stops."""
+    video: Annotated[Path | None, arg(metavar="FILE.gif")] = None
+    """Moving picture to write, from the side; needs no display."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not (0.0 < self.seconds <= 3600.0 and 0.0 <= self.push <= 10.0):
+            raise UsageError(f"play takes up to 3600 s and pushes of 0 to 10 m/s, got {self.seconds} and {self.push}")

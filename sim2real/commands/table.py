@@ -40,6 +40,11 @@ COMMANDS: dict[str, Command] = {
         "convert files of other recorders into logs", "stages.import_logs.stage",
         "stages.import_logs.config.ImportConfig", examples=("import data.npz --mjcf robot.xml", "info LOG"),
     ),
+    "play": ConfigCommand(
+        "let a walking policy follow velocities on a twin: in a window, with keys, or into a picture",
+        "commands.play", "commands.config.PlayConfig",
+        examples=("play go2", "play go2 --command 0.5 0 0.4 --video walk.gif", "play go2 --window"),
+    ),
     "new": ConfigCommand(
         "write the files of a pipeline for a robot that has a model", "commands.new", "commands.config.NewConfig",
         examples=("new go2 go2.xml --log run.csv", "identify go2"),

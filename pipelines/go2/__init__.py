@@ -1,0 +1,45 @@
+"""A Unitree Go2 that walks: it follows a commanded velocity."""
+
+from sim2real.stages.config import DeployConfig, TrainConfig
+from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.train.config import PPOConfig
+from sim2real.train.environment.variation import VariationConfig
+
+VARY = VariationConfig(
+    range={
+        "foot_friction": (0.4, 1.3),
+        "payload": (-1.0, 2.5),
+        "motor_strength": (0.85, 1.15),
+        "joint_damping": (0.02, 0.4),
+        "actuator_delay": (0.0, 0.018),
+    },
+    start_position=0.1,
+    start_velocity=0.3,
+    push=0.6,
+    push_hz=0.25,
+)
+WALK = PPOConfig(
+    num_envs=4096,
+    rollout_steps=24,
+    total_steps=110_000_000,
+    minibatches=8,
+    epochs=4,
+    learning_rate=7e-4,
+    hidden=(256, 128, 64),
+    privileged=True,
+    reward_scale=0.05,
+    entropy_coef=0.004,
+    max_grad_norm=1.0,
+    log_std_init=-1.0,
+    value_coef=1.0,
+    gamma=0.985,
+    evaluations=5,
+)
+
+PIPELINE = Pipeline(
+    name="go2",
+    summary="quadruped with a floating base: follow a commanded velocity",
+    package=__name__,
+    train=TrainConfig(model="nominal", episode_s=10.0, timelines=256, sensitivity=False, vary=VARY, ppo=WALK),
+    deploy=DeployConfig(episodes=5, duration_s=10.0),
+)

@@ -1,0 +1,116 @@
+"""``sim2real play``: a policy walks on a twin in C MuJoCo."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.artifacts.run.run_folder import newest
+from sim2real.commands.config import PlayConfig, ShipConfig
+from sim2real.commands.export.policy import find_bundle
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.policy.bundle import load_bundle
+from sim2real.robots.walking.robot import ComposedRobot
+from sim2real.robots.walking.twin import HiddenTwin, Twin, Walked, walk
+from sim2real.stages.pipeline.pipeline import available, load_pipeline
+from sim2real.stages.terminal.console import note, wrote
+
+FRAMES_PER_S = 12.5
+SHIPPED = "walk"
+"""Folder of a pipeline with the bundle that comes with it."""
+_KEYS = {265: (0, 0.1), 264: (0, -0.1), 44: (1, 0.1), 46: (1, -0.1), 263: (2, 0.1), 262: (2, -0.1)}
+"""Key of GLFW -> entry of the command, and its change: arrows, comma, full stop."""
+_SPACE = 32
+
+
+def run(config: PlayConfig) -> Walked:
+    """Walk, print how it went, and return it.
+
+    Raises:
+        UsageError: There is no policy, the robot does not walk, or the window and the picture exclude each other.
+    """
+    if config.window and config.video:
+        raise UsageError("play shows a window or writes a picture", hint="leave out --window or --video")
+    robot, folder = _chosen(config)
+    hidden = None if config.seed is None else HiddenTwin.draw(np.random.default_rng(config.seed), len(robot.joints))
+    twin, wanted = Twin(robot, hidden, config.seed or 0), np.array(config.command)
+    shown = _window(twin, wanted) if config.window else None
+    walked = walk(twin, load_bundle(folder), lambda _: wanted, config.seconds, config.push, shown=shown)
+    if config.video:
+        write_picture(twin, walked.qpos, config.video)
+        wrote(config.video)
+    end = f"fell after {walked.fell_s:.1f} s" if walked.fell_s is not None else f"walked for {config.seconds:g} s"
+    note(f"{end}; off the command by {walked.error_m_s:.3f} m/s and {walked.error_rad_s:.3f} rad/s")
+    return walked
+
+
+def steer(wanted: np.ndarray, key: int) -> None:
+    """Change the commanded velocity ``(3,)`` by a key."""
+    if key == _SPACE:
+        wanted[:] = 0.0
+    elif key in _KEYS:
+        entry, change = _KEYS[key]
+        wanted[entry] = np.clip(wanted[entry] + change, -1.0, 1.0)
+
+
+def write_picture(twin: Twin, qpos: np.ndarray, out: Path) -> None:
+    """Write the robot from the side, as a moving picture of its links."""
+    from matplotlib.animation import PillowWriter
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.8, 2.7), dpi=80, layout="constrained")
+    axes = figure.subplots()
+    every = max(1, round(twin.robot.rate_hz / FRAMES_PER_S))
+    writer = PillowWriter(fps=round(twin.robot.rate_hz / every))
+    with writer.saving(figure, str(out), 80):
+        for row in qpos[::every]:
+            axes.clear()
+            for start, end in twin.links(row):
+                axes.plot([start[0], end[0]], [start[2], end[2]], color="#0b62b0", lw=3, solid_capstyle="round")
+            axes.axhline(0.0, color="#1c2530", lw=1)
+            axes.set(xlim=(row[0] - 0.7, row[0] + 0.7), ylim=(-0.05, 0.6), aspect="equal", xlabel="forwards [m]")
+            writer.grab_frame()
+
+
+def _chosen(config: PlayConfig) -> tuple[ComposedRobot, Path]:
+    """Return the robot and the folder of its policy: of the newest training, or the one that the pipeline ships."""
+    source = config.source
+    pipelines = available()
+    if source is None:
+        raise UsageError("play needs a pipeline, a run or a bundle", hint="sim2real play go2")
+    if source in pipelines:
+        pipeline = load_pipeline(source)
+        shipped = pipeline.folder / SHIPPED
+        try:
+            folder = newest(config.runs, source, "train").output("bundle")
+        except Sim2RealError:
+            if not shipped.is_dir():
+                raise
+            folder = shipped
+    else:
+        folder = find_bundle(ShipConfig(source, runs=config.runs))
+        named = next((p.name for p in folder.resolve().parents if p.name in pipelines), None)
+        if named is None:
+            raise UsageError(f"{folder} lies in no folder of a pipeline", hint="sim2real play go2")
+        pipeline = load_pipeline(named)
+    robot: Any = pipeline.load()
+    if not isinstance(robot, ComposedRobot):
+        raise UsageError(f"pipeline {pipeline.name!r} does not walk", hint="sim2real play go2")
+    return robot, folder
+
+
+def _window(twin: Twin, wanted: np.ndarray) -> Any:
+    """Open a window whose keys steer; return what shows a policy step at its time."""
+    from mujoco import viewer
+
+    window: Any = viewer.launch_passive(twin.model, twin.data, key_callback=lambda key: steer(wanted, key))
+    begin = time.monotonic()
+
+    def shown(_: Twin, t_s: float) -> None:
+        window.sync()
+        time.sleep(max(0.0, begin + t_s - time.monotonic()))
+
+    return shown

@@ -1,0 +1,1 @@
+"""Robots with a floating base that follow a commanded velocity."""

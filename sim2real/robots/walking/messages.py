@@ -1,0 +1,46 @@
+"""The messages of a robot with a floating base."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flax import struct
+
+from sim2real.arrays import namespace
+from sim2real.graph.base import Base
+from sim2real.types import Array
+
+
+@struct.dataclass
+class BodyReading(Base):
+    """A measurement of encoders and IMU.
+
+    Attributes:
+        position: Shape ``(joints,)`` [rad].
+        velocity: Shape ``(joints,)`` [rad/s].
+        quaternion: Shape ``(4,)``: orientation of the base in the world, w first.
+        gyro: Shape ``(3,)``: angular velocity in the axes of the base [rad/s].
+    """
+
+    position: Array
+    velocity: Array
+    quaternion: Array
+    gyro: Array
+
+
+def into_base(quaternion: Array, vector: Any) -> Array:
+    """Return a vector of the world ``(3,)`` in the axes of the base.
+
+    Args:
+        quaternion: Shape ``(4,)``, w first; its length is taken out, as the mean of two orientations is shorter than 1.
+    """
+    xp = namespace(quaternion, vector)
+    unit = quaternion / xp.sqrt(xp.sum(quaternion**2))
+    w, u = unit[0], -unit[1:]
+    vector = xp.asarray(vector, dtype=unit.dtype)
+    return vector + 2.0 * xp.cross(u, xp.cross(u, vector) + w * vector)
+
+
+def gravity_of(quaternion: Array) -> Array:
+    """Return the direction of gravity in the axes of the base, shape ``(3,)``; ``(0, 0, -1)`` while it is level."""
+    return into_base(quaternion, (0.0, 0.0, -1.0))

@@ -1,0 +1,95 @@
+"""A walking robot in simulation, and its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.composer.world import WorldParams
+from sim2real.identify.parameters import Parameter
+from sim2real.robots.contract import RobotModel
+from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.walking.scene import Ground
+from sim2real.robots.walking.world import PAYLOAD, WalkingWorld
+from sim2real.types import PyTree, Scalar
+
+FRICTION, STRENGTH, DAMPING = "foot_friction", "motor_strength", "joint_damping"
+
+
+class WalkingModel(RobotModel):
+    """A composed task on MJX: on Warp if JAX computes on a GPU, as MJX's JAX is 20 times slower with contacts there.
+
+    Args:
+        height_m: Height of the base at the start of an episode [m].
+        rooms: Contacts and rows of constraints that Warp has room for in a copy.
+    """
+
+    def __init__(
+        self,
+        make_task: Callable[[], Ground],
+        height_m: float,
+        loads: tuple[float, float] = (-1.0, 3.0),
+        rooms: tuple[int, int] = (16, 96),
+    ) -> None:
+        self._make_task, self._height_m, self._loads, self._rooms = make_task, height_m, loads, rooms
+
+    @cached_property
+    def task(self) -> Ground:
+        """The composed task."""
+        return self._make_task()
+
+    @property
+    def tick_s(self) -> float:
+        """The world's period [s]."""
+        return float(self.task.control_timestep)
+
+    def dynamics(self) -> list[Parameter]:
+        """Return friction of the feet, load, strength of the motors and damping of the joints."""
+        return [
+            Parameter(FRICTION, "1", 0.8, 0.2, 2.0, about="friction of the feet on the ground"),
+            Parameter(PAYLOAD, "kg", 0.0, *self._loads, "linear", about="load in the base"),
+            Parameter(STRENGTH, "1", 1.0, 0.5, 1.5, about="factor on the motors' gains"),
+            Parameter(DAMPING, "N m s/rad", 0.1, 0.01, 2.0, about="damping of each joint"),
+        ]
+
+    def make_world(self, resumed: bool = False) -> WalkingWorld:
+        """Return the world's node."""
+        del resumed
+        task, on_gpu = self.task, jax.default_backend() == "gpu"
+        places = {
+            FRICTION: (task.foot_geoms, "friction"),
+            "gain": (task.actuators, "gainprm"),
+            "bias": (task.actuators, "biasprm"),
+            DAMPING: (task.joints, "damping"),
+        }
+        options = {"impl": "warp", "nconmax": self._rooms[0], "njmax": self._rooms[1]} if on_gpu else {}
+        return WalkingWorld(task, places, self._loads, **options)
+
+    def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
+        """Return the world's parameters for an episode: the base is level and at rest."""
+        usual = self._world_params.values
+        strength = jnp.asarray(values[STRENGTH], jnp.float32)
+        placed = {
+            FRICTION: usual[FRICTION].at[..., 0].set(values[FRICTION]),
+            "gain": usual["gain"] * strength,
+            "bias": usual["bias"] * strength,
+            DAMPING: jnp.full_like(usual[DAMPING], values[DAMPING]),
+            PAYLOAD: jnp.asarray(values[PAYLOAD], jnp.float32),
+        }
+        base = np.array([0.0, 0.0, self._height_m, 1.0, 0.0, 0.0, 0.0], np.float32)
+        position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
+        return WorldParams(placed, jnp.concatenate([base, position]), jnp.concatenate([jnp.zeros(6), velocity]))
+
+    def true_state(self, state: PyTree) -> PyTree:
+        """Return positions, velocities and torques, and what the feet did."""
+        data, v = state.data, state.variables
+        return data.qpos[2:], data.qvel, data.actuator_force, v["air_s"], v["ground_s"], v["mean"]
+
+    @cached_property
+    def _world_params(self) -> WorldParams:
+        with jax.ensure_compile_time_eval():  # a cached array must not belong to the function that JAX traces now
+            return self.make_world().init_params()

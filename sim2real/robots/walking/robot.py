@@ -1,0 +1,95 @@
+"""A composed task as a robot of the command line: a floating base that follows commanded velocities."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+
+from sim2real.artifacts.estimation.noise import Noise
+from sim2real.graph.node import BaseNode
+from sim2real.robots.contract import Robot, RobotDrive
+from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.robots.control_loop.training_task import LoopTask
+from sim2real.robots.walking.agent import WalkingAgent
+from sim2real.robots.walking.commands import Commands
+from sim2real.robots.walking.drive import BodySensor, TargetDrive
+from sim2real.robots.walking.model import WalkingModel
+from sim2real.robots.walking.moment import Moment
+from sim2real.robots.walking.scene import Ground
+from sim2real.robots.walking.task import Term, WalkingTask
+
+
+class ComposedRobot(Robot):
+    """A robot with a floating base, from an MJCF file, and terms of a reward.
+
+    Attributes:
+        mjcf: The model, with its floor.
+        joints: Names of the joints, in the order of the motors.
+        feet: Names of the feet: of a sphere, and of a site in its middle.
+        stance: Positions of the joints that the action 0 commands [rad].
+        height_m: Height of the base in this stance [m].
+        touching_m: Height of a foot's site below which it touches the ground [m].
+        scale: Change of a target by the action 1 [rad].
+        history: Earlier observations that the policy gets.
+        delays_s: Delays without an identification: of the sensor, of the actuator [s].
+        noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
+    """
+
+    mjcf: ClassVar[Path]
+    joints: ClassVar[tuple[str, ...]]
+    feet: ClassVar[tuple[str, ...]]
+    stance: ClassVar[tuple[float, ...]]
+    height_m: ClassVar[float]
+    touching_m: ClassVar[float]
+    scale: ClassVar[float] = 0.5
+    history: ClassVar[int] = 2
+    rate_hz = 50.0
+    commands: ClassVar[Commands] = Commands()
+    delays_s: ClassVar[tuple[float, float]] = (0.008, 0.008)
+    noise: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
+
+    def __init__(self) -> None:
+        stance = np.asarray(self.stance, np.float32)
+        self.sensor = BodySensor(self.joints, stance)
+        self.drive: RobotDrive = self.make_drive()
+        self.agent = WalkingAgent(self.joints, stance, self.scale, self.history, self.commands)
+        self.model = WalkingModel(self.make_task, self.height_m)
+        self.task = WalkingTask(self.commands, stance, 1.0 / self.rate_hz, self.terms(), self.falls)
+
+    @abstractmethod
+    def terms(self) -> Mapping[str, Term]:
+        """Return the terms of the reward by name: weight, and a function of a ``Moment``."""
+
+    def falls(self, now: Moment) -> jax.Array:
+        """Return whether the robot has fallen: it lies lower than half of its height, or on its side."""
+        return (now.height < 0.5 * self.height_m) | (now.gravity[2] > -0.5)
+
+    def make_task(self) -> Ground:
+        """Return the composed task; in training the floor sees the feet alone."""
+        return Ground(self.mjcf, self.feet, self.touching_m, collide=self.feet)
+
+    def make_drive(self) -> RobotDrive:
+        """Return the motors; default: targets, for the twin alone."""
+        return TargetDrive(self)
+
+    def nominal(self) -> dict[str, float]:
+        """Return the nominal values of the model's parameters, and the delays."""
+        return super().nominal() | dict(zip(DELAYS, self.delays_s, strict=True))
+
+    def training(self, *arguments: Any, **options: Any) -> tuple[dict[str, BaseNode], LoopTask]:
+        """Return the graph in simulation, whose sensor has the nominal noise, and the training task."""
+        nodes, task = super().training(*arguments, **options)
+        sensor: Any = nodes[self.roles.sensor]
+        sizes = {field: len(np.ravel(getattr(self.sensor.at_rest, field))) for field in self.noise}
+        sensor.noise = tuple(
+            Noise(f"{field}[{i}]", self.sensor.units[field], deviation, 0.0, bias)
+            for field, (deviation, bias) in self.noise.items()
+            for i in range(sizes[field])
+        )
+        return nodes, task

@@ -1,0 +1,108 @@
+"""The task of a walking robot: follow commanded velocities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2real.graph.base import GraphState
+from sim2real.robots.contract import RobotTask
+from sim2real.robots.control_loop.loop import Draw
+from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.roles import Roles
+from sim2real.robots.walking.commands import Commands
+from sim2real.robots.walking.messages import gravity_of, into_base
+from sim2real.robots.walking.moment import Moment
+from sim2real.types import Key
+
+Term = tuple[float, Callable[[Moment], jax.Array]]
+"""A weight, and a measure of a moment."""
+
+
+class WalkingTask(RobotTask):
+    """Follow velocities, without a fall.
+
+    Args:
+        terms: Name -> weight and measure, whose product is a term of the reward.
+        falls: Returns whether a robot has fallen, from height and gravity of a moment.
+        close: Largest error of the mean velocity that counts as success [m/s, rad/s].
+    """
+
+    def __init__(
+        self,
+        commands: Commands,
+        stance: np.ndarray,
+        period_s: float,
+        terms: Mapping[str, Term],
+        falls: Callable[[Moment], jax.Array],
+        close: float = 0.2,
+    ) -> None:
+        self._commands, self._stance, self._period_s = commands, np.asarray(stance, np.float32), period_s
+        self._terms, self._falls, self._close = terms, falls, close
+        self.aim_size = commands.size
+
+    def random(self, key: Key, draw: Draw) -> tuple[dict, EpisodeStart]:
+        """Return parameters, and a start in the stance with random commands."""
+        k_values, k_commands = jax.random.split(key)
+        stance = jnp.asarray(self._stance)
+        return draw(k_values), EpisodeStart(stance, jnp.zeros_like(stance), self._commands.draw(k_commands))
+
+    def at_rest(self, trial: int) -> EpisodeStart:
+        """Return the start in the stance with the commands of a trial."""
+        return EpisodeStart(self._stance, np.zeros_like(self._stance), self._commands.of_trial(trial))
+
+    def judged(self, graph_state: GraphState, roles: Roles) -> Moment:
+        """Return the moment after a step, from the true state."""
+        world, agent = graph_state.state[roles.world], graph_state.state[roles.supervisor]
+        data, v = world.data, world.variables
+        t_s = (graph_state.step - 1) * self._period_s
+        turn, feet = data.qpos[3:7], v["at_m"]
+        moment = Moment(
+            command=self._commands.at(graph_state.params[roles.supervisor].aim, t_s),
+            linear=into_base(turn, data.qvel[:3]),
+            angular=data.qvel[3:6],
+            gravity=gravity_of(turn),
+            mean=v["mean"],
+            height=data.qpos[2] - jnp.min(feet[:, 2]),
+            offset=data.qpos[7:] - self._stance,
+            torque=data.actuator_force,
+            last=agent.last,
+            before=agent.before,
+            touches=v["air_s"] == 0.0,
+            lands=(v["ground_s"] > 0.0) & (v["ground_s"] < self._period_s + 1e-4) & (v["swing_s"] > 0.0),
+            swing_s=v["swing_s"],
+            slip_m_s=v["slip_m_s"],
+            falls=jnp.bool_(False),
+        )
+        return moment._replace(falls=self._falls(moment))
+
+    def reward(self, state: Moment, action: jax.Array) -> dict[str, jax.Array]:
+        """Return the terms."""
+        del action
+        return {name: jnp.float32(weight * measure(state)) for name, (weight, measure) in self._terms.items()}
+
+    def success(self, state: Moment) -> jax.Array:
+        """Return whether the mean velocity is near the commanded one."""
+        return jnp.all(jnp.abs(state.mean - state.command) < self._close)
+
+    def terminated(self, state: Moment) -> jax.Array:
+        """Return whether the robot has fallen."""
+        return state.falls
+
+    def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return how well a deployment went by encoders and IMU: share of the time upright, error of the yaw rate."""
+        turn = np.stack([states[f"quaternion[{i}]"] for i in range(4)], axis=-1)
+        turn = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
+        upright = 1.0 - 2.0 * (turn[:, 1] ** 2 + turn[:, 2] ** 2)
+        gyro, wanted = states["gyro[2]"], states["aim[2]"]
+        count = min(len(gyro), len(wanted))
+        window = max(1, round(0.4 / max(float(np.median(np.diff(t_s))), 1e-3)))
+        smooth = np.convolve(gyro[:count] - wanted[:count], np.ones(window) / window, "valid")
+        return {
+            "success": float((upright > 0.5).mean()),
+            "tilt_rad": float(np.arccos(np.clip(upright, -1.0, 1.0)).max()),
+            "yaw_error_rad_s": float(np.abs(smooth).mean()),
+        }

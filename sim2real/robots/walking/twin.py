@@ -1,0 +1,212 @@
+"""A walking robot on C MuJoCo, the judge of policies: every geom collides, and timing and parameters are hidden."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from sim2real.robots.walking.messages import BodyReading, gravity_of, into_base
+from sim2real.robots.walking.robot import ComposedRobot
+
+_mj: Any = mujoco
+STEP_S = 0.002
+"""Time step of the twin's physics, shorter than that of training [s]."""
+_SETTLED_S = 1.0
+"""Time after a new command that does not count [s]."""
+
+
+@dataclass(frozen=True)
+class HiddenTwin:
+    """What a twin differs by; no policy and no training reads it.
+
+    Attributes:
+        friction: Of feet and floor.
+        load_kg: In the base.
+        strength: Factor on the gains of each motor.
+        damping, dry: Of each joint [N m s/rad], [N m].
+        sensing_s: Time from the motion to the observation [s].
+        acting_s: Time from the observation to the motors' new target: computation and transport [s].
+        bias_rad: Of each encoder.
+    """
+
+    friction: float = 0.8
+    load_kg: float = 0.0
+    strength: np.ndarray = field(default_factory=lambda: np.ones(12))
+    damping: float = 0.1
+    dry: float = 0.2
+    sensing_s: float = 0.008
+    acting_s: float = 0.011
+    bias_rad: np.ndarray = field(default_factory=lambda: np.zeros(12))
+
+    @staticmethod
+    def draw(rng: np.random.Generator, joints: int) -> HiddenTwin:
+        """Draw a twin from ranges wider than those of training."""
+        return HiddenTwin(
+            friction=float(rng.uniform(0.4, 1.3)),
+            load_kg=float(rng.uniform(-1.0, 3.0)),
+            strength=rng.uniform(0.8, 1.2, joints),
+            damping=float(rng.uniform(0.02, 0.5)),
+            dry=float(rng.uniform(0.05, 0.4)),
+            sensing_s=float(rng.uniform(0.004, 0.012)),
+            acting_s=float(rng.uniform(0.004, 0.022)),
+            bias_rad=rng.uniform(-0.02, 0.02, joints),
+        )
+
+
+class Walked(NamedTuple):
+    """An episode on a twin.
+
+    Attributes:
+        fell_s: When the robot fell [s]; None: it did not.
+        error_m_s: Mean error of the forward and sideways velocity, each averaged over a step of the gait [m/s].
+        error_rad_s: Mean error of the yaw rate [rad/s].
+        qpos: Shape ``(N, nq)``: positions at each policy step.
+    """
+
+    fell_s: float | None
+    error_m_s: float
+    error_rad_s: float
+    qpos: np.ndarray
+
+
+class Twin:
+    """A robot on C MuJoCo, stepped by ``advance`` from one policy step to the next.
+
+    Observations and targets take effect with the delays in ``hidden``, to the nearest physics step.
+    """
+
+    def __init__(self, robot: ComposedRobot, hidden: HiddenTwin | None = None, seed: int = 0) -> None:
+        self.robot, self.hidden = robot, hidden or HiddenTwin()
+        self._rng, h = np.random.default_rng(seed), self.hidden
+        spec = _mj.MjSpec.from_file(str(robot.mjcf))
+        spec.option.timestep, spec.option.cone = STEP_S, _mj.mjtCone.mjCONE_ELLIPTIC
+        spec.option.iterations, spec.option.ls_iterations = 50, 20
+        self.model = model = spec.compile()
+        # Set the hidden parameters, and let MuJoCo compute the constants of the load.
+        base = int(model.jnt_bodyid[0])
+        before = float(model.body_mass[base])
+        model.body_mass[base] = before + h.load_kg
+        model.body_ipos[base] *= before / (before + h.load_kg)
+        model.geom_friction[:, 0] = h.friction
+        model.actuator_gainprm[:, 0] *= h.strength
+        model.actuator_biasprm[:, 1:3] *= h.strength[:, None]
+        model.dof_damping[6:], model.dof_frictionloss[6:] = h.damping, h.dry
+        self.data = _mj.MjData(model)
+        _mj.mj_setConst(model, self.data)
+        self.reset()
+
+    def reset(self) -> None:
+        """Place the robot in its stance."""
+        stance = np.asarray(self.robot.stance)
+        _mj.mj_resetData(self.model, self.data)
+        self.data.qpos[:7] = (0, 0, self.robot.height_m, 1, 0, 0, 0)
+        self.data.qpos[7:], self.data.ctrl[:] = stance, stance
+        _mj.mj_forward(self.model, self.data)
+        late = max(1, round(self.hidden.sensing_s / STEP_S))
+        self._past = deque([self._measured()] * (late + 1), maxlen=late + 1)
+        self._coming: deque[tuple[float, np.ndarray]] = deque()
+
+    def read(self) -> BodyReading:
+        """Return the measurement that has arrived, with noise."""
+        reading, noise = self._past[0], {n: size for n, (size, _) in self.robot.noise.items()}
+        exact = {n: np.asarray(getattr(reading, n)) for n in noise}
+        reading = reading.replace(**{n: x + noise[n] * self._rng.normal(size=len(x)) for n, x in exact.items()})
+        return reading.replace(position=reading.position + self.hidden.bias_rad)
+
+    def send(self, goal: np.ndarray) -> None:
+        """Send joint targets ``(joints,)`` [rad], which arrive later."""
+        self._coming.append((self.data.time + self.hidden.acting_s, np.asarray(goal, np.float64)))
+
+    def advance(self, seconds: float) -> None:
+        """Step the physics."""
+        for _ in range(round(seconds / STEP_S)):
+            while self._coming and self._coming[0][0] <= self.data.time + 1e-9:
+                self.data.ctrl[:] = self._coming.popleft()[1]
+            _mj.mj_step(self.model, self.data)
+            self._past.append(self._measured())
+
+    def push(self, size_m_s: float) -> None:
+        """Change the base's horizontal velocity at once by a size, in a random direction [m/s]."""
+        angle = self._rng.uniform(0.0, 2.0 * np.pi)
+        self.data.qvel[:2] += size_m_s * np.array([np.cos(angle), np.sin(angle)])
+
+    def fallen(self) -> bool:
+        """Return whether the robot lies on its side, or its base on the ground."""
+        low = self.data.qpos[2] < 0.4 * self.robot.height_m
+        return bool(low or gravity_of(self.data.qpos[3:7])[2] > -0.5)
+
+    def links(self, qpos: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return both ends ``(3,)`` of each link at positions ``(nq,)`` [m]."""
+        data = _mj.MjData(self.model)
+        data.qpos[:] = qpos
+        _mj.mj_kinematics(self.model, data)
+        base = int(self.model.jnt_bodyid[0])
+        moved = [b for b in range(base + 1, self.model.nbody) if self.model.body_parentid[b] != 0]
+        links = [(data.xpos[self.model.body_parentid[b]].copy(), data.xpos[b].copy()) for b in moved]
+        sites = [self.model.site(name).id for name in self.robot.feet]
+        return links + [(data.xpos[self.model.site_bodyid[s]].copy(), data.site_xpos[s].copy()) for s in sites]
+
+    def _measured(self) -> BodyReading:
+        q, v = self.data.qpos, self.data.qvel
+        return BodyReading(q[7:].copy(), v[6:].copy(), q[3:7].copy(), v[3:6].copy())
+
+
+def walk(
+    twin: Twin,
+    runner: Callable[[np.ndarray], np.ndarray],
+    command: Callable[[float], np.ndarray],
+    seconds: float,
+    push_m_s: float = 0.0,
+    every_s: float = 5.0,
+    shown: Callable[[Twin, float], None] | None = None,
+) -> Walked:
+    """Let a bundle's runner walk on a twin, in numpy.
+
+    Args:
+        command: Time -> commanded velocity ``(3,)``.
+        push_m_s: Size of a push every ``every_s`` [m/s].
+        shown: Called after each policy step.
+    """
+    robot, period_s = twin.robot, 1.0 / twin.robot.rate_hz
+    stance, steps = np.asarray(robot.stance, np.float32), round(seconds * robot.rate_hz)
+    last, past = np.zeros(len(stance), np.float32), np.zeros((robot.history, 6 + 3 * len(stance)), np.float32)
+    velocity, wanted, qpos = np.zeros((steps, 3)), np.zeros((steps, 3)), np.zeros((steps, twin.model.nq))
+    changed_s, fell_s = 0.0, None
+    settled = np.zeros(steps, bool)
+    for i in range(steps):
+        t_s = i * period_s
+        # Observe and act as the agent's node does.
+        reading = twin.read()
+        now = np.concatenate(
+            [reading.gyro, gravity_of(reading.quaternion), reading.position - stance, reading.velocity, last]
+        ).astype(np.float32)
+        wanted[i] = command(t_s)
+        observation = np.concatenate([now, wanted[i], past.ravel()]).astype(np.float32)
+        past = np.concatenate([now[None], past])[: robot.history]
+        last = np.asarray(runner(observation), np.float32)
+        twin.send(stance + robot.scale * last)
+        twin.advance(period_s)
+        # Judge by the true motion; what follows a new command or a push does not count as an error.
+        velocity[i, :2] = into_base(twin.data.qpos[3:7], twin.data.qvel[:3])[:2]
+        velocity[i, 2] = twin.data.qvel[5]
+        qpos[i] = twin.data.qpos
+        if i and not np.array_equal(wanted[i], wanted[i - 1]):
+            changed_s = t_s
+        if push_m_s and (i + 1) % round(every_s / period_s) == 0:
+            twin.push(push_m_s)
+            changed_s = t_s
+        settled[i] = t_s - changed_s >= _SETTLED_S
+        if shown is not None:
+            shown(twin, t_s)
+        if twin.fallen():
+            fell_s, velocity, wanted, qpos, settled = t_s, velocity[:i], wanted[:i], qpos[:i], settled[:i]
+            break
+    window = np.ones(round(0.4 * robot.rate_hz)) / round(0.4 * robot.rate_hz)
+    error = np.stack([np.convolve(velocity[:, k] - wanted[:, k], window, "same") for k in range(3)], axis=-1)
+    error = error[settled] if settled.any() else np.zeros((1, 3))
+    return Walked(fell_s, float(np.hypot(error[:, 0], error[:, 1]).mean()), float(np.abs(error[:, 2]).mean()), qpos)

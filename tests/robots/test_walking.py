@@ -1,0 +1,91 @@
+"""A robot with a floating base: commands, its twin in C MuJoCo, and the policy that comes with pipelines/go2."""
+
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from pipelines.go2.robot import ROBOT
+from sim2real.commands.config import PlayConfig
+from sim2real.commands.play import run, steer
+from sim2real.errors import UsageError
+from sim2real.policy.bundle import load_bundle
+from sim2real.robots.walking.commands import Commands
+from sim2real.robots.walking.messages import gravity_of
+from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
+
+BUNDLE = Path(__file__).parents[2] / "pipelines/go2/walk"
+
+
+def test_gravity_points_to_the_low_side():
+    rolled = np.array([np.cos(0.2), np.sin(0.2), 0.0, 0.0])  # the left side goes up, by 0.4 rad
+    np.testing.assert_allclose(gravity_of(rolled), [0.0, -np.sin(0.4), -np.cos(0.4)], atol=1e-12)
+    np.testing.assert_allclose(gravity_of(0.9 * rolled), gravity_of(rolled), atol=1e-12)
+
+
+def test_commands_follow_one_another_and_some_are_zero():
+    commands = Commands(most=(1.0, 0.5, 0.8), every_s=2.0, stand=0.5, count=50)
+    drawn = np.asarray(commands.draw(jax.random.key(0)))
+    rows = drawn.reshape(50, 3)
+    assert (np.abs(rows) <= np.array([1.0, 0.5, 0.8])).all()
+    assert 10 < (rows == 0).all(1).sum() < 40
+    np.testing.assert_array_equal(commands.at(drawn, np.float64(3.9)), rows[1])
+    np.testing.assert_array_equal(commands.at(drawn, np.float64(4.0)), rows[2])
+    np.testing.assert_array_equal(commands.at(drawn, np.float64(100.0)), rows[0])
+
+
+def test_the_observation_is_the_contract_of_the_bundle():
+    contract = load_bundle(BUNDLE).contract
+    assert contract.observation_size == ROBOT.agent.observation_size
+    assert [t.name for t in contract.observation] == [t.name for t in ROBOT.agent.observation]
+    assert [t.name for t in contract.action] == list(ROBOT.joints)
+
+
+def test_the_shipped_policy_walks_on_hidden_twins_with_pushes():
+    for seed in range(2):
+        twin = Twin(ROBOT, HiddenTwin.draw(np.random.default_rng(seed), 12), seed)
+        walked = walk(twin, load_bundle(BUNDLE), lambda _: np.array([0.6, 0.0, 0.3]), 6.0, push_m_s=0.5)
+        assert walked.fell_s is None
+        assert walked.error_m_s < 0.25
+        assert walked.qpos[-1, :2] @ walked.qpos[-1, :2] > 1.0  # it went somewhere
+
+
+def test_without_a_policy_a_push_does_not_make_it_walk():
+    walked = walk(Twin(ROBOT), lambda _: np.zeros(12), lambda _: np.array([0.6, 0.0, 0.0]), 3.0)
+    assert walked.error_m_s > 0.4
+
+
+def test_targets_act_as_late_as_the_twin_says():
+    for delay_s in (0.004, 0.02):
+        twin = Twin(ROBOT, HiddenTwin(acting_s=delay_s))
+        before = twin.data.ctrl.copy()
+        twin.send(before + 0.1)
+        twin.advance(delay_s)
+        np.testing.assert_array_equal(twin.data.ctrl, before)
+        twin.advance(0.002)
+        np.testing.assert_allclose(twin.data.ctrl, before + 0.1)
+
+
+def test_play_writes_a_picture(tmp_path, capsys):
+    run(PlayConfig("go2", seconds=0.5, video=tmp_path / "a.gif", runs=tmp_path))
+    assert (tmp_path / "a.gif").read_bytes()[:3] == b"GIF"
+    assert "walked for 0.5 s" in capsys.readouterr().err
+
+
+def test_play_refuses_a_robot_that_does_not_walk(tmp_path):
+    bundle = tmp_path / "pendulum" / "walk"
+    shutil.copytree(BUNDLE, bundle)
+    with pytest.raises(UsageError, match="does not walk"):
+        run(PlayConfig(str(bundle)))
+
+
+def test_keys_steer_within_limits():
+    wanted = np.zeros(3)
+    for _ in range(20):
+        steer(wanted, 265)
+    steer(wanted, 262)
+    np.testing.assert_allclose(wanted, [1.0, 0.0, -0.1])
+    steer(wanted, 32)
+    np.testing.assert_array_equal(wanted, np.zeros(3))
