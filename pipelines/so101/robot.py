@@ -6,6 +6,7 @@ import os
 import random
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,12 +71,16 @@ class SO101Robot(Robot):
     Its goals stay in a box of joint angles that keeps the arm 4 cm above the table. In a corner of the box it is folded
     away: the upper arm lies back on its stop, the forearm above it, the hand points up. It stays there without torque.
     From any other pose it sinks to the table when it loses its torque.
+
+    Args:
+        calibration: The calibration of the arm on a port; None: the file that `find` returns.
     """
 
-    def __init__(self, servos: Servos = SERVOS) -> None:
+    def __init__(self, servos: Servos = SERVOS, calibration: Path | None = None) -> None:
+        settings = partial(calibrated, calibration=calibration)
         probe = Probe(step=0.12, lag_s=-0.004)
         self.sensor = JointSensor(servos)
-        self.drive = ServoDrive(servos, probe=probe, embedded=embedded, settings=calibrated)
+        self.drive = ServoDrive(servos, probe=probe, embedded=embedded, settings=settings)
         self.agent = ServoAgent(servos, TARGET, FEATURES, observe)
         self.model = ComposedModel(servos, Reach, TARGET, HAND, dynamics, parameters.causes(JOINTS))
         self.task = AimTask(servos, TARGET, success, score)
@@ -97,9 +102,9 @@ def embedded() -> Embedded:
     return Embedded(f"{Path(__file__).with_name('plant.py')}:SO101Plant", emulator)
 
 
-def calibrated(port: str) -> StsDrive:
+def calibrated(port: str, calibration: Path | None = None) -> StsDrive:
     """Return the servos' settings with the calibration of the arm on a port."""
-    joints = read(Path(__file__).with_name("calibration.json") if port == "embedded" else find())
+    joints = read(Path(__file__).with_name("calibration.json") if port == "embedded" else calibration or find())
     return replace(SHEET.drive, joints=joints)
 
 
@@ -182,6 +187,13 @@ def read(path: Path) -> tuple[CalibratedJoint, ...]:
             f"calibration file {path} has no motor {lacking[0]!r}. There are: {', '.join(joints)}",
             hint="is it an SO-101's?",
         )
+    # The bus is read in the order of the ids: with another order, each joint would get the readings of another one.
+    for name, servo_id in zip(JOINTS, SERVOS.ids, strict=True):
+        if joints[name].servo_id != servo_id:
+            raise UsageError(
+                f"calibration file {path}: motor {name!r} has id {joints[name].servo_id}, not {servo_id}",
+                hint="lerobot-setup-motors gives each servo its id",
+            )
     return tuple(joints[name] for name in JOINTS)
 
 
@@ -191,11 +203,7 @@ def find() -> Path:
     Raises:
         UsageError: There is none, or there are several.
     """
-    if named := os.environ.get(CALIBRATION):
-        return Path(named).expanduser()
-    home = os.environ.get("HF_LEROBOT_HOME", "~/.cache/huggingface/lerobot")
-    folder = Path(os.environ.get("HF_LEROBOT_CALIBRATION", f"{home}/calibration")).expanduser() / "robots"
-    paths = [path for kind in ("so101_follower", "so_follower") for path in sorted((folder / kind).glob("*.json"))]
+    folder, paths = calibrations()
     if len(paths) != 1:
         there = f"several calibrations: {', '.join(path.name for path in paths)}" if paths else "no calibration"
         raise UsageError(
@@ -203,6 +211,16 @@ def find() -> Path:
             hint=f"set {CALIBRATION} to the file of this arm; lerobot-calibrate writes one",
         )
     return paths[0]
+
+
+def calibrations() -> tuple[Path, list[Path]]:
+    """Return LeRobot's folder, and its calibrations of SO-101 arms; or the file that SO101_CALIBRATION names alone."""
+    if named := os.environ.get(CALIBRATION):
+        path = Path(named).expanduser()
+        return path.parent, [path]
+    home = os.environ.get("HF_LEROBOT_HOME", "~/.cache/huggingface/lerobot")
+    folder = Path(os.environ.get("HF_LEROBOT_CALIBRATION", f"{home}/calibration")).expanduser() / "robots"
+    return folder, [p for kind in ("so101_follower", "so_follower") for p in sorted((folder / kind).glob("*.json"))]
 
 
 ROBOT = SO101Robot()

@@ -115,6 +115,11 @@ BENCHES = {
         "the processor time of the tests, all programs compiled",
         ("sim2real", "pipelines", "datasets", "tests", "scripts/bench.py", "scripts/benches", "pyproject.toml"),
     ),
+    "twin": Bench(
+        "runs.twin",
+        "from an empty environment to an accepted twin of the embedded SO-101, moved by hand as asked",
+        (*_STAGES, "pipelines/so101", "pyproject.toml"),
+    ),
     "train": Bench("train", "PPO on the pendulum with its delays", (*_GRAPH, "sim2real/train")),
     "view": Bench(
         "live_view",

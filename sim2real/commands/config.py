@@ -24,9 +24,16 @@ class NewConfig:
     """Log of the robot; its commands, measurements and rate are taken over."""
     drive: Literal["position", "velocity", "torque", "duty", "mit"] = "position"
     """Command of the drives, if there is no log."""
+    like: Annotated[str | None, arg(metavar="PIPELINE")] = None
+    """Pipeline whose robot this one is too: checks or makes the calibration of the robot on --port, then records and
+    identifies it."""
+    port: Annotated[str | None, arg(metavar="PORT")] = None
+    """Serial port of the robot, for --like."""
     robot: Annotated[RobotFlags, arg(name="")] = field(default_factory=RobotFlags)
     folder: Path = Path("pipelines")
     """Folder of pipelines."""
+    runs: Path = Path("runs")
+    """Folder of all runs, for --like."""
 
 
 @dataclass(frozen=True)

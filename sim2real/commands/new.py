@@ -47,12 +47,19 @@ ROBOT = MjcfRobot(RobotConfig.load(Path(__file__).with_name(ROBOT_FILE)))
 '''
 
 
-def run(config: NewConfig) -> None:
-    """Write a pipeline's folder.
+def run(config: NewConfig) -> bool:
+    """Write a pipeline's folder; with ``--like`` also calibrate, record and identify the robot on the port.
+
+    Returns:
+        False if the identification was not accepted.
 
     Raises:
         UsageError: When the name is none, the folder exists, or the model cannot be driven.
     """
+    if config.like is not None:
+        from sim2real.commands.new_like import run as run_like
+
+        return run_like(config)
     # Check name, model and folder.
     if config.model is None or not re.fullmatch(r"[a-z]\w*", config.name):
         raise UsageError(
@@ -83,6 +90,7 @@ def run(config: NewConfig) -> None:
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
         wrote(folder / name)
+    return True
 
 
 def _described(config: NewConfig) -> tuple[RobotConfig, str]:

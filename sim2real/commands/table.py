@@ -47,7 +47,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "new": ConfigCommand(
         "write the files of a pipeline for a robot that has a model", "commands.new", "commands.config.NewConfig",
-        examples=("new go2 go2.xml --log run.csv", "identify go2"),
+        examples=("new go2 go2.xml --log run.csv", "new my_arm --like so101 --port /dev/ttyACM0"),
     ),
     "export": CommandGroup(
         "write the estimates for MuJoCo, mjlab, Isaac Lab or as JSON; or a policy for a machine with numpy alone",

@@ -148,6 +148,11 @@ class PlannedBus(ABC):
             overload_ns = start_ns + round(config.overload_after_s * 1e9)
             self._at(overload_ns, self._overload, overload_ns)
 
+    @property
+    def baud_rate(self) -> int:
+        """Bits per second on the wire."""
+        return self._config.baud_rate
+
     @abstractmethod
     def execute(self, request: Request) -> None:
         """Carry out an instruction that is complete on the wire, and reply to it."""

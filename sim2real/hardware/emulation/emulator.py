@@ -17,6 +17,7 @@ import os
 import select
 import signal
 import sys
+import termios
 import time
 import tty
 from collections.abc import Sequence
@@ -36,6 +37,8 @@ _IDLE_NS: Final = 2_000_000  # longest time without stepping the plant: catching
 _PR_SET_TIMERSLACK: Final = 29
 _TIMER_SLACK_NS: Final = 1_000
 _REAL_TIME_PRIORITY: Final = 2  # above the threads of the controlling process, which have 1: a servo does not wait
+_NOT_SET: Final = termios.B50  # until a host sets a rate; no servo has this one
+_SPEEDS: Final = {r: getattr(termios, f"B{r}", -1) for r in (38_400, 57_600, 115_200, 500_000, 1_000_000, 2_000_000)}
 _TYPES: Final = {"int": int, "float": float, "bool": {"True": True, "False": False}.__getitem__}
 
 
@@ -48,6 +51,9 @@ class _Pty:
     def __init__(self) -> None:
         self.fd, self._host_fd = os.openpty()
         tty.setraw(self._host_fd)
+        settings = termios.tcgetattr(self._host_fd)
+        settings[4:6] = [_NOT_SET, _NOT_SET]
+        termios.tcsetattr(self._host_fd, termios.TCSANOW, settings)
         os.set_blocking(self.fd, False)
         self.port = os.ttyname(self._host_fd)
 
@@ -67,12 +73,17 @@ class _Pty:
         except BlockingIOError:
             return False
 
-    def receive(self) -> bytes:
-        """Return the bytes that the host has sent."""
+    def receive(self, baud_rate: int) -> bytes:
+        """Return the bytes that the host has sent; none if it has set another baud rate."""
         try:
-            return os.read(self.fd, 4096)
+            data, speed = os.read(self.fd, 4096), termios.tcgetattr(self._host_fd)[4]
         except BlockingIOError:
             return b""
+        # The operating system has one constant for all other rates.
+        fits = speed in (_NOT_SET, _SPEEDS.get(baud_rate)) or (
+            baud_rate not in _SPEEDS and speed not in _SPEEDS.values()
+        )
+        return data if fits else b""
 
 
 class _StopFlag:
@@ -115,7 +126,7 @@ def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_
             pty.unplug()
         # Pass the bytes on, then compute all events up to now.
         if pty.fd in ready:
-            bus.feed(pty.receive(), now_ns)
+            bus.feed(pty.receive(bus.baud_rate), now_ns)
         if parent_fd in ready and not os.read(parent_fd, 1024):
             return
         bus.run_until(now_ns)

@@ -1,0 +1,45 @@
+"""How a person moves an SO-101 by hand, so that `sim2real new --like so101` can check or make its calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sim2real.hardware.feetech.calibration import CalibratedJoint
+from sim2real.hardware.feetech.hand_motion import Nudge
+
+from .parts import JOINTS, TRAVEL_RAD
+from .robot import SERVOS, SO101Robot, calibrations, read
+
+MIDDLE = "upper arm upright, forearm and hand level and forward, jaw half open"
+"""The pose in which every joint is in the middle of its travel."""
+_MOTIONS = (
+    ("gripper", "open the jaw", 1),
+    ("wrist_roll", "roll the hand to its left, anticlockwise as seen from the base", 1),
+    ("wrist_flex", "bend the hand down", 1),
+    ("elbow_flex", "lift the forearm", -1),
+    ("shoulder_lift", "lean the upper arm back", -1),
+    ("shoulder_pan", "turn the arm to its right, clockwise as seen from above", 1),
+)
+NUDGES = tuple(Nudge(joint, words, direction, TRAVEL_RAD.get(joint)) for joint, words, direction in _MOTIONS)
+IDS = dict(zip(SERVOS.ids, JOINTS, strict=True))
+BAUD_RATE = SERVOS.baud_rate
+
+
+def robot(calibration: Path) -> SO101Robot:
+    """Return an arm with a calibration of its own."""
+    return SO101Robot(calibration=calibration)
+
+
+def calibration_of(joints: tuple[CalibratedJoint, ...]) -> Path | None:
+    """Return LeRobot's calibration of the arm with these servos; None: there is no calibration at all.
+
+    Of several files, it is the one with the homing offsets of the servos.
+
+    Raises:
+        UsageError: The file is refused; see `read`.
+    """
+    paths = calibrations()[1]
+    if len(paths) < 2:
+        return paths[0] if paths else None
+    offsets = [joint.homing_offset for joint in joints]
+    return next((p for p in paths if [joint.homing_offset for joint in read(p)] == offsets), paths[0])

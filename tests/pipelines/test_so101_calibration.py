@@ -1,0 +1,116 @@
+"""A wrong calibration or assembly of an SO-101 is found before a motor moves; without a calibration it is made."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sim2real.commands.new_like import calibrate
+from sim2real.errors import HardwareLost, Sim2RealError
+from sim2real.hardware.emulation.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.truth import Kind
+from sim2real.hardware.feetech.emulation import StsEmulation
+from sim2real.hardware.plant import OperatingMode
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+pytestmark = pytest.mark.realtime
+SO101 = load_pipeline("so101")
+GUIDE, PERSON = SO101.load("guide"), SO101.load("person")
+PLANT = f"{Path(__file__).with_name('wrong_arms.py')}:WrongArm"
+GOOD = json.loads((SO101.folder / "calibration.json").read_text())
+
+
+@pytest.fixture
+def arm(tmp_path, monkeypatch):
+    """Start an embedded arm with a person, and LeRobot's calibration of it; stopped at the end of the test."""
+    arms = []
+
+    def start(changes=None, emulation=None, **plant):
+        hand, file = tmp_path / "hand.npz", tmp_path / "lerobot.json"
+        PERSON.write_motion(hand, begin_s=6.0, speed_rad_s=4.0)
+        file.write_text(json.dumps({name: entry | (changes or {}).get(name, {}) for name, entry in GOOD.items()}))
+        monkeypatch.setenv("SO101_CALIBRATION", str(file))
+        settings = {"homing_offset": 85, "plant_step_s": 0.001} | (emulation or {})
+        truth = tmp_path / "truth.bin"
+        arms.append(EmbeddedRobot(PLANT, StsEmulation(**settings), {"hand": str(hand)} | plant, truth))
+        return arms[-1]
+
+    yield start
+    for each in arms:
+        each.stop()
+
+
+def modes(arm):
+    """Return the modes in which the arm's motors have been."""
+    arm.stop()
+    return set(arm.truth().of(Kind.EFFECT)["values"][:, 0].tolist())
+
+
+RANGE = GOOD["shoulder_pan"]["range_min"], GOOD["shoulder_pan"]["range_max"]
+FAULTS = {
+    "missing servo": ({"missing": 5}, {}, {}, r"no servo answers .* joint 'wrist_roll' \(id 5\)\. Ids that answer"),
+    "wrong baud rate": ({}, {}, {"baud_rate": 115_200}, "answer at 115200 baud, not at 1000000"),
+    "wrong model": ({}, {}, {"model_number": 1284}, "is model 1284"),
+    "another arm's file": ({}, {}, {"homing_offset": -310}, "has homing offset -310, its calibration has 85"),
+    "ids exchanged in the file": (
+        {}, {"shoulder_lift": {"id": 3}, "elbow_flex": {"id": 2}}, {}, "'shoulder_lift' has id 3, not 2",
+    ),
+    "one id twice in the file": ({}, {"elbow_flex": {"id": 2}}, {}, "both have id 2"),
+    "a seam in the range": ({}, {"elbow_flex": {"range_min": 0, "range_max": 4095}}, {}, "passed from count 4095"),
+    "one stop was not reached": ({}, {"elbow_flex": {"range_max": 2100}}, {}, "not moved from stop to stop"),
+    "servos exchanged": ({"exchanged": [2, 3]}, {}, {}, "elbow_flex was to be moved, but servo 2, shoulder_lift"),
+    "a servo mounted turned": ({"turned": 4}, {}, {}, "wrist_flex turned in the other direction"),
+    "a direction turned in the file": ({}, {"gripper": {"drive_mode": 1}}, {}, "gripper turned in the other direction"),
+    "a zero that is off": (
+        {}, {"shoulder_pan": {"range_min": RANGE[0] + 160, "range_max": RANGE[1] + 160}}, {},
+        r"shoulder_pan turns at least \d+ degrees beyond",
+    ),
+    "a horn that has slipped": ({"slipped": 1}, {}, {}, r"shoulder_pan turns at least \d+ degrees beyond"),
+    "a joint at its stop when calibrated": (
+        {}, {"wrist_flex": {"range_min": 1842, "range_max": 3672}}, {},
+        r"in the middle pose .*: wrist_flex -\d+ degrees",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
+    plant, changes, emulation, message = FAULTS[fault]
+    wrong = arm(changes, emulation, **plant)
+    with pytest.raises(Sim2RealError, match=f"(?s){message}"):
+        calibrate(wrong.port, GUIDE, tmp_path / "calibration.json")
+    assert modes(wrong) <= {OperatingMode.OFF}
+    assert not (tmp_path / "calibration.json").exists()
+
+
+@pytest.mark.slow
+def test_a_right_calibration_is_accepted(arm, tmp_path):
+    right = arm()
+    calibrate(right.port, GUIDE, tmp_path / "calibration.json")
+    assert json.loads((tmp_path / "calibration.json").read_text()) == GOOD
+    assert modes(right) <= {OperatingMode.OFF}
+
+
+@pytest.mark.slow
+def test_without_a_calibration_the_motion_makes_one(arm, tmp_path, monkeypatch):
+    """Its zeros are those of the arm. Before, the encoders' seam was inside of the joints' travel."""
+    new = arm(emulation={"homing_offset": 1900})
+    monkeypatch.delenv("SO101_CALIBRATION")
+    monkeypatch.setenv("HF_LEROBOT_CALIBRATION", str(tmp_path / "none"))
+    made = tmp_path / "calibration.json"
+    calibrate(new.port, GUIDE, made)
+    for joint, zero in zip(GUIDE.read(made), load_pipeline("so101").load("plant").ZERO_COUNTS, strict=True):
+        tolerance = 200 if joint.name == "wrist_roll" else 25
+        assert joint.zero_count + joint.homing_offset == pytest.approx(zero, abs=tolerance)
+        assert joint.direction == 1
+    assert modes(new) <= {OperatingMode.OFF}
+
+
+def test_two_servos_of_one_id_are_refused(arm, tmp_path, monkeypatch):
+    """Their answers collide on the wire; here the second one comes after the first."""
+    from sim2real.hardware.feetech.device import StsLink
+
+    real, alone = StsLink.answering, arm()
+    monkeypatch.setattr(StsLink, "answering", lambda self, packet, wait_s: 2 * real(self, packet, wait_s))
+    with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1"):
+        calibrate(alone.port, GUIDE, tmp_path / "calibration.json")
