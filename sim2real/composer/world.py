@@ -230,6 +230,11 @@ class ComposedWorld(BaseWorld):
         data = state.data.replace(qpos=qpos, qvel=qvel, qacc=qacc)
         return self.output(dataclasses.replace(state, data=data))
 
+    @property
+    def has_reward(self) -> bool:
+        """Whether the task has a reward, which is in the state."""
+        return self.environment.has_reward
+
     def ends(self, state: State) -> tuple[jax.Array, jax.Array]:
         """Return whether the task ended its episode, and whether its time limit did, at this tick or before."""
         return state.done & ~state.truncated, state.truncated

@@ -13,8 +13,9 @@ from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
 from sim2real.composer.task import split_reward
 from sim2real.errors import UsageError
+from sim2real.graph.base import GraphState
 from sim2real.train.environment.composed import TaskEnvironment, TaskState
-from sim2real.train.environment.graph_environment import GraphEnvironment
+from sim2real.train.environment.graph_environment import GraphEnvironment, _require_reward
 from sim2real.train.environment.protocol import check_environment
 
 CART = """
@@ -159,3 +160,36 @@ def test_named_terms_are_one_reward_in_the_c_engine(named):
 def test_names_without_terms_are_refused():
     with pytest.raises(UsageError, match=r"returned no terms[\s\S]*hint: return a number"):
         split_reward({})
+
+
+@struct.dataclass
+class Earned:
+    """The part of a composed world's state that a reward may read."""
+
+    reward: jax.Array
+    terms: dict
+    position: jax.Array
+
+
+@pytest.mark.parametrize("reads", ["reward", "terms", "nothing", "other"])
+def test_a_reward_that_ignores_the_composed_task_is_refused(reads):
+    state = Earned(reward=jnp.float32(1.0), terms={"far": jnp.float32(2.0)}, position=jnp.float32(3.0))
+    graph_state = GraphState(state={"world": state})
+    rewards = {
+        "reward": lambda gs, action: 2.0 * gs.state["world"].reward,
+        "terms": lambda gs, action: gs.state["world"].terms["far"] - action[0],
+        "nothing": lambda gs, action: -action[0],
+        "other": lambda gs, action: gs.state["world"].position - action[0],
+    }
+    task = SimpleNamespace(reward=rewards[reads])
+    if reads in ("reward", "terms"):
+        _require_reward(task, graph_state, jnp.zeros(1), "world")
+        return
+    with pytest.raises(UsageError, match="ignores `get_reward`"):
+        _require_reward(task, graph_state, jnp.zeros(1), "world")
+
+
+def test_a_composed_world_knows_whether_its_task_has_a_reward():
+    bare = cart('ctrlrange="-2 1" ctrllimited="true"').task.root_entity
+    assert not composer.ComposedWorld("world", composer.NullTask(bare)).has_reward
+    assert composer.ComposedWorld("world", Named(bare)).has_reward

@@ -137,6 +137,7 @@ class GraphEnvironment:
 
         # jit, so that each is traced only once for all its uses: tracing MuJoCo's worlds takes 5 s.
         self._start, self._play = jax.jit(self._reset), jax.jit(self._step)
+        self._rewarding = [name for name, node in graph.nodes.items() if getattr(node, "has_reward", False)]
         self._ending = {name: node.ends for name, node in graph.nodes.items() if isinstance(node, _EndingWorld)}
 
     @property
@@ -185,7 +186,10 @@ class GraphEnvironment:
         # Run to the supervisor's first step.
         gs = graph.init(k_init, params=params, eps=eps)
         gs, step_state, _ = graph.observe(gs, inside=True)
-        terms = terms_of(jax.eval_shape(task.reward, gs, jnp.asarray(self.action_low, jnp.float32)))
+        action = jnp.asarray(self.action_low, jnp.float32)
+        for name in self._rewarding:
+            _require_reward(task, gs, action, name)
+        terms = terms_of(jax.eval_shape(task.reward, gs, action))
         zero = jnp.float32(0.0)
         state = EnvState(gs, step_state, zero, {n: zero for n in terms}, zero, width)
         return state, task.observe(step_state)
@@ -221,3 +225,21 @@ class GraphEnvironment:
         metrics |= {f"{REWARD}{name}": term for name, term in terms.items()}
         new = EnvState(gs, step_state, total, terms, good, state.width)
         return Step(new, task.observe(step_state), reward, terminated, truncated, valid, metrics)
+
+
+def _require_reward(task: TrainingTask, graph_state: GraphState, action: jax.Array, world: str) -> None:
+    """Refuse a training task whose reward does not depend on that of the composed task in a world."""
+    state = graph_state.state[world]
+
+    def rewarded(earned: tuple[jax.Array, dict[str, jax.Array]]) -> Rewards:
+        known = {**graph_state.state, world: state.replace(reward=earned[0], terms=earned[1])}
+        return task.reward(graph_state.replace(state=known), action)
+
+    # An input that no operation reads, and that is no output, has no effect.
+    program = jax.make_jaxpr(rewarded)((state.reward, state.terms)).jaxpr
+    read = {id(v) for equation in program.eqns for v in equation.invars} | {id(v) for v in program.outvars}
+    if not any(id(v) in read for v in program.invars):
+        raise UsageError(
+            f"the reward of {type(task).__name__} ignores `get_reward` of the task in world {world!r}",
+            hint=f"use graph_state.state[{world!r}].reward or .terms in `reward`, or let get_reward return 0",
+        )

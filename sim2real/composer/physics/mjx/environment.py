@@ -101,6 +101,7 @@ class MjxEnvironment:
         model: The compiled ``mujoco.MjModel``.
         mjx_model: The ``mjx.Model``.
         initial: The ``mjx.Data`` that episodes start from.
+        has_reward: Whether the task's ``get_reward`` returns anything but the number 0.
     """
 
     def __init__(
@@ -304,7 +305,9 @@ class MjxEnvironment:
         rings = {r.name: r.update(rings[r.name], now, physics, random_state, True) for r in self._rings}
         dtype, task = state.reward.dtype, type(self.task).__name__
         # Compute the reward, the discount and the end of the episode.
-        reward, terms = split_reward(self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics))
+        earned = self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics)
+        self.has_reward = not (isinstance(earned, int | float) and earned == 0)
+        reward, terms = split_reward(earned)
         discount = jnp.asarray(self._hooks.call(f"{task}.get_discount", self.task.get_discount, physics), dtype)
         ends = self._hooks.call(f"{task}.should_terminate_episode", self.task.should_terminate_episode, physics)
         observation = {r.name: r.read(rings[r.name], now) for r in self._rings}
