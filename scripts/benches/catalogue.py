@@ -130,6 +130,11 @@ BENCHES = {
             "scripts/benches/twelve_joints.py",
         ),
     ),
+    "walk": Bench(
+        "walk",
+        "a walking policy on hidden twins in C MuJoCo: falls and errors, without and with pushes",
+        ("sim2real/robots/walking", "sim2real/policy", "pipelines/go2"),
+    ),
 }
 
 
