@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from sim2real.artifacts.run.run_folder import OpenStage
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.validation.prediction import samples
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.identify.interrupted import Best
+from sim2real.stages.identify.interrupted import Best, left_behind
 from sim2real.stages.live.viewer import live_view
 
 _PERIOD_S = 5.0
@@ -22,12 +22,19 @@ _PERIOD_S = 5.0
 
 
 @contextmanager
-def watched(best: Best, stage: OpenStage, config: IdentifyConfig) -> Iterator[None]:
-    """Write the progress of the searches in the block, beside a viewer if one is configured."""
+def searching(
+    stage: OpenStage, pipeline: str, config: IdentifyConfig, logs: Sequence[Path], again: Callable[[Path], str]
+) -> Iterator[Best]:
+    """Yield the record of the best values, and write the progress, beside a viewer if one is configured.
+
+    Args:
+        again: See ``left_behind``.
+    """
     live = LiveFit(stage.folder, config.view is not None, config.settle_s)
-    best.on_begin, best.on_advance = live.begin, live.advance
-    with live_view(config.view, stage.folder, f"identify {stage.run_dir.name}", dict):
-        yield
+    view = live_view(config.view, stage.folder, f"identify {stage.run_dir.name}", dict)
+    with left_behind(stage, pipeline, logs, again) as best, view:
+        best.on_begin, best.on_advance = live.begin, live.advance
+        yield best
 
 
 class LiveFit:

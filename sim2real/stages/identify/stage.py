@@ -19,9 +19,8 @@ from sim2real.stages.estimation import recording_advice
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
 from sim2real.stages.identify.inputs import Inputs, prepare, robot_of
-from sim2real.stages.identify.interrupted import Best, left_behind
 from sim2real.stages.identify.judgement import judge
-from sim2real.stages.identify.live_fit import watched
+from sim2real.stages.identify.live_fit import Best, searching
 from sim2real.stages.identify.show import show, summary
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -93,10 +92,9 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     files = {"log" if i == 0 else f"log_{i}": path for i, path in enumerate(paths)}
     with (
         open_stage(root, pipeline.name, "identify", config, files, run_dir) as stage,
-        left_behind(
-            stage, pipeline.name, paths, lambda file: recording_advice.onward(pipeline, config, root, file)
+        searching(
+            stage, pipeline.name, config, paths, lambda file: recording_advice.onward(pipeline, config, root, file)
         ) as best,
-        watched(best, stage, config),
     ):
         inputs = inputs.storing_refits(stage.folder, root)
         identification = _identify(inputs, best)
