@@ -11,6 +11,7 @@ VARY = VariationConfig(
         "payload": (-1.0, 2.5),
         "motor_strength": (0.85, 1.15),
         "joint_damping": (0.02, 0.4),
+        "sensor_delay": (0.007, 0.009),
         "actuator_delay": (0.0, 0.018),
     },
     start_position=0.1,

@@ -18,7 +18,7 @@ from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.task import Task
 from sim2real.composer.variation.variators import CONSTANTS
 from sim2real.errors import UsageError
-from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseWorld
 
 if TYPE_CHECKING:
@@ -137,6 +137,12 @@ class ComposedWorld(BaseWorld):
         if self._apart:
             return self.environment.reset_apart(key, self._model(params), (qpos, qvel))
         return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel), self._lawful(params))
+
+    def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
+        """Return the delay of commands in an episode [s]: `delay` in the parameters of their sender."""
+        del rng
+        delay = getattr((graph_state or GraphState()).params.get(self.input_name), "delay", None)
+        return {} if delay is None else {self.input_name: delay}
 
     def output(self, state: State) -> PyTree:
         """Return the message of a state; default: the task's observation."""

@@ -16,6 +16,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.base import GraphState
 from sim2real.graph.schedule import draw
+from sim2real.robots.control_loop.loop import DelayParams
 from sim2real.runtime.compilation.compiled import CompiledGraph
 
 CART = """
@@ -271,3 +272,10 @@ def test_without_the_other_library_the_error_names_the_extra(name, module, neede
     with pytest.raises(Sim2RealError, match=f"for {library} need {library}, which is not installed") as caught:
         getattr(composer, name)
     assert caught.value.hint == "pip install 'sim2real[interop]'"
+
+
+def test_commands_are_as_late_as_the_parameters_of_their_sender(witness):
+    sender = DelayParams(delay=jnp.float32(0.012))
+    delays = witness.init_delays(None, GraphState(params={"actuator": sender}))
+    assert {name: float(delay) for name, delay in delays.items()} == {"actuator": pytest.approx(0.012)}
+    assert witness.init_delays(None, GraphState(params={"actuator": DelayParams()})) == {}

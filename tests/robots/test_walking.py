@@ -1,5 +1,7 @@
 """A robot with a floating base: commands, its twin in C MuJoCo, and the policy that comes with pipelines/go2."""
 
+import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipelines.go2.robot import ROBOT
+from sim2real import cli
 from sim2real.commands.config import PlayConfig
 from sim2real.commands.play import run, steer
 from sim2real.errors import UsageError
@@ -16,7 +19,8 @@ from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.messages import gravity_of
 from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
 
-BUNDLE = Path(__file__).parents[2] / "pipelines/go2/walk"
+ROOT = Path(__file__).parents[2]
+BUNDLE = ROOT / "pipelines/go2/walk"
 
 
 def test_gravity_points_to_the_low_side():
@@ -89,3 +93,14 @@ def test_keys_steer_within_limits():
     np.testing.assert_allclose(wanted, [1.0, 0.0, -0.1])
     steer(wanted, 32)
     np.testing.assert_array_equal(wanted, np.zeros(3))
+
+
+def test_the_commands_of_the_guide_run(tmp_path, monkeypatch):
+    text = (ROOT / "docs/guides/walk.md").read_text()
+    commands = re.findall(r"^    sim2real (play .*)$", text, re.MULTILINE)
+    assert len(commands) == 3
+    (tmp_path / "pipelines").symlink_to(ROOT / "pipelines")
+    monkeypatch.chdir(tmp_path)
+    for command in commands:
+        assert not cli.main(shlex.split(command))
+    assert (tmp_path / "walk.gif").is_file()

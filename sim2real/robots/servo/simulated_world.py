@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from sim2real.composer.world import ComposedWorld, WorldParams
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, Value
-from sim2real.robots.control_loop.loop import delay_of
 from sim2real.robots.control_loop.messages import JointReading
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.robots.roles import ROLES
@@ -102,6 +101,5 @@ class ServoWorld(ComposedWorld):
         MuJoCo's integrator (a leapfrog scheme) moves a joint as if a force had acted half a time step earlier. Half a
         step is therefore added to the delay, so that an identified delay is that of the real robot.
         """
-        del rng
-        delays = delay_of(self.input_name, self.input_name, graph_state)
+        delays = super().init_delays(rng, graph_state)
         return {name: delay + self.lead_s for name, delay in delays.items()}
