@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +58,8 @@ def one(pipeline: str, bundle: Path | None, seconds: float, push: float, seed: i
     from sim2real.stages.pipeline.pipeline import load_pipeline
 
     found = load_pipeline(pipeline)
-    robot, rng = found.load(), np.random.default_rng(seed)
+    robot: Any = found.load()
+    rng = np.random.default_rng(seed)
     twin = Twin(robot, HiddenTwin.draw(np.random.default_rng(1000 + seed), len(robot.joints)), seed)
     count = int(seconds / EVERY_S) + 1
     commands = (

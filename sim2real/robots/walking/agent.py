@@ -148,7 +148,7 @@ class WalkingAgent(RobotAgent):
 
     def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
         """Return the node's parameters for an episode: its commands are the aim."""
-        return AgentParams(policy, start.aim, np.float32(self._stance))
+        return AgentParams(policy, start.aim, np.asarray(self._stance, np.float32))
 
     def tilt_rad(self, observation: np.ndarray) -> float:
         """Return the angle between the base's vertical axis and gravity [rad]."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.errors import UsageError
-from sim2real.types import Array, Key
+from sim2real.types import Array, Key, Scalar
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Commands:
         """Return the commands of a trial: the same number gives the same commands, on hardware and in simulation."""
         return np.asarray(self.draw(jax.random.key(trial)), np.float32)
 
-    def at(self, drawn: Array, t_s: Array) -> Array:
+    def at(self, drawn: Array, t_s: Scalar) -> Array:
         """Return the command ``(3,)`` at a time of an episode [s]."""
         xp = namespace(drawn, t_s)
         row = xp.asarray(t_s / self.every_s + 1e-4, dtype=np.int32) % self.count

@@ -48,7 +48,7 @@ class TargetDrive(RobotDrive):
     expected_delay_s = (0.002, 0.003, 0.002)
 
     def __init__(self, robot: Any) -> None:
-        self.rate_hz = robot.rate_hz
+        self.rate_hz = robot.policy_hz
 
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:
         """Refuse: a subclass of the robot makes the drive of a device."""

@@ -36,6 +36,7 @@ class ComposedRobot(Robot):
         height_m: Height of the base in this stance [m].
         touching_m: Height of a foot's site below which it touches the ground [m].
         scale: Change of a target by the action 1 [rad].
+        policy_hz: Steps of the policy per second [Hz].
         history: Earlier observations that the policy gets.
         delays_s: Delays without an identification: of the sensor, of the actuator [s].
         noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
@@ -49,7 +50,7 @@ class ComposedRobot(Robot):
     touching_m: ClassVar[float]
     scale: ClassVar[float] = 0.5
     history: ClassVar[int] = 2
-    rate_hz = 50.0
+    policy_hz: ClassVar[float] = 50.0
     commands: ClassVar[Commands] = Commands()
     delays_s: ClassVar[tuple[float, float]] = (0.008, 0.008)
     noise: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})

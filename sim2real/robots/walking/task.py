@@ -18,7 +18,7 @@ from sim2real.robots.walking.messages import gravity_of, into_base
 from sim2real.robots.walking.moment import Moment
 from sim2real.types import Key
 
-Term = tuple[float, Callable[[Moment], jax.Array]]
+Term = tuple[float, Callable[[Moment], jax.Array | float]]
 """A weight, and a measure of a moment."""
 
 
@@ -61,10 +61,10 @@ class WalkingTask(RobotTask):
         t_s = (graph_state.step - 1) * self._period_s
         turn, feet = data.qpos[3:7], v["at_m"]
         moment = Moment(
-            command=self._commands.at(graph_state.params[roles.supervisor].aim, t_s),
-            linear=into_base(turn, data.qvel[:3]),
+            command=jnp.asarray(self._commands.at(graph_state.params[roles.supervisor].aim, t_s)),
+            linear=jnp.asarray(into_base(turn, data.qvel[:3])),
             angular=data.qvel[3:6],
-            gravity=gravity_of(turn),
+            gravity=jnp.asarray(gravity_of(turn)),
             mean=v["mean"],
             height=data.qpos[2] - jnp.min(feet[:, 2]),
             offset=data.qpos[7:] - self._stance,
