@@ -10,9 +10,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Final, Literal, Self
+from typing import Final, Literal, Self, TypeAlias
 
 import numpy as np
+
+from sim2real.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,24 @@ class Transaction:
 
 
 @dataclass(frozen=True)
+class ReadingPart:
+    """A part of a reading beside positions, velocities and loads, such as the gyro's rates.
+
+    Args:
+        shape: Shape of its values; () is one number.
+        low: Lowest value that is possible; a lower one stops the robot.
+        high: Highest value that is possible.
+        norm: Lowest and highest norm of the values that is possible, such as that of a quaternion; None: any.
+    """
+
+    unit: str
+    shape: tuple[int, ...] = ()
+    low: float = -math.inf
+    high: float = math.inf
+    norm: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Reading:
     """A measurement of n motors, in the order of the device's `motors`.
 
@@ -41,13 +61,19 @@ class Reading:
         position_rad: Shape (n,) [rad], from the zero of the device's settings.
         velocity_rad_s: Shape (n,) [rad/s].
         load: Shape (n,), in the unit that the device's `measures` names; NaN if it does not name `load`.
-        transaction: The times of the instruction and its answer.
+        transaction: The times of the instruction and its answer. If the device sends its state without a request,
+            `t_sent_ns` is the time of the sample.
+        parts: Name -> values of the other parts, as the device's `parts` declares them.
+        tick: The device's number of the sample, if it sends its state without a request: two readings with one tick are
+            one sample. None: each reading is a sample of its own.
     """
 
     position_rad: np.ndarray
     velocity_rad_s: np.ndarray
     load: np.ndarray
     transaction: Transaction
+    parts: Mapping[str, np.ndarray] = field(default_factory=dict)
+    tick: int | None = None
 
 
 @dataclass(frozen=True)
@@ -69,18 +95,44 @@ class Counters:
     withheld: int = 0
 
 
+Stale: TypeAlias = Literal["zero", "hold"] | float
+"""The safe replacement of a stale command: zero, the last command again, or this number."""
+
+
+@dataclass(frozen=True)
+class CommandColumn:
+    """One number for each motor, in a command that has several, such as the gain of a position controller."""
+
+    name: str
+    unit: str
+    stale: Stale
+
+
 @dataclass(frozen=True)
 class CommandKind:
     """The quantity of a command.
 
     Args:
         name: Its name in messages, in the plural.
-        stale: The safe replacement of a stale command: zeros, or the last command again.
+        unit: Its unit; "" if it has columns.
+        stale: The safe replacement of a stale command; of each column if it has columns.
+        columns: The k numbers for each motor, in order; none: one number, and commands have the shape (n,).
     """
 
     name: str
     unit: str
-    stale: Literal["zero", "hold"]
+    stale: Stale | tuple[Stale, ...]
+    columns: tuple[CommandColumn, ...] = ()
+
+    @classmethod
+    def of_columns(cls, name: str, *columns: CommandColumn) -> CommandKind:
+        """Return the kind of a command of the shape (n, k)."""
+        return cls(name, "", tuple(column.stale for column in columns), columns)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each column; one unit without columns."""
+        return tuple(column.unit for column in self.columns) or (self.unit,)
 
 
 VOLTAGE: Final = CommandKind("volts", "V", "zero")
@@ -94,6 +146,7 @@ class Alone(Enum):
     TORQUE_OFF = "takes its torque off"
     STOPS = "stops"
     GOES_ON = "goes on as commanded last"
+    DAMPS = "damps its joint"
 
 
 @dataclass(frozen=True)
@@ -120,6 +173,8 @@ class WithoutHost:
             return f"takes its torque off after {self.after_s:g} s"
         if self.does is Alone.STOPS:
             return f"stops after {self.after_s:g} s, torque stays on"
+        if self.does is Alone.DAMPS:
+            return f"damps its joint after {self.after_s:g} s"
         if math.isfinite(self.after_s):
             return f"notices after {self.after_s:g} s, but {self.does.value}"
         return self.does.value + (f" ({self.why})" if self.why else "")
@@ -132,8 +187,11 @@ class Device(ABC):
     """Motors that are measured together and commanded together, with one kind of command from `open` to `close`.
 
     The constructor checks its settings and touches nothing; `open` connects, and leaves the torque off. Arrays of
-    commands have shape (n,), float64, in the order of `motors`. Every method may be called from any thread while the
-    device is open, `make_safe` from a signal handler too.
+    commands have shape (n,), or (n, k) if `commanded` has k columns, float64, in the order of `motors`. Every method
+    may be called from any thread while the device is open, `make_safe` from a signal handler too.
+
+    The ways out bring the motors into the device's safe state. That is torque off, unless the robot would fall: the
+    motors of legs damp their joints until the robot lies, and only then is the torque off.
 
     Methods raise HardwareLost when the device does not answer within its limits, and SafetyStop when a motor has
     stopped itself or the torque was taken off from outside.
@@ -170,6 +228,11 @@ class Device(ABC):
         """Quantity -> unit of a reading; ``position`` [rad] and ``velocity`` [rad/s] always."""
         return {"position": "rad", "velocity": "rad/s", "load": "1"}
 
+    @property
+    def parts(self) -> Mapping[str, ReadingPart]:
+        """Name -> further part of a reading; default: none."""
+        return {}
+
     # -- from open to close
 
     @abstractmethod
@@ -188,7 +251,7 @@ class Device(ABC):
 
     @abstractmethod
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest command that the motors follow, each of shape (n,).
+        """Return the lowest and the highest command that the motors follow, each of shape (n,) or (n, k).
 
         A gate with wider limits is refused, as a motor may ignore such a command without an error. Infinite: there is
         no such limit, or `command` raises.
@@ -223,11 +286,14 @@ class Device(ABC):
 
     @abstractmethod
     def rest(self) -> np.ndarray:
-        """Return the command that the motors follow right after `enable`, ``(n,)``."""
+        """Return the command that the motors follow right after `enable`, ``(n,)`` or ``(n, k)``."""
 
     @abstractmethod
     def measure(self) -> Reading:
         """Read all motors.
+
+        A device that sends its state without a request returns the first sample that was taken after the call, so
+        that its time lies within the step that reads it.
 
         Raises:
             SafetyStop: A motor has stopped itself.
@@ -239,7 +305,7 @@ class Device(ABC):
         """Send a command; in a dry run, an instruction that takes as long and moves nothing.
 
         Args:
-            values: Shape (n,) [the unit of `commanded`].
+            values: Shape (n,) [the unit of `commanded`], or (n, k).
 
         Raises:
             SafetyStop: A value is not finite or too large, or a motor has stopped itself.
@@ -248,7 +314,28 @@ class Device(ABC):
 
     @abstractmethod
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the share of full torque that motors apply, in [-1, 1], from command and positions, all ``(n,)``."""
+        """Return the share of full torque that motors apply, ``(n,)`` in [-1, 1], from command and positions ``(n,)``.
+
+        A device with columns gets commands ``(n, k)``.
+        """
+
+    def soften(self, command: np.ndarray, left: float) -> np.ndarray:
+        """Return a command of a soft stop, in place of the last one.
+
+        Default: a command that is zero when stale fades, and one that is held stays. Columns need another method.
+
+        Args:
+            left: Share of the fade that is left, from 1 to 0.
+
+        Raises:
+            UsageError: Commands have columns, and the class has no method of its own.
+        """
+        if self.commanded.columns:
+            raise UsageError(
+                f"{type(self).__name__} commands columns and has no soft stop",
+                hint="define soften: the columns' way to rest",
+            )
+        return command if self.commanded.stale == "hold" else command * left
 
     @abstractmethod
     def check(self) -> None:
@@ -269,7 +356,7 @@ class Device(ABC):
 
     @abstractmethod
     def disable(self) -> None:
-        """Switch the torque off, confirmed by every motor; `enable` may follow.
+        """Bring the motors into the safe state, then torque off, confirmed by every motor; `enable` may follow.
 
         Raises:
             HardwareLost: A motor does not answer.
@@ -277,7 +364,7 @@ class Device(ABC):
 
     @abstractmethod
     def make_safe(self) -> None:
-        """Take the torque off at once, without a lock and without waiting for answers. Never raises.
+        """Begin the safe state at once, without a lock and without waiting for answers. Never raises.
 
         For signal handlers and watchdog threads: the interrupted code may hold any lock. The torque can be switched on
         again only after `close` and `open`.
@@ -285,4 +372,4 @@ class Device(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Take the torque off and disconnect. Never raises; may be called twice, and before `open`."""
+        """Bring the motors into the safe state and disconnect. Never raises; may be called twice, and before `open`."""

@@ -12,8 +12,10 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.hardware.device import Device, Reading
 
-_POWER_OF_GEAR: Final = {"rad": 1, "rad/s": 1, "N m": -1, "V": 0, "A": 0, "1": 0}
+_POWER_OF_GEAR: Final = {"rad": 1, "rad/s": 1, "N m": -1, "V": 0, "A": 0, "1": 0, "N m/rad": -2, "N m s/rad": -2}
 """Unit -> power of the gear in the ratio of the motor's value to the joint's: it turns faster, with less torque."""
+_UNDIRECTED: Final = ("N m/rad", "N m s/rad")
+"""Units of gains, which are positive in both directions."""
 
 
 T = TypeVar("T", "float", "np.ndarray")
@@ -95,22 +97,29 @@ class Mounting:
         self._turns = direction * gear
         # Plain joints need no conversion, so their units may be any.
         plain = all(joint.is_plain for joint in mounted)
-        self._factor, self._load = (
-            np.ones(len(mounted)) if plain else direction * gear ** _power(unit, what)
-            for unit, what in ((kind.unit, kind.name), (device.measures.get("load", "1"), "loads"))
-        )
-        self._offset = self._zero if kind.unit == "rad" else np.zeros(len(mounted))
+
+        def factor(unit: str, what: str) -> np.ndarray:
+            if plain:
+                return np.ones(len(mounted))
+            power = _power(unit, what)
+            return (1.0 if unit in _UNDIRECTED else direction) * gear**power
+
+        self._load = factor(device.measures.get("load", "1"), "loads")
+        self._factor = np.stack([factor(unit, kind.name) for unit in kind.units], axis=-1)
+        self._offset = np.stack([self._zero * (unit == "rad") for unit in kind.units], axis=-1)
+        if not kind.columns:
+            self._factor, self._offset = self._factor[:, 0], self._offset[:, 0]
 
     def to_motors(self, command: np.ndarray) -> np.ndarray:
-        """Return the device's command for one of the joints, ``(n,)``."""
+        """Return the device's command for one of the joints, ``(n,)`` or ``(n, k)``."""
         return self._offset + self._factor * command
 
     def to_joints(self, command: np.ndarray) -> np.ndarray:
-        """Return the joints' command for one of the device, ``(n,)``."""
+        """Return the joints' command for one of the device, ``(n,)`` or ``(n, k)``."""
         return (command - self._offset) / self._factor
 
     def limits(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest command of the joints between the device's, each ``(n,)``."""
+        """Return the lowest and the highest command of the joints between the device's, each ``(n,)`` or ``(n, k)``."""
         ends = self.to_joints(low), self.to_joints(high)
         return np.minimum(*ends), np.maximum(*ends)  # a direction of -1 swaps them
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TypeAlias
 
 import numpy as np
 
 from sim2real.errors import SafetyStop, UsageError
+from sim2real.hardware.device import Stale
+
+_Limit: TypeAlias = "float | Sequence[float] | Sequence[Sequence[float]]"
 
 
 @dataclass(frozen=True)
@@ -17,12 +20,15 @@ class GateConfig:
     """The limits of commands and measurements.
 
     Args:
-        limit: Largest magnitude of a command, or (low, high), each one value or one per actuator [the command's unit].
-        slew_per_s: Largest rate of change of a command [the command's unit per second]; None: no limit.
+        limit: Largest magnitude of a command, or (low, high), each one value or one per actuator [the command's unit];
+            for commands with columns one value per column, or of the shape (n, k).
+        slew_per_s: Largest rate of change of a command [the command's unit per second]; one value, or one per column;
+            None: no limit.
         command_timeout_s: Age from which a command is stale [s].
         max_speed_rad_s: Speed above which the robot is stopped, whether measured or computed from successive positions;
             one value or one per joint [rad/s]; None: not checked.
-        stale: Replacement of a stale command: ``zero``, or ``hold``, the last command that was sent (for positions).
+        stale: Replacement of a stale command: ``zero``, or ``hold``, the last command that was sent (for positions), or
+            a number. A tuple with one for each column is for commands of the shape (n, k).
         stuck_effort: Fraction of a joint's torque: a joint that is driven with more than this in both directions must
             move, or the robot is stopped; one value or one per joint; above 1: not checked. See
             `sim2real.hardware.safety.plausibility`.
@@ -35,12 +41,12 @@ class GateConfig:
         stop_s: Longest time in which a soft stop brings the robot to rest [s].
     """
 
-    limit: float | tuple[float | Sequence[float], float | Sequence[float]] = 1.0
-    slew_per_s: float | None = None
+    limit: float | tuple[_Limit, _Limit] = 1.0
+    slew_per_s: float | Sequence[float] | None = None
     command_timeout_s: float = 0.1
     max_speed_rad_s: float | Sequence[float] | None = None
     node: str = "actuator"
-    stale: Literal["zero", "hold"] = "zero"
+    stale: Stale | tuple[Stale, ...] = "zero"
     joints: tuple[str, ...] = ()
     stuck_effort: float | Sequence[float] = 0.2
     stuck_s: float = 0.2
@@ -54,12 +60,19 @@ class GateConfig:
         """Check that all limits are in their ranges and fit each other."""
         # A gate that refuses every command, or the one at rest, would stop the robot at once.
         low, high = self.range
-        if low.ndim > 1 or (low.ndim and high.ndim and low.shape != high.shape):
+        if low.ndim > 1 + self.has_columns or (low.ndim and high.ndim and low.shape != high.shape):
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} has another number of lows than of highs")
         if not np.all(low <= high):
             raise UsageError(f"gate of {self.node!r}: limit {self.limit} lets nothing through")
-        if self.stale == "zero" and not np.all((low <= 0.0) & (high >= 0.0)):
-            raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain 0, the command at rest")
+        stale = [entry if isinstance(entry, float) else 0.0 for entry in self.replacements]
+        fixed = [entry != "hold" for entry in self.replacements]
+        if self.has_columns:
+            for limits in (low, high):
+                if limits.ndim and limits.shape[-1] != len(stale):
+                    raise UsageError(f"gate of {self.node!r}: limits for {limits.shape[-1]} of {len(stale)} columns")
+        if not np.all((low <= stale) & (high >= stale) | ~np.asarray(fixed)):
+            what = f"{stale}, the stale command" if self.has_columns else f"{stale[0]:g}, the command at rest"
+            raise UsageError(f"gate of {self.node!r}: limit {self.limit} does not contain {what}")
         if self.envelope_rad is not None and not np.all(np.less(*map(np.asarray, self.envelope_rad))):
             raise UsageError(f"gate of {self.node!r}: envelope_rad = {self.envelope_rad} holds no position")
         # All other limits are positive, each one value or one per joint.
@@ -74,8 +87,23 @@ class GateConfig:
         return f"joint {self.joints[index]!r}" if index < len(self.joints) else f"joint {index}"
 
     @property
+    def has_columns(self) -> bool:
+        """Whether commands have the shape (n, k)."""
+        return isinstance(self.stale, tuple)
+
+    @property
+    def replacements(self) -> tuple[Stale, ...]:
+        """The replacement of a stale command, for each column; one entry without columns."""
+        return self.stale if isinstance(self.stale, tuple) else (self.stale,)
+
+    @property
+    def holds(self) -> bool:
+        """Whether a stale command holds its last value, in one column or more."""
+        return "hold" in self.replacements
+
+    @property
     def range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest command, each of shape () or (n,)."""
+        """Lowest and highest command, each of shape () or (n,); (k,) or (n, k) for commands with columns."""
         low, high = self.limit if isinstance(self.limit, tuple) else (-self.limit, self.limit)
         return np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
 
@@ -87,8 +115,8 @@ class GateCounts:
     Args:
         passed: Calls that returned a command.
         cut: For each actuator, calls in which a limit changed its command.
-        low: For each actuator, the lowest command that was returned.
-        total: For each actuator, the sum of the commands that were returned.
+        low: For each actuator, the lowest command that was returned; with columns, of the first one.
+        total: For each actuator, the sum of the commands that were returned; with columns, of the first one.
     """
 
     passed: int = 0
@@ -101,7 +129,9 @@ class GateCounts:
     total: list[float] = field(default_factory=list)
 
     def add(self, allowed: np.ndarray, cut: np.ndarray) -> None:
-        """Count a returned command ``(n,)``, and the actuators ``(n,)`` for which a limit changed it."""
+        """Count a returned command ``(n,)`` or ``(n, k)``, and the entries of it that a limit changed."""
+        if allowed.ndim > 1:
+            allowed, cut = allowed[:, 0], np.any(cut, axis=1, keepdims=True)[:, 0]
         before = (self.low, self.high, self.total, self.cut) if self.passed else (allowed, allowed, 0.0, 0)
         self.low, self.high = np.minimum(before[0], allowed).tolist(), np.maximum(before[1], allowed).tolist()
         self.total, self.cut = np.add(before[2], allowed).tolist(), np.add(before[3], cut).tolist()
@@ -123,7 +153,7 @@ class SafetyGate:
         """Start again, with counts at zero and no stop.
 
         Args:
-            start: Shape (n,): the command that the robot follows now, from which the slew limit starts; it may be
+            start: Shape (n,) or (n, k): the command that the robot follows now, where the slew limit starts; it may be
                 outside the limits. None: zero, not allowed if stale commands are replaced by the last one.
         """
         self.counts = GateCounts()
@@ -136,10 +166,14 @@ class SafetyGate:
 
     @property
     def fallback(self) -> np.ndarray:
-        """The replacement of a stale command, float64 of shape (n,); UsageError without a `start` or a command."""
+        """The replacement of a stale command, shape (n,) or (n, k); UsageError without a `start` or a command."""
         if self._last is None:
             raise UsageError(f"gate of {self.config.node!r} has nothing to hold", hint="call reset(start) first")
-        return np.zeros_like(self._last) if self.config.stale == "zero" else self._last.copy()
+        replaced = self._last.copy()
+        for column, stale in enumerate(self.config.replacements):
+            if stale != "hold":
+                replaced[..., column if self.config.has_columns else slice(None)] = 0.0 if stale == "zero" else stale
+        return replaced
 
     def apply(
         self, command: np.ndarray, age_s: float, now_s: float, speed_rad_s: np.ndarray | float | None = None
@@ -149,13 +183,13 @@ class SafetyGate:
         A stale command is replaced by `fallback`, to which the slew limit does not apply.
 
         Args:
-            command: Shape (n,): the policy's command.
+            command: Shape (n,) or (n, k): the policy's command.
             age_s: Time since the policy computed it [s]; NaN counts as stale.
             now_s: A monotonic time, for the slew limit [s].
             speed_rad_s: Shape (n,) or scalar: measured speeds [rad/s]; None: not checked.
 
         Returns:
-            Shape (n,), float64.
+            The shape of the command, float64.
 
         Raises:
             SafetyStop: A value is not finite, or a speed is above its limit.
@@ -167,7 +201,7 @@ class SafetyGate:
         wanted = np.array(command, dtype=np.float64, ndmin=1)
         self._require_finite("command", wanted)
         self._require_slow(speed_rad_s)
-        if self._last is None and self.config.stale == "zero":
+        if self._last is None and not self.config.holds:
             self._last = np.zeros_like(wanted)
         fallback = self.fallback
         self._require_shape(wanted)
@@ -191,26 +225,32 @@ class SafetyGate:
         if self.config.slew_per_s is None or self._last is None:
             return wanted
         elapsed_s = 0.0 if self._last_s is None else max(0.0, now_s - self._last_s)
-        if self.config.stale == "hold":
+        if self.config.holds:
             # The robot held its position meanwhile: a long pause must not allow a large jump.
             elapsed_s = min(elapsed_s, self.config.command_timeout_s)
-        largest = self.config.slew_per_s * elapsed_s
+        limit = np.asarray(self.config.slew_per_s, np.float64)
+        # Infinite times 0 s is no number, but no limit.
+        largest = limit * elapsed_s if elapsed_s > 0.0 else np.where(np.isinf(limit), np.inf, 0.0)
         slewed = np.clip(wanted, self._last - largest, self._last + largest)
         self.counts.slewed += bool(np.any(slewed != wanted))
         return slewed
 
     def _require_shape(self, values: np.ndarray) -> None:
+        columns = self.config.has_columns
+        if values.ndim != 1 + columns or (columns and values.shape[1] != len(self.config.replacements)):
+            wanted = f"(n, {len(self.config.replacements)})" if columns else "(n,)"
+            raise UsageError(f"gate of {self.config.node!r}: commands of shape {values.shape}, not {wanted}")
         for other in (self._low, self._high, self._last):
-            if other is not None and other.ndim and other.shape != values.shape:
+            if other is not None and other.ndim > columns and other.shape != values.shape:
                 raise UsageError(
                     f"gate of {self.config.node!r}: commands of shape {values.shape}, limits or start of {other.shape}"
                 )
 
     def _require_finite(self, what: str, values: np.ndarray) -> None:
-        bad = np.flatnonzero(~np.isfinite(values))
+        bad = np.argwhere(~np.isfinite(values))
         if bad.size:
-            index = int(bad[0])
-            self._halt(f"{what}[{index}] = {values[index]} is not finite")
+            index = tuple(bad[0].tolist())
+            self._halt(f"{what}[{', '.join(map(str, index))}] = {values[index]} is not finite")
 
     def _require_slow(self, speed_rad_s: np.ndarray | float | None) -> None:
         limit = self.config.max_speed_rad_s

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from sim2real.errors import SafetyStop
+from sim2real.hardware.device import ReadingPart
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.leaps import STAMP_S, reach_rad
 
@@ -12,6 +15,26 @@ _MIN_SPEED_RATIO = 0.5
 """The smallest share of its speed that a joint keeps from one reading to the next."""
 _HARD = 10.0
 """A push in one direction, which a weight would explain, is suspicious after this many times ``stuck_s``."""
+
+
+def require_parts(parts: Mapping[str, np.ndarray], declared: Mapping[str, ReadingPart]) -> None:
+    """Raise SafetyStop if a part of a reading is missing, has another shape, or has values that are not possible."""
+    for name, part in declared.items():
+        values = np.asarray(parts.get(name, np.zeros(0)), np.float64)
+        if name not in parts or values.shape != part.shape:
+            fault = f"has the shape {values.shape}" if name in parts else "is missing"
+            raise SafetyStop(f"part {name!r} of the reading {fault}, declared is {part.shape}")
+        # A value that is no number is in no range.
+        if not np.all((values >= part.low) & (values <= part.high)):
+            raise SafetyStop(
+                f"part {name!r} of the reading is {values.tolist()} {part.unit}, not {part.low:g} to {part.high:g}",
+                hint="look at the sensor and its cable",
+            )
+        if part.norm is not None and not part.norm[0] <= (norm := float(np.linalg.norm(values))) <= part.norm[1]:
+            raise SafetyStop(
+                f"part {name!r} of the reading has the norm {norm:.4g}, not {part.norm[0]:g} to {part.norm[1]:g}",
+                hint="look at the sensor and its cable",
+            )
 
 
 class Plausibility:

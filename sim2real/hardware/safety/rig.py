@@ -15,7 +15,7 @@ from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.device import Device, Reading, Transaction
 from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.safety.gate import GateConfig, SafetyGate
-from sim2real.hardware.safety.plausibility import Plausibility
+from sim2real.hardware.safety.plausibility import Plausibility, require_parts
 from sim2real.runtime.clock import keep_time
 
 _CHECK_PERIOD_S: Final = 0.5
@@ -61,6 +61,7 @@ class Rig:
     Attributes:
         measuring: The bus's use by `measure` since `start`.
         commanding: The bus's use by `command` since `start`.
+        repeats: Readings since `start` that were the sample before once again, by the device's tick.
 
     Raises:
         UsageError: Gate, joints and device do not fit together.
@@ -80,6 +81,8 @@ class Rig:
         self._sampled_s: float | None = None
         self._eased_s: float | None = None
         self._commanded_s: float | None = None
+        self._tick: int | None = None
+        self.repeats = 0
         self._lock = threading.Lock()
         self._done = threading.Event()
         self._failure: Sim2RealError | None = None
@@ -127,6 +130,7 @@ class Rig:
         self._done.set()
         self._done = threading.Event()
         self._commanded_s = self._speed_rad_s = self._failure = self._sampled_s = self._eased_s = None
+        self._tick, self.repeats = None, 0
         self.measuring, self.commanding = BusUse(), BusUse()
         self._require_reach()
         # The slew limit starts from the command that the motors follow at rest.
@@ -167,6 +171,13 @@ class Rig:
         measured = self.device.measure()
         reading, transaction = self._mounting.reading(measured), measured.transaction
         self.measuring.add(transaction)
+        # The same sample once again adds nothing to the checks.
+        repeated = measured.tick is not None and measured.tick == self._tick
+        self._tick = measured.tick
+        if repeated:
+            self.repeats += 1
+            return reading
+        require_parts(measured.parts, self.device.parts)
         effort = np.zeros(len(measured.position_rad))
         if sent is not None and not self.torque_withheld:
             # On the motors' side: the checks do not depend on the direction.
@@ -180,7 +191,7 @@ class Rig:
         """Send a command through the gate and return the gate's output.
 
         Args:
-            command: Shape ``(n,)``, of the joints [the device's unit].
+            command: Shape ``(n,)`` or ``(n, k)``, of the joints [the device's unit].
             age_s: Time since the policy computed it [s].
             now_s: A monotonic time, for the slew limit [s].
 
@@ -210,7 +221,10 @@ class Rig:
             )
 
     def ease(self) -> None:
-        """Begin a soft stop: from now on voltages fade to zero within ``stop_s``, and goals keep their values."""
+        """Begin a soft stop: from now on the device softens the last command within ``stop_s``.
+
+        Voltages fade to zero, goals keep their values, and legs sit down.
+        """
         self._eased_s = time.monotonic()
 
     @property
@@ -219,17 +233,22 @@ class Rig:
         if self._eased_s is None:
             return False
         passed_s = time.monotonic() - self._eased_s
-        faded = self.gate.config.stale == "hold" or self._sent is None or not np.any(self._sent)
+        config = self.gate.config
+        if config.has_columns:
+            faded = passed_s > _FADE * config.stop_s
+        else:
+            faded = config.holds or self._sent is None or not np.any(self._sent)
         still = self._speed_rad_s is not None and bool(np.all(np.abs(self._speed_rad_s) < _STILL_RAD_S))
         return passed_s > self.gate.config.stop_s or (faded and still)
 
     def _softened(self, command: np.ndarray) -> np.ndarray:
         if self._eased_s is None or self._sent is None:
             return command
-        if self.gate.config.stale == "hold":
-            return self._sent
+        # A goal that is held stays the last one; a voltage that fades is the agent's newest.
+        columns, holds = self.gate.config.has_columns, self.gate.config.holds
         left = 1.0 - (time.monotonic() - self._eased_s) / (_FADE * self.gate.config.stop_s)
-        return np.asarray(command) * max(0.0, left)
+        last = self._sent if holds or columns else np.asarray(command)
+        return self._mounting.to_joints(self.device.soften(self._mounting.to_motors(last), max(0.0, left)))
 
     def wait_until_still(self, timeout_s: float, speed_rad_s: float = _STILL_RAD_S, for_s: float = 0.5) -> Reading:
         """Wait, with torque off, until all joints are still; raise HardwareLost if they move after ``timeout_s``.
@@ -273,12 +292,13 @@ class Rig:
         """Refuse gate limits beyond the reach of the motors, or for another number of motors."""
         gate, (low, high) = self.gate.config, self._mounting.limits(*self.device.reach())
         for limits in gate.range:
-            if limits.ndim and limits.shape != low.shape:
-                raise UsageError(f"gate of {gate.node!r}: limits for {limits.size} motors, but there are {low.size}")
+            if limits.ndim > gate.has_columns and limits.shape != low.shape:
+                count = len(self.device.motors)
+                raise UsageError(f"gate of {gate.node!r}: limits for {len(limits)} motors, but there are {count}")
         if np.any(gate.range[0] < low) or np.any(gate.range[1] > high):
             raise UsageError(
                 f"gate of {gate.node!r}: limit {gate.limit} exceeds the reach of the motors, "
-                f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} {self.device.commanded.unit}",
+                f"{np.round(low, 3).tolist()} to {np.round(high, 3).tolist()} {', '.join(self.device.commanded.units)}",
                 hint="narrow the limit, or set the joints' zeros and the motors' own limits",
             )
 

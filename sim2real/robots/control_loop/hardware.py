@@ -149,6 +149,8 @@ class ServoActuator(BaseNode):
     Args:
         rate: Steps per second [Hz].
         field: Field of the agent's message that is the command, shape ``(servos,)``.
+        message: Makes the node's message from this command. If the device's commands have columns, it has a field of
+            the shape ``(servos,)`` for each, by the column's name.
         **options: Options of ``BaseNode``.
     """
 
@@ -195,7 +197,14 @@ class ServoActuator(BaseNode):
         now_s = self.now()
         age_s = now_s - float(message.ts_sent[-1]) if int(message.seq[-1]) >= 0 else 0.0
         wanted = np.asarray(getattr(message.data, self._field)[-1], np.float64)
-        return step_state, self._message(self._rig.command(wanted, age_s, now_s))
+        names = [column.name for column in self._rig.device.commanded.columns]
+        if not names:
+            return step_state, self._message(self._rig.command(wanted, age_s, now_s))
+        # With columns, the message is made first, and its fields are sent.
+        sent = self._message(wanted)
+        table = np.stack([np.asarray(getattr(sent, name), np.float64) for name in names], axis=-1)
+        allowed = self._rig.command(table, age_s, now_s)
+        return step_state, sent.replace(**{name: allowed[:, i].astype(np.float32) for i, name in enumerate(names)})
 
 
 class Excitation(BaseNode):

@@ -37,8 +37,8 @@ class BodySensor(RobotSensor):
 
     def read(self, reading: Reading) -> BodyReading:
         """Return the message of a reading."""
-        more: Any = reading
-        return BodyReading(reading.position_rad, reading.velocity_rad_s, more.more["quaternion"], more.more["gyro"])
+        parts = reading.parts
+        return BodyReading(reading.position_rad, reading.velocity_rad_s, parts["quaternion"], parts["gyro"])
 
 
 class TargetDrive(RobotDrive):
