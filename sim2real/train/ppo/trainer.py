@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.errors import UsageError
 from sim2real.runtime.program_arguments import data_of, with_data
 from sim2real.train.config import PPOConfig as PPOConfig
 from sim2real.train.environment.protocol import TrainingEnvironment, check_environment, get_width
@@ -43,7 +42,7 @@ from sim2real.train.ppo.update import TrainState, keys, make_policy, update
 from sim2real.train.scale.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
 from sim2real.train.scale.compilation import compile_lowered, small_random_numbers
 from sim2real.train.scale.devices import Shardings, gather, place, replicate, shardings_of
-from sim2real.train.scale.processes import agree, leads
+from sim2real.train.scale.processes import agree, leads, require_one_clock
 from sim2real.train.sweep import Sweep as Sweep
 from sim2real.train.sweep import with_numbers
 from sim2real.types import Array, PyTree
@@ -87,8 +86,7 @@ def train(
         Sim2RealError: An observation, a reward or a loss is not finite, or the checkpoint cannot be read.
     """
     start = time.perf_counter()
-    if config.minutes is not None and jax.process_count() > 1:
-        raise UsageError("minutes: several processes have several clocks", hint="use a target, or total_steps")
+    require_one_clock(config)
     key = key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
     session = _Session.of(env, config, key, sweep or Sweep({}), (actor, critic, teacher))
 
