@@ -8,13 +8,13 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 72_000,
-    "lines of composer": 13_500,
+    "lines without composer": 67_450,
+    "lines of composer": 12_310,
     "files in the fullest folder": 15,
-    "docstring lines [%]": 21.0,
-    "Any in 1,000 lines": 5.5,
+    "docstring lines [%]": 20.0,
+    "Any in 1,000 lines": 4.9,
     "words of the dialect": 11,
-    "other words of the dialect": 200,
+    "other words of the dialect": 204,
     "largest number of project imports": 18,
     "levels of robot classes": 2,
     "public members of SO101Robot": 20,
@@ -22,7 +22,7 @@ LIMITS = {
 }
 """The 11 words that remain are names in file formats (``left_out`` in parameters.json, the column ``told``), evosax's
 ``tell``, and a word in the column names of recorders."""
-AT_LEAST = {"comment lines [%]": 1.4}
+AT_LEAST = {"comment lines [%]": 1.68}
 
 
 @pytest.fixture(scope="module")

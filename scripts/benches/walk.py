@@ -6,6 +6,7 @@ import argparse
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,19 +29,22 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--twins", type=int, default=50, help="hidden twins")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of an episode [s]")
     parser.add_argument("--push", type=float, default=0.5, help="size of a push every 5 s [m/s]")
+    parser.add_argument(
+        "--delays-ms", type=float, nargs="*", default=[], help="delays from motion to new targets, of all twins [ms]"
+    )
 
 
 def run(options: argparse.Namespace) -> Report:
     """Let the policy walk on all twins, without and with pushes."""
     workers = min(os.cpu_count() or 1, options.twins)
+    trials = [("calm", 0.0, None), ("pushed", options.push, None)]
+    trials += [(f"pushed_{ms:g}_ms", options.push, ms / 1e3) for ms in options.delays_ms]
     rows: list[Row] = []
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        for name, push in (("calm", 0.0), ("pushed", options.push)):
+        for name, push, delay_s in trials:
             begin = time.perf_counter()
-            walked = list(
-                pool.map(partial(one, options.pipeline, options.bundle, options.seconds, push), range(options.twins))
-            )
-            fell, *errors = (np.array(column) for column in zip(*walked, strict=True))
+            play = partial(one, options.pipeline, options.bundle, options.seconds, push, delay_s)
+            fell, *errors = (np.array(column) for column in zip(*pool.map(play, range(options.twins)), strict=True))
             about = f"{options.twins} twins, {options.seconds:g} s" + (f", {push:g} m/s every 5 s" if push else "")
             rows.append(row(f"walk/{name}/falls", int(fell.sum()), f"of {options.twins}", about, "0"))
             for (figure, unit, goal), values in zip(ERRORS, errors, strict=True):
@@ -51,8 +55,14 @@ def run(options: argparse.Namespace) -> Report:
     return {"rows": rows}
 
 
-def one(pipeline: str, bundle: Path | None, seconds: float, push: float, seed: int) -> tuple[bool, float, float]:
-    """Walk on a hidden twin; return whether it fell, and the errors [m/s], [rad/s]."""
+def one(
+    pipeline: str, bundle: Path | None, seconds: float, push: float, delay_s: float | None, seed: int
+) -> tuple[bool, float, float]:
+    """Walk on a hidden twin; return whether it fell, and the errors [m/s], [rad/s].
+
+    Args:
+        delay_s: Delay of the twin, a third of it on the sensors' side [s]; None: the twin's own.
+    """
     from sim2real.policy.bundle import load_bundle
     from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
     from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -60,7 +70,10 @@ def one(pipeline: str, bundle: Path | None, seconds: float, push: float, seed: i
     found = load_pipeline(pipeline)
     robot: Any = found.load()
     rng = np.random.default_rng(seed)
-    twin = Twin(robot, HiddenTwin.draw(np.random.default_rng(1000 + seed), len(robot.joints)), seed)
+    hidden = HiddenTwin.draw(np.random.default_rng(1000 + seed), len(robot.joints))
+    if delay_s is not None:
+        hidden = replace(hidden, sensing_s=delay_s / 3, acting_s=delay_s * 2 / 3)
+    twin = Twin(robot, hidden, seed)
     count = int(seconds / EVERY_S) + 1
     commands = (
         rng.uniform(-1.0, 1.0, (count, 3)) * robot.commands.most * (rng.random((count, 1)) > robot.commands.stand)
