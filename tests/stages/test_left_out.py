@@ -120,7 +120,9 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
     selection = SimpleNamespace(names=lambda _: ("cogging",), near=[SimpleNamespace(z=z)])
     monkeypatch.setattr(fitting.held_out_parts, "chosen", lambda *_: selection)
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
-    inputs = SimpleNamespace(config=config, table=table, model=None, episodes=[], fitted=1, windows=[], names=["log"])
+    inputs = SimpleNamespace(
+        config=config, table=table, model=None, episodes=[], fitted=1, windows=[], names=["log"], refits=None
+    )
     fitting.fit_model(inputs, Best())
     fewer = tables[1][1]
     assert fewer.terms == ("cogging",)
