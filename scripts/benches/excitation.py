@@ -118,9 +118,12 @@ def _rows(case: str, estimate: sim2real.Identification, truth: dict[str, float])
         estimates = {p.name: p for p in estimate.parameters}
         size = np.array([abs(truth[n]) if what == "friction" else 1.0 for n in names])
         errors = np.array([estimates[n].estimate - truth[n] for n in names]) / size
-        widths = np.array([(estimates[n].high95 - estimates[n].low95) / 2 for n in names]) / size
+        ends = [(estimates[n].low95, estimates[n].high95) for n in names]
+        # A parameter that the data does not determine has no interval.
+        widths = [(high - low) / 2 / s for (low, high), s in zip(ends, size, strict=True) if None not in (low, high)]
+        width = round(scale * float(np.mean(widths)), 2) if widths else None
         rows += [
             row(f"excitation/{case}/{what}_error", round(scale * rmse(errors), 2), unit, "rms over the joints"),
-            row(f"excitation/{case}/{what}_interval", round(scale * float(widths.mean()), 2), unit, "mean half 95 %"),
+            row(f"excitation/{case}/{what}_interval", width, unit, "mean half 95 %"),
         ]
     return [*rows, row(f"excitation/{case}/verdict", estimate.verdict.status, "")]
