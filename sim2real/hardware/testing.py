@@ -86,7 +86,6 @@ class DeviceConformance(ABC):
         patience_s: Time in which a motor must be in the safe state, on a busy machine too [s].
         safe_modes: Modes of a motor in the safe state.
         no_address: An address without a device.
-        unrequested: Whether the device sends its state without a request, so that a lost sample is not requested again.
     """
 
     emulation: ClassVar[type[BusEmulation]]
@@ -96,7 +95,6 @@ class DeviceConformance(ABC):
     patience_s: ClassVar[float] = 1.0
     safe_modes: ClassVar[frozenset[int]] = frozenset({OperatingMode.OFF})
     no_address: ClassVar[str] = "/dev/no-such-port"
-    unrequested: ClassVar[bool] = False
 
     @abstractmethod
     def make_device(self, port: str) -> Device:
@@ -229,7 +227,7 @@ class DeviceConformance(ABC):
         assert np.all(spread < 0.05), f"the motors stand still, but their readings differ by {spread} rad"
         assert counters.retries <= counters.lost_replies
         assert (counters.late_replies if "late" in fault else counters.lost_replies) >= 2
-        if "late" not in fault and not self.unrequested:
+        if "late" not in fault:
             assert max(r.transaction.retries for r in readings) >= 1
 
     def test_silence_is_hardware_lost(self, start: Started) -> None:

@@ -6,8 +6,10 @@ import time
 import jax
 import numpy as np
 import pytest
+from flax import struct
 
 from sim2real.errors import SafetyStop, UsageError
+from sim2real.graph.base import Base
 from sim2real.hardware.device import (
     Alone,
     CommandColumn,
@@ -26,7 +28,7 @@ from sim2real.log.reader import output_units, read_log
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.control_loop.hardware import Excitation, ServoActuator, ServoSensor
 from sim2real.robots.control_loop.loop import control_nodes
-from sim2real.robots.control_loop.messages import Goals, JointCommands
+from sim2real.robots.control_loop.messages import Goals
 from sim2real.robots.roles import ROLES
 from sim2real.robots.walking.drive import BodySensor
 from sim2real.runtime.asynchronous import AsyncGraph
@@ -43,6 +45,25 @@ COLUMNS = (
 )
 LOW, HIGH = np.tile([-1.5, -20.0, 0.0, 0.0, -20.0], (N, 1)), np.tile([1.5, 20.0, 100.0, 5.0, 20.0], (N, 1))
 UNITS = {column.name: column.unit for column in COLUMNS}
+
+
+@struct.dataclass
+class JointCommands(Base):
+    """A command for motors that add a controller's torque and a torque: ``kp (q - position) + kd (dq - speed) + tau``.
+
+    Attributes:
+        q: Shape ``(joints,)`` [rad].
+        dq: Shape ``(joints,)`` [rad/s].
+        kp: Shape ``(joints,)`` [N m/rad].
+        kd: Shape ``(joints,)`` [N m s/rad].
+        tau: Shape ``(joints,)`` [N m].
+    """
+
+    q: jax.Array
+    dq: jax.Array
+    kp: jax.Array
+    kd: jax.Array
+    tau: jax.Array
 
 
 class Legs(Device):

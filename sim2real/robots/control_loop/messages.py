@@ -22,25 +22,6 @@ class JointReading(Base):
 
 
 @struct.dataclass
-class JointCommands(Base):
-    """A command for motors that add a controller's torque and a torque: ``kp (q - position) + kd (dq - speed) + tau``.
-
-    Attributes:
-        q: Shape ``(joints,)`` [rad].
-        dq: Shape ``(joints,)`` [rad/s].
-        kp: Shape ``(joints,)`` [N m/rad].
-        kd: Shape ``(joints,)`` [N m s/rad].
-        tau: Shape ``(joints,)`` [N m].
-    """
-
-    q: Array
-    dq: Array
-    kp: Array
-    kd: Array
-    tau: Array
-
-
-@struct.dataclass
 class Goals(Base):
     """A command.
 

@@ -40,6 +40,13 @@ class WalkingState(Base):
     carry: PyTree = ()
 
 
+def features(reading: BodyReading, stance: np.ndarray, last: Array) -> Array:
+    """Return what the policy gets of a reading: gyro, gravity, joints beside the stance, then its last action."""
+    xp = namespace(reading.position, last)
+    parts = [reading.gyro, gravity_of(reading.quaternion), reading.position - stance, reading.velocity, last]
+    return xp.concatenate(parts).astype(np.float32)
+
+
 class WalkingNode(BaseNode):
     """Sends joint targets around the stance; ``step`` draws them from a policy in JAX.
 
@@ -111,10 +118,7 @@ class WalkingNode(BaseNode):
 
     def _now(self, step_state: StepState) -> Array:
         reading: BodyReading = step_state.inputs[self._sensor][-1].data
-        offsets, last = reading.position - self._stance, step_state.state.last
-        xp = namespace(reading.position, last)
-        parts = [reading.gyro, gravity_of(reading.quaternion), offsets, reading.velocity, last]
-        return xp.concatenate(parts).astype(np.float32)
+        return features(reading, self._stance, step_state.state.last)
 
 
 class WalkingAgent(RobotAgent):

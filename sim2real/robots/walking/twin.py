@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from sim2real.robots.walking.agent import features
 from sim2real.robots.walking.messages import BodyReading, gravity_of, into_base
 from sim2real.robots.walking.robot import ComposedRobot
 
@@ -181,10 +182,7 @@ def walk(
     for i in range(steps):
         t_s = i * period_s
         # Observe and act as the agent's node does.
-        reading = twin.read()
-        now = np.concatenate(
-            [reading.gyro, gravity_of(reading.quaternion), reading.position - stance, reading.velocity, last]
-        ).astype(np.float32)
+        now = features(twin.read(), stance, last)
         wanted[i] = command(t_s)
         observation = np.concatenate([now, wanted[i], past.ravel()]).astype(np.float32)
         past = np.concatenate([now[None], past])[: robot.history]

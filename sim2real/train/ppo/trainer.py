@@ -69,9 +69,8 @@ def train(
 
     Args:
         key: From ``jax.random.key`` or ``PRNGKey``; seed i depends on it and on i alone.
-        on_progress: Called after every evaluation, those before a resumption too. Each ``Progress`` of this process
-            has the best policy so far, so that a caller that raises an exception, which ends the training, loses
-            nothing.
+        on_progress: Called after every evaluation, those before a resumption too; an exception that it raises ends the
+            training. A ``Progress`` of this process has the best policy so far.
         checkpoint: File that receives the whole training after each evaluation. Of several processes all have to name
             one, and the first writes it.
         resume: A checkpoint to continue from. The result equals that of an uninterrupted training, bit for bit on one
