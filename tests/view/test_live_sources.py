@@ -1,6 +1,7 @@
 """What a live view shows: rows of growing files, each once, in time; and a model in 3-D."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from sim2real.artifacts.progress import BEST_FIT, PROGRESS, write_best_fit, write_progress
 from sim2real.graph.episode import Episode, Steps
 from sim2real.view.live.follower import Follower
-from sim2real.view.live.log_source import _thinned
+from sim2real.view.live.log_source import LogSource, _thinned
 from sim2real.view.live.stage_sources import FitSource, ProgressSource
 from sim2real.view.model_scene import ModelScene
 
@@ -36,6 +37,19 @@ def test_of_each_group_of_steps_the_latest_is_shown():
     assert len(thinned.steps["agent"]) == len(lateness["agent"]) == n / 4
     assert {7, 123, 399} <= set(thinned.outputs["agent"]["goal"].tolist())
     assert np.count_nonzero(lateness["agent"] > 2.0) == 3
+
+
+def test_a_goal_stands_beside_the_position_of_its_joint(tmp_path, monkeypatch):
+    at = 1_000 * np.arange(4)
+    steps = Steps(at, at, at, np.full(4, -1), at + 100, np.zeros(4, np.int64))
+    outputs = {"actuator": {"goal": np.ones((4, 2))}, "sensor": {"position": np.zeros((4, 2))}}
+    episode = Episode({node: steps for node in outputs}, {}, outputs, {})
+    source = LogSource(tmp_path / "log.mcap", "record/log", lambda ns: 0.0)
+    monkeypatch.setattr(source, "_tail", SimpleNamespace(read=lambda: episode, epoch_ns=0))
+    plots = source.read().plots
+    assert not [title for title in plots if title.startswith("goal")]
+    beside = {title: [c.values[0] for c in curves] for title, curves in plots.items() if title.startswith("position")}
+    assert list(beside.values()) == [[0.0, 1.0], [0.0, 1.0]]
 
 
 def test_curves_grow_by_whole_lines(tmp_path):

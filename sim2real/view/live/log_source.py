@@ -44,7 +44,7 @@ class LogSource:
             for node, steps in thinned.steps.items()
         ]
         return _moved(
-            replace(tab, plots={**tab.plots, "Lateness [ms]": curves}, episode=None, recent_s=RECENT_S),
+            replace(tab, plots={**_with_goals(tab.plots), "Lateness [ms]": curves}, episode=None, recent_s=RECENT_S),
             self._offset_s(self._tail.epoch_ns),
         )
 
