@@ -33,7 +33,7 @@ def run(config: PlayConfig) -> Walked:
         UsageError: There is no policy, the robot does not walk, or the window and the picture exclude each other.
     """
     if config.window and config.video:
-        raise UsageError("play shows a window or writes a picture", hint="leave out --window or --video")
+        raise UsageError("play shows a window or writes a picture", hint="run it with one of both")
     robot, folder = _chosen(config)
     hidden = None if config.seed is None else HiddenTwin.draw(np.random.default_rng(config.seed), len(robot.joints))
     twin, wanted = Twin(robot, hidden, config.seed or 0), np.array(config.command)
