@@ -14,64 +14,26 @@ from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, Transform
 from sim2real.robots.from_model.joints.joint_patterns import require_quick
 from sim2real.robots.from_model.joints.quantities import (
-    ABOUT as ABOUT,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    ALIKE as ALIKE,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    BOTH_WAYS as BOTH_WAYS,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    EXCITE as EXCITE,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    FACTORS as FACTORS,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    FALLBACK as FALLBACK,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    FIXED as FIXED,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    LAWS as LAWS,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    LIMITS as LIMITS,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    OF_MODEL as OF_MODEL,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    ON_DOF as ON_DOF,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    ON_DRIVE as ON_DRIVE,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    ONLY_NAMED as ONLY_NAMED,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    OPTIONAL as OPTIONAL,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    TILT as TILT,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    VANISHING as VANISHING,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    WHOLE as WHOLE,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    WIDE as WIDE,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    ParameterPattern as ParameterPattern,
-)
-from sim2real.robots.from_model.joints.quantities import (
-    letters as letters,
+    ABOUT,
+    ALIKE,
+    BOTH_WAYS,
+    EXCITE,
+    FACTORS,
+    FALLBACK,
+    FIXED,
+    LAWS,
+    LIMITS,
+    OF_MODEL,
+    ON_DOF,
+    ON_DRIVE,
+    ONLY_NAMED,
+    OPTIONAL,
+    TILT,
+    VANISHING,
+    WHOLE,
+    WIDE,
+    ParameterPattern,
+    letters,
 )
 from sim2real.robots.from_model.joints.sharing import sharing
 from sim2real.robots.from_model.mjcf import gains_of, limit_of, slides_of, unit_for
