@@ -48,6 +48,7 @@ TABLES = {
     "two_devices": ("scaling_h200",),
     "view": ("view",),
     "excitation": ("excitation",),
+    "twin": ("twin",),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
 PAGES = (
@@ -285,6 +286,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "two_devices": lambda chosen: sentences.on_two_devices(*chosen.values()),
         "view": lambda chosen: recordings.view(*chosen.values()),
         "excitation": lambda chosen: recordings.excitation(*chosen.values()),
+        "twin": lambda chosen: sentences.twin(*chosen.values()),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}
     chosen = {table: {name: reports[name] for name in names} for table, names in there.items()}

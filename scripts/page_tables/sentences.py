@@ -26,6 +26,16 @@ def on_a_gpu(arm: Mapping[str, Any], pendulum: Mapping[str, Any]) -> str:
     )
 
 
+def twin(report: Mapping[str, Any]) -> str:
+    """Return the time of `new --like so101`, from an empty environment to an accepted twin."""
+    v = values(report)
+    return (
+        f"From an empty environment to an accepted twin of the emulated arm, on {report['machine']['cores']} cores: "
+        f"{v['twin/wall']:.0f} s,\nof which the installation takes {v['twin/install']:.0f} s "
+        f"(`python scripts/bench.py twin`). The arm is moved by a program, as the command asks.\n"
+    )
+
+
 def faults(report: Mapping[str, Any]) -> str:
     """Return the number of runs that were safe, and how late the latest one was."""
     v, kinds = values(report), report["flags"]["faults"]

@@ -50,3 +50,12 @@ def test_without_an_answer_nothing_moves_and_the_pipeline_is_there(arm, tmp_path
     assert f"on {arm.port}" in done.stderr
     arm.stop()
     assert set(arm.truth().of(Kind.EFFECT)["values"][:, 0].tolist()) <= {OperatingMode.OFF}
+
+
+@pytest.mark.full
+@pytest.mark.realtime
+def test_an_answer_gives_an_accepted_twin(arm, tmp_path):
+    code, told = new(arm, tmp_path, "\n")
+    assert (code, told.count(QUESTION)) == (0, 1), told
+    (page,) = tmp_path.glob("runs/my_arm/*/report.html")
+    assert "accepted" in page.read_text()
