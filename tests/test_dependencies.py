@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "mixture": {"sim2real.graph.fitting"},
     "parquet": {"sim2real.log.importing.files.lerobot"},
     "tensorboard": {"sim2real.stages.train.tensorboard"},
+    "unitree": {"sim2real.hardware.unitree.messages"},
     "warp": set(),  # MJX imports Warp itself
 }
 """Extra -> modules that import its packages. A scene is called by ``view.recording``, which has checked by then."""

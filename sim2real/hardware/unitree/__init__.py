@@ -1,0 +1,1 @@
+"""Unitree's robots on their low-level interface: messages over DDS, and the device."""
