@@ -5,6 +5,8 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.ready-docs
 WARP_READY := .venv/.ready-warp
+# LeRobot cannot be installed beside the viewer (pyproject.toml): a test installs the part that it needs.
+EXTRAS := --all-extras --no-extra lerobot
 SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never UV_COMPILE_BYTECODE=1 VIRTUAL_ENV= $(BIN)/uv sync --locked --inexact --quiet
 
 .PHONY: demo test test-all bench docs format wheel
@@ -42,9 +44,9 @@ format: $(READY)
 # uv and pip stay in .venv beside what uv.lock lists: hence --inexact.
 # Where packages come from a mirror that only pip is configured for, pip installs the same versions by their hashes.
 define INSTALL
-	@$(SYNC) --all-extras $(1) || { \
+	@$(SYNC) $(EXTRAS) $(1) || { \
 	  echo "uv cannot reach the package index: installing the locked versions with pip" >&2; \
-	  $(BIN)/uv export --frozen --offline --quiet --all-extras $(1) --no-dev --no-emit-project -o .venv/requirements.txt && \
+	  $(BIN)/uv export --frozen --offline --quiet $(EXTRAS) $(1) --no-dev --no-emit-project -o .venv/requirements.txt && \
 	  $(BIN)/python -m pip install --quiet --no-deps -r .venv/requirements.txt && \
 	  $(BIN)/python -m pip install --quiet --no-deps --editable .; }
 	@touch $@
@@ -59,7 +61,7 @@ $(WARP_READY): $(READY)
 	$(call INSTALL)
 
 $(DOCS_READY): $(READY)
-	@$(SYNC) --all-extras --no-extra warp --group docs || $(BIN)/python -m pip install --quiet sphinx furo myst-parser
+	@$(SYNC) $(EXTRAS) --no-extra warp --group docs || $(BIN)/python -m pip install --quiet sphinx furo myst-parser
 	@touch $@
 
 $(BIN)/uv: | $(BIN)/pip

@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "interop": {"sim2real.interop.brax_adapter", "sim2real.interop.gymnasium_adapter"},
     "mixture": {"sim2real.graph.fitting"},
     "parquet": {"sim2real.log.importing.files.lerobot"},
+    "lerobot": {"sim2real.hardware.lerobot.device"},
     "tensorboard": {"sim2real.stages.train.tensorboard"},
     "unitree": {"sim2real.hardware.unitree.messages"},
     "warp": set(),  # MJX imports Warp itself
@@ -130,8 +131,8 @@ def test_an_extra_is_imported_only_where_the_error_names_it(extra, imported):
     assert hints or not packages
 
 
-@pytest.mark.parametrize("extra", [name for name in EXTRAS if name != "warp"])
-def test_developers_have_every_extra_but_warp(extra):
+@pytest.mark.parametrize("extra", [name for name in EXTRAS if name not in ("warp", "lerobot")])
+def test_developers_have_every_extra_but_two(extra):
     assert re.search(rf"sim2real\[[^]]*\b{extra}\b", str(PROJECT["optional-dependencies"]["dev"]))
 
 

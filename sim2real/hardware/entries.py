@@ -14,6 +14,7 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     DEVICES: {
         "dynamixel": "sim2real.hardware.dynamixel.device:servos",
         "feetech": "sim2real.hardware.feetech.device:servos",
+        "lerobot": "sim2real.hardware.lerobot.device:servos",
     },
     WORLDS: {},
 }
