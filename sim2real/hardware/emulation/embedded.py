@@ -10,17 +10,38 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import Field, asdict
 from pathlib import Path
-from typing import IO, Any, Final, Self, cast
+from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, Protocol, Self, cast
 
 from sim2real.errors import HardwareLost
-from sim2real.hardware.emulation.emulated_bus import BusEmulation
 from sim2real.hardware.emulation.truth import Truth, read_truth
 
 _LOGGER = logging.getLogger(__name__)
 _START_TIMEOUT_S: Final = 20.0
 _STOP_TIMEOUT_S: Final = 3.0
+
+
+class Emulated(Protocol):
+    """Settings of an emulated robot: a dataclass whose fields become flags of its process.
+
+    Attributes:
+        program: Module of the process.
+        seed: Seed of jitter, noise and faults.
+        actuation_latency_s: Time from a command to its effect [s].
+        actuation_jitter_s: Half-width of the variation of that time [s].
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Field]]
+    program: ClassVar[str]
+    if TYPE_CHECKING:
+
+        @property
+        def seed(self) -> int: ...  # noqa: D102
+        @property
+        def actuation_latency_s(self) -> float: ...  # noqa: D102
+        @property
+        def actuation_jitter_s(self) -> float: ...  # noqa: D102
 
 
 class EmbeddedRobot:
@@ -41,7 +62,7 @@ class EmbeddedRobot:
     def __init__(
         self,
         plant: str,
-        config: BusEmulation,
+        config: Emulated,
         plant_args: Mapping[str, Any] | None = None,
         truth_path: Path | str | None = None,
     ) -> None:
@@ -55,7 +76,7 @@ class EmbeddedRobot:
             sys.executable,
             "-P",
             "-m",
-            "sim2real.hardware.emulation.emulator",
+            config.program,
             "--until-stdin-closes",
             "--plant",
             plant,

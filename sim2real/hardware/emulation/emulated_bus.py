@@ -307,6 +307,8 @@ class PlannedBus(ABC):
 class BusEmulation(Emulation):
     """Settings of a certain bus; see `Emulation` for their meaning."""
 
+    program: ClassVar[str] = "sim2real.hardware.emulation.emulator"
+    """Module of the process that emulates the bus."""
     bus_type: ClassVar[Callable[..., PlannedBus]]
     """Makes the bus from plant, settings, truth, ``send`` and ``start_ns``."""
 

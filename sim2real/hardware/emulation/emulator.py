@@ -20,7 +20,7 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -86,7 +86,7 @@ class _Pty:
         return data if fits else b""
 
 
-class _StopFlag:
+class StopFlag:
     """A flag that SIGTERM and SIGINT set, and the time of SIGUSR1, from which times of faults count."""
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class _StopFlag:
         self.faulty_ns = time.monotonic_ns()
 
 
-def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_fd: int | None) -> None:
+def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: StopFlag, parent_fd: int | None) -> None:
     """Run the bus until `stop` is set; with `parent_fd`, also until the other end of that pipe is closed."""
     inputs = [pty.fd] if parent_fd is None else [pty.fd, parent_fd]
     while not stop.is_set:
@@ -133,7 +133,7 @@ def _serve(bus: PlannedBus, pty: _Pty, truth: TruthLog, stop: _StopFlag, parent_
         truth.flush_if_due(now_ns)
 
 
-def _keep_time() -> None:
+def keep_time() -> None:
     """Reduce the lateness of this process as far as the operating system allows."""
     # Sleeps end within about 1 us of the requested time, instead of 50 us.
     with contextlib.suppress(AttributeError, OSError):
@@ -146,12 +146,9 @@ def _keep_time() -> None:
     gc.disable()
 
 
-def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
+def _parser(arguments: Sequence[str] | None, program: str, about: str | None, kind: type) -> argparse.ArgumentParser:
     """Return the parser of the command line, with a flag for each setting of the named emulation."""
-    # The flag --emulation determines the other flags.
-    parser = argparse.ArgumentParser(
-        prog="python -m sim2real.hardware.emulation.emulator", description=__doc__, add_help=False
-    )
+    parser = argparse.ArgumentParser(prog=f"python -m {program}", description=about, add_help=False)
     place = "MODULE_OR_FILE:NAME"
     parser.add_argument(
         "--emulation", required=True, metavar=place, help="the class of the settings, which makes the bus"
@@ -159,8 +156,8 @@ def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
     # The class of the settings decides the other flags.
     named = parser.parse_known_args(arguments)[0]
     settings = load_named(named.emulation, "emulation")
-    if not (isinstance(settings, type) and issubclass(settings, BusEmulation)):
-        raise UsageError(f"emulation {named.emulation!r} is no class of settings of an emulated bus")
+    if not (isinstance(settings, type) and issubclass(settings, kind)):
+        raise UsageError(f"emulation {named.emulation!r} is no class of settings of this emulator, no {kind.__name__}")
     parser.set_defaults(settings=settings)
     parser.add_argument("-h", "--help", action="help")
     parser.add_argument("--plant", required=True, metavar=place, help="the callable that returns the plant")
@@ -178,7 +175,8 @@ def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
     return parser
 
 
-def _plant_arguments(text: str) -> dict[str, Any]:
+def plant_arguments(text: str) -> dict[str, Any]:
+    """Return the keyword arguments of --plant-args; UsageError if they are no JSON object."""
     try:
         arguments = json.loads(text)
     except json.JSONDecodeError as error:
@@ -188,13 +186,11 @@ def _plant_arguments(text: str) -> dict[str, Any]:
     return arguments
 
 
-def _run(options: argparse.Namespace) -> None:
+def _run(options: argparse.Namespace, config: BusEmulation, stop: StopFlag) -> None:
     # Make plant and port.
-    stop = _StopFlag()
-    config = options.settings(**{field.name: getattr(options, field.name) for field in fields(options.settings)})
-    plant = load_plant(options.plant, _plant_arguments(options.plant_args))
+    plant = load_plant(options.plant, plant_arguments(options.plant_args))
     pty = _Pty()
-    _keep_time()
+    keep_time()
     start_ns = time.monotonic_ns()
     truth = TruthLog(options.truth, truth_header(plant, config, start_ns))
     # Report the port to the parent, and serve until the end.
@@ -207,14 +203,34 @@ def _run(options: argparse.Namespace) -> None:
         truth.close()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the emulator's command line; return its exit code."""
+def emulate(
+    arguments: Sequence[str] | None,
+    program: str,
+    about: str | None,
+    kind: type,
+    run: Callable[[argparse.Namespace, Any, StopFlag], None],
+) -> int:
+    """Run the command line of an emulator; return its exit code.
+
+    Args:
+        program: Its module.
+        about: Its help.
+        kind: Class of its settings.
+        run: Emulates with options and settings until the flag is set.
+    """
     try:
-        _run(_parser(arguments).parse_args(arguments))
+        options = _parser(arguments, program, about, kind).parse_args(arguments)
+        config = options.settings(**{field.name: getattr(options, field.name) for field in fields(options.settings)})
+        run(options, config, StopFlag())
     except Sim2RealError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line of an emulated bus; return its exit code."""
+    return emulate(arguments, BusEmulation.program, __doc__, BusEmulation, _run)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,7 @@ from sim2real.types import Key, PyTree
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
-    from sim2real.hardware.emulation.embedded import EmbeddedRobot
-    from sim2real.hardware.emulation.emulated_bus import BusEmulation
+    from sim2real.hardware.emulation.embedded import EmbeddedRobot, Emulated
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig
     from sim2real.hardware.safety.rig import Rig
@@ -37,7 +36,7 @@ class Embedded:
     """
 
     plant: str
-    emulator: BusEmulation
+    emulator: Emulated
     plant_args: Mapping[str, Any] = field(default_factory=dict)
 
     def mounted(self, joints: Sequence[Joint], zero_rad: float) -> Embedded:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from sim2real.robots.walking.agent import features
+from sim2real.robots.walking.hidden import HiddenTwin as HiddenTwin
+from sim2real.robots.walking.hidden import hidden_spec, hide
 from sim2real.robots.walking.messages import BodyReading, gravity_of, into_base
 from sim2real.robots.walking.robot import ComposedRobot
 
@@ -19,44 +20,6 @@ STEP_S = 0.002
 """Time step of the twin's physics, shorter than that of training [s]."""
 _SETTLED_S = 1.0
 """Time after a new command that does not count [s]."""
-
-
-@dataclass(frozen=True)
-class HiddenTwin:
-    """What a twin differs by; no policy and no training reads it.
-
-    Attributes:
-        friction: Of feet and floor.
-        load_kg: In the base.
-        strength: Factor on the gains of each motor.
-        damping, dry: Of each joint [N m s/rad], [N m].
-        sensing_s: Time from the motion to the observation [s].
-        acting_s: Time from the observation to the motors' new target: computation and transport [s].
-        bias_rad: Of each encoder.
-    """
-
-    friction: float = 0.8
-    load_kg: float = 0.0
-    strength: np.ndarray = field(default_factory=lambda: np.ones(12))
-    damping: float = 0.1
-    dry: float = 0.2
-    sensing_s: float = 0.008
-    acting_s: float = 0.011
-    bias_rad: np.ndarray = field(default_factory=lambda: np.zeros(12))
-
-    @staticmethod
-    def draw(rng: np.random.Generator, joints: int) -> HiddenTwin:
-        """Draw a twin from ranges wider than those of training."""
-        return HiddenTwin(
-            friction=float(rng.uniform(0.4, 1.3)),
-            load_kg=float(rng.uniform(-1.0, 3.0)),
-            strength=rng.uniform(0.8, 1.2, joints),
-            damping=float(rng.uniform(0.02, 0.5)),
-            dry=float(rng.uniform(0.05, 0.4)),
-            sensing_s=float(rng.uniform(0.004, 0.012)),
-            acting_s=float(rng.uniform(0.004, 0.022)),
-            bias_rad=rng.uniform(-0.02, 0.02, joints),
-        )
 
 
 class Walked(NamedTuple):
@@ -83,22 +46,10 @@ class Twin:
 
     def __init__(self, robot: ComposedRobot, hidden: HiddenTwin | None = None, seed: int = 0) -> None:
         self.robot, self.hidden = robot, hidden or HiddenTwin()
-        self._rng, h = np.random.default_rng(seed), self.hidden
-        spec = _mj.MjSpec.from_file(str(robot.mjcf))
-        spec.option.timestep, spec.option.cone = STEP_S, _mj.mjtCone.mjCONE_ELLIPTIC
-        spec.option.iterations, spec.option.ls_iterations = 50, 20
-        self.model = model = spec.compile()
-        # Set the hidden parameters, and let MuJoCo compute the constants of the load.
-        base = int(model.jnt_bodyid[0])
-        before = float(model.body_mass[base])
-        model.body_mass[base] = before + h.load_kg
-        model.body_ipos[base] *= before / (before + h.load_kg)
-        model.geom_friction[:, 0] = h.friction
-        model.actuator_gainprm[:, 0] *= h.strength
-        model.actuator_biasprm[:, 1:3] *= h.strength[:, None]
-        model.dof_damping[6:], model.dof_frictionloss[6:] = h.damping, h.dry
-        self.data = _mj.MjData(model)
-        _mj.mj_setConst(model, self.data)
+        self._rng = np.random.default_rng(seed)
+        self.model = hidden_spec(robot.mjcf, STEP_S).compile()
+        hide(self.model, int(self.model.jnt_bodyid[0]), self.hidden)
+        self.data = _mj.MjData(self.model)
         self.reset()
 
     def reset(self) -> None:

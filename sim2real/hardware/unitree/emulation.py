@@ -1,0 +1,200 @@
+"""An emulated robot of Unitree in planned time, without DDS: its motors, its IMU, their latencies and their noise.
+
+The times of all events are computed from the times at which the host wrote its commands, and do not depend on how late
+the emulator's process runs: a command that is written at t takes effect one actuation latency later, and a state holds
+the measurements of one sensing latency earlier.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import asdict, dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.hardware.emulation.truth import Kind, TruthLog
+from sim2real.hardware.plant import STATE_PERIOD_S
+from sim2real.hardware.unitree.body import LAW, Body
+from sim2real.hardware.unitree.messages import HEAD, LOW_LEVEL, NO_POSITION, NO_VELOCITY, SERVO, LowCmd, LowState
+
+STATE_HZ = 500
+"""States per second."""
+
+
+@dataclass(frozen=True)
+class UnitreeEmulation:
+    """Settings of an emulated robot; times of faults count from its start, or from a signal.
+
+    Attributes:
+        sensing_latency_s: Age of the measurements in a state when it is sent [s].
+        actuation_latency_s: Time from the writing of a command to its effect on the motors [s].
+        actuation_jitter_s: Half-width of the uniform variation of that time [s]; at most the latency. Commands take
+            effect in the order in which they were written.
+        position_noise_rad: Deviation of the noise of encoders [rad].
+        velocity_noise_rad_s: Deviation of the noise of the motors' speeds [rad/s].
+        gyro_noise_rad_s: Deviation of the noise of the gyro [rad/s].
+        tilt_noise_rad: Deviation of the noise of the orientation, about each axis [rad].
+        accelerometer_noise_m_s2: Deviation of the noise of the accelerometer [m/s^2].
+        alone_after_s: Time without an intact command after which motors damp their joints [s]; None: they go on as
+            commanded last.
+        alone_kd: Damping of the joints then [N m s/rad].
+        silent_after_s: Time from which no state is sent and no command received, as with an unplugged cable [s].
+        on_signal: Whether this time counts from SIGUSR1 to the process.
+        seed: Seed of jitter and noise.
+    """
+
+    program: ClassVar[str] = "sim2real.hardware.unitree.emulator"
+
+    sensing_latency_s: float = 0.0
+    actuation_latency_s: float = 0.0
+    actuation_jitter_s: float = 0.0
+    position_noise_rad: float = 0.0003
+    velocity_noise_rad_s: float = 0.03
+    gyro_noise_rad_s: float = 0.01
+    tilt_noise_rad: float = 0.002
+    accelerometer_noise_m_s2: float = 0.05
+    alone_after_s: float | None = 0.02
+    alone_kd: float = 3.0
+    silent_after_s: float | None = None
+    on_signal: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check that all values are in their ranges."""
+        negative = [name for name, value in asdict(self).items() if value is not None and value < 0]
+        if negative or self.actuation_jitter_s > self.actuation_latency_s:
+            name = (negative or ["actuation_jitter_s"])[0]
+            raise UsageError(f"emulator: {name} = {getattr(self, name)} is below 0, or a jitter above its latency")
+
+
+class EmulatedLegs:
+    """Motors and IMU of a body.
+
+    Args:
+        start_ns: Time 0 of the body, CLOCK_MONOTONIC [ns].
+
+    Attributes:
+        ignored: Commands whose CRC or head was wrong.
+    """
+
+    def __init__(self, body: Body, config: UnitreeEmulation, truth: TruthLog, start_ns: int) -> None:
+        self._body, self._config, self._truth, self._start_ns = body, config, truth, start_ns
+        self._rng = np.random.default_rng(config.seed)
+        self._step_ns = round(1e9 * body.step_s)
+        self._index = 0
+        self._coming: deque[tuple[int, int, np.ndarray, np.ndarray]] = deque()
+        self._modes, self._law = np.zeros(body.motors, np.uint8), np.zeros((body.motors, len(LAW)))
+        self._heard_ns: int | None = None
+        self._damps = False
+        self.ignored = 0
+        # Measurements on the grid of the physics, the newest last, as far back as a state reaches.
+        self._dtype = body.measure().dtype
+        depth = int(1e9 * config.sensing_latency_s) // self._step_ns + 3
+        self._history: deque[np.ndarray] = deque(maxlen=depth)
+        self._stride = max(1, round(STATE_PERIOD_S / body.step_s))
+        self._remember()
+
+    def receive(self, command: LowCmd, t_ns: int) -> None:
+        """Schedule a command that was written at ``t_ns``; one with a wrong CRC or head is ignored, as by the robot."""
+        record, config = command.record, self._config
+        if tuple(record["head"]) != HEAD or record["level_flag"] != LOW_LEVEL or not command.intact:
+            self.ignored += 1
+            return
+        motors = record["motor_cmd"][: self._body.motors]
+        law = np.stack([motors[name] for name in LAW], axis=-1).astype(np.float64)
+        jitter_s = self._rng.uniform(-1.0, 1.0) * config.actuation_jitter_s
+        effect_ns = t_ns + round(1e9 * (config.actuation_latency_s + jitter_s))
+        if self._coming:
+            effect_ns = max(effect_ns, self._coming[-1][0])
+        self._coming.append((effect_ns, t_ns, motors["mode"].copy(), law))
+
+    def advance(self, t_ns: int) -> None:
+        """Integrate the body to the last grid point at or before a time [ns]."""
+        while (now_ns := self._now_ns()) + self._step_ns <= t_ns:
+            # A command acts from the grid point nearest to its time.
+            while self._coming and self._coming[0][0] <= now_ns + self._step_ns // 2:
+                self._apply(*self._coming.popleft())
+            alone_s = self._config.alone_after_s
+            if self._heard_ns is not None and alone_s is not None and now_ns - self._heard_ns > 1e9 * alone_s:
+                self._damp(now_ns)
+            self._body.step()
+            self._index += 1
+            self._remember()
+
+    def state(self, t_ns: int) -> LowState:
+        """Return the state that is sent at a time [ns] that `advance` has reached."""
+        # Interpolate the measurements of one latency earlier between grid points.
+        config, draw = self._config, self._rng.normal
+        back = (self._now_ns() - t_ns) / self._step_ns + config.sensing_latency_s / self._body.step_s
+        back = min(max(back, 0.0), len(self._history) - 1.0)
+        later, share = self._history[-1 - int(back)], back % 1.0
+        earlier = self._history[max(-2 - int(back), -len(self._history))]
+        measured = (later + share * (earlier - later)).view(self._dtype)[0]
+        # Fill the message, with noise.
+        message, n = LowState(), self._body.motors
+        record, motors, imu = message.record, message.record["motor_state"][:n], message.record["imu_state"]
+        record["head"], record["level_flag"] = HEAD, LOW_LEVEL
+        record["tick"] = (t_ns - self._start_ns) // 1_000_000 % (1 << 32)
+        motors["mode"], motors["tau_est"], motors["temperature"] = self._modes, measured["tau_est"], 35
+        motors["q"] = measured["q"] + config.position_noise_rad * draw(size=n)
+        motors["dq"] = measured["dq"] + config.velocity_noise_rad_s * draw(size=n)
+        quaternion = _tilted(measured["quaternion"], config.tilt_noise_rad * draw(size=3))
+        imu["quaternion"], imu["rpy"] = quaternion, _roll_pitch_yaw(quaternion)
+        imu["gyroscope"] = measured["gyroscope"] + config.gyro_noise_rad_s * draw(size=3)
+        imu["accelerometer"] = measured["accelerometer"] + config.accelerometer_noise_m_s2 * draw(size=3)
+        record["foot_force"], record["power_v"], record["bms_state"]["soc"] = measured["foot_force"], 29.6, 90
+        message.sign()
+        return message
+
+    def _apply(self, effect_ns: int, t_ns: int, modes: np.ndarray, law: np.ndarray) -> None:
+        """Let a command act. A motor that is off has no torque; Unitree's two numbers take a controller out."""
+        q, dq, kp, kd = (law[:, LAW.index(name)] for name in ("q", "dq", "kp", "kd"))
+        kp[np.abs(q) >= 0.99 * NO_POSITION], kd[np.abs(dq) >= 0.99 * NO_VELOCITY] = 0.0, 0.0
+        q[kp == 0.0], dq[kd == 0.0] = 0.0, 0.0
+        law[modes != SERVO] = 0.0
+        law[~np.isfinite(law).all(axis=1)] = 0.0
+        self._modes, self._law, self._heard_ns, self._damps = modes, law, t_ns, False
+        self._body.drive(law)
+        now_ns = self._now_ns()
+        self._truth.write(Kind.EFFECT, 0, t_ns, now_ns, now_ns, now_ns - effect_ns, (float(modes[0]), float(law[0, 0])))
+
+    def _damp(self, now_ns: int) -> None:
+        """Let the motors that are on damp their joints, as the host is silent."""
+        if self._damps:
+            return
+        self._damps, law = True, np.zeros_like(self._law)
+        law[self._modes == SERVO, LAW.index("kd")] = self._config.alone_kd
+        self._body.drive(law)
+        self._truth.write(Kind.WATCHDOG, 0, self._heard_ns or 0, now_ns, now_ns, 0)
+
+    def _now_ns(self) -> int:
+        return self._start_ns + self._index * self._step_ns
+
+    def _remember(self) -> None:
+        self._history.append(self._body.measure().reshape(1).view(np.float64))
+        if self._index % self._stride == 0:
+            now_ns = self._now_ns()
+            self._truth.write(Kind.STATE, 0, 0, now_ns, now_ns, 0, tuple(self._body.state().values()))
+
+
+def truth_header(body: Body, config: UnitreeEmulation, start_ns: int) -> dict[str, object]:
+    """Return the header of a truth file; ``start_ns`` is time 0 of the body."""
+    facts = {"servo_ids": [], "state_names": list(body.state()), "truth": body.truth()}
+    return {"start_ns": start_ns, "config": asdict(config), **facts}
+
+
+def _tilted(quaternion: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
+    """Return an orientation ``(4,)``, turned by small angles ``(3,)`` about the body's axes."""
+    w, v = quaternion[0], quaternion[1:]
+    half = 0.5 * angles_rad
+    turned = np.concatenate([[w - v @ half], v + w * half + np.cross(v, half)])
+    return turned / np.linalg.norm(turned)
+
+
+def _roll_pitch_yaw(q: np.ndarray) -> tuple[float, float, float]:
+    w, x, y, z = (float(c) for c in q)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    return float(roll), float(pitch), float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
