@@ -16,7 +16,7 @@ from sim2real.hardware.bus.models import ServoModel
 from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
 from sim2real.hardware.bus.port import LinkConfig
 from sim2real.hardware.device import Counters, WithoutHost
-from sim2real.hardware.safety.guardian import Guardian
+from sim2real.hardware.safety.guardian import BusGuardian
 
 _LOGGER = logging.getLogger(__name__)
 _SAFE_REPEATS: Final = 5
@@ -177,7 +177,7 @@ class GuardedServos(Generic[L]):
         if link.guardian is None:
             queries = link.form.torque_queries(link.table.torque, self.ids)
             times_s = self.config.silence_s, self.config.reply_timeout_s
-            link.guardian = Guardian(link.fd, self._off_packet, queries, *times_s)
+            link.guardian = BusGuardian(link.fd, self._off_packet, queries, *times_s)
         link.guardian.arm()
 
     @contextmanager

@@ -31,19 +31,19 @@ _DEAD: Final = "the guardian has died or was stopped: the torque would stay on i
 
 
 class Guardian:
-    """A separate process that takes the torque off when this one dies, or gives no sign of life while torque is on.
+    """A separate process that makes the motors safe when this one dies, or gives no sign of life while torque is on.
 
-    It shares the open port and its lock, so that no other process gets the port before the torque is off. In normal
-    operation it only receives signs of life from `beat`, which cost 10 us each, and answers them: a guardian that died
-    or was stopped is noticed at the next one. If this process dies while the guardian is stopped, the kernel lets it
-    continue (Linux), and it takes the torque off. It reports its actions on stderr.
+    In normal operation it only receives signs of life from `beat`, which cost 10 us each, and answers them: a guardian
+    that died or was stopped is noticed at the next one. If this process dies while the guardian is stopped, the kernel
+    lets it continue (Linux), and it makes the motors safe. It reports its actions on stderr.
 
     Args:
-        off: The packet that takes the torque of all servos off.
-        servos: For each servo, the packet that reads its torque register, and the answers that mean "off".
+        program: Arguments of Python that start the process: flags, then a file or a module. It gets the file descriptor
+            of the link to this process, and the longest silence, and then ``arguments``.
         silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
             counts.
-        answer_s: Longest wait for a servo's answer [s].
+        pass_fds: Further file descriptors that the process inherits.
+        settle_s: Longest time until the motors are in the safe state [s].
 
     Raises:
         HardwareLost: It does not start.
@@ -51,34 +51,32 @@ class Guardian:
 
     def __init__(
         self,
-        port_fd: int,
-        off: bytes,
-        servos: Sequence[tuple[bytes, Sequence[bytes]]],
+        program: Sequence[str],
         silence_s: float,
-        answer_s: float,
+        arguments: Sequence[str] = (),
+        pass_fds: Sequence[int] = (),
+        settle_s: float = _SETTLE_TIMEOUT_S,
     ) -> None:
+        self._settle_s = settle_s
         self._silence_s = silence_s
         self._interval_s = silence_s / _BEATS or _INTERVAL_S
         self._beat_s = 0.0
         self._unheard_s: float | None = None  # when the first sign of life was sent that was not answered yet
-        self._armed = False
+        self._armed = self._tripped = False
         self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
         self._messages = b""
         # The signs of life go over a socket with a small buffer, which is full when the guardian hangs.
         self._link, other = socket.socketpair()
         self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNHEARD_BYTES)
         longest_s = silence_s + self._interval_s if silence_s else 0.0  # signs of life are one interval apart
-        numbers = [str(port_fd), str(other.fileno()), repr(longest_s), repr(answer_s)]
-        # Start it. -I -S: neither the user's site packages nor the working directory may affect what runs here.
-        command = [sys.executable, "-I", "-S", str(Path(process.__file__)), *numbers, off.hex()]
-        command += [f"{query.hex()}:{','.join(a.hex() for a in answers)}" for query, answers in servos]
+        command = [sys.executable, *program, str(other.fileno()), repr(longest_s), *arguments]
         try:
             # In a new session, so that Ctrl-C in a terminal reaches only the control process.
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                pass_fds=(port_fd, other.fileno()),
+                pass_fds=(*pass_fds, other.fileno()),
                 start_new_session=True,
             )
         except OSError as error:
@@ -152,8 +150,14 @@ class Guardian:
         self._beat_s = 0.0
         self.beat()
 
+    def trip(self) -> None:
+        """Let it make the motors safe now. Without a lock, for signal handlers; never raises."""
+        self._tripped = True
+        with suppress(OSError):  # it has died, or does not read
+            self._link.send(process.TRIP)
+
     def settle(self) -> bool:
-        """Wait until it has finished taking the torque off, if it is doing so. Never raises.
+        """Wait until the motors are in the safe state, if it is making them safe. Never raises.
 
         Returns:
             Whether it still watches: it has neither taken over nor died, and was not stopped.
@@ -165,9 +169,9 @@ class Guardian:
                     self._require_running(time.monotonic())
         except SafetyStop:
             return False
-        if self._messages and process.SAFE not in self._messages:
-            self._hears(process.SAFE, _SETTLE_TIMEOUT_S)
-        return not self._messages
+        if (self._messages or self._tripped) and process.SAFE not in self._messages:
+            self._hears(process.SAFE, self._settle_s)
+        return not (self._messages or self._tripped)
 
     def end(self, confirmed: bool) -> None:
         """End the guardian. Never raises.
@@ -228,3 +232,29 @@ class Guardian:
                     break
                 self._listen()
         return message in self._messages
+
+
+class BusGuardian(Guardian):
+    """A guardian of servos on a bus: it takes their torque off.
+
+    It shares the open port and its lock, so that no other process gets the port before the torque is off.
+
+    Args:
+        off: The packet that takes the torque of all servos off.
+        servos: For each servo, the packet that reads its torque register, and the answers that mean "off".
+        silence_s: As in ``Guardian`` [s].
+        answer_s: Longest wait for a servo's answer [s].
+    """
+
+    def __init__(
+        self,
+        port_fd: int,
+        off: bytes,
+        servos: Sequence[tuple[bytes, Sequence[bytes]]],
+        silence_s: float,
+        answer_s: float,
+    ) -> None:
+        # -I -S: neither the user's site packages nor the working directory may affect what runs there.
+        program = ["-I", "-S", str(Path(process.__file__))]
+        packets = [f"{query.hex()}:{','.join(a.hex() for a in answers)}" for query, answers in servos]
+        super().__init__(program, silence_s, [str(port_fd), repr(answer_s), off.hex(), *packets], (port_fd,))

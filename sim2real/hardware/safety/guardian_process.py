@@ -1,6 +1,8 @@
-"""The guardian process: takes the torque off when the process that controls the servos has died or is silent.
+"""The guardian process: makes the motors safe when the process that controls them has died or is silent.
 
-    python -I -S guardian_process.py PORT_FD LINK_FD SILENCE_S ANSWER_S OFF QUERY:ANSWER[,ANSWER] ...
+Run as a program, it takes the torque of servos on a bus off:
+
+    python -I -S guardian_process.py LINK_FD SILENCE_S PORT_FD ANSWER_S OFF QUERY:ANSWER[,ANSWER] ...
 
 It has the port open before torque goes on, and writes to it only when the control process no longer does. It imports
 few modules, so that it starts within 20 ms. The packets, which depend on the protocol, are hexadecimal arguments from
@@ -13,7 +15,7 @@ import signal
 import sys
 import time
 
-READY, BEAT, REST, LEAVE = b"r", b"+", b"-", b"q"
+READY, BEAT, REST, LEAVE, TRIP = b"r", b"+", b"-", b"q", b"!"
 HEARD, TRIPPED, SAFE, FAILED = b".", b"t", b"s", b"f"
 GIVE_UP_S = 10.0
 _QUIET_S, _LONGEST_ANSWER_S = 0.002, 0.02
@@ -22,10 +24,16 @@ _PRIORITY = 3  # above the threads that it watches, which have 1: should one nev
 
 
 class Guard:
-    """Decides when to take the torque off, and does it; arguments as in `sim2real.hardware.safety.guardian`."""
+    """Decides when to make the motors safe; a subclass does it."""
 
-    def __init__(self, port_fd: int, answer_s: float, off: bytes, servos: list[tuple[bytes, list[bytes]]]) -> None:
-        self._fd, self._answer_s, self._off, self._servos = port_fd, answer_s, off, servos
+    cut = "cut the motors' power"
+    """The advice to a person if the motors do not confirm."""
+    at_rest = True
+    """Whether the death of the control process counts while the torque is off, too."""
+
+    def take_torque_off(self) -> str:
+        """Make the motors safe and take their torque off; return the reason if that failed, else ""."""
+        raise NotImplementedError
 
     def watch(self, link: int, silence_s: float) -> None:
         """Wait until the control process ends it; act when it dies, or is silent for too long with torque on.
@@ -43,8 +51,13 @@ class Guard:
                 messages = _receive_messages(link)
                 if messages.endswith(LEAVE):
                     return
+                if TRIP in messages and not tripped:
+                    tripped = True
+                    self._trip(link, "the control process stopped the robot")
+                    continue
                 if not messages:
-                    self.make_safe("the control process is gone")
+                    if armed or self.at_rest:
+                        self.make_safe("the control process is gone")
                     return
                 armed, heard_s = messages.endswith(BEAT), time.monotonic()
                 if armed:
@@ -52,23 +65,34 @@ class Guard:
             elif watched and time.monotonic() - heard_s >= silence_s:
                 # Stay until the control process leaves: it may resume, and switch torque on before it notices.
                 tripped = True
-                _write(link, TRIPPED)
-                confirmed = self.make_safe(f"the control process was silent for {silence_s:.2f} s")
-                _write(link, SAFE if confirmed else FAILED)
+                self._trip(link, f"the control process was silent for {silence_s:.2f} s")
+
+    def _trip(self, link: int, reason: str) -> None:
+        _write(link, TRIPPED)
+        _write(link, SAFE if self.make_safe(reason) else FAILED)
 
     def make_safe(self, reason: str) -> bool:
-        """Take the torque off, report it on stderr, and return whether all servos have confirmed."""
+        """Take the torque off, report it on stderr, and return whether all motors have confirmed."""
         begin_s = time.monotonic()
-        failure = self._take_torque_off()
+        failure = self.take_torque_off()
         took_ms = 1e3 * (time.monotonic() - begin_s)
         if failure:
-            result = f"torque off could NOT be confirmed, {failure}; cut the servos' power"
+            result = f"torque off could NOT be confirmed, {failure}; {self.cut}"
         else:
             result = f"torque is off, confirmed after {took_ms:.0f} ms"
         _write(2, f"sim2real guardian: {reason}: {result}\n".encode())
         return not failure
 
-    def _take_torque_off(self) -> str:
+
+class BusGuard(Guard):
+    """Takes the torque of servos on a bus off; arguments as in `sim2real.hardware.safety.guardian.BusGuardian`."""
+
+    cut = "cut the servos' power"
+
+    def __init__(self, port_fd: int, answer_s: float, off: bytes, servos: list[tuple[bytes, list[bytes]]]) -> None:
+        self._fd, self._answer_s, self._off, self._servos = port_fd, answer_s, off, servos
+
+    def take_torque_off(self) -> str:
         """Switch all servos off, repeatedly until each has confirmed; return the reason if that failed, else "".
 
         Repeated, because the first packet is lost if the control process died while it was writing one, and because
@@ -145,8 +169,8 @@ def continue_when_host_dies() -> None:
         pass
 
 
-def main(arguments: list[str]) -> None:
-    """Run until the control process ends."""
+def begin() -> None:
+    """Ignore the terminal's signals, and get the priority over the threads that it watches."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     try:  # noqa: SIM105 - as above
@@ -155,10 +179,15 @@ def main(arguments: list[str]) -> None:
     except (AttributeError, OSError):
         pass
     continue_when_host_dies()
-    port_fd, link, silence_s, answer_s, off, *rest = arguments
+
+
+def main(arguments: list[str]) -> None:
+    """Run until the control process ends."""
+    begin()
+    link, silence_s, port_fd, answer_s, off, *rest = arguments
     packets = [text.partition(":") for text in rest]
     servos = [(bytes.fromhex(q), [bytes.fromhex(a) for a in answers.split(",")]) for q, _, answers in packets]
-    Guard(int(port_fd), float(answer_s), bytes.fromhex(off), servos).watch(int(link), float(silence_s))
+    BusGuard(int(port_fd), float(answer_s), bytes.fromhex(off), servos).watch(int(link), float(silence_s))
 
 
 if __name__ == "__main__":
