@@ -28,7 +28,7 @@ MAY_IMPORT = {
     "parquet": {"sim2real.log.importing.files.lerobot"},
     "lerobot": {"sim2real.hardware.lerobot.device"},
     "tensorboard": {"sim2real.stages.train.tensorboard"},
-    "unitree": {"sim2real.hardware.unitree.messages", "sim2real.hardware.unitree.emulator"},
+    "unitree": {f"sim2real.hardware.unitree.{name}" for name in ("dds", "emulator", "messages")},
     "warp": set(),  # MJX imports Warp itself
 }
 """Extra -> modules that import its packages. A scene is called by ``view.recording``, which has checked by then."""

@@ -99,6 +99,11 @@ class Guardian:
         """The guardian's process id."""
         return self._process.pid
 
+    @property
+    def took_over(self) -> bool:
+        """Whether it has made the motors safe, or was about to."""
+        return bool(self._messages) or self._tripped
+
     def arm(self) -> None:
         """Arm the guardian; called before torque goes on.
 
@@ -169,9 +174,9 @@ class Guardian:
                     self._require_running(time.monotonic())
         except SafetyStop:
             return False
-        if (self._messages or self._tripped) and process.SAFE not in self._messages:
+        if self.took_over and process.SAFE not in self._messages:
             self._hears(process.SAFE, self._settle_s)
-        return not (self._messages or self._tripped)
+        return not self.took_over
 
     def end(self, confirmed: bool) -> None:
         """End the guardian. Never raises.

@@ -1,0 +1,202 @@
+"""The legs of a robot that behaves, what is refused, and other programs on its topics; over DDS."""
+
+import math
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds")
+from unitree_responder import CONTROLS, DAMPS, START_RAD, Responder
+
+from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.device import Alone
+from sim2real.hardware.emulation.truth import Kind
+from sim2real.hardware.registry import load_device
+from sim2real.hardware.unitree import guarded, legs
+from sim2real.hardware.unitree.dds import Address, DdsLink
+from sim2real.hardware.unitree.device import UnitreeLegs
+from sim2real.hardware.unitree.legs import LegDrive
+from sim2real.hardware.unitree.messages import OFF
+
+pytestmark = pytest.mark.realtime
+MIXED = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
+
+
+@pytest.fixture
+def robot(tmp_path):
+    served = Responder(tmp_path / "truth.bin")
+    yield served
+    served.stop()
+
+
+@pytest.fixture
+def device(robot):
+    """The device, not opened; patient, for the machine may be busy."""
+    made = UnitreeLegs(robot.port, MIXED, LegDrive(lie_s=1.0), silence_s=0.6, max_silence_s=0.5)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def other(robot):
+    """Another program on the robot's topics."""
+    link = DdsLink(Address.parse(robot.port), "another program")
+    yield link
+    link.close()
+
+
+def run(device, link=None, check=False):
+    """Command and measure for at most 5 s; a link beside the device switches the motors off."""
+    end_s = time.monotonic() + 5.0
+    while time.monotonic() < end_s:
+        device.command(device.rest())
+        if link is not None:
+            link.write(legs.off())
+        device.measure()
+        if check:
+            device.check()
+
+
+def ways_of(robot):
+    """Return the ways in which the first motor was driven, in their order."""
+    robot.stop()
+    return robot.truth().of(Kind.EFFECT, 0)["values"][:, 0].tolist()
+
+
+def test_joints_in_another_order_move_and_are_measured(robot, device):
+    device.open()
+    device.enable()
+    np.testing.assert_allclose(device.measure().position_rad, START_RAD, atol=1e-3)
+    goal = device.rest()
+    goal[1] = [START_RAD[1] + 0.3, 0.0, 40.0, 4.0, 0.0]
+    for _ in range(250):
+        device.command(goal)
+        reading = device.measure()
+    moved = np.flatnonzero(np.abs(reading.position_rad - START_RAD) > 0.05)
+    assert moved.tolist() == [1]
+    assert device.motors[1] == "FL_thigh"
+    assert reading.parts["battery_voltage"] == 28.0
+    assert reading.parts["temperature"].tolist() == [30.0] * 12
+    np.testing.assert_allclose(reading.parts["accelerometer"], [0, 0, 9.81], atol=1e-6)
+    assert device.without_host()[0].does is Alone.GOES_ON
+    device.disable()
+    robot.stop()
+    driven = robot.truth().of(Kind.EFFECT, 4)["values"][:, 0].tolist()
+    assert driven == [DAMPS, CONTROLS, DAMPS, OFF]
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [(0, 2.0, r"FL_hip: q = 2 is outside \[-1.0472"), (2, -1.0, "kp = -1"), (4, math.nan, "tau = nan")],
+)
+def test_a_command_beyond_the_reach_is_not_sent(column, value, words):
+    device = UnitreeLegs("lo:0", MIXED)
+    values = np.stack([START_RAD, *np.zeros((4, 12))], axis=1)
+    values[0, column] = value
+    with pytest.raises(SafetyStop, match=words):
+        device.command(values)
+
+
+def test_torque_that_was_taken_off_stays_off(device):
+    device.open()
+    device.enable()
+    device.disable()
+    with pytest.raises(SafetyStop, match="the torque is off"):
+        device.command(device.rest())
+    assert device.counters.transactions > 0
+
+
+def test_another_program_is_refused_before_torque_goes_on(device, other, monkeypatch):
+    monkeypatch.setattr(guarded, "LEASE_S", -0.5)
+    other.write(legs.off())
+    with pytest.raises(HardwareLost, match="another program publishes rt/lowcmd: another program"):
+        device.open()
+
+
+def test_another_program_that_comes_later_stops_the_robot(robot, device):
+    device.open()
+    device.enable()
+    device.check()
+    link = DdsLink(Address.parse(robot.port), "")
+    with pytest.raises(SafetyStop, match=r"publishes rt/lowcmd: program .*follow both"):
+        run(device, check=True)
+    link.close()
+
+
+def test_motors_that_switch_off_stop_the_robot(robot, device):
+    device.open()
+    device.enable()
+    link = DdsLink(Address.parse(robot.port), "")
+    with pytest.raises(SafetyStop, match=r"FL_calf.* took the torque off"):
+        run(device, link)
+    link.close()
+
+
+def test_a_robot_that_was_left_on_is_laid_down_first(robot, device, other):
+    end_s = time.monotonic() + 5.0
+    standing = legs.command(np.tile([0.0, 0.0, 20.0, 1.0, 0.0], (12, 1)))
+    while not (state := other.next_state(1.0)).record["motor_state"]["mode"][0] and time.monotonic() < end_s:
+        other.write(standing)
+    assert state.record["motor_state"]["mode"][0]
+    other.close()
+    device.open()
+    device.close()
+    assert ways_of(robot) == [CONTROLS, DAMPS, OFF]
+
+
+def test_a_robot_that_is_not_there_is_lost(monkeypatch):
+    monkeypatch.setattr(guarded, "_OPEN_S", 0.2)
+    with pytest.raises(HardwareLost, match=r"the robot on lo:9 has sent no state for 0.2 s") as caught:
+        UnitreeLegs("lo:9").open()
+    assert "interface and domain" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("port", "words"), [("eth0:233", "'233' is no DDS domain"), ("eth0:x", "'x' is no DDS domain")]
+)
+def test_a_port_without_a_domain_is_refused(port, words):
+    with pytest.raises(UsageError, match=words):
+        UnitreeLegs(port)
+
+
+def test_an_address_is_an_interface_and_a_domain():
+    assert Address.parse("eth0") == Address("eth0", 0)
+    assert 'address="192.168.123.99"' in Address.parse("192.168.123.99:3").config
+    assert Address.parse(":4").config is None
+    with pytest.raises(UsageError, match="0 to 11, each once"):
+        load_device("unitree")("lo:1", (1, 2), LegDrive(), baud_rate=0, silence_s=0.1)
+    with pytest.raises(UsageError, match="at most kd_max = 2"):
+        LegDrive(damping=5.0, kd_max=2.0)
+
+
+def test_a_soft_stop_fades_evenly_to_damping():
+    device = UnitreeLegs("lo:0")
+    start = np.tile([0.5, 1.0, 40.0, 1.0, 8.0], (12, 1))
+    sent = start
+    for left in np.linspace(1.0, 0.0, 11):
+        sent = device.soften(sent, left)
+        wanted = [0.5, left, 40.0 * left, left + (1.0 - left) * 5.0, 8.0 * left]
+        np.testing.assert_allclose(sent[0], wanted, atol=1e-9)
+    # The next soft stop begins with a command of its own.
+    np.testing.assert_allclose(device.soften(start, 0.9), start)
+
+
+def test_the_guide_makes_the_device_and_has_its_limits():
+    page = (Path(__file__).parents[3] / "docs" / "guides" / "unitree.md").read_text()
+    found = {}
+    exec(re.search(r"```python\n(.*?)```", page, re.DOTALL)[1], found)
+    drive = found["legs"].drive
+    for words in (f"`LegDrive.kp_max`, {drive.kp_max:g}", f"`LegDrive.damping`, {drive.damping:g}"):
+        assert words in page
+    assert f"`LegDrive.lie_s`, {drive.lie_s:g} s" in page
+    assert all(f"`{name}`" in page for name in found["legs"].parts)
+
+
+def test_the_effort_is_a_share_of_the_largest_torque():
+    device = UnitreeLegs("lo:0", MIXED)
+    command = np.tile([0.1, 0.0, 50.0, 1.0, 0.0], (12, 1))
+    effort = device.effort(command, np.zeros(12))
+    np.testing.assert_allclose(effort[:3], [5.0 / 23.7, 5.0 / 23.7, 5.0 / 45.4])

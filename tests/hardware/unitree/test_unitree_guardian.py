@@ -1,0 +1,131 @@
+"""A control process that dies or hangs: the guardian lets the legs damp, then takes their torque off."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds")
+from unitree_responder import CONTROLS, DAMPS, Responder
+
+from sim2real.hardware.emulation.truth import Kind
+from sim2real.hardware.safety.guardian_process import BEAT, REST, Guard
+from sim2real.hardware.unitree.messages import OFF
+from sim2real.log.reader import read_log
+
+pytestmark = pytest.mark.realtime
+
+HOST = """
+import sys, jax, numpy as np
+from sim2real.errors import Sim2RealError
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
+from sim2real.hardware.unitree.device import UnitreeLegs
+from sim2real.hardware.unitree.legs import LegDrive
+from sim2real.log.writer import McapRecorder
+from sim2real.robots.control_loop.hardware import Excitation, ServoActuator, ServoSensor
+from sim2real.robots.control_loop.loop import control_nodes
+from sim2real.robots.control_loop.messages import Goals
+from sim2real.robots.roles import ROLES
+from sim2real.robots.walking.drive import BodySensor
+from sim2real.runtime.asynchronous import AsyncGraph
+sys.path.insert(0, {tests!r})
+from unitree_responder import START_RAD
+from test_columns_rig import JointCommands
+
+device = UnitreeLegs({port!r}, drive=LegDrive(lie_s=1.0), silence_s=0.3, max_silence_s=0.5)
+low, high = device.reach()
+gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, max_speed_rad_s=30.0)
+body = BodySensor(device.motors, START_RAD)
+
+def controllers(goal):
+    return JointCommands(goal, np.zeros(12), np.full(12, 40.0), np.full(12, 3.0), np.zeros(12))
+
+with Rig(device, gate) as rig:
+    sensor = ServoSensor(ROLES.sensor, 50.0, rig, body.read, body.at_rest, delay=0.002)
+    player = Excitation(ROLES.supervisor, 50.0, np.tile(START_RAD, (3000, 1)), Goals, delay=0.002)
+    actuator = ServoActuator(ROLES.actuator, 50.0, rig, "goal", controllers, delay=0.002)
+    graph = AsyncGraph(control_nodes(sensor, player, actuator), player)
+    state = graph.init(jax.random.key(0), {{}})
+    graph.warmup(state)
+    inputs = [(name, i) for name, node in graph.nodes.items() for i in node.inputs]
+    graph.recorder = McapRecorder({log!r}, {{}}, {{}}, state.aux["outputs"], inputs, {{}}, {{}})
+    rig.start()
+    graph.start(state)
+    print("on", flush=True)
+    try:
+        graph.run_for(60.0)
+    except Sim2RealError as error:
+        rig.close()
+        print(error, flush=True)
+        sys.exit(error.exit_code)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+def test_the_legs_damp_and_then_switch_off(tmp_path, number):
+    robot, log = Responder(tmp_path / "truth.bin"), tmp_path / "log.mcap"
+    code = HOST.format(tests=str(tmp_path), port=robot.port, log=str(log))
+    folders = os.pathsep.join([os.path.dirname(__file__), os.path.dirname(os.path.dirname(__file__))])
+    host = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": folders},
+    )
+    assert host.stdout.readline() == "on\n", host.stderr.read()
+    time.sleep(0.8)
+    end_ns = time.monotonic_ns()
+    host.send_signal(number)
+    time.sleep(1.5)
+    host.send_signal(signal.SIGCONT)
+    said, errors = host.communicate(timeout=20)
+    robot.stop()
+    # Every motor was driven, damped, and switched off; in this order, once each.
+    truth = robot.truth()
+    for motor in range(12):
+        rows = truth.of(Kind.EFFECT, motor)
+        ways = rows["values"][:, 0].tolist()
+        assert ways[-3:] == [CONTROLS, DAMPS, OFF], ways
+        damped_s, off_s = (rows["t_ns"][-2:] - end_ns) * 1e-9
+        assert 0.0 < damped_s < (0.2 if number == signal.SIGKILL else 0.6)
+        assert off_s > damped_s + 0.3
+    reason = "the control process is gone" if number == signal.SIGKILL else "the control process was silent"
+    assert f"sim2real guardian: {reason}" in errors
+    assert "torque is off, confirmed after" in errors
+    if number == signal.SIGSTOP:
+        assert host.returncode == 3, (said, errors)
+    # The log holds what was measured until then.
+    with warnings.catch_warnings(action="ignore"):  # it has no end
+        outputs = read_log(log).outputs
+    assert len(outputs["sensor"]["quaternion"]) > 20
+    np.testing.assert_allclose(outputs["actuator"]["kp"][-1], np.full(12, 40.0))
+
+
+@pytest.mark.parametrize(("last", "acts"), [(BEAT, ["the control process is gone"]), (REST, [])])
+def test_a_robot_whose_torque_was_off_may_have_another_master(last, acts):
+    """The death of the control process counts for legs only while their torque is on."""
+
+    class Watch(Guard):
+        at_rest = False
+        acted = ()
+
+        def make_safe(self, reason):
+            self.acted = [*self.acted, reason]
+            return True
+
+    link, other = socket.socketpair()
+    with link, other:
+        guard = Watch()
+        other.send(BEAT)
+        other.send(last)
+        other.shutdown(socket.SHUT_WR)
+        guard.watch(link.fileno(), 0.0)
+        assert list(guard.acted) == acts
