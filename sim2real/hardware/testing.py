@@ -86,6 +86,7 @@ class DeviceConformance(ABC):
         patience_s: Time in which a motor must be in the safe state, on a busy machine too [s].
         safe_modes: Modes of a motor in the safe state.
         no_address: An address without a device.
+        silent_after_s: Age of an emulator that goes silent; a device whose guardian starts slowly needs more [s].
     """
 
     emulation: ClassVar[type[BusEmulation]]
@@ -95,6 +96,7 @@ class DeviceConformance(ABC):
     patience_s: ClassVar[float] = 1.0
     safe_modes: ClassVar[frozenset[int]] = frozenset({OperatingMode.OFF})
     no_address: ClassVar[str] = "/dev/no-such-port"
+    silent_after_s: ClassVar[float] = 0.6
 
     @abstractmethod
     def make_device(self, port: str) -> Device:
@@ -232,7 +234,7 @@ class DeviceConformance(ABC):
 
     def test_silence_is_hardware_lost(self, start: Started) -> None:
         """A device that no longer answers raises HardwareLost; `make_safe` and `close` still return normally."""
-        _, device = start(silent_after_s=0.6)
+        _, device = start(silent_after_s=self.silent_after_s)
         with device:
             device.enable()
             with pytest.raises(HardwareLost):

@@ -10,6 +10,7 @@ from sim2real.hardware.testing import DeviceConformance
 class TestUnitreeLegs(DeviceConformance):
     patience_s = 2.0
     no_address = "no-such-interface:0"
+    silent_after_s = 3.0
 
     def make_device(self, port):
         from sim2real.hardware.unitree.device import UnitreeLegs
