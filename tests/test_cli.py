@@ -18,6 +18,7 @@ from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.run import run_folder
 from sim2real.commands.loop import in_brief
 from sim2real.stages.config import RecordConfig
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}
 
@@ -185,6 +186,15 @@ def test_flags_reach_the_stage_and_the_result_goes_to_stdout(calls, capsys, tmp_
     assert f"wrote elsewhere/pendulum/{folder.name}/record/result.txt" in out
     assert "seed  0" in out
     assert not err
+
+
+def test_a_range_replaces_one_of_the_pipeline_or_is_added_to_them(calls):
+    ranges = ["--vary.range", "roughness", "0", "0.04", "--vary.range", "payload", "-2", "3"]
+    assert cli.main(["train", "go2", *ranges]) == 0
+    ((_, config, _),) = calls
+    own = load_pipeline("go2").train.vary.range
+    assert config.vary.range == {**own, "payload": (-2.0, 3.0), "roughness": (0.0, 0.04)}
+    assert own["payload"] == (-1.0, 2.5)
 
 
 def test_run_is_all_four_stages_in_one_folder_with_one_seed(calls, capsys):

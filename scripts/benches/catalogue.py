@@ -132,7 +132,7 @@ BENCHES = {
     ),
     "walk": Bench(
         "walk",
-        "a walking policy on hidden twins in C MuJoCo: falls and errors, without and with pushes",
+        "a walking policy on hidden twins in C MuJoCo: falls and errors; with pushes, and on rough ground",
         ("sim2real/robots/walking", "sim2real/policy", "pipelines/go2"),
     ),
 }

@@ -1,4 +1,4 @@
-"""A walking policy on hidden twins in C MuJoCo: falls, and errors of the velocity, without and with pushes."""
+"""A walking policy on hidden twins in C MuJoCo: falls, and errors of the velocity; with pushes, and on rough ground."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 import os
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -18,7 +18,7 @@ from benches.figures import Report, Row, four_digits, row
 
 EVERY_S = 2.5
 """How long a command lasts [s]."""
-QUICK = {"twins": 1, "seconds": 0.2, "push": 0.1}
+QUICK = {"twins": 1, "seconds": 0.2, "push": 0.1, "rough_m": 0.01}
 ERRORS = (("error_m_s", "m/s", "0.08"), ("error_rad_s", "rad/s", "0.1"))
 
 
@@ -29,6 +29,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--twins", type=int, default=50, help="hidden twins")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of an episode [s]")
     parser.add_argument("--push", type=float, default=0.5, help="size of a push every 5 s [m/s]")
+    parser.add_argument("--rough-m", type=float, default=0.04, help="height of the bumps of rough ground [m]")
     parser.add_argument(
         "--delays-ms", type=float, nargs="*", default=[], help="delays from motion to new targets, of all twins [ms]"
     )
@@ -37,16 +38,19 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Report:
     """Let the policy walk on all twins, without and with pushes."""
     workers = min(os.cpu_count() or 1, options.twins)
-    trials = [("calm", 0.0, None), ("pushed", options.push, None)]
-    trials += [(f"pushed_{ms:g}_ms", options.push, ms / 1e3) for ms in options.delays_ms]
+    calm = Trial(options.pipeline, options.bundle, options.seconds)
+    pushed = replace(calm, push_m_s=options.push)
+    trials = {"calm": calm, "pushed": pushed, "rough": replace(calm, rough_m=options.rough_m)}
+    trials |= {f"pushed_{ms:g}_ms": replace(pushed, delay_s=ms / 1e3) for ms in options.delays_ms}
     rows: list[Row] = []
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        for name, push, delay_s in trials:
+        for name, trial in trials.items():
             begin = time.perf_counter()
-            play = partial(one, options.pipeline, options.bundle, options.seconds, push, delay_s)
-            fell, *errors = (np.array(column) for column in zip(*pool.map(play, range(options.twins)), strict=True))
-            about = f"{options.twins} twins, {options.seconds:g} s" + (f", {push:g} m/s every 5 s" if push else "")
-            rows.append(row(f"walk/{name}/falls", int(fell.sum()), f"of {options.twins}", about, "0"))
+            played = pool.map(partial(one, trial), range(options.twins))
+            fell, *errors = (np.array(column) for column in zip(*played, strict=True))
+            about = f"{options.twins} twins, {trial.seconds:g} s{trial.about}"
+            goal = "2" if trial.rough_m else "0"
+            rows.append(row(f"walk/{name}/falls", int(fell.sum()), f"of {options.twins}", about, goal))
             for (figure, unit, goal), values in zip(ERRORS, errors, strict=True):
                 worst = f"worst twin {values.max():.3f}"
                 rows.append(row(f"walk/{name}/{figure}", four_digits(values.mean()), unit, worst, goal))
@@ -55,29 +59,48 @@ def run(options: argparse.Namespace) -> Report:
     return {"rows": rows}
 
 
-def one(
-    pipeline: str, bundle: Path | None, seconds: float, push: float, delay_s: float | None, seed: int
-) -> tuple[bool, float, float]:
-    """Walk on a hidden twin; return whether it fell, and the errors [m/s], [rad/s].
+@dataclass(frozen=True)
+class Trial:
+    """A walk on a hidden twin.
 
-    Args:
+    Attributes:
+        bundle: Folder of the policy; None: the pipeline's.
+        push_m_s: Size of a push every 5 s [m/s].
+        rough_m: Height of the bumps of the ground; 0: it is flat [m].
         delay_s: Delay of the twin, a third of it on the sensors' side [s]; None: the twin's own.
     """
+
+    pipeline: str
+    bundle: Path | None
+    seconds: float
+    push_m_s: float = 0.0
+    rough_m: float = 0.0
+    delay_s: float | None = None
+
+    @property
+    def about(self) -> str:
+        """The disturbance in words."""
+        pushed = f", {self.push_m_s:g} m/s every 5 s" if self.push_m_s else ""
+        return pushed + (f", bumps of {100 * self.rough_m:g} cm" if self.rough_m else "")
+
+
+def one(trial: Trial, seed: int) -> tuple[bool, float, float]:
+    """Walk on a hidden twin; return whether it fell, and the errors [m/s], [rad/s]."""
     from sim2real.policy.bundle import load_bundle
     from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
     from sim2real.stages.pipeline.pipeline import load_pipeline
 
-    found = load_pipeline(pipeline)
+    found = load_pipeline(trial.pipeline)
     robot: Any = found.load()
     rng = np.random.default_rng(seed)
     hidden = HiddenTwin.draw(np.random.default_rng(1000 + seed), len(robot.joints))
-    if delay_s is not None:
-        hidden = replace(hidden, sensing_s=delay_s / 3, acting_s=delay_s * 2 / 3)
-    twin = Twin(robot, hidden, seed)
-    count = int(seconds / EVERY_S) + 1
+    if trial.delay_s is not None:
+        hidden = replace(hidden, sensing_s=trial.delay_s / 3, acting_s=trial.delay_s * 2 / 3)
+    twin = Twin(robot, hidden, seed, trial.rough_m)
+    count = int(trial.seconds / EVERY_S) + 1
     commands = (
         rng.uniform(-1.0, 1.0, (count, 3)) * robot.commands.most * (rng.random((count, 1)) > robot.commands.stand)
     )
-    runner = load_bundle(bundle or found.folder / "walk")
-    walked = walk(twin, runner, lambda t_s: commands[int(t_s / EVERY_S + 1e-6)], seconds, push)
+    runner = load_bundle(trial.bundle or found.folder / "walk")
+    walked = walk(twin, runner, lambda t_s: commands[int(t_s / EVERY_S + 1e-6)], trial.seconds, trial.push_m_s)
     return walked.fell_s is not None, walked.error_m_s, walked.error_rad_s

@@ -49,6 +49,7 @@ class Episodes:
         longest_pause_s: Longest time between two policy steps [s].
         push_hz: Pushes of each joint per second [Hz]; 0 for none.
         curriculum: Share of all differences between episodes at the first and at the last update.
+        follow: Success of the training's episodes above which this share grows; 0: it grows with the updates.
         draws: Parameter -> drawn values ``(K,)``.
         recorded_s: Node -> durations of its steps on the robot ``(N,)`` [s].
         drawn_s: Node -> durations of its steps in the timelines ``(M,)`` [s].
@@ -64,6 +65,7 @@ class Episodes:
     longest_pause_s: float = 0.0
     push_hz: float = 0.0
     curriculum: tuple[float, float] = (1.0, 1.0)
+    follow: float = 0.0
     draws: Mapping[str, np.ndarray] = field(default_factory=dict)
     recorded_s: Mapping[str, np.ndarray] = field(default_factory=dict)
     drawn_s: Mapping[str, np.ndarray] = field(default_factory=dict)

@@ -10,7 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
@@ -148,7 +148,7 @@ def parse(
         with _plain_if_requested(), contextlib.redirect_stderr(talk):
             parsed, unknown = tyro.cli(
                 kind or type(default),
-                default=default,
+                default=_without_tables(default),
                 args=_with_viewer(arguments),
                 prog=prog,
                 description=description,
@@ -161,7 +161,31 @@ def parse(
         raise _usage_error(end, talk.getvalue(), prog) from None
     if unknown:
         raise _unknown(unknown, default, prog)
-    return parsed
+    return _with_tables(parsed, default)
+
+
+def _without_tables(config: Any) -> Any:
+    """Return a configuration with empty tables, such as ranges: the parser adds no names to tables with entries."""
+    changed = {}
+    for item in fields(config):
+        value = getattr(config, item.name)
+        if is_dataclass(value):
+            changed[item.name] = _without_tables(value)
+        elif isinstance(value, dict):
+            changed[item.name] = {}
+    return replace(config, **changed) if changed else config
+
+
+def _with_tables(parsed: Any, default: Any) -> Any:
+    """Return the parsed configuration with the default's tables, in which the parsed names replace or add entries."""
+    changed = {}
+    for item in fields(parsed):
+        value, before = getattr(parsed, item.name), getattr(default, item.name)
+        if is_dataclass(value) and type(value) is type(before):
+            changed[item.name] = _with_tables(value, before)
+        elif isinstance(value, dict) and isinstance(before, dict):
+            changed[item.name] = {**before, **value}
+    return replace(parsed, **changed) if changed else parsed
 
 
 def _with_viewer(arguments: Sequence[str]) -> list[str]:

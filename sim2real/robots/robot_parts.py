@@ -190,6 +190,11 @@ class RobotTask(_Part, Protocol):
         """Return a start with an offset of positions ``(channels,)`` [rad] and velocities [rad/s]."""
         return start.replace(position=start.position + position, velocity=start.velocity + velocity)
 
+    def narrowed(self, start: EpisodeStart, share: Array) -> EpisodeStart:
+        """Return a start with a share ``()`` of the task's difficulty, for a curriculum; default: all of it."""
+        del share
+        return start
+
     def judged(self, graph_state: GraphState, roles: Roles) -> PyTree:
         """Return the state that ``reward``, ``success`` and ``terminated`` evaluate; default: the world's."""
         return graph_state.state[roles.world]

@@ -104,3 +104,15 @@ def test_the_commands_of_the_guide_run(tmp_path, monkeypatch):
     for command in commands:
         assert not cli.main(shlex.split(command))
     assert (tmp_path / "walk.gif").is_file()
+
+
+def test_the_training_of_the_guide_is_on_rough_ground(tmp_path, monkeypatch, capsys):
+    text = (ROOT / "docs/guides/walk.md").read_text()
+    (command,) = re.findall(r"^    sim2real (train .*roughness.*)$", text, re.MULTILINE)
+    (tmp_path / "pipelines").symlink_to(ROOT / "pipelines")
+    monkeypatch.chdir(tmp_path)
+    assert not cli.main([*shlex.split(command), "--explain", "--timelines", "1", "--episode-s", "1"])
+    out = capsys.readouterr().out
+    assert re.search(r"^roughness +0 +\[0\.00\d+, 0\.03\d+\]", out, re.MULTILINE)
+    assert re.search(r"^push angular +.* rad/s", out, re.MULTILINE)
+    assert "0.3 of these differences at the first update, up to 1 while success is above 0.6" in out

@@ -1,5 +1,7 @@
 """Pushes change velocities by what was said, and differences grow over the training."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,7 +58,7 @@ def test_joints_are_pushed_as_often_and_as_hard_as_was_said(pushes):
 def test_a_push_changes_the_velocity_by_what_was_drawn(loop):
     _, task, graph = loop
     world = loop[0]["world"]
-    always = Pushes(world.name, world, 2.0, 1.0)
+    always = Pushes(world.name, world, (2.0,), 1.0)
     calm, pushed = GraphEnvironment(graph, task), GraphEnvironment(graph, task, pushes=always)
     state, _ = jax.jit(calm.reset)(KEY)
     action = jnp.array([1.0])
@@ -77,6 +79,32 @@ def test_what_cannot_be_pushed_is_refused(loop):
     with pytest.raises(UsageError, match="must not exceed the policy's rate, 50 Hz, got 60"):
         Pushes.of(VariationConfig(push=1.0, push_hz=60.0), loop[0]["world"], 50.0)
     assert Pushes.of(VariationConfig(), Wall("wall", 50.0), 50.0) is None
+    with pytest.raises(UsageError, match=r"vary.push_angular: a .* has no floating base"):
+        Pushes.of(VariationConfig(push=1.0, push_angular=1.0), loop[0]["world"], 50.0)
+
+
+def test_a_floating_base_is_pushed_by_sizes_of_its_own():
+    class Floating(BaseNode):
+        floats = True
+
+        def velocity(self, state):
+            return state
+
+        def with_velocity(self, state, velocity):
+            return velocity
+
+        def step(self, step_state):
+            return step_state, None
+
+    def largest(**vary):
+        pushes = Pushes.of(VariationConfig(push=0.5, push_hz=25.0, **vary), Floating("world", 50.0), 50.0)
+        after = jax.vmap(lambda key: pushes.kicks(key, (6,)))(jax.random.split(KEY, 500))
+        assert [len(values[0]) for _, _, values in pushes.named(after)] == [3, 3]
+        return np.abs(after).max(0)
+
+    np.testing.assert_allclose(largest(push_angular=2.0), [0.5] * 3 + [2.0] * 3, rtol=0.05)
+    np.testing.assert_allclose(largest(push_angular=0.0), [0.5] * 3 + [0.0] * 3, rtol=0.05)
+    np.testing.assert_allclose(largest(), [0.5] * 6, rtol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -87,6 +115,9 @@ def test_what_cannot_be_pushed_is_refused(loop):
         ({"push_hz": 0.0}, "vary.push_hz must lie"),
         ({"curriculum": (0.0, 2.0)}, "vary.curriculum must be two shares"),
         ({"curriculum": (1.0, 0.0)}, "the second above 0, got 1.0 0.0"),
+        ({"follow": 0.5}, "vary.follow must lie in .* beside a vary.curriculum that grows, got 0.5"),
+        ({"follow": 1.0, "curriculum": (0.5, 1.0)}, "vary.follow must lie"),
+        ({"push_angular": 1.0}, "vary.push_angular must lie in .* beside a vary.push above 0"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings, said):
@@ -161,3 +192,36 @@ def test_what_grows_is_resumed_bit_for_bit(interrupted):
     found = train(Growing(), CONFIG, KEY, resume=path)
     jax.tree.map(np.testing.assert_array_equal, found.policies, whole.policies)
     np.testing.assert_array_equal(found.history["reward"], whole.history["reward"])
+
+
+class Following(Growing):
+    """Episodes are successful as long as they have less than half of the differences."""
+
+    follow = 0.5
+
+    def step(self, state, action, key):
+        made = super().step(state, action, key)
+        return made._replace(metrics={**made.metrics, "success": (state["width"] < 0.5).astype(jnp.float32)})
+
+
+def test_differences_that_follow_success_grow_while_it_is_high(tmp_path):
+    """In a quarter of the updates from the first to the last share at most: by 1/3 of 0.5 each, and then they stay."""
+    config = replace(CONFIG, total_steps=12 * 32, evaluations=12, num_envs=8)
+    assert config.updates == 12
+    first = {}
+
+    def keep(progress):
+        if progress.evaluation == 3:
+            first["file"] = (tmp_path / "saved").read_bytes()
+
+    found = train(Following(), config, KEY, keep, checkpoint=tmp_path / "saved")
+    widths, step = found.history["width"][:, 0], 0.5 / 3
+    np.testing.assert_allclose(widths[:2], [0.2 + step, 0.2 + 2 * step], rtol=1e-5)
+    np.testing.assert_allclose(widths[3:], widths[2], rtol=1e-6, err_msg="no longer successful")
+    assert 0.5 < widths[2] <= 0.7
+    np.testing.assert_allclose(found.history["return"], 0.7, rtol=1e-6, err_msg="evaluations have the last share")
+    # A training that was interrupted goes on at the share that it had reached.
+    (tmp_path / "first").write_bytes(first["file"])
+    again = train(Following(), config, KEY, resume=tmp_path / "first")
+    np.testing.assert_array_equal(again.history["width"], found.history["width"])
+    np.testing.assert_array_equal(again.history["reward"], found.history["reward"])

@@ -8,7 +8,7 @@ from array import array
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from sim2real.hardware.feetech.protocol import PROTOCOL
 if TYPE_CHECKING:
     from sim2real.hardware.safety.guardian import Guardian
 
+T = TypeVar("T")
 _PRIMITIVES: Final = ("ping", "_read", "_write", "_sync_read")
 _BUS: Final = "FeetechMotorsBus"
 _MIN_LOSSES: Final = 3
@@ -101,7 +102,7 @@ class LerobotLink:
         late_s = np.array(self._late_us, np.float64) * 1e-6
         return Counters(self._transactions, self._lost, self._retried, self._late, late_s, self.withheld)
 
-    def call(self, function: Callable[[], Any]) -> tuple[Any, Transaction]:
+    def call(self, function: Callable[[], T]) -> tuple[T, Transaction]:
         """Return the result of a call of LeRobot's, and the times of its last instruction.
 
         Raises:

@@ -66,6 +66,8 @@ class LoopTask:
             start = task.moved(start, *self.offsets(key_start, width))
         else:
             values, start = task.random(key, draw)
+        if width is not None:
+            start = task.narrowed(start, width)
         params = self.robot.node_parameters(values, start)
         if width is not None:
             sensor = self.robot.roles.sensor

@@ -7,17 +7,17 @@ from functools import cached_property
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sim2real.composer.world import WorldParams
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.contract import RobotModel
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.walking.scene import Ground
+from sim2real.robots.walking.terrain import Terrain
 from sim2real.robots.walking.world import PAYLOAD, WalkingWorld
 from sim2real.types import PyTree, Scalar
 
-FRICTION, STRENGTH, DAMPING = "foot_friction", "motor_strength", "joint_damping"
+FRICTION, STRENGTH, DAMPING, ROUGHNESS = "foot_friction", "motor_strength", "joint_damping", "roughness"
 
 
 class WalkingModel(RobotModel):
@@ -25,6 +25,7 @@ class WalkingModel(RobotModel):
 
     Args:
         height_m: Height of the base at the start of an episode [m].
+        terrain: Largest roughness, and where in the task's ground it is.
         rooms: Contacts and rows of constraints that Warp has room for in a copy.
     """
 
@@ -32,10 +33,12 @@ class WalkingModel(RobotModel):
         self,
         make_task: Callable[[], Ground],
         height_m: float,
+        terrain: Terrain,
         loads: tuple[float, float] = (-1.0, 3.0),
         rooms: tuple[int, int] = (16, 96),
     ) -> None:
-        self._make_task, self._height_m, self._loads, self._rooms = make_task, height_m, loads, rooms
+        self._make_task, self._height_m, self._terrain = make_task, height_m, terrain
+        self._loads, self._rooms = loads, rooms
 
     @cached_property
     def task(self) -> Ground:
@@ -48,12 +51,13 @@ class WalkingModel(RobotModel):
         return float(self.task.control_timestep)
 
     def dynamics(self) -> list[Parameter]:
-        """Return friction of the feet, load, strength of the motors and damping of the joints."""
+        """Return friction of feet, load, strength of motors, damping of joints, and roughness of the ground."""
         return [
             Parameter(FRICTION, "1", 0.8, 0.2, 2.0, about="friction of the feet on the ground"),
             Parameter(PAYLOAD, "kg", 0.0, *self._loads, "linear", about="load in the base"),
             Parameter(STRENGTH, "1", 1.0, 0.5, 1.5, about="factor on the motors' gains"),
             Parameter(DAMPING, "N m s/rad", 0.1, 0.01, 2.0, about="damping of each joint"),
+            Parameter(ROUGHNESS, "m", 0.0, 0.0, self._terrain.most_m, "linear", about="height of bumps of the ground"),
         ]
 
     def make_world(self, resumed: bool = False) -> WalkingWorld:
@@ -70,7 +74,10 @@ class WalkingModel(RobotModel):
         return WalkingWorld(task, places, self._loads, **options)
 
     def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
-        """Return the world's parameters for an episode: the base is level and at rest."""
+        """Return the world's parameters for an episode: the base is level and at rest.
+
+        On rough ground the base starts at the place that has the roughness, above the highest bump there.
+        """
         usual = self._world_params.values
         strength = jnp.asarray(values[STRENGTH], jnp.float32)
         placed = {
@@ -80,14 +87,19 @@ class WalkingModel(RobotModel):
             DAMPING: jnp.full_like(usual[DAMPING], values[DAMPING]),
             PAYLOAD: jnp.asarray(values[PAYLOAD], jnp.float32),
         }
-        base = np.array([0.0, 0.0, self._height_m, 1.0, 0.0, 0.0, 0.0], np.float32)
+        bumps_m = jnp.asarray(values[ROUGHNESS] if self.task.rough else 0.0, jnp.float32)
+        x_m = self._terrain.start_m(bumps_m) if self.task.rough else 0.0
+        base = jnp.array([x_m, 0.0, self._height_m + bumps_m, 1.0, 0.0, 0.0, 0.0], jnp.float32)
         position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
         return WorldParams(placed, jnp.concatenate([base, position]), jnp.concatenate([jnp.zeros(6), velocity]))
 
     def true_state(self, state: PyTree) -> PyTree:
-        """Return positions, velocities and torques, and what the feet did."""
+        """Return height above the ground, positions, velocities and torques, and what the feet did."""
         data, v = state.data, state.variables
-        return data.qpos[2:], data.qvel, data.actuator_force, v["air_s"], v["ground_s"], v["mean"]
+        position = data.qpos[2:]
+        if self.task.rough is not None:
+            position = position.at[0].add(-self.task.rough.at(data.qpos[:2]))
+        return position, data.qvel, data.actuator_force, v["air_s"], v["ground_s"], v["mean"]
 
     @cached_property
     def _world_params(self) -> WorldParams:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from abc import abstractmethod
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -19,10 +21,11 @@ from sim2real.robots.control_loop.training_task import LoopTask
 from sim2real.robots.walking.agent import WalkingAgent
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.drive import BodySensor, TargetDrive
-from sim2real.robots.walking.model import WalkingModel
+from sim2real.robots.walking.model import ROUGHNESS, WalkingModel
 from sim2real.robots.walking.moment import Moment
 from sim2real.robots.walking.scene import Ground
 from sim2real.robots.walking.task import Term, WalkingTask
+from sim2real.robots.walking.terrain import Terrain
 
 
 class ComposedRobot(Robot):
@@ -39,6 +42,7 @@ class ComposedRobot(Robot):
         policy_hz: Steps of the policy per second [Hz].
         history: Earlier observations that the policy gets.
         delays_s: Delays without an identification: of the sensor, of the actuator [s].
+        terrain: Rough ground, on which a training with the parameter ``roughness`` takes place.
         noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
     """
 
@@ -52,6 +56,7 @@ class ComposedRobot(Robot):
     history: ClassVar[int] = 2
     policy_hz: ClassVar[float] = 50.0
     commands: ClassVar[Commands] = Commands()
+    terrain: ClassVar[Terrain] = Terrain()
     delays_s: ClassVar[tuple[float, float]] = (0.008, 0.008)
     noise: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
 
@@ -60,7 +65,7 @@ class ComposedRobot(Robot):
         self.sensor = BodySensor(self.joints, stance)
         self.drive: RobotDrive = self.make_drive()
         self.agent = WalkingAgent(self.joints, stance, self.scale, self.history, self.commands)
-        self.model = WalkingModel(self.make_task, self.height_m)
+        self.model = WalkingModel(self.make_task, self.height_m, self.terrain)
         self.task = WalkingTask(self.commands, stance, 1.0 / self.rate_hz, self.terms(), self.falls)
 
     @abstractmethod
@@ -71,9 +76,10 @@ class ComposedRobot(Robot):
         """Return whether the robot has fallen: it lies lower than half of its height, or on its side."""
         return (now.height < 0.5 * self.height_m) | (now.gravity[2] > -0.5)
 
-    def make_task(self) -> Ground:
+    def make_task(self, rough: bool = False) -> Ground:
         """Return the composed task; in training the floor sees the feet alone."""
-        return Ground(self.mjcf, self.feet, self.touching_m, collide=self.feet)
+        ground = self.terrain.growing() if rough else None
+        return Ground(self.mjcf, self.feet, self.touching_m, self.feet, ground)
 
     def make_drive(self) -> RobotDrive:
         """Return the motors; default: targets, for the twin alone."""
@@ -83,9 +89,18 @@ class ComposedRobot(Robot):
         """Return the nominal values of the model's parameters, and the delays."""
         return super().nominal() | dict(zip(DELAYS, self.delays_s, strict=True))
 
-    def training(self, *arguments: Any, **options: Any) -> tuple[dict[str, BaseNode], LoopTask]:
-        """Return the graph in simulation, whose sensor has the nominal noise, and the training task."""
-        nodes, task = super().training(*arguments, **options)
+    def training(
+        self, values: Mapping[str, float], draws: Mapping[str, np.ndarray], *arguments: Any, **options: Any
+    ) -> tuple[dict[str, BaseNode], LoopTask]:
+        """Return the graph in simulation, whose sensor has the nominal noise, and the training task.
+
+        The ground is a height field only if episodes have roughness: a plane costs less.
+        """
+        robot = self
+        if ROUGHNESS in draws or values.get(ROUGHNESS, 0.0) > 0.0:
+            robot = copy.copy(self)
+            robot.model = WalkingModel(partial(self.make_task, rough=True), self.height_m, self.terrain)
+        nodes, task = super(ComposedRobot, robot).training(values, draws, *arguments, **options)
         sensor: Any = nodes[self.roles.sensor]
         sizes = {field: len(np.ravel(getattr(self.sensor.at_rest, field))) for field in self.noise}
         sensor.noise = tuple(

@@ -9,6 +9,7 @@ from typing import Any
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.errors import UsageError
+from sim2real.robots.walking.terrain import FLOOR, HeightField
 
 _SMOOTHED_S = 0.4
 """Time constant of the mean velocity that success is judged by: a gait sways within a step [s]."""
@@ -22,9 +23,17 @@ class Ground(composer.Task):
         feet: Sites in the middle of the feet's spheres.
         touching_m: Height of such a site below which the foot touches the ground [m].
         collide: Geoms that the floor sees in training; empty: all.
+        rough: Heights of the ground in place of the model's floor; None: it is flat.
     """
 
-    def __init__(self, path: Path, feet: Sequence[str], touching_m: float, collide: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        path: Path,
+        feet: Sequence[str],
+        touching_m: float,
+        collide: Sequence[str] = (),
+        rough: HeightField | None = None,
+    ) -> None:
         model = mjcf.from_path(str(path))
         self._entity = composer.ModelWrapperEntity(model)
         free = [j for j in model.find_all("joint") if j.tag == "freejoint" or j.type == "free"]
@@ -35,10 +44,22 @@ class Ground(composer.Task):
         self.actuators = model.find_all("actuator")
         self.joints = [actuator.joint for actuator in self.actuators]
         self.foot_geoms = [model.find("geom", name) for name in feet]
-        self._touching_m = touching_m
+        self._touching_m, self.rough = touching_m, rough
+        if rough is not None:
+            floor = model.find("geom", FLOOR)
+            if floor is None:
+                raise UsageError(f"{path} has no geom {FLOOR!r}, which rough ground replaces")
+            # MJCF lists the rows of heights from the last one to the first.
+            (rows, columns), share = rough.heights.shape, rough.heights[::-1] / rough.heights.max()
+            floor.type, floor.hfield = (
+                "hfield",
+                model.asset.add(
+                    "hfield", name="ground", nrow=rows, ncol=columns, size=rough.size, elevation=share.ravel()
+                ),
+            )
         if collide:
             for geom in model.find_all("geom"):
-                if geom.name != "floor":
+                if geom.name != FLOOR:
                     geom.contype, geom.conaffinity = 0, int(geom.name in collide)
         self._entity.observables.disable_all()
 
@@ -61,7 +82,8 @@ class Ground(composer.Task):
         del random_state
         v, xp, tick_s = physics.variables, physics.np, self.physics_timestep
         at = physics.bind(self.feet).xpos
-        touches, moved = at[:, 2] < self._touching_m, xp.sqrt(xp.sum((at - v["at_m"])[:, :2] ** 2, axis=-1)) / tick_s
+        height = at[:, 2] if self.rough is None else at[:, 2] - self.rough.at(at[:, :2])
+        touches, moved = height < self._touching_m, xp.sqrt(xp.sum((at - v["at_m"])[:, :2] ** 2, axis=-1)) / tick_s
         lands = touches & (v["air_s"] > 0)
         v["swing_s"] = xp.where(lands, v["air_s"], v["swing_s"])
         v["slip_m_s"] = xp.where(touches & (v["ground_s"] > 0), moved, 0.0)

@@ -16,7 +16,7 @@ from sim2real.robots.roles import Roles
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.messages import gravity_of, into_base
 from sim2real.robots.walking.moment import Moment
-from sim2real.types import Key
+from sim2real.types import Array, Key
 
 Term = tuple[float, Callable[[Moment], jax.Array | float]]
 """A weight, and a measure of a moment."""
@@ -53,6 +53,10 @@ class WalkingTask(RobotTask):
     def at_rest(self, trial: int) -> EpisodeStart:
         """Return the start in the stance with the commands of a trial."""
         return EpisodeStart(self._stance, np.zeros_like(self._stance), self._commands.of_trial(trial))
+
+    def narrowed(self, start: EpisodeStart, share: Array) -> EpisodeStart:
+        """Return a start whose commanded velocities are smaller by a share."""
+        return start.replace(aim=share * start.aim)
 
     def judged(self, graph_state: GraphState, roles: Roles) -> Moment:
         """Return the moment after a step, from the true state."""

@@ -14,10 +14,13 @@ from sim2real.robots.walking.hidden import HiddenTwin as HiddenTwin
 from sim2real.robots.walking.hidden import hidden_spec, hide
 from sim2real.robots.walking.messages import BodyReading, gravity_of, into_base
 from sim2real.robots.walking.robot import ComposedRobot
+from sim2real.robots.walking.terrain import FLOOR
 
 _mj: Any = mujoco
 STEP_S = 0.002
 """Time step of the twin's physics, shorter than that of training [s]."""
+_REACH_M = 30.0
+"""Rough ground in each direction from the start: an episode's way, with pushes [m]."""
 _SETTLED_S = 1.0
 """Time after a new command that does not count [s]."""
 
@@ -42,12 +45,25 @@ class Twin:
     """A robot on C MuJoCo, stepped by ``advance`` from one policy step to the next.
 
     Observations and targets take effect with the delays in ``hidden``, to the nearest physics step.
+
+    Args:
+        seed: Of noise, pushes and ground.
+        roughness_m: Difference between the lowest and the highest point of the ground; 0: it is the model's floor [m].
     """
 
-    def __init__(self, robot: ComposedRobot, hidden: HiddenTwin | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, robot: ComposedRobot, hidden: HiddenTwin | None = None, seed: int = 0, roughness_m: float = 0.0
+    ) -> None:
         self.robot, self.hidden = robot, hidden or HiddenTwin()
         self._rng = np.random.default_rng(seed)
-        self.model = hidden_spec(robot.mjcf, STEP_S).compile()
+        spec = hidden_spec(robot.mjcf, STEP_S)
+        self._rough = robot.terrain.even(roughness_m, seed, _REACH_M) if roughness_m else None
+        if self._rough is not None:
+            (rows, columns), share = self._rough.heights.shape, self._rough.heights / roughness_m
+            spec.add_hfield(name="ground", nrow=rows, ncol=columns, size=self._rough.size, userdata=share.ravel())
+            floor = spec.geom(FLOOR)
+            floor.type, floor.hfieldname = _mj.mjtGeom.mjGEOM_HFIELD, "ground"
+        self.model = spec.compile()
         hide(self.model, int(self.model.jnt_bodyid[0]), self.hidden)
         self.data = _mj.MjData(self.model)
         self.reset()
@@ -56,7 +72,8 @@ class Twin:
         """Place the robot in its stance."""
         stance = np.asarray(self.robot.stance)
         _mj.mj_resetData(self.model, self.data)
-        self.data.qpos[:7] = (0, 0, self.robot.height_m, 1, 0, 0, 0)
+        bumps_m = 0.0 if self._rough is None else float(self._rough.heights.max())
+        self.data.qpos[:7] = (0, 0, self.robot.height_m + bumps_m, 1, 0, 0, 0)
         self.data.qpos[7:], self.data.ctrl[:] = stance, stance
         _mj.mj_forward(self.model, self.data)
         late = max(1, round(self.hidden.sensing_s / STEP_S))
@@ -89,7 +106,8 @@ class Twin:
 
     def fallen(self) -> bool:
         """Return whether the robot lies on its side, or its base on the ground."""
-        low = self.data.qpos[2] < 0.4 * self.robot.height_m
+        ground_m = 0.0 if self._rough is None else float(self._rough.at(self.data.qpos[:2]))
+        low = self.data.qpos[2] - ground_m < 0.4 * self.robot.height_m
         return bool(low or gravity_of(self.data.qpos[3:7])[2] > -0.5)
 
     def links(self, qpos: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,7 @@ class WalkingWorld(ComposedWorld):
         loads: Smallest and largest load in the base [kg].
     """
 
+    floats: Literal[True] = True
     _table: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
 
     def __init__(

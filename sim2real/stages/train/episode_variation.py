@@ -133,8 +133,8 @@ def with_disturbances(
         for name, unit, values in zip(("position", "velocity"), ("rad", "rad/s"), offsets, strict=True):
             added |= {f"start {name}": (unit, values)} if values.any() else {}
     if pushes is not None:
-        kicks = pushes.kicks(k_push, (round(COUNT / pushes.chance),), last)
-        added["push"] = ("rad/s", kicks[kicks != 0.0])
+        kicks = pushes.kicks(k_push, (round(COUNT / pushes.chance), len(pushes.sizes)), last)
+        added |= {name: (unit, hit[hit != 0.0]) for name, unit, hit in pushes.named(kicks) if hit.any()}
     return replace(
         episodes,
         noise=tuple(replace(n, deviation=share * n.deviation, bias=share * n.bias) for n in episodes.noise),
@@ -142,4 +142,5 @@ def with_disturbances(
         draws={**draws, **{name: np.ravel(np.asarray(values, np.float64)) for name, (_, values) in added.items()}},
         push_hz=vary.push_hz if pushes is not None else 0.0,
         curriculum=vary.curriculum,
+        follow=vary.follow,
     )

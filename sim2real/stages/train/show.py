@@ -127,7 +127,9 @@ def disturbance_rows(episodes: Episodes) -> dict[str, Json]:
     rows: dict[str, Json] = {"pushes": f"{episodes.push_hz:g} a second for each joint"} if episodes.push_hz else {}
     if episodes.curriculum != (1.0, 1.0):
         first, last = episodes.curriculum
-        rows["curriculum"] = f"{first:g} of these differences at the first update, {last:g} at the last one"
+        text = f"{first:g} of these differences at the first update, "
+        how = f"up to {last:g} while success is above {episodes.follow:g}"
+        rows["curriculum"] = text + (how if episodes.follow else f"{last:g} at the last one")
     return rows
 
 

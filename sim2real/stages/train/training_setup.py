@@ -86,7 +86,8 @@ def prepare(
     # Add starts and pushes.
     set_start(task, config)
     pushes = Pushes.of(config.vary, nodes[robot.roles.world], robot.rate_hz)
-    env = GraphEnvironment(graph, task, drawn.steps, pushes, config.vary.curriculum if config.vary.grows else None)
+    curriculum = config.vary.curriculum if config.vary.grows else None
+    env = GraphEnvironment(graph, task, drawn.steps, pushes, curriculum, config.vary.follow)
     episodes = episodes_of(identification, values, draws, noise, drawn, timing, config)
     episodes = with_disturbances(episodes, config.vary, task, pushes, config.seed)
     if config.vary.grows and not (episodes.parameters or noise):

@@ -103,6 +103,7 @@ class GraphEnvironment:
         steps: Shape ``(E,)``: policy steps of each timeline; None: all of them.
         curriculum: Share of the differences between episodes at the first and at the last update; None: always all.
             ``reset`` takes the last.
+        follow: Success of episodes above which the share grows; 0: it grows with the updates.
 
     Raises:
         UsageError: The supervisor makes several steps in one row of the timelines, or the task has no curriculum.
@@ -115,9 +116,10 @@ class GraphEnvironment:
         steps: np.ndarray | None = None,
         pushes: Pushes | None = None,
         curriculum: tuple[float, float] | None = None,
+        follow: float = 0.0,
     ) -> None:
         self.graph, self.task = graph, task
-        self.pushes, self.curriculum = pushes, curriculum
+        self.pushes, self.curriculum, self.follow = pushes, curriculum, follow
         if curriculum is not None and not isinstance(task, WideningTask):
             raise UsageError(
                 f"a {type(task).__name__} has no curriculum: it has no `params_at`",

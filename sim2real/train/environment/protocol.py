@@ -117,19 +117,63 @@ class WideningEnvironment(Protocol):
         ...
 
 
-def get_width(env: TrainingEnvironment, config: PPOConfig, update: jax.Array) -> jax.Array | None:
-    """Return the share of the differences, shape ``()``, after ``update`` updates; None without a curriculum."""
+@runtime_checkable
+class FollowingEnvironment(WideningEnvironment, Protocol):
+    """An environment whose curriculum may follow success: the metric ``success`` of its episodes."""
+
+    follow: float
+    """Success above which the share grows; 0: it grows with the updates."""
+
+
+QUICKEST = 0.25
+"""Share of the updates in which a curriculum that follows success reaches its last share if success is always high."""
+
+
+def get_width(
+    env: TrainingEnvironment, config: PPOConfig, update: jax.Array, reached: jax.Array | None = None
+) -> jax.Array | None:
+    """Return the share of the differences, shape ``()``, after ``update`` updates; None without a curriculum.
+
+    Args:
+        reached: The share that success has reached, for training; ``update >= config.updates`` is an evaluation.
+    """
     if not isinstance(env, WideningEnvironment) or env.curriculum is None:
         return None
     first, last = env.curriculum
+    if reached is not None:
+        return jnp.where(update >= config.updates, jnp.float32(last), reached)
     return jnp.float32(first) + (last - first) * jnp.clip(update / max(config.updates - 1, 1), 0.0, 1.0)
 
 
+def first_reached(env: TrainingEnvironment) -> float | None:
+    """Return the first share of a curriculum that follows success; None if there is none."""
+    if not isinstance(env, FollowingEnvironment) or env.curriculum is None or env.follow == 0.0:
+        return None
+    return env.curriculum[0]
+
+
+def widen(
+    env: TrainingEnvironment, config: PPOConfig, reached: jax.Array, success: jax.Array, ended: jax.Array
+) -> jax.Array:
+    """Return the share of the differences after a rollout: it grows if the episodes that ended were successful.
+
+    Args:
+        success: Shape ``(T, N)``: the metric of each row.
+        ended: Shape ``(T, N)``, bool: the episode ended in the row.
+    """
+    if not isinstance(env, FollowingEnvironment) or env.curriculum is None:
+        return reached
+    first, last = env.curriculum
+    mean = jnp.sum(jnp.where(ended, success, 0.0)) / jnp.maximum(jnp.sum(ended), 1)
+    growth = (last - first) / max(QUICKEST * config.updates, 1.0)
+    return jnp.where(mean > env.follow, jnp.minimum(reached + growth, last), reached)
+
+
 def get_reset(
-    env: TrainingEnvironment, config: PPOConfig, update: jax.Array
+    env: TrainingEnvironment, config: PPOConfig, update: jax.Array, reached: jax.Array | None = None
 ) -> Callable[[jax.Array], tuple[PyTree, jax.Array]]:
-    """Return the reset of the episodes that start after ``update ()`` updates."""
-    width = get_width(env, config, update)
+    """Return the reset of the episodes that start after ``update ()`` updates; ``reached`` as in ``get_width``."""
+    width = get_width(env, config, update, reached)
     if width is None or not isinstance(env, WideningEnvironment):
         return env.reset
     return lambda key: env.reset_at(key, width)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -28,18 +28,26 @@ class PushableWorld(Protocol):
         ...
 
 
+@runtime_checkable
+class FloatingWorld(PushableWorld, Protocol):
+    """A world whose velocities are those of a floating base: linear ``(3,)`` [m/s], then angular ``(3,)`` [rad/s]."""
+
+    floats: Literal[True]
+
+
 @dataclass(frozen=True)
 class Pushes:
     """Pushes of each joint, independent of the others, at the times of policy steps.
 
     Attributes:
-        size: Largest change of a velocity [rad/s, or m/s]; changes are uniform within it, in both directions.
+        sizes: Largest change of each velocity, or of all with one number [rad/s, or m/s]; changes are uniform within
+            it, in both directions. Six: of a floating base, linear ones first.
         chance: Probability that a joint is pushed in a row.
     """
 
     node: str
     world: PushableWorld
-    size: float
+    sizes: tuple[float, ...]
     chance: float
 
     @staticmethod
@@ -54,18 +62,30 @@ class Pushes:
             )
         if vary.push_hz > rate_hz:
             raise UsageError(f"vary.push_hz must not exceed the policy's rate, {rate_hz:g} Hz, got {vary.push_hz:g}")
-        return Pushes(world.name, world, vary.push, vary.push_hz / rate_hz)
+        floats, angular = isinstance(world, FloatingWorld), vary.push_angular
+        if angular is not None and not floats:
+            raise UsageError(
+                f"vary.push_angular: a {type(world).__name__} has no floating base", hint="--vary.push pushes joints"
+            )
+        sizes = (vary.push,) * 3 + (vary.push if angular is None else angular,) * 3 if floats else (vary.push,)
+        return Pushes(world.name, world, sizes, vary.push_hz / rate_hz)
 
     def kicks(self, key: jax.Array, shape: tuple[int, ...], width: jax.Array | None = None) -> jax.Array:
         """Draw the changes of the velocities in a row, 0 for a joint that is not pushed.
 
         Args:
-            width: Share of ``size``; None: all of it.
+            width: Share of ``sizes``; None: all of them.
         """
         k_whether, k_how = jax.random.split(key)
-        size = self.size if width is None else self.size * width
+        size = jnp.float32(self.sizes[0] if len(self.sizes) == 1 else self.sizes) * (1.0 if width is None else width)
         hit = jax.random.bernoulli(k_whether, self.chance, shape)
         return jnp.where(hit, size * jax.random.uniform(k_how, shape, minval=-1.0, maxval=1.0), 0.0)
+
+    def named(self, kicks: jax.Array) -> list[tuple[str, str, jax.Array]]:
+        """Return name, unit and values of drawn changes ``(N, len(sizes))``."""
+        if len(self.sizes) == 1:
+            return [("push", "rad/s", kicks)]
+        return [("push", "m/s", kicks[:, :3]), ("push angular", "rad/s", kicks[:, 3:])]
 
     def apply(self, graph_state: GraphState, key: jax.Array, width: jax.Array | None = None) -> GraphState:
         """Return the graph's state after the pushes of a row; ``width`` as in ``kicks``."""

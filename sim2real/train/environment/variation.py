@@ -25,9 +25,12 @@ class VariationConfig:
     from the posterior."""
     range: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
     """Draw a parameter uniformly from this range instead, for instance a payload: NAME LOW HIGH, one flag a
-    parameter."""
+    parameter. The pipeline's own ranges of other parameters stay."""
     push: float = 0.0
-    """Largest change of a joint's velocity by a push from outside [rad/s], uniform within it; 0: no pushes."""
+    """Largest change of a joint's velocity by a push from outside [rad/s], or of a floating base's linear velocity
+    [m/s], uniform within it; 0: no pushes."""
+    push_angular: float | None = None
+    """Largest change of a floating base's angular velocity by a push [rad/s]; default: the number of --vary.push."""
     push_hz: float = 0.5
     """Pushes of each joint in a second, at random times [Hz]."""
     start_position: float = 0.0
@@ -35,8 +38,12 @@ class VariationConfig:
     start_velocity: float = 0.0
     """Largest offset of a joint's velocity at an episode's start, drawn for each joint [rad/s]."""
     curriculum: tuple[float, float] = (1.0, 1.0)
-    """Share of all these differences (parameters, delays, noise, pushes, starts) at the first and at the last update;
-    in between it grows linearly. Evaluations have the last. 0 1 begins with the model alone."""
+    """Share of all these differences (parameters, delays, noise, pushes, starts), and of the velocities that a walking
+    robot is commanded, at the first and at the last update; in between it grows linearly, or as --vary.follow sets.
+    Evaluations have the last. 0 1 begins with the model alone."""
+    follow: float = 0.0
+    """Success of the training's episodes above which the share of a curriculum grows, 0 to 1: from the first to the
+    last share in a quarter of the updates at the earliest; below it the share stays. 0: it grows linearly."""
 
     @property
     def grows(self) -> bool:
@@ -52,6 +59,10 @@ class VariationConfig:
         for name in ("push", "start_position", "start_velocity"):
             if not 0.0 <= getattr(self, name) <= 100.0:
                 raise UsageError(f"vary.{name} must lie in [0, 100], got {getattr(self, name)}")
+        if self.push_angular is not None and not (self.push and 0.0 <= self.push_angular <= 100.0):
+            raise UsageError(
+                f"vary.push_angular must lie in [0, 100] beside a vary.push above 0, got {self.push_angular}"
+            )
         if not 0.0 < self.push_hz <= 1000.0:
             raise UsageError(f"vary.push_hz must lie in (0, 1000] Hz, got {self.push_hz}")
         if not (0.0 <= self.curriculum[0] <= 1.0 and 0.0 < self.curriculum[1] <= 1.0):
@@ -59,6 +70,11 @@ class VariationConfig:
             raise UsageError(
                 f"vary.curriculum must be two shares in [0, 1], the second above 0, got {shares}",
                 hint="--randomise 2 makes the differences themselves larger",
+            )
+        if not 0.0 <= self.follow < 1.0 or (self.follow and not self.grows):
+            raise UsageError(
+                f"vary.follow must lie in [0, 1) beside a vary.curriculum that grows, got {self.follow}",
+                hint="--vary.curriculum 0.3 1 --vary.follow 0.6 starts at 0.3, and grows while success is above 0.6",
             )
         for name, (low, high) in self.range.items():
             if not low < high:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment
+from sim2real.train.environment.protocol import TrainingEnvironment, first_reached
 from sim2real.train.networks.architectures import Factory, make_network, name_of
 from sim2real.train.networks.normaliser import Normaliser
 from sim2real.train.networks.policy import Policy
@@ -55,7 +55,9 @@ def make_initial_state(
     carries = (net.initial_carry() for net in (networks.actor, networks.critic))
     copies = Copies(*_blank(shapes, count), *(_repeated(carry, count) for carry in carries))
     keys = keys if len(configs) == 1 else jnp.tile(keys, len(configs))
-    return TrainState(params, optimiser, normaliser, privileged, copies, jnp.zeros(members, jnp.int32), keys)
+    share = first_reached(env)
+    reached = None if share is None else jnp.full(members, share, jnp.float32)
+    return TrainState(params, optimiser, normaliser, privileged, copies, jnp.zeros(members, jnp.int32), keys, reached)
 
 
 def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, Array]:

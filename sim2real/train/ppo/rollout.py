@@ -106,6 +106,7 @@ def collect(
     key: jax.Array,
     teacher: Policy | None = None,
     evaluating: jax.Array | bool = False,
+    reached: jax.Array | None = None,
 ) -> tuple[Copies, Rows]:
     """Play ``rollout_steps`` rows with exploration noise; a copy whose episode ends starts another one.
 
@@ -115,6 +116,7 @@ def collect(
         teacher: Its actions are recorded in every row, while the policy acts.
         evaluating: Shape ``()``, bool: play without exploration noise, cut no episode, and draw episodes as at the end
             of the curriculum.
+        reached: Shape ``()``: the share of a curriculum that follows success; None without such a curriculum.
 
     Returns:
         The copies after the rollout, and the rows.
@@ -123,7 +125,7 @@ def collect(
     key_reset, key_noise, key_step = jax.random.split(key, 3)
 
     # Draw one initial state per copy for the whole rollout, as a reset may cost more than a row.
-    reset = get_reset(env, config, jnp.where(evaluating, config.updates, update))
+    reset = get_reset(env, config, jnp.where(evaluating, config.updates, update), reached)
     initial = jax.vmap(reset)(jax.random.split(key_reset, count))
     fresh = Copies(*initial, repeat(policy.initial_carry(), count), copies.critic_carry)
     copies = select(jnp.broadcast_to(update == 0, (count,)), fresh, copies)

@@ -11,7 +11,13 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.runtime.program_arguments import data_of, with_data
 from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import Step, TrainingEnvironment, WideningEnvironment, require_privileged
+from sim2real.train.environment.protocol import (
+    FollowingEnvironment,
+    Step,
+    TrainingEnvironment,
+    WideningEnvironment,
+    require_privileged,
+)
 from sim2real.train.networks.architectures import is_recurrent
 from sim2real.train.networks.policy import Policy
 from sim2real.types import PyTree
@@ -30,6 +36,7 @@ class TeacherEnvironment:
         self.observation_size = env.observation_size + self.privileged_size
         self.action_low, self.action_high = env.action_low, env.action_high
         self.curriculum = env.curriculum if isinstance(env, WideningEnvironment) else None
+        self.follow = env.follow if isinstance(env, FollowingEnvironment) else 0.0
 
     @property
     def data(self) -> PyTree:

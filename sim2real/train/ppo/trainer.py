@@ -188,7 +188,7 @@ def _train_until_evaluation(
         number = jnp.where(evaluating, i - count, state.update)
         policy = make_policy(env, config, networks, state.params, state.normaliser)
         copies = choose(evaluating, evaluated_copies, state.copies)
-        copies, rows = collect(env, config, policy, copies, number, key, networks.teacher, evaluating)
+        copies, rows = collect(env, config, policy, copies, number, key, networks.teacher, evaluating, state.reached)
 
         # Update the networks, or add the rows to the evaluation.
         def learn() -> tuple[TrainState, PolicyEvaluation, _Figures]:
@@ -211,7 +211,7 @@ def _train_until_evaluation(
     stats = jax.tree.map(lambda leaf: leaf[:count], stats)
     finite = {name: stats.pop(name).all(0) for name in FINITE if name in stats}
     values = {name: leaf.mean(0) for name, leaf in stats.items()} | finite
-    width = get_width(env, config, state.update - 1)
+    width = get_width(env, config, state.update - 1, state.reached)
     values |= {} if width is None else {"width": width}
     policy = make_policy(env, config, networks, state.params, state.normaliser)
     if apart:

@@ -12,7 +12,7 @@ import optax
 
 from sim2real.policy.network import NetworkSpec
 from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment
+from sim2real.train.environment.protocol import TrainingEnvironment, widen
 from sim2real.train.networks.normaliser import Normaliser, deviations, normalise_parameters, update_normaliser
 from sim2real.train.networks.policy import Policy, log_prob
 from sim2real.train.networks.sequences import ActorCritic, unroll
@@ -32,6 +32,7 @@ class TrainState(NamedTuple):
         privileged: Statistics of the value function's further inputs; None if it has none.
         update: Shape ``()``, int32: number of updates so far.
         key: The seed's key; it never changes. ``keys`` derives the keys of an update from it.
+        reached: Shape ``()``: the share of a curriculum that follows success; None without such a curriculum.
     """
 
     params: dict[str, PyTree]
@@ -41,6 +42,7 @@ class TrainState(NamedTuple):
     copies: Copies
     update: jax.Array
     key: jax.Array
+    reached: jax.Array | None = None
 
 
 _Learner = tuple[PyTree, optax.OptState]
@@ -177,7 +179,11 @@ def update(
         stats |= {"finite_privileged": jnp.isfinite(rows.privileged_following).all((0, 1))}
 
     # The normaliser comes last: the log densities above are those of the policy that played the rows.
-    return TrainState(params, optimiser_state, *_normalisers(state, rows), copies, state.update + 1, state.key), stats
+    after = TrainState(params, optimiser_state, *_normalisers(state, rows), copies, state.update + 1, state.key)
+    if state.reached is None:
+        return after, stats
+    ended = rows.terminated | rows.truncated
+    return after._replace(reached=widen(env, config, state.reached, rows.metrics["success"], ended)), stats
 
 
 def _normalisers(state: TrainState, rows: Rows) -> tuple[Normaliser, Normaliser | None]:

@@ -33,7 +33,7 @@ def picture(path: Path, episodes: Episodes) -> None:
 def _figure(episodes: Episodes) -> Figure:
     nodes = [n for n in episodes.recorded_s if n in episodes.drawn_s]
     noise = [n for n in episodes.noise if n.column in episodes.off]
-    grows = episodes.curriculum != (1.0, 1.0)
+    grows = episodes.curriculum != (1.0, 1.0) and not episodes.follow
     count = max(1, len(episodes.parameters) + len(nodes) + len(noise) + grows)
     rows = math.ceil(count / _COLUMNS)
     figure = new_figure(0.3 + _ROW_IN * rows)

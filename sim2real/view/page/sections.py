@@ -84,7 +84,9 @@ def _drawn_blocks(artifact: StageFolder) -> list[Block]:
     if drawn.curriculum != (1.0, 1.0):
         first, last = drawn.curriculum
         caption += (
-            f" The share of all differences grows from {first:g} to {last:g} in training; the plots show {last:g}."
+            f" The share of all differences grows from {first:g} to {last:g} in training"
+            + (f" while success is above {drawn.follow:g}" if drawn.follow else "")
+            + f"; the plots show {last:g}."
         )
     return [FigureBlock(episodes_svg(drawn, "train-episodes"), caption)]
 
