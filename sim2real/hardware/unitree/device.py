@@ -132,7 +132,10 @@ class UnitreeLegs(GuardedLegs, Device):
     def enable(self) -> None:
         """Start the guardian, and let all motors damp at their positions; see `Device.enable`."""
         self._left, self._rest = 1.0, np.zeros((MOTORS, 5))
-        self._rest[:, 0], self._rest[:, 3] = self.measure().position_rad, self.drive.damping
+        low, high = self.reach()
+        # A robot that lies may rest on the stops of its joints, a little beyond their range.
+        self._rest[:, 0] = np.clip(self.measure().position_rad, low[:, 0], high[:, 0])
+        self._rest[:, 3] = self.drive.damping
         self.switch_on(self._message(self._rest))
 
     def rest(self) -> np.ndarray:

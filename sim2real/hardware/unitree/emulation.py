@@ -40,6 +40,10 @@ class UnitreeEmulation:
         alone_after_s: Time without an intact command after which motors damp their joints [s]; None: they go on as
             commanded last.
         alone_kd: Damping of the joints then [N m s/rad].
+        reply_loss: Probability that a state is not sent.
+        corrupt: Probability that a state has a wrong CRC.
+        late: Probability that a state is held up; later states wait for it.
+        late_s: Time for which it is held up [s].
         silent_after_s: Time from which no state is sent and no command received, as with an unplugged cable [s].
         on_signal: Whether this time counts from SIGUSR1 to the process.
         seed: Seed of jitter and noise.
@@ -57,6 +61,10 @@ class UnitreeEmulation:
     accelerometer_noise_m_s2: float = 0.05
     alone_after_s: float | None = 0.02
     alone_kd: float = 3.0
+    reply_loss: float = 0.0
+    corrupt: float = 0.0
+    late: float = 0.0
+    late_s: float = 0.009
     silent_after_s: float | None = None
     on_signal: bool = False
     seed: int = 0
@@ -64,6 +72,9 @@ class UnitreeEmulation:
     def __post_init__(self) -> None:
         """Check that all values are in their ranges."""
         negative = [name for name, value in asdict(self).items() if value is not None and value < 0]
+        unlikely = [name for name in ("reply_loss", "corrupt", "late") if getattr(self, name) > 1]
+        if unlikely:
+            raise UsageError(f"emulator: {unlikely[0]} = {getattr(self, unlikely[0])} is no probability")
         if negative or self.actuation_jitter_s > self.actuation_latency_s:
             name = (negative or ["actuation_jitter_s"])[0]
             raise UsageError(f"emulator: {name} = {getattr(self, name)} is below 0, or a jitter above its latency")
@@ -155,10 +166,14 @@ class EmulatedLegs:
         q[kp == 0.0], dq[kd == 0.0] = 0.0, 0.0
         law[modes != SERVO] = 0.0
         law[~np.isfinite(law).all(axis=1)] = 0.0
+        changed = modes != self._modes
         self._modes, self._law, self._heard_ns, self._damps = modes, law, t_ns, False
         self._body.drive(law)
-        now_ns = self._now_ns()
-        self._truth.write(Kind.EFFECT, 0, t_ns, now_ns, now_ns, now_ns - effect_ns, (float(modes[0]), float(law[0, 0])))
+        # Mode, goal and position gain: of the first motor for each command, of the others if their mode changes.
+        now_ns, changed[0] = self._now_ns(), True
+        for i in np.flatnonzero(changed).tolist():
+            values = float(modes[i]), float(q[i]), float(kp[i])
+            self._truth.write(Kind.EFFECT, i, t_ns, now_ns, now_ns, now_ns - effect_ns, values)
 
     def _damp(self, now_ns: int) -> None:
         """Let the motors that are on damp their joints, as the host is silent."""

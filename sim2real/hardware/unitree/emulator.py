@@ -12,10 +12,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import random
 import select
 import socket
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -67,18 +69,48 @@ def _run(options: argparse.Namespace, config: UnitreeEmulation, stop: StopFlag) 
         ready = {"port": f"lo:{domain}", "pid": os.getpid(), "truth": str(options.truth.resolve())}
         print(json.dumps(ready), flush=True)
         parent_fd = sys.stdin.fileno() if options.until_stdin_closes else None
-        _serve(legs, config, reader, writer, truth, start_ns, stop, parent_fd)
+        _serve(legs, config, reader, _Sender(writer, config, truth), truth, start_ns, stop, parent_fd)
     finally:
         truth.close()
         del writer, reader, participant, network
         lock.close()
 
 
+class _Sender:
+    """Sends states, with the faults of the settings."""
+
+    def __init__(self, writer: DataWriter, config: UnitreeEmulation, truth: TruthLog) -> None:
+        self._writer, self._config, self._truth = writer, config, truth
+        self._random = random.Random(config.seed)
+        self._waiting: deque[tuple[LowState, int]] = deque()
+        self._held_ns = 0
+
+    def send(self, state: LowState, state_ns: int) -> None:
+        """Send a state that is due at ``state_ns``, and those that were held up before it; or hold it up."""
+        config, chance = self._config, self._random.random
+        if self._held_ns == 0 and chance() < config.late:
+            self._held_ns = state_ns + round(1e9 * config.late_s)
+        self._waiting.append((state, state_ns))
+        if state_ns < self._held_ns:
+            return
+        self._held_ns = 0
+        while self._waiting:
+            state, state_ns = self._waiting.popleft()
+            if chance() < config.corrupt:
+                state.record["crc"] ^= 1
+            lost = chance() < config.reply_loss
+            if not lost:
+                self._writer.write(state)
+            done_ns, sampled_ns = time.monotonic_ns(), state_ns - round(1e9 * config.sensing_latency_s)
+            kind = Kind.LOSS if lost else Kind.SAMPLE
+            self._truth.write(kind, 0, state_ns, sampled_ns, done_ns, done_ns - state_ns)
+
+
 def _serve(
     legs: EmulatedLegs,
     config: UnitreeEmulation,
     reader: DataReader,
-    writer: DataWriter,
+    sender: _Sender,
     truth: TruthLog,
     start_ns: int,
     stop: StopFlag,
@@ -111,9 +143,7 @@ def _serve(
         state_ns = now_ns - (now_ns - due_ns) % _PERIOD_NS
         due_ns = state_ns + _PERIOD_NS
         if not silent:
-            writer.write(legs.state(state_ns))
-            done_ns = time.monotonic_ns()
-            truth.write(Kind.REPLY, 0, state_ns, state_ns, done_ns, done_ns - state_ns)
+            sender.send(legs.state(state_ns), state_ns)
 
 
 def _free_domain() -> tuple[socket.socket, int]:

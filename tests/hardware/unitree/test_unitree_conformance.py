@@ -20,6 +20,6 @@ class TestUnitreeLegs(DeviceConformance):
         return UnitreeLegs(port, drive=LegDrive(lie_s=1.0), silence_s=0.6, max_silence_s=0.5)
 
     def make_robot(self, truth_path, **settings):
-        from unitree_responder import Responder
+        from unitree_bench import emulated
 
-        return Responder(truth_path, **settings)
+        return emulated(truth_path, **settings)

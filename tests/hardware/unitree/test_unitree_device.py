@@ -9,25 +9,24 @@ import numpy as np
 import pytest
 
 pytest.importorskip("cyclonedds")
-from unitree_responder import CONTROLS, DAMPS, START_RAD, Responder
+from unitree_bench import CONTROLS, DAMPS, OFF, emulated, ways
 
+from pipelines.go2.plant import LYING
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
-from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.registry import load_device
 from sim2real.hardware.unitree import guarded, legs
 from sim2real.hardware.unitree.dds import Address, DdsLink
 from sim2real.hardware.unitree.device import UnitreeLegs
 from sim2real.hardware.unitree.legs import LegDrive
-from sim2real.hardware.unitree.messages import OFF
 
 pytestmark = pytest.mark.realtime
 MIXED = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
 
 
 @pytest.fixture
-def robot(tmp_path):
-    served = Responder(tmp_path / "truth.bin")
+def robot(tmp_path, request):
+    served = emulated(tmp_path / "truth.bin", getattr(request, "param", "floor"))
     yield served
     served.stop()
 
@@ -48,44 +47,40 @@ def other(robot):
     link.close()
 
 
-def run(device, link=None, check=False):
-    """Command and measure for at most 5 s; a link beside the device switches the motors off."""
-    end_s = time.monotonic() + 5.0
+def run(device, command, seconds, each=lambda: None):
+    """Command and measure."""
+    end_s = time.monotonic() + seconds
     while time.monotonic() < end_s:
-        device.command(device.rest())
-        if link is not None:
-            link.write(legs.off())
+        device.command(command)
+        each()
         device.measure()
-        if check:
-            device.check()
 
 
-def ways_of(robot):
-    """Return the ways in which the first motor was driven, in their order."""
-    robot.stop()
-    return robot.truth().of(Kind.EFFECT, 0)["values"][:, 0].tolist()
-
-
+@pytest.mark.parametrize("robot", ["stand"], indirect=True)
 def test_joints_in_another_order_move_and_are_measured(robot, device):
     device.open()
     device.enable()
-    np.testing.assert_allclose(device.measure().position_rad, START_RAD, atol=1e-3)
-    goal = device.rest()
-    goal[1] = [START_RAD[1] + 0.3, 0.0, 40.0, 4.0, 0.0]
-    for _ in range(250):
-        device.command(goal)
-        reading = device.measure()
-    moved = np.flatnonzero(np.abs(reading.position_rad - START_RAD) > 0.05)
+    goal = np.tile([0.0, 0.0, 60.0, 3.0, 0.0], (12, 1))
+    goal[:, 0] = LYING
+    run(device, goal, 0.6)
+    start, begin_ns = device.measure().position_rad, time.monotonic_ns()
+    goal[1, 0] -= 0.5
+    run(device, goal, 0.6)
+    end_ns = time.monotonic_ns()
+    reading = device.measure()
+    moved = np.flatnonzero(np.abs(reading.position_rad - start) > 0.25)
     assert moved.tolist() == [1]
     assert device.motors[1] == "FL_thigh"
-    assert reading.parts["battery_voltage"] == 28.0
-    assert reading.parts["temperature"].tolist() == [30.0] * 12
-    np.testing.assert_allclose(reading.parts["accelerometer"], [0, 0, 9.81], atol=1e-6)
+    assert reading.parts["battery_voltage"] == pytest.approx(29.6)
+    assert reading.parts["temperature"].tolist() == [35.0] * 12
+    np.testing.assert_allclose(reading.parts["accelerometer"], [0, 0, 9.81], atol=0.5)
     assert device.without_host()[0].does is Alone.GOES_ON
     device.disable()
-    robot.stop()
-    driven = robot.truth().of(Kind.EFFECT, 4)["values"][:, 0].tolist()
-    assert driven == [DAMPS, CONTROLS, DAMPS, OFF]
+    assert ways(robot)[0] == [DAMPS, CONTROLS, DAMPS, OFF]
+    # It is the fifth motor of the messages.
+    t_ns, states = robot.truth().states()
+    meanwhile = (t_ns > begin_ns) & (t_ns < end_ns)
+    assert max(range(12), key=lambda i: np.ptp(states[f"position[{i}]"][meanwhile])) == 4
 
 
 @pytest.mark.parametrize(
@@ -94,7 +89,8 @@ def test_joints_in_another_order_move_and_are_measured(robot, device):
 )
 def test_a_command_beyond_the_reach_is_not_sent(column, value, words):
     device = UnitreeLegs("lo:0", MIXED)
-    values = np.stack([START_RAD, *np.zeros((4, 12))], axis=1)
+    values = np.zeros((12, 5))
+    values[:, 0] = LYING
     values[0, column] = value
     with pytest.raises(SafetyStop, match=words):
         device.command(values)
@@ -122,7 +118,7 @@ def test_another_program_that_comes_later_stops_the_robot(robot, device):
     device.check()
     link = DdsLink(Address.parse(robot.port), "")
     with pytest.raises(SafetyStop, match=r"publishes rt/lowcmd: program .*follow both"):
-        run(device, check=True)
+        run(device, device.rest(), 5.0, device.check)
     link.close()
 
 
@@ -131,20 +127,20 @@ def test_motors_that_switch_off_stop_the_robot(robot, device):
     device.enable()
     link = DdsLink(Address.parse(robot.port), "")
     with pytest.raises(SafetyStop, match=r"FL_calf.* took the torque off"):
-        run(device, link)
+        run(device, device.rest(), 5.0, lambda: link.write(legs.off()))
     link.close()
 
 
 def test_a_robot_that_was_left_on_is_laid_down_first(robot, device, other):
     end_s = time.monotonic() + 5.0
-    standing = legs.command(np.tile([0.0, 0.0, 20.0, 1.0, 0.0], (12, 1)))
+    standing = legs.command(np.stack([LYING, *np.tile([[0.0], [20.0], [1.0], [0.0]], 12)], axis=1))
     while not (state := other.next_state(1.0)).record["motor_state"]["mode"][0] and time.monotonic() < end_s:
         other.write(standing)
     assert state.record["motor_state"]["mode"][0]
     other.close()
     device.open()
     device.close()
-    assert ways_of(robot) == [CONTROLS, DAMPS, OFF]
+    assert ways(robot)[0] == [CONTROLS, DAMPS, OFF]
 
 
 def test_a_robot_that_is_not_there_is_lost(monkeypatch):

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 pytest.importorskip("cyclonedds")
-from unitree_responder import CONTROLS, DAMPS, Responder
+from unitree_bench import CONTROLS, DAMPS, OFF, emulated, ways
 
 from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.safety.guardian_process import BEAT, REST, Guard
-from sim2real.hardware.unitree.messages import OFF
 from sim2real.log.reader import read_log
 
 pytestmark = pytest.mark.realtime
@@ -35,21 +34,20 @@ from sim2real.robots.control_loop.messages import Goals
 from sim2real.robots.roles import ROLES
 from sim2real.robots.walking.drive import BodySensor
 from sim2real.runtime.asynchronous import AsyncGraph
-sys.path.insert(0, {tests!r})
-from unitree_responder import START_RAD
+from pipelines.go2.plant import LYING
 from test_columns_rig import JointCommands
 
-device = UnitreeLegs({port!r}, drive=LegDrive(lie_s=1.0), silence_s=0.3, max_silence_s=0.5)
+device = UnitreeLegs({port!r}, drive=LegDrive(lie_s=1.0), silence_s=0.6, max_silence_s=1.0)
 low, high = device.reach()
-gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, max_speed_rad_s=30.0)
-body = BodySensor(device.motors, START_RAD)
+gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, max_speed_rad_s=30.0, command_timeout_s=2.0)
+body = BodySensor(device.motors, np.array(LYING))
 
 def controllers(goal):
     return JointCommands(goal, np.zeros(12), np.full(12, 40.0), np.full(12, 3.0), np.zeros(12))
 
 with Rig(device, gate) as rig:
     sensor = ServoSensor(ROLES.sensor, 50.0, rig, body.read, body.at_rest, delay=0.002)
-    player = Excitation(ROLES.supervisor, 50.0, np.tile(START_RAD, (3000, 1)), Goals, delay=0.002)
+    player = Excitation(ROLES.supervisor, 50.0, np.tile(LYING, (3000, 1)), Goals, delay=0.002)
     actuator = ServoActuator(ROLES.actuator, 50.0, rig, "goal", controllers, delay=0.002)
     graph = AsyncGraph(control_nodes(sensor, player, actuator), player)
     state = graph.init(jax.random.key(0), {{}})
@@ -70,33 +68,31 @@ with Rig(device, gate) as rig:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
 def test_the_legs_damp_and_then_switch_off(tmp_path, number):
-    robot, log = Responder(tmp_path / "truth.bin"), tmp_path / "log.mcap"
-    code = HOST.format(tests=str(tmp_path), port=robot.port, log=str(log))
-    folders = os.pathsep.join([os.path.dirname(__file__), os.path.dirname(os.path.dirname(__file__))])
+    robot, log = emulated(tmp_path / "truth.bin"), tmp_path / "log.mcap"
+    code = HOST.format(port=robot.port, log=str(log))
+    folder = os.path.dirname(os.path.dirname(__file__))
     host = subprocess.Popen(
         [sys.executable, "-c", code],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "PYTHONPATH": folders},
+        env={**os.environ, "PYTHONPATH": folder},
     )
     assert host.stdout.readline() == "on\n", host.stderr.read()
     time.sleep(0.8)
     end_ns = time.monotonic_ns()
     host.send_signal(number)
-    time.sleep(1.5)
+    time.sleep(2.0)
     host.send_signal(signal.SIGCONT)
     said, errors = host.communicate(timeout=20)
-    robot.stop()
-    # Every motor was driven, damped, and switched off; in this order, once each.
-    truth = robot.truth()
-    for motor in range(12):
-        rows = truth.of(Kind.EFFECT, motor)
-        ways = rows["values"][:, 0].tolist()
-        assert ways[-3:] == [CONTROLS, DAMPS, OFF], ways
-        damped_s, off_s = (rows["t_ns"][-2:] - end_ns) * 1e-9
-        assert 0.0 < damped_s < (0.2 if number == signal.SIGKILL else 0.6)
-        assert off_s > damped_s + 0.3
+    # The motors were driven, damped, and switched off; in this order, once each.
+    found, since_ns = ways(robot)
+    assert found[-3:] == [CONTROLS, DAMPS, OFF]
+    damped_s, off_s = (since_ns[-2:] - end_ns) * 1e-9
+    assert 0.0 < damped_s < (0.3 if number == signal.SIGKILL else 1.0)
+    assert off_s > damped_s + 0.3
+    last = {int(row["servo_id"]): row["values"][0] for row in robot.truth().of(Kind.EFFECT)}
+    assert last == dict.fromkeys(range(12), 0.0)
     reason = "the control process is gone" if number == signal.SIGKILL else "the control process was silent"
     assert f"sim2real guardian: {reason}" in errors
     assert "torque is off, confirmed after" in errors
