@@ -26,7 +26,8 @@ from pipelines.so101.robot import SERVOS  # noqa: E402
 from sim2real.errors import UsageError  # noqa: E402
 from sim2real.hardware.emulation.embedded import EmbeddedRobot  # noqa: E402
 from sim2real.hardware.feetech.emulation import StsEmulation  # noqa: E402
-from sim2real.hardware.lerobot.device import LerobotServos, LerobotSettings, servos  # noqa: E402
+from sim2real.hardware.lerobot.device import LerobotServos, LerobotSettings  # noqa: E402
+from sim2real.hardware.lerobot.link import LerobotConfig  # noqa: E402
 from sim2real.hardware.testing import DeviceConformance  # noqa: E402
 from sim2real.robots.servo.drive import ServoDrive  # noqa: E402
 
@@ -42,10 +43,12 @@ class TestLerobot(DeviceConformance):
     plant = f"{Path(__file__).parents[1] / 'plants.py'}:Joints"
     plant_args = {"ids": list(IDS), "start_rad": [0.0] * 6}  # noqa: RUF012
     patience_s = 2.0
+    silent_after_s = 4.0  # LeRobot writes 70 registers when it connects
 
     def make_device(self, port):
-        settings = LerobotSettings("so101_follower", "arm", FOLDER)
-        return servos(port, IDS, settings, baud_rate=1_000_000, silence_s=0.8)
+        # Patient with lost answers: LeRobot reads all six servos again if one of their answers is lost.
+        make = LerobotSettings("so101_follower", "arm", FOLDER).make
+        return LerobotServos(LerobotConfig(port, max_silence_s=3.0, silence_s=0.8, make=make), IDS)
 
 
 def test_the_guide_drives_the_arm(tmp_path, monkeypatch):
