@@ -8,17 +8,19 @@ import numpy as np
 import pytest
 from environments import Bandit
 
+from sim2real.artifacts.episodes import Episodes
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.train.show import training_summary
 from sim2real.train.config import PPOConfig
 from sim2real.train.environment.graph_environment import GraphEnvironment
 from sim2real.train.environment.protocol import Step
 from sim2real.train.environment.pushes import Pushes
 from sim2real.train.environment.variation import VariationConfig
-from sim2real.train.ppo.trainer import train
+from sim2real.train.ppo.trainer import Sweep, train
 
 KEY = jax.random.key(4)
 CONFIG = PPOConfig(
@@ -217,9 +219,11 @@ def test_differences_that_follow_success_grow_while_it_is_high(tmp_path):
     found = train(Following(), config, KEY, keep, checkpoint=tmp_path / "saved")
     widths, step = found.history["width"][:, 0], 0.5 / 3
     np.testing.assert_allclose(widths[:2], [0.2 + step, 0.2 + 2 * step], rtol=1e-5)
-    np.testing.assert_allclose(widths[3:], widths[2], rtol=1e-6, err_msg="no longer successful")
-    assert 0.5 < widths[2] <= 0.7
+    np.testing.assert_allclose(widths[2:], widths[1], rtol=1e-6, err_msg="no longer successful")
     np.testing.assert_allclose(found.history["return"], 0.7, rtol=1e-6, err_msg="evaluations have the last share")
+    # The result reports how far it came.
+    shown = training_summary(found, config, Sweep({}), Episodes((), curriculum=(0.2, 0.7), follow=0.5))
+    assert shown["share reached"] == "0.53 of 0.7: success did not stay above 0.5"
     # A training that was interrupted goes on at the share that it had reached.
     (tmp_path / "first").write_bytes(first["file"])
     again = train(Following(), config, KEY, resume=tmp_path / "first")

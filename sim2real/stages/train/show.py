@@ -77,7 +77,17 @@ def training_summary(result: TrainResult, ppo: PPOConfig, sweep: Sweep, episodes
         "episodes that end at a pause": f"{episodes.cut} of {episodes.timelines}",
         "timelines drawn again": episodes.again,
         **disturbance_rows(episodes),
+        **_reached(result, episodes),
     }
+
+
+def _reached(result: TrainResult, episodes: Episodes) -> dict[str, Json]:
+    """Return the share of a curriculum that follows success at the end; empty without one."""
+    if not episodes.follow:
+        return {}
+    share, last = float(result.history["width"][-1][result.best_seed]), episodes.curriculum[1]
+    late = "" if share >= last - 1e-6 else f" of {last:g}: success did not stay above {episodes.follow:g}"
+    return {"share reached": f"{share:.2f}{late}"}
 
 
 def episode_summary(episodes: Episodes) -> dict[str, Json]:

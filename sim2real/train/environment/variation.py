@@ -74,7 +74,7 @@ class VariationConfig:
         if not 0.0 <= self.follow < 1.0 or (self.follow and not self.grows):
             raise UsageError(
                 f"vary.follow must lie in [0, 1) beside a vary.curriculum that grows, got {self.follow}",
-                hint="--vary.curriculum 0.3 1 --vary.follow 0.6 starts at 0.3, and grows while success is above 0.6",
+                hint="--vary.curriculum 0.3 1 --vary.follow 0.35 starts at 0.3, and grows while success is above 0.6",
             )
         for name, (low, high) in self.range.items():
             if not low < high:
