@@ -98,10 +98,10 @@ BENCHES = {
     ),
     "runner": Bench(
         "runner",
-        "a step of a policy in numpy, and the loop of twelve joints at 500 Hz",
+        "a step of a policy in numpy, and the loop of twelve joints at 500 Hz, of servos and of a Go2",
         (
             *("sim2real/policy", "sim2real/runtime", "sim2real/hardware", "sim2real/robots"),
-            "scripts/benches/twelve_joints.py",
+            *("scripts/benches/twelve_joints.py", "pipelines/go2/plant.py", "pipelines/go2/go2.xml"),
         ),
     ),
     "scaling": Bench(

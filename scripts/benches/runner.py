@@ -1,4 +1,4 @@
-"""A policy on the robot: a single step of it, and the loop of twelve joints on an emulated bus."""
+"""A policy on the robot: a single step of it, and the loop of twelve joints, on an emulated bus and an emulated Go2."""
 
 from __future__ import annotations
 
@@ -6,14 +6,20 @@ import argparse
 import itertools
 import tempfile
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from flax import struct
 
 from benches.figures import Report, Row, row
+from pipelines.go2.plant import LYING
+from sim2real.graph.base import Base
 from sim2real.graph.node import BaseNode
+from sim2real.hardware.device import Device
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import VoltageDrive
@@ -75,8 +81,23 @@ def _see(reading: JointReading) -> Any:
     return np.concatenate([reading.position, reading.velocity]).astype(np.float32)
 
 
-def nodes_of(rig: Rig, rate_hz: float) -> dict[str, BaseNode]:
-    """Return sensor, policy and actuator of twelve joints."""
+@struct.dataclass
+class Controllers(Base):
+    """A command of legs: torques, and damping."""
+
+    q: Any
+    dq: Any
+    kp: Any
+    kd: Any
+    tau: Any
+
+
+def _damped(torque: Any) -> Controllers:
+    return Controllers(np.array(LYING), np.zeros(JOINTS), np.zeros(JOINTS), np.full(JOINTS, 3.0), torque)
+
+
+def nodes_of(rig: Rig, rate_hz: float, message: Callable[[Any], Base] = Goals) -> dict[str, BaseNode]:
+    """Return sensor, policy and actuator of twelve joints; ``message`` makes a command of the policy's action."""
     rest = JointReading(np.zeros(JOINTS), np.zeros(JOINTS))
     agent = DirectAgent("agent", rate_hz, _see, (2 * JOINTS, JOINTS), 1, Goals, delay=0.0005)
     return control_nodes(
@@ -84,13 +105,13 @@ def nodes_of(rig: Rig, rate_hz: float) -> dict[str, BaseNode]:
             "sensor", rate_hz, rig, lambda r: JointReading(r.position_rad, r.velocity_rad_s), rest, delay=0.001
         ),
         PolicyNode(agent, policy(5 * JOINTS, JOINTS, rate_hz)),
-        ServoActuator("actuator", rate_hz, rig, "goal", Goals, delay=0.0005),
+        ServoActuator("actuator", rate_hz, rig, "goal", message, delay=0.0005),
     )
 
 
-def loop(rate_hz: float, seconds: float, spin_s: float) -> list[Row]:
-    """Measure the lateness of the nodes of twelve joints on the wall clock, beside an emulated bus."""
-    # The emulator, the device and the rig, then the graph on them.
+@contextmanager
+def servos() -> Iterator[Rig]:
+    """Yield a rig of twelve servos on an emulated bus."""
     plant = f"{Path(__file__).with_name('twelve_joints.py')}:TwelveJoints"
     config = EmulatorConfig(baud_rate=BAUD, return_delay_us=0, plant_step_s=0.001)
     with (
@@ -99,17 +120,36 @@ def loop(rate_hz: float, seconds: float, spin_s: float) -> list[Row]:
     ):
         bus = BusConfig(robot.port, baud_rate=BAUD, silence_s=1.0, max_silence_s=1.0)
         device = DynamixelServos(bus, list(range(1, JOINTS + 1)), VoltageDrive(SUPPLY_V))
-        with Rig(device, GateConfig(LIMIT_V, stuck_effort=2.0)) as rig, realtime():
-            nodes = nodes_of(rig, rate_hz)
-            graph = AsyncGraph(nodes, nodes["agent"], spin_s=spin_s)
-            with graph:
-                graph.start(graph.init(jax.random.key(0)))
-                begin = time.process_time()
-                graph.run_for(seconds)
-                cpu = (time.process_time() - begin) / seconds
-                statistics = graph.statistics()
-            lost, bus_ms = device.counters.lost_replies, 1e-3 * np.array(rig.measuring.transfer_us)
-    what, rows = f"runner/{JOINTS}_joints_{rate_hz:g}_hz", []
+        with Rig(device, GateConfig(LIMIT_V, stuck_effort=2.0)) as rig:
+            yield rig
+
+
+@contextmanager
+def legs() -> Iterator[Rig]:
+    """Yield a rig of an emulated Go2 that lies, over DDS."""
+    from sim2real.hardware.unitree.device import UnitreeLegs
+    from sim2real.hardware.unitree.emulation import UnitreeEmulation
+
+    with EmbeddedRobot("pipelines.go2.plant:Go2Body", UnitreeEmulation()) as robot:
+        device = UnitreeLegs(robot.port, silence_s=1.0, max_silence_s=1.0)
+        low, high = device.reach()
+        gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, stuck_effort=2.0)
+        with Rig(device, gate) as rig:
+            yield rig
+
+
+def loop(what: str, rig: Rig, nodes: dict[str, BaseNode], rate_hz: float, seconds: float, spin_s: float) -> list[Row]:
+    """Measure the lateness of the nodes of twelve joints on the wall clock, beside the emulator."""
+    with realtime():
+        graph = AsyncGraph(nodes, nodes["agent"], spin_s=spin_s)
+        with graph:
+            graph.start(graph.init(jax.random.key(0)))
+            begin = time.process_time()
+            graph.run_for(seconds)
+            cpu = (time.process_time() - begin) / seconds
+            statistics = graph.statistics()
+        lost, bus_ms = rig.device.counters.lost_replies, 1e-3 * np.array(rig.measuring.transfer_us)
+    rows = []
     for name, node in statistics.items():
         late = [round(1e3 * q, 3) for q in node.lateness_s]
         rows.append(row(f"{what}/{name}/lateness_ms", late, "ms", "p50, p99, max", "p99 < 1"))
@@ -118,6 +158,19 @@ def loop(rate_hz: float, seconds: float, spin_s: float) -> list[Row]:
     rows.append(row(f"{what}/reading_ms", took, "ms", "p50, p99; the period is 1 / rate", f"< {1e3 / rate_hz:g}"))
     rows.append(row(f"{what}/cpu", round(cpu, 3), "cores"))
     return [*rows, row(f"{what}/lost_replies", lost, "")]
+
+
+def a_cycle(device: Device, cycles: int) -> Row:
+    """Measure the processor time of one reading and one command of a device whose torque is off."""
+    device.enable()
+    rest = device.rest()
+    begin = time.thread_time()
+    for _ in range(cycles):
+        device.measure()
+        device.command(rest)
+    took_us = 1e6 * (time.thread_time() - begin) / cycles
+    device.disable()
+    return row("runner/go2/measure_and_command_us", round(took_us), "us of the processor", goal="< 500")
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -131,5 +184,11 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Measure single steps of the policy, and the loop."""
-    return {"rows": [*a_step(options.steps), *loop(options.rate, options.seconds, options.spin_s)]}
+    """Measure single steps of the policy, and the loops."""
+    flags, rows = (options.rate, options.seconds, options.spin_s), a_step(options.steps)
+    with servos() as rig:
+        rows += loop(f"runner/{JOINTS}_joints_{options.rate:g}_hz", rig, nodes_of(rig, options.rate), *flags)
+    with legs() as rig:
+        rows.append(a_cycle(rig.device, options.steps // 10))
+        rows += loop(f"runner/go2_{options.rate:g}_hz", rig, nodes_of(rig, options.rate, _damped), *flags)
+    return {"rows": rows}

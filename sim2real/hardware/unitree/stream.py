@@ -43,12 +43,14 @@ class StateStream:
     def begin(self, timeout_s: float) -> LowState:
         """Wait for the first states, learn by how much the tick grows, and return the newest state."""
         with self._lock:
-            states, end_s = [], time.monotonic() + timeout_s
+            states, damaged, end_s = [], 0, time.monotonic() + timeout_s
             while len(states) < _LEARNT:
-                state = self._robot.next_state(max(0.0, end_s - time.monotonic()))
+                left_s = end_s - time.monotonic()
+                state = self._robot.next_state(left_s) if left_s > 0.0 else None
                 if state is None:
-                    raise self._silent(timeout_s)
+                    raise self._silent(timeout_s, damaged)
                 states += [state] if state.intact else []
+                damaged += not state.intact
             ticks = np.array([state.record["tick"] for state in states], np.int64)
             self._step = max(1, round(float(np.median(np.diff(ticks)))))
             self._tick, self._taken_s = int(ticks[-1]), time.monotonic()
@@ -62,13 +64,15 @@ class StateStream:
             begin_ns = time.monotonic_ns()
             while (old := self._robot.next_state(0.0)) is not None:
                 self._is_next(old)
-            lost, end_s = self._lost, time.monotonic() + self._max_silence_s
+            lost, damaged, end_s = self._lost, 0, time.monotonic() + self._max_silence_s
             while True:
-                state = self._robot.next_state(max(0.0, end_s - time.monotonic()))
+                left_s = end_s - time.monotonic()
+                state = self._robot.next_state(left_s) if left_s > 0.0 else None
                 if state is None:
-                    raise self._silent(self._max_silence_s)
+                    raise self._silent(self._max_silence_s, damaged)
                 if self._is_next(state):
                     break
+                damaged += not state.intact
             # Count it.
             arrived_ns = time.monotonic_ns()
             retries, waited_s = self._lost - lost, 1e-9 * (arrived_ns - begin_ns)
@@ -101,7 +105,12 @@ class StateStream:
         self._tick, self._taken_s = tick, now_s
         return True
 
-    def _silent(self, time_s: float) -> HardwareLost:
+    def _silent(self, time_s: float, damaged: int) -> HardwareLost:
+        if damaged:
+            return HardwareLost(
+                f"the robot on {self._robot.address} has sent {damaged} states in {time_s:g} s, all with a wrong CRC",
+                hint="is it a Go2, and does its firmware fill in the CRC of its states?",
+            )
         return HardwareLost(
             f"the robot on {self._robot.address} has sent no state for {time_s:g} s",
             hint="is it on, is the cable in, and are interface and domain the robot's?",

@@ -37,17 +37,21 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from pipelines.go2.plant import LYING
 from test_columns_rig import JointCommands
 
-device = UnitreeLegs({port!r}, drive=LegDrive(lie_s=1.0), silence_s=0.6, max_silence_s=1.0)
+device = UnitreeLegs({port!r}, drive=LegDrive(lie_s=3.0), silence_s=0.6, max_silence_s=1.0)
 low, high = device.reach()
-gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, max_speed_rad_s=30.0, command_timeout_s=2.0)
+gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, command_timeout_s=2.0)
 body = BodySensor(device.motors, np.array(LYING))
 
 def controllers(goal):
-    return JointCommands(goal, np.zeros(12), np.full(12, 40.0), np.full(12, 3.0), np.zeros(12))
+    return JointCommands(goal, np.zeros(12), np.full(12, 60.0), np.full(12, 4.0), np.zeros(12))
+
+# It stands up within 0.6 s.
+stood = np.clip(np.arange(3000) / 30.0, 0.0, 1.0)[:, None]
+goals = LYING + stood * (np.array([0.0, 0.8, -1.5] * 4) - LYING)
 
 with Rig(device, gate) as rig:
     sensor = ServoSensor(ROLES.sensor, 50.0, rig, body.read, body.at_rest, delay=0.002)
-    player = Excitation(ROLES.supervisor, 50.0, np.tile(LYING, (3000, 1)), Goals, delay=0.002)
+    player = Excitation(ROLES.supervisor, 50.0, goals, Goals, delay=0.002)
     actuator = ServoActuator(ROLES.actuator, 50.0, rig, "goal", controllers, delay=0.002)
     graph = AsyncGraph(control_nodes(sensor, player, actuator), player)
     state = graph.init(jax.random.key(0), {{}})
@@ -67,7 +71,7 @@ with Rig(device, gate) as rig:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
-def test_the_legs_damp_and_then_switch_off(tmp_path, number):
+def test_a_robot_that_stands_sinks_before_its_motors_switch_off(tmp_path, number):
     robot, log = emulated(tmp_path / "truth.bin"), tmp_path / "log.mcap"
     code = HOST.format(port=robot.port, log=str(log))
     folder = os.path.dirname(os.path.dirname(__file__))
@@ -79,11 +83,13 @@ def test_the_legs_damp_and_then_switch_off(tmp_path, number):
         env={**os.environ, "PYTHONPATH": folder},
     )
     assert host.stdout.readline() == "on\n", host.stderr.read()
-    time.sleep(0.8)
+    time.sleep(1.2)
     end_ns = time.monotonic_ns()
     host.send_signal(number)
-    time.sleep(2.0)
-    host.send_signal(signal.SIGCONT)
+    if number == signal.SIGSTOP:
+        time.sleep(1.0)
+        host.send_signal(signal.SIGCONT)
+    # The guardian holds the other end of stderr, until it ends.
     said, errors = host.communicate(timeout=20)
     # The motors were driven, damped, and switched off; in this order, once each.
     found, since_ns = ways(robot)
@@ -91,6 +97,12 @@ def test_the_legs_damp_and_then_switch_off(tmp_path, number):
     damped_s, off_s = (since_ns[-2:] - end_ns) * 1e-9
     assert 0.0 < damped_s < (0.3 if number == signal.SIGKILL else 1.0)
     assert off_s > damped_s + 0.3
+    # It sinks more slowly than it falls, and lies when the torque goes off.
+    t_ns, states = robot.truth().states()
+    height, sinking = states["base[2]"], t_ns > end_ns
+    assert height[~sinking][-1] > 0.25
+    assert np.gradient(height, 1e-9 * t_ns)[sinking].min() > -1.0
+    assert height[t_ns < since_ns[-1]][-1] < 0.12
     last = {int(row["servo_id"]): row["values"][0] for row in robot.truth().of(Kind.EFFECT)}
     assert last == dict.fromkeys(range(12), 0.0)
     reason = "the control process is gone" if number == signal.SIGKILL else "the control process was silent"
@@ -102,7 +114,7 @@ def test_the_legs_damp_and_then_switch_off(tmp_path, number):
     with warnings.catch_warnings(action="ignore"):  # it has no end
         outputs = read_log(log).outputs
     assert len(outputs["sensor"]["quaternion"]) > 20
-    np.testing.assert_allclose(outputs["actuator"]["kp"][-1], np.full(12, 40.0))
+    np.testing.assert_allclose(outputs["actuator"]["kp"][-1], np.full(12, 60.0))
 
 
 @pytest.mark.parametrize(("last", "acts"), [(BEAT, ["the control process is gone"]), (REST, [])])
