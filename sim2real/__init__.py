@@ -98,9 +98,9 @@ def callable_package(name: str) -> None:
 def __getattr__(name: str) -> Any:
     """Import a public name from its module on first use."""
     if name == "__version__":
-        from importlib import metadata
+        from sim2real.installation import version
 
-        value: Any = metadata.version("sim2real")
+        value: Any = version()
     elif name in _MODULES:
         value = importlib.import_module(f"sim2real.{name}")
     elif name in _MODULE_OF_NAME:

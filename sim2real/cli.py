@@ -11,6 +11,8 @@ from sim2real.commands import exit_code
 from sim2real.commands.command_kinds import DEMO_PIPELINE, EXIT_CODES
 from sim2real.commands.table import COMMANDS
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError, did_you_mean
+from sim2real.installation import require_one
+from sim2real.later import not_installed
 from sim2real.runtime import compilation_cache
 from sim2real.stages.terminal.interruption import SignalHandling
 
@@ -68,6 +70,9 @@ def _run_command(arguments: list[str], signals: SignalHandling) -> int:
         return end.code if isinstance(end.code, int) else OK if end.code is None else ERROR
     except OSError as error:
         return exit_code.ended_by(signals.received) if signals.received else exit_code.refused(error)
+    except ModuleNotFoundError as error:
+        missing = not_installed(error)
+        return exit_code.failed(missing) if missing else exit_code.unexpected(error)
     except Exception as error:
         if signals.received:  # an extension that is interrupted while it is imported raises ImportError
             return exit_code.ended_by(signals.received)
@@ -77,6 +82,7 @@ def _run_command(arguments: list[str], signals: SignalHandling) -> int:
 
 def _dispatch(arguments: list[str]) -> None:
     """Find the command and call it."""
+    require_one()
     command, rest = (arguments[0], arguments[1:]) if arguments else ("--help", [])
     if command in ("-h", "--help", "help"):
         print(HELP)

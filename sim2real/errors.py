@@ -41,6 +41,10 @@ class UsageError(Sim2RealError):
     exit_code = USAGE
 
 
+class NotInstalled(UsageError):  # noqa: N818
+    """A command, or a part of a robot, needs a package that this installation lacks (exit code 2)."""
+
+
 class SafetyStop(Sim2RealError):  # noqa: N818 - an event, not a mistake in the program
     """The robot was stopped by a limit, a watchdog or a value that is not finite (exit code 3)."""
 

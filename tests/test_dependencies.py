@@ -127,7 +127,8 @@ def test_an_extra_is_imported_only_where_the_error_names_it(extra, imported):
     packages = [package_of(r) for r in EXTRAS[extra] if "mujoco" not in r]
     found = set().union(*(importers(imported, package) for package in packages))
     assert found == MAY_IMPORT[extra]
-    hints = [path for name, path in sources().items() if name in found and f"sim2real[{extra}]" in path.read_text()]
+    named = re.compile(rf"sim2real\[{extra}\]|with_extra\(.{extra}.\)")
+    hints = [path for name, path in sources().items() if name in found and named.search(path.read_text())]
     assert hints or not packages
 
 

@@ -15,7 +15,10 @@ ROOMS = [
     "graph", "runtime", "policy", "composer", "worlds", "hardware", "log", "artifacts", "identify", "train", "robots",
     "view", "stages", "interop", "commands", "cli",
 ]  # fmt: skip
-EVERYWHERE = {"arrays", "errors", "leaps", "moved", "callable_package", "types"}
+EVERYWHERE = {
+    *("arrays", "callable_package", "errors", "installation", "later", "leaps", "moved", "plain_pytree", "pytree"),
+    *("random_numbers", "types"),
+}
 STAGES = {path.parent.name for path in (PACKAGE / "stages").glob("*/stage.py")}
 COMPOSED = {"latency": {"record", "identify"}, "record": {"check"}}
 """Stages that call other stages: latency records steps and identifies the delay from them, and record checks a motion

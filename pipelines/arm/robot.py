@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.arrays import namespace
+from sim2real.later import jax, jnp
+from sim2real.random_numbers import uniform
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.hardware import Embedded
 from sim2real.robots.control_loop.messages import JointReading
@@ -47,7 +47,8 @@ def embedded() -> Embedded:
 
 def draw_target(key: Key) -> Array:
     """Return a target ``(3,)`` [m]."""
-    return tip_of(jnp, jax.random.uniform(key, (3,), minval=jnp.array(LOW), maxval=jnp.array(HIGH)))
+    angles = uniform(key, LOW, HIGH)
+    return tip_of(namespace(angles), angles)
 
 
 TARGET = Aim(

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.arrays import namespace
 from sim2real.graph.base import Array, Base, GraphState, StepState
 from sim2real.identify.parameters import Parameter
+from sim2real.later import jnp
 from sim2real.robots.servo.agent import DirectAgent
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 
@@ -20,14 +20,14 @@ HISTORY = 4
 """Past steps in the policy's observation."""
 
 
-@struct.dataclass
+@pytree.dataclass
 class Command(Base):
     """The motor's command; ``action`` has shape ``(1,)`` [V]."""
 
     action: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class Measurement(Base):
     """Angle ``th`` [rad] and angular velocity ``thdot`` [rad/s]."""
 
@@ -35,7 +35,7 @@ class Measurement(Base):
     thdot: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class PendulumParams(Base):
     """A DC motor that turns an eccentric mass.
 
@@ -73,7 +73,7 @@ def nominal_params() -> PendulumParams:
         R=7.73125142447252,
         c=0.000975041213361349,
         max_speed=60.0,
-        start=jnp.array([jnp.pi, 0.0]),
+        start=np.array([np.pi, 0.0], np.float32),
     )
 
 

@@ -8,13 +8,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from sim2real.arrays import namespace
 from sim2real.errors import SafetyStop
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter
+from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask, Session
 from sim2real.robots.control_loop.hardware import Embedded, ServoSession
@@ -45,7 +45,8 @@ _PUSHES, _PUSH_V, _PUSH_S = 5, 1.5, 0.3
 
 def upright(th: Any, thdot: Any) -> Any:
     """Return where the pendulum counts as upright: cos(th) > 0.95 and |thdot| < 0.5 rad/s."""
-    return (jnp.cos(th) > 0.95) & (jnp.abs(thdot) < 0.5)
+    xp = namespace(th, thdot)
+    return (xp.cos(th) > 0.95) & (xp.abs(thdot) < 0.5)
 
 
 class HingeSensor(RobotSensor):

@@ -10,13 +10,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter
+from sim2real.later import jax, jnp
+from sim2real.random_numbers import uniform
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.hardware import Embedded
 from sim2real.robots.control_loop.messages import JointReading
@@ -120,8 +120,9 @@ def dynamics() -> list[Parameter]:
 
 def draw_target(key: Key) -> Array:
     """Return a target [m] and an opening [rad], ``(4,)``."""
-    angles = jax.random.uniform(key, (6,), minval=jnp.array(LOW), maxval=jnp.array(HIGH))
-    return jnp.append(tip_of(jnp, angles), angles[5])
+    angles = uniform(key, LOW, HIGH)
+    xp = namespace(angles)
+    return xp.append(tip_of(xp, angles), angles[5])
 
 
 def place_target(aim: Array) -> dict[str, Array]:

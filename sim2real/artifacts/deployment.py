@@ -22,6 +22,8 @@ FORMAT = 2
 RESULT, SIMULATION = "result.json", "simulation.npz"
 PROBE = "probe.mcap"
 """Log of the small steps that measure the delay before the episodes."""
+AS_HERE = "as in this log"
+"""The model with the parameters fitted to the deployment's own log."""
 _AGAIN = "run `sim2real deploy` again"
 _RUN = "{run}"
 """Placeholder for the run's folder in the next command, as the folder may move."""

@@ -13,6 +13,7 @@ from sim2real.artifacts.run.run_folder import STAGES, attempts, run_folders
 from sim2real.artifacts.run.stage_status import stage_status
 from sim2real.commands.flags import flag_names
 from sim2real.hardware import entries
+from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
 from sim2real.stages.pipeline.pipeline import available, load_pipeline
 from sim2real.stages.terminal.console import pairs, shown, table
@@ -39,6 +40,8 @@ def _programs() -> str:
     if (configured := os.environ.get("JAX_COMPILATION_CACHE_DIR")) is not None:
         return f"{configured} (JAX_COMPILATION_CACHE_DIR)"
     folder = compilation_cache.location()
+    if not has_jax():
+        return "none: JAX is not installed"
     if folder is None:
         return f"not kept: {compilation_cache.VARIABLE} is {compilation_cache.OFF}"
     return f"{shown(folder)}, {compilation_cache.size_bytes(folder) / 1e6:.0f} MB"

@@ -6,22 +6,25 @@ import dataclasses
 import operator
 from typing import TYPE_CHECKING, Self, TypeAlias, TypeVar
 
-import jax
-import numpy as np
-from flax import struct
-
+from sim2real import pytree
 from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import jax
+    import numpy as np
+
+    Array: TypeAlias = jax.Array | np.ndarray
+    """JAX's arrays in a compiled program, numpy's if nodes run on a clock."""
+    Number: TypeAlias = Array | np.number | np.bool_ | float
+    """A scalar of JAX, numpy or Python."""
+    Value: TypeAlias = jax.Array | float
+    """A quantity in a compiled program: a number, or one for each joint."""
+else:
+    Array = Number = Value = PyTree
+
 T = TypeVar("T", bound="Base")
-Array: TypeAlias = jax.Array | np.ndarray
-"""JAX's arrays in a compiled program, numpy's if nodes run on a clock."""
-Number: TypeAlias = Array | np.number | np.bool_ | float
-"""A scalar of JAX, numpy or Python."""
-Value: TypeAlias = jax.Array | float
-"""A quantity in a compiled program: a number, or one for each joint."""
 
 
 class Base:
@@ -38,10 +41,10 @@ class Base:
         return dataclasses.replace(instance, **changes)
 
     def _map(self: T, op: Callable[..., PyTree], other: PyTree) -> T:
-        same = jax.tree_util.tree_structure(self) == jax.tree_util.tree_structure(other)
+        same = pytree.structure(self) == pytree.structure(other)
         if same:
-            return jax.tree_util.tree_map(op, self, other)
-        return jax.tree_util.tree_map(lambda leaf: op(leaf, other), self)
+            return pytree.map(op, self, other)
+        return pytree.map(lambda leaf: op(leaf, other), self)
 
     def __add__(self: T, other: PyTree) -> T:
         return self._map(operator.add, other)
@@ -56,18 +59,18 @@ class Base:
         return self._map(operator.truediv, other)
 
     def __neg__(self: T) -> T:
-        return jax.tree_util.tree_map(operator.neg, self)
+        return pytree.map(operator.neg, self)
 
     def __getitem__(self: T, index: PyTree) -> T:
-        return jax.tree_util.tree_map(lambda leaf: leaf[index], self)
+        return pytree.map(lambda leaf: leaf[index], self)
 
 
-@struct.dataclass
+@pytree.dataclass
 class Empty(Base):
     """No parameters, no state or no output."""
 
 
-@struct.dataclass
+@pytree.dataclass
 class InputState(Base):
     """The last W consumed messages of one input, oldest first.
 
@@ -86,11 +89,11 @@ class InputState(Base):
     delay_dist: PyTree = None
 
     def __getitem__(self, index: PyTree) -> InputState:
-        take = jax.tree_util.tree_map(lambda leaf: leaf[index], (self.seq, self.ts_sent, self.ts_recv, self.data))
+        take = pytree.map(lambda leaf: leaf[index], (self.seq, self.ts_sent, self.ts_recv, self.data))
         return InputState(*take, delay_dist=self.delay_dist)
 
 
-@struct.dataclass
+@pytree.dataclass
 class StepState(Base):
     """The data that ``BaseNode.step`` may read and replace.
 
@@ -105,13 +108,13 @@ class StepState(Base):
     rng: jax.Array | None = None
     state: PyTree = None
     params: PyTree = None
-    inputs: dict[str, InputState] = struct.field(default_factory=dict)
+    inputs: dict[str, InputState] = pytree.field(default_factory=dict)
     eps: Number = 0
     seq: Number = 0
     ts: Number = 0.0
 
 
-@struct.dataclass
+@pytree.dataclass
 class GraphState(Base):
     """The state of a whole graph; dictionaries are keyed by node name.
 
@@ -128,10 +131,10 @@ class GraphState(Base):
 
     eps: Number = 0
     step: Number = -1
-    rng: dict[str, jax.Array] = struct.field(default_factory=dict)
-    params: dict[str, PyTree] = struct.field(default_factory=dict)
-    state: dict[str, PyTree] = struct.field(default_factory=dict)
-    seq: dict[str, Number] = struct.field(default_factory=dict)
-    delays: dict[str, dict[str, PyTree]] = struct.field(default_factory=dict)
-    buffer: dict[str, PyTree] = struct.field(default_factory=dict)
-    aux: dict[str, PyTree] = struct.field(default_factory=dict)
+    rng: dict[str, jax.Array] = pytree.field(default_factory=dict)
+    params: dict[str, PyTree] = pytree.field(default_factory=dict)
+    state: dict[str, PyTree] = pytree.field(default_factory=dict)
+    seq: dict[str, Number] = pytree.field(default_factory=dict)
+    delays: dict[str, dict[str, PyTree]] = pytree.field(default_factory=dict)
+    buffer: dict[str, PyTree] = pytree.field(default_factory=dict)
+    aux: dict[str, PyTree] = pytree.field(default_factory=dict)

@@ -13,14 +13,13 @@ from numbers import Real
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, InputState
 from sim2real.graph.interpolation import between, mean_of
+from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 
 if TYPE_CHECKING:
@@ -151,7 +150,7 @@ _INTERPOLATIONS = ("zoh", "linear", "linear_real_only", "zoh_mean")
 _INTEGERS = ("hold", "round")
 
 
-@struct.dataclass
+@pytree.dataclass
 class TrainableDist(Base, DelayDistribution):
     """A delay that may change while the graph runs, between two bounds: ``min + alpha * (max - min)``.
 
@@ -170,11 +169,11 @@ class TrainableDist(Base, DelayDistribution):
     """
 
     alpha: jax.Array
-    min: float = struct.field(pytree_node=False)
-    max: float = struct.field(pytree_node=False)
-    interp: str = struct.field(pytree_node=False, default="zoh")
-    burst: int = struct.field(pytree_node=False, default=0)
-    integers: str = struct.field(pytree_node=False, default="hold")
+    min: float = pytree.field(pytree_node=False)
+    max: float = pytree.field(pytree_node=False)
+    interp: str = pytree.field(pytree_node=False, default="zoh")
+    burst: int = pytree.field(pytree_node=False, default=0)
+    integers: str = pytree.field(pytree_node=False, default="hold")
 
     @classmethod
     def create(

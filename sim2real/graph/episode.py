@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from sim2real.arrays import is_jax
 from sim2real.errors import UsageError
+from sim2real.later import jax
 from sim2real.types import Json, PyTree
 
 if TYPE_CHECKING:
@@ -246,11 +248,11 @@ def messages_from_records(records: list[MessageRecord]) -> Messages:
 
 def named_leaves(tree: PyTree) -> dict[str, PyTree]:
     """Return the leaves of a message by dotted name (``th``, ``pose.x``), in a fixed order."""
-    import jax  # imported late: a log of plain dictionaries is written without JAX
-
     if isinstance(tree, Mapping) and not any(isinstance(v, Mapping) or is_dataclass(v) for v in tree.values()):
         return dict(tree)
-    flat, _ = jax.tree_util.tree_flatten_with_path(tree)
+    from sim2real import pytree  # imported late: a log of plain dictionaries is read without JAX
+
+    flat, _ = pytree.flatten_with_path(tree)
 
     def label(path: tuple[object, ...]) -> str:
         return ".".join(str(getattr(p, "name", getattr(p, "key", getattr(p, "idx", p)))) for p in path) or "value"
@@ -260,13 +262,13 @@ def named_leaves(tree: PyTree) -> dict[str, PyTree]:
 
 def _copied(tree: PyTree) -> PyTree:
     """Return a tree with numpy copies of its arrays; of a JAX key its numbers."""
-    import jax
+    from sim2real import pytree
 
     def one(leaf: PyTree) -> np.ndarray:
-        key = isinstance(leaf, jax.Array) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        key = is_jax(leaf) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return np.array(jax.random.key_data(leaf) if key else leaf)
 
-    return jax.tree_util.tree_map(one, tree)
+    return pytree.map(one, tree)
 
 
 def _stack(outputs: list[PyTree]) -> dict[str, np.ndarray]:

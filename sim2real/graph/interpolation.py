@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
+from sim2real.later import jax, jnp
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Array

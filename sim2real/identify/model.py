@@ -6,16 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-import jax
 import numpy as np
 
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.export.card.plain import PlainSimulation as PlainSimulation
 from sim2real.identify.parameters import ParameterTable
+from sim2real.later import jax
 from sim2real.types import Array, PyTree
 
-Rows = TypeVar("Rows", np.ndarray, jax.Array)
+Rows = TypeVar("Rows", np.ndarray, "jax.Array")
 
 
 @dataclass(frozen=True)

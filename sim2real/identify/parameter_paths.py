@@ -6,11 +6,10 @@ import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 
-import jax
-import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
 from sim2real.errors import UsageError
+from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 
 _STEP = re.compile(r"([A-Za-z_]\w*)((?:\[-?\d+\])*)$")

@@ -7,14 +7,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sim2real.artifacts.estimation.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
 from sim2real.identify.parameter_paths import set_leaf
+from sim2real.later import jax, jnp
 from sim2real.types import Array, PyTree
 
 _BELOW, _BEYOND = 4.0, 50.0

@@ -296,7 +296,7 @@ def _snapshot(node: str, output: PyTree, expected: dict[str, None]) -> list[PyTr
             f"the output of node {node!r} has the fields {', '.join(output)}, expected {', '.join(expected)}"
         )
     else:
-        import jax  # imported late: a log of plain dictionaries is written without JAX
+        from sim2real import pytree  # imported late: a log of plain dictionaries is written without JAX
 
-        leaves = jax.tree_util.tree_leaves(output)
+        leaves = pytree.leaves(output)
     return [leaf.copy() if type(leaf) is np.ndarray and leaf.flags.writeable else leaf for leaf in leaves]

@@ -8,7 +8,6 @@ import importlib.util
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType
 
@@ -17,6 +16,7 @@ import safetensors.numpy
 from safetensors import SafetensorError
 
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.installation import version
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.network import NetworkSpec
 from sim2real.policy.onnx_graph import build_onnx, with_contract
@@ -133,7 +133,7 @@ def _described(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
         **({} if plain else {"network": spec.to_dict()}),
         "normaliser": {"mean": weights["mean"].tolist(), "std": weights["std"].tolist(), "clip": OBSERVATION_CLIP},
         "versions": {"python": platform.python_version()}
-        | {name: _version(name) for name in ("sim2real", "numpy", "onnx")},
+        | {name: version(name) for name in ("sim2real", "numpy", "onnx")},
     }
 
 
@@ -387,11 +387,3 @@ def check_parity(
             f"{backend} and ONNX disagree by {worst:.2e} of the action range, {tolerance:.0e} is allowed",
             hint="a normaliser with tiny standard deviations or huge weights loses float32's precision",
         )
-
-
-def _version(name: str) -> str | None:
-    """Return the version of a distribution, or None if it runs uninstalled from its sources."""
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return None

@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
+from sim2real.installation import with_extra
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.network import NetworkSpec
 
@@ -126,7 +127,7 @@ class OnnxBackend:
         except ImportError as error:
             raise UsageError(
                 "backend 'onnx' needs onnxruntime, which is not installed",
-                hint="pip install 'sim2real[hardware]', or use backend 'numpy'",
+                hint=f"{with_extra('hardware')}, or use backend 'numpy'",
             ) from error
         # One thread: the policy is small, and the control loop has one core.
         options = onnxruntime.SessionOptions()

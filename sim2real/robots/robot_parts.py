@@ -10,8 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState
@@ -25,15 +23,17 @@ from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.probe import Probe
 from sim2real.robots.roles import Roles
-from sim2real.train.environment.graph_environment import TrainingTask
 from sim2real.train.environment.tasks import Rewards
 from sim2real.types import Array, Key, PyTree, Scalar
 
 if TYPE_CHECKING:
+    import jax
+
     from sim2real.hardware.device import Reading
     from sim2real.hardware.emulation.embedded import EmbeddedRobot
     from sim2real.hardware.safety.rig import GateConfig, Rig
     from sim2real.robots.gate_limits import GateLimits
+    from sim2real.train.environment.graph_environment import TrainingTask
 
 
 class Session(AbstractContextManager["Session"], Protocol):
@@ -213,6 +213,8 @@ class RobotTask(_Part, Protocol):
 
     def terminated(self, state: PyTree) -> jax.Array:
         """Return whether the episode ends, such as after a fall, bool; default: never."""
+        import jax.numpy as jnp  # in training alone
+
         del state
         return jnp.bool_(False)
 

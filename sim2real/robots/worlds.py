@@ -6,25 +6,26 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.later import jax, jnp
 from sim2real.robots.contract import RecordedRobot, Robot, RobotModel, RobotTask
 from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.from_model.recorded import LoggedRobot
 from sim2real.robots.roles import Roles
-from sim2real.train.environment.graph_environment import TrainingTask
 from sim2real.train.environment.tasks import EndingTask, Rewards
 from sim2real.types import Array, Key, PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
+
+if TYPE_CHECKING:
+    from sim2real.train.environment.graph_environment import TrainingTask
 
 AnyRobot = TypeVar("AnyRobot", bound=RecordedRobot)
 

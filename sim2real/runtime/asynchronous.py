@@ -7,7 +7,6 @@ import contextlib
 import threading
 from collections.abc import Mapping, Sequence
 
-import jax
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
@@ -21,13 +20,13 @@ from sim2real.graph.windows import check_bursts
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.failure import noted
-from sim2real.runtime.init import collect, init_graph_state
+from sim2real.runtime.init import collect, init_graph_state, key_numbers
 from sim2real.runtime.simulated import SimulatedRun
 from sim2real.runtime.statistics import NodeStatistics
 from sim2real.runtime.stepper import Stepper
 from sim2real.runtime.wall_clock.handover import Reply
 from sim2real.runtime.wall_clock.wall_clock import WallClockRun
-from sim2real.types import PyTree
+from sim2real.types import Key, PyTree
 
 _INTERRUPTED_S = 1.0
 """Time that the nodes' ``stop`` may take when a start is interrupted, e.g. by Ctrl-C [s]."""
@@ -91,7 +90,7 @@ class AsyncGraph:
         self._check_options()
 
     def init(
-        self, rng: jax.Array, params: Mapping[str, PyTree] | None = None, order: Sequence[str] | None = None
+        self, rng: Key | None, params: Mapping[str, PyTree] | None = None, order: Sequence[str] | None = None
     ) -> GraphState:
         """Return the state in which the graph starts; see ``init_graph_state`` for the arguments."""
         return init_graph_state(self.nodes, self.supervisor, rng, params, order)
@@ -319,10 +318,7 @@ class AsyncGraph:
         return timeline, 0
 
     def _seed(self, graph_state: GraphState) -> np.random.Generator:
-        key = graph_state.rng[self.supervisor.name]
-        if jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key):
-            key = jax.random.key_data(key)
-        return np.random.default_rng([int(graph_state.eps), *np.asarray(key).ravel().tolist()])
+        return np.random.default_rng([int(graph_state.eps), *key_numbers(graph_state.rng[self.supervisor.name])])
 
     def _running(self) -> WallClockRun | SimulatedRun:
         if self._run is None:

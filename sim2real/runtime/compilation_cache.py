@@ -19,6 +19,7 @@ from importlib import metadata
 from pathlib import Path
 
 from sim2real.errors import UsageError
+from sim2real.installation import has_jax
 
 VARIABLE = "SIM2REAL_CACHE"
 """A folder, or ``off``."""
@@ -35,13 +36,13 @@ _MARKS: list[Path] = []
 
 
 def location(place: str | None = None) -> Path | None:
-    """Return the folder of this machine's programs; None where the cache is off.
+    """Return the folder of this machine's programs; None where the cache is off, or JAX is not installed.
 
     Args:
         place: A folder, or ``off``; None takes ``SIM2REAL_CACHE``, otherwise the platform's cache folder.
     """
     place = place or os.environ.get(VARIABLE) or None
-    if place == OFF:
+    if place == OFF or not has_jax():
         return None
     home = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "sim2real"
     root = Path(place).expanduser() if place else home

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-import jax
 import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection
@@ -38,7 +38,7 @@ class Format:
 
     def __init__(self, node: str, default: PyTree) -> None:
         self.node = node
-        leaves, self.tree = jax.tree_util.tree_flatten(default)
+        leaves, self.tree = pytree.flatten(default)
         self.default = [np.asarray(leaf) for leaf in leaves]
 
     def pack(self, output: PyTree) -> list[np.ndarray]:
@@ -47,7 +47,7 @@ class Format:
         Raises:
             UsageError: Structure, shapes or dtypes differ from those of the default output.
         """
-        leaves, tree = jax.tree_util.tree_flatten(output)
+        leaves, tree = pytree.flatten(output)
         if tree != self.tree:
             raise self._differs(f"{tree}, not {self.tree}")
         arrays = [np.array(leaf) for leaf in leaves]
@@ -61,7 +61,7 @@ class Format:
 
     def unpack(self, leaves: Sequence[Array]) -> PyTree:
         """Return the output that has these leaves."""
-        return jax.tree_util.tree_unflatten(self.tree, leaves)
+        return pytree.unflatten(self.tree, leaves)
 
     def _differs(self, how: str) -> UsageError:
         return UsageError(

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-import jax
-import jax.numpy as jnp
-from jax.typing import ArrayLike
+import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, phase_ticks
 from sim2real.graph.rules import waits_for_schedule
+from sim2real.installation import has_jax
+from sim2real.later import jax, jnp
 from sim2real.runtime.compilation.bounds import DelayBounds, bounds_of
-from sim2real.types import PyTree
+from sim2real.types import Array, PyTree
+
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike
 
 OUTPUTS = "outputs"
 """Key in ``GraphState.aux`` of the default outputs by node name; each is drawn once and shared by all readers."""
@@ -47,7 +51,7 @@ T = TypeVar("T")
 def init_graph_state(
     nodes: Mapping[str, BaseNode],
     supervisor: BaseNode | str,
-    rng: jax.Array,
+    rng: jax.Array | None,
     params: Mapping[str, PyTree] | None = None,
     order: Sequence[str] | None = None,
     bounds: DelayBounds | None = None,
@@ -58,6 +62,7 @@ def init_graph_state(
     alone.
 
     Args:
+        rng: JAX's key; None: no node gets random numbers.
         params: Parameters to use; for nodes without an entry ``init_params`` is called.
         order: Names of nodes that are initialised first; then comes the supervisor, then the others.
         bounds: Bounds of the trainable delays; None: those of the connections.
@@ -68,13 +73,13 @@ def init_graph_state(
     # Order the nodes, and derive the keys.
     first = supervisor if isinstance(supervisor, str) else supervisor.name
     names = _order(nodes, first, params or {}, order or ())
-    keys = {n: jax.random.split(jax.random.fold_in(rng, jnp.uint32(zlib.crc32(n.encode()))), 5) for n in nodes}
+    keys = {n: _keys(rng, n) for n in nodes}
     state = GraphState(
-        eps=jnp.int32(0),
-        step=jnp.int32(-1),
+        eps=_strong(np.int32(0)),
+        step=_strong(np.int32(-1)),
         rng={n: keys[n][0] for n in nodes},
         params={n: _fixed(nodes[n], p) for n, p in (params or {}).items()},
-        seq={n: jnp.int32(0) for n in nodes},
+        seq={n: _strong(np.int32(0)) for n in nodes},
     )
 
     # Parameters of all nodes, then their states, default outputs and trainable delays.
@@ -85,9 +90,17 @@ def init_graph_state(
     for n in names:
         node_state = _fixed(nodes[n], nodes[n].init_state(keys[n][2], state))
         state = state.replace(state={**state.state, n: node_state})
-    outputs = {n: jax.tree_util.tree_map(_strong, nodes[n].init_output(keys[n][3], state)) for n in names}
+    outputs = {n: pytree.map(_strong, nodes[n].init_output(keys[n][3], state)) for n in names}
     state = state.replace(aux={**state.aux, OUTPUTS: outputs})
     return state.replace(delays={n: d for n in names if (d := _delays(nodes[n], keys[n][4], state, bounds))})
+
+
+def key_numbers(key: PyTree) -> list[int]:
+    """Return the numbers of a node's key; none without a key."""
+    if key is None:
+        return []
+    data = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
+    return np.asarray(data).ravel().tolist()
 
 
 def default_output(graph_state: GraphState, node: str) -> PyTree:
@@ -108,7 +121,14 @@ def _order(
     return list(dict.fromkeys([*order, supervisor, *nodes]))
 
 
-def _delays(node: BaseNode, key: jax.Array, state: GraphState, bounds: DelayBounds | None) -> dict[str, TrainableDist]:
+def _keys(rng: jax.Array | None, node: str) -> PyTree:
+    """Return the keys of a node: one for its steps, four for its start."""
+    if rng is None:
+        return [None] * 5
+    return jax.random.split(jax.random.fold_in(rng, jnp.uint32(zlib.crc32(node.encode()))), 5)
+
+
+def _delays(node: BaseNode, key: PyTree, state: GraphState, bounds: DelayBounds | None) -> dict[str, TrainableDist]:
     """Return the distributions of a node's trainable inputs, at the delays that ``init_delays`` returns."""
     of_node = (bounds or bounds_of({node.name: node})).get(node.name, {})
     delays = node.init_delays(key, state) if of_node else {}
@@ -118,10 +138,12 @@ def _delays(node: BaseNode, key: jax.Array, state: GraphState, bounds: DelayBoun
 
 def _fixed(node: BaseNode, tree: T) -> T:
     """Return arrays without JAX's weak types; the objects of a node in plain Python stay unchanged."""
-    return jax.tree_util.tree_map(_strong, tree) if node.jittable else tree
+    return pytree.map(_strong, tree) if node.jittable else tree
 
 
-def _strong(leaf: ArrayLike) -> jax.Array:
+def _strong(leaf: ArrayLike) -> Array:
+    if not has_jax():
+        return np.asarray(leaf)
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         return leaf
     return jnp.asarray(leaf, dtype=jnp.result_type(leaf))

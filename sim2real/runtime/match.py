@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.core import ShapedArray
 
 from sim2real.errors import UsageError
+from sim2real.later import jax, jnp
 
 if TYPE_CHECKING:
+    from jax.core import ShapedArray
     from jax.typing import ArrayLike
 
 
@@ -64,4 +63,4 @@ def _describe(leaf: object) -> jax.ShapeDtypeStruct | ShapedArray | None:
         kind = jax.typeof(leaf)
     except TypeError:
         return None
-    return kind if isinstance(kind, ShapedArray) else None
+    return kind if hasattr(kind, "weak_type") else None

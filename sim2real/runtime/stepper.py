@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import InputState, StepState
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Recorder, StepStateRecorder
 from sim2real.graph.node import BaseNode, to_ticks
+from sim2real.later import jax, jnp
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.match import matched
 from sim2real.runtime.wall_clock.handover import Reply
@@ -62,7 +62,7 @@ class Stepper:
         jit = jit and self.node.jittable
         arguments = (data.step_state(0, 0), data.ages(0))
         # Keep the compiled step while the types of its arguments stay the same.
-        leaves, tree = jax.tree_util.tree_flatten((arguments, data.form.default))
+        leaves, tree = pytree.flatten((arguments, data.form.default))
         signature = (jit, tree, [(np.shape(x), jnp.result_type(x)) for x in leaves] if jit else None)
         if signature == self._signature:
             return
@@ -88,10 +88,10 @@ class Stepper:
         """
         if self._compiled is not None:
             changed, output = jax.block_until_ready(self._compiled(step_state, dict(ages)))
-            leaves = [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(output)]
+            leaves = [np.asarray(leaf) for leaf in pytree.leaves(output)]
         else:
             if self.node.jittable:  # eager JAX: steps may use `.at[...]` on their inputs
-                step_state = jax.tree_util.tree_map(jnp.asarray, step_state)
+                step_state = pytree.map(jnp.asarray, step_state)
             changed, output = self._call(step_state, ages)
             leaves = data.form.pack(output)
         return Result(changed, changed.pop("ts", None), leaves)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2real.errors import Sim2RealError
+from sim2real.installation import with_extra
 
 _GRPC_PORT, _WEB_PORT = 9876, 9090
 """Rerun's own ports; a port that is in use is replaced by a free one."""
@@ -57,7 +58,7 @@ def rerun_module() -> Any:
     try:
         import rerun
     except ImportError as error:
-        raise Sim2RealError("the Rerun viewer is not installed", hint="pip install 'sim2real[view]'") from error
+        raise Sim2RealError("the Rerun viewer is not installed", hint=with_extra("view")) from error
     return rerun
 
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import is_color_like, to_hex
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.log.ages import oldest_input
 from sim2real.view import style
+from sim2real.view.node_looks import color_of, in_order, slowest_period_s
 from sim2real.view.style import BLUE, INK, MUTED, ORANGE, new_figure, styled, to_svg
 
 _PERIODS_SHOWN = 4.5
@@ -39,38 +37,6 @@ class Times:
 def times(steps: Steps) -> Times:
     """Return the times of a node's steps."""
     return Times(np.diff(steps.woken) / 1e3, (steps.woken - steps.start) / 1e3, (steps.end - steps.woken) / 1e3)
-
-
-def in_order(episode: Episode) -> list[str]:
-    """Return the nodes' names: first those with an ``order``, then the others, senders before readers if possible."""
-    senders: Mapping[str, set[str]] = {
-        n: {i["from"] for i in node.get("inputs", {}).values()} for n, node in episode.metadata.get("graph", {}).items()
-    }
-    order: list[str] = []
-    remaining = list(episode.steps)
-    while remaining:
-        ready = [n for n in remaining if not (senders.get(n, set()) & set(remaining) - {n})] or remaining
-        order.append(ready[0])
-        remaining.remove(ready[0])
-    orders = {n: node.get("order") for n, node in episode.metadata.get("graph", {}).items()}
-    place = {n: orders[n] if isinstance(orders.get(n), int) else math.inf for n in order}
-    return sorted(order, key=lambda n: place[n])  # a stable sort
-
-
-def color_of(episode: Episode, node: str, default: str) -> str:
-    """Return a node's colour as ``#rrggbb``.
-
-    Args:
-        default: Returned if the node has no valid colour.
-    """
-    color = episode.metadata.get("graph", {}).get(node, {}).get("color")
-    return to_hex(color) if isinstance(color, str) and is_color_like(color) else default
-
-
-def slowest_period_s(episode: Episode) -> float:
-    """Return the longest of the nodes' median periods [s]."""
-    periods = [float(np.median(np.diff(s.start))) for s in episode.steps.values() if len(s) > 1]
-    return max(periods, default=1e6 * episode.duration_s) / 1e6
 
 
 def histograms(episode: Episode, name: str) -> str:

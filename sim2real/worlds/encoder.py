@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
-from flax import struct
-
+from sim2real import pytree
 from sim2real.graph.base import Base
+from sim2real.later import jnp
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Value
 
 
-@struct.dataclass
+@pytree.dataclass
 class Encoder(Base):
     """An encoder with a zero offset and an eccentric mount.
 

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import jax.numpy as jnp
-from flax import struct
-
+from sim2real import pytree
 from sim2real.graph.base import Base
+from sim2real.later import jnp
 
 if TYPE_CHECKING:
     import jax
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from sim2real.graph.base import Value
 
 
-@struct.dataclass
+@pytree.dataclass
 class FrictionParams(Base):
     """Coefficients of friction divided by the joint's inertia; None leaves a term out.
 

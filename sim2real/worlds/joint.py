@@ -5,8 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import TYPE_CHECKING, NamedTuple
 
-from flax import struct
-
+from sim2real import pytree
 from sim2real.graph.base import Base, GraphState
 from sim2real.types import PyTree
 from sim2real.worlds.friction import rubbed
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from sim2real.graph.base import Value
 
 
-@struct.dataclass
+@pytree.dataclass
 class JointState(Base):
     """State of one joint or of several.
 

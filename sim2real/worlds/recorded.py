@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
-from flax import struct
-
+from sim2real import pytree
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
+from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 from sim2real.worlds.encoder import Encoder
 
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
     from sim2real.graph.base import Value
 
 
-@struct.dataclass
+@pytree.dataclass
 class CommandDelay(Base):
     """Parameters of a recorded actuator.
 
@@ -49,7 +47,7 @@ class RecordedActuator(BaseNode):
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the command that the node was made with."""
         del rng, graph_state
-        return jax.tree_util.tree_map(lambda leaf: leaf, self._message)
+        return pytree.map(lambda leaf: leaf, self._message)
 
 
 class RecordedSensor(BaseNode):

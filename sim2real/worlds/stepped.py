@@ -7,12 +7,10 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeVar
 
-import jax
-import jax.numpy as jnp
-
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseWorld
+from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 from sim2real.worlds.recorded import command_delay
 

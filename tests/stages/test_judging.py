@@ -14,6 +14,7 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.stages.deploy import show, verdict
 from sim2real.stages.deploy.next_command import with_command
+from sim2real.stages.estimation import replay
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.view.page.deployment_tables import tables
 from sim2real.view.page.stage_verdicts import deploy_banner
@@ -169,7 +170,7 @@ def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be
     def too_little(*_):
         raise Sim2RealError("0.0 s of them in motion")
 
-    monkeypatch.setattr(verdict, "tested", too_little)
+    monkeypatch.setattr(replay, "tested", too_little)
     pipeline = load_pipeline("pendulum")
     told = verdict.judge(deployed(success=0.0), pipeline, BUNDLE, IDENTIFIED, folder).advice
     assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")

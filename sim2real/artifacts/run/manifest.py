@@ -12,12 +12,12 @@ import platform
 import subprocess
 from collections.abc import Mapping
 from enum import Enum
-from importlib import metadata
 from numbers import Integral, Real
 from pathlib import Path, PurePath
 
 from sim2real.artifacts.run.locks import held_lock, read_with_lock
 from sim2real.errors import Sim2RealError
+from sim2real.installation import version
 from sim2real.types import Json
 
 MANIFEST = "manifest.json"
@@ -169,10 +169,7 @@ def versions() -> dict[str, str | None]:
     """Return the versions of the packages that affect results; None for a missing package."""
     versions_by_name: dict[str, str | None] = {"python": platform.python_version(), "platform": platform.platform()}
     for name in PACKAGES:
-        try:
-            versions_by_name[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions_by_name[name] = None
+        versions_by_name[name] = version(name)
     return versions_by_name
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +10,7 @@ from sim2real.artifacts.run.run_folder import newest, pipeline_of
 from sim2real.commands.config import ExportConfig
 from sim2real.commands.export.formats import FILES, write
 from sim2real.errors import UsageError
+from sim2real.installation import version
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.estimation.held_out_parts import having
 from sim2real.stages.pipeline import python_arguments
@@ -82,7 +82,7 @@ def _export(
         ("pipeline", identification.pipeline),
         ("verdict", identification.verdict.status),
         *(("log", f"{log.path} {log.sha256}") for log in identification.logs[:1]),
-        ("sim2real", metadata.version("sim2real")),
+        ("sim2real", version()),
     ]
     if identification.verdict.status != "accepted":
         note(f"verdict: {identification.verdict.status}; the file contains the verdict, too")

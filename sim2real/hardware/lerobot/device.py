@@ -17,6 +17,7 @@ from sim2real.hardware.device import POSITION, CommandKind, Device, Reading, Tra
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.models import MODELS
 from sim2real.hardware.lerobot.link import LerobotConfig, LerobotLink
+from sim2real.installation import with_extra
 
 _FULL_ERROR_RAD: Final = 1 / (16 * reg.P_GAIN_UNIT_PER_RAD)
 """Position error at which a servo with LeRobot's P gain of 16 pushes with its whole duty [rad]."""
@@ -47,7 +48,7 @@ class LerobotSettings:
         except ImportError as error:
             raise UsageError(
                 f"the device 'lerobot' cannot import a robot of LeRobot: {error}",
-                hint="pip install 'sim2real[lerobot]'",
+                hint=with_extra("lerobot"),
             ) from error
         kinds = RobotConfig.get_known_choices()
         if self.kind not in kinds:

@@ -15,15 +15,14 @@ from typing import Any, ClassVar, Final, Self, get_args
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.installation import with_extra
 
 try:
     from cyclonedds import idl
     from cyclonedds.idl import annotations
     from cyclonedds.idl.types import array, float32, int16, int32, uint8, uint16, uint32
 except ImportError as error:
-    raise UsageError(
-        "Unitree's robots need cyclonedds, which is not installed", hint="pip install 'sim2real[unitree]'"
-    ) from error
+    raise UsageError("Unitree's robots need cyclonedds, which is not installed", hint=with_extra("unitree")) from error
 
 COMMAND_TOPIC: Final = "rt/lowcmd"
 STATE_TOPIC: Final = "rt/lowstate"

@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
@@ -17,6 +15,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.sizes import padded, rounded
+from sim2real.later import jax, jnp
 from sim2real.types import Array, PyTree
 
 Retimed = Callable[[Timeline], Timeline]

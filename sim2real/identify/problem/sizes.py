@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 
+from sim2real.later import jax
 from sim2real.types import PyTree
 
 _EXACT = 4

@@ -8,9 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.interpolate import CubicSpline
-from scipy.signal import find_peaks
 
+from sim2real.later import Later
+from sim2real.types import PyTree
+
+interpolate = Later("scipy.interpolate")
+signal = Later("scipy.signal")
 _MAX_ROWS = 40_000
 """Maximum number of compared rows; more rows change no lag."""
 _MIN_SPREAD = 1e-4
@@ -235,7 +238,7 @@ def _peaks(
         return []
     kind = np.where(size >= _LOBE * top, np.sign(alike), 0.0)
     bounds = [0, *(np.flatnonzero(np.diff(kind)) + 1), len(kind)]
-    humps = find_peaks(size, height=_LOBE * top, prominence=_PROMINENT)[0]
+    humps = signal.find_peaks(size, height=_LOBE * top, prominence=_PROMINENT)[0]
     highest = sorted({int(a + size[a:b].argmax()) for a, b in pairwise(bounds) if kind[a]} | set(humps.tolist()))
     inside = [k for k in highest if 0 < k < last]
     # A range that is highest at its end is no peak: a drift causes this correlation.
@@ -248,11 +251,11 @@ def _peaks(
     if len(inside) == 1 or end - begin < rows // 4:
         return [Peak(k, *_between(alike[k - 1 : k + 2])) for k in inside]
     # Interpolate the command by a smooth curve: at ten samples a wave, half a sample is more than the noise.
-    curve = CubicSpline(np.arange(rows), command)
+    curve = interpolate.CubicSpline(np.arange(rows), command)
     return [_peak(k, alike[k - 1 : k + 2], k - most, measured[begin:end], curve, begin) for k in inside]
 
 
-def _peak(at: int, three: np.ndarray, lag: int, measured: np.ndarray, curve: CubicSpline, begin: int) -> Peak:
+def _peak(at: int, three: np.ndarray, lag: int, measured: np.ndarray, curve: PyTree, begin: int) -> Peak:
     """Return the peak beside a lag, with the correlation of some rows of the measurement, which start at ``begin``."""
     rows, off = np.arange(begin, begin + len(measured)) - lag, _between(three)[0]
 
@@ -322,7 +325,7 @@ def _moves_early(early: float, late: float, measured: np.ndarray, command: np.nd
 
 def _coarse(command: np.ndarray) -> float:
     """Return the expected misfit of a curve through samples, from a curve through every other sample."""
-    between = CubicSpline(np.arange(0, len(command), 2), command[::2])(np.arange(1, len(command) - 1, 2))
+    between = interpolate.CubicSpline(np.arange(0, len(command), 2), command[::2])(np.arange(1, len(command) - 1, 2))
     return float(_SPLINE_ERROR * np.mean((between - command[1:-1:2]) ** 2) / max(command.var(), 1e-300))
 
 

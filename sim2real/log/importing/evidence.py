@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import combinations, product
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
+from sim2real.later import Later
 from sim2real.log.importing.command_response import Following, following, on_grid
 
 DEGREES = 180.0 / np.pi
@@ -14,6 +14,7 @@ SURE = 0.6
 """A column follows another from this correlation on."""
 EQUAL_R, EQUAL_SLOPE = 0.95, 0.9
 """A column equals another, apart from a lag, if correlation and slope in one unit are above these."""
+optimize = Later("scipy.optimize")
 _MAX_DISTANCE = 10.0
 """Distance between a column that moves and one that does not."""
 _COPIED_S, _FEW_ROWS = 1.0, 200
@@ -30,7 +31,7 @@ def order(relation: Following, scale: float = 1.0) -> np.ndarray:
     distance = np.where(relation.moved, relation.by_level(scale).distance(scale), np.where(rests, 1.0, _MAX_DISTANCE))
     diagonal = np.diag(distance)
     # Ignore a tenth of the distance: similar motions can differ by more than noise.
-    best = linear_sum_assignment(distance - 0.1 * np.diag(diagonal) - 1e-6 * np.eye(len(diagonal)))[1]
+    best = optimize.linear_sum_assignment(distance - 0.1 * np.diag(diagonal) - 1e-6 * np.eye(len(diagonal)))[1]
     selected = np.arange(len(diagonal))
     # Exchange commands in a loop only if that halves the distance at least.
     for loop in _loops(best):

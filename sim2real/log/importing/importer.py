@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 
 from sim2real.errors import OK, UsageError
 from sim2real.graph.episode import Episode, StepRecord, Steps
+from sim2real.installation import version
 from sim2real.log.importing import plausibility
 from sim2real.log.importing.files.foreign import ForeignFile, open_foreign
 from sim2real.log.importing.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, load_mapping, positive
@@ -124,7 +124,7 @@ def import_opened(file: ForeignFile, mapping: ImportMapping, samples: slice | No
             "stamps": stamps,
             "graph": {name: {"rate_hz": _rate_hz(t), "inputs": {}} for name, t in ticks.items()},
             "mapping": {name: asdict(node) for name, node in mapping.nodes.items()},
-            "versions": {"sim2real": metadata.version("sim2real")},
+            "versions": {"sim2real": version()},
         },
         units=mapping.units,
     )

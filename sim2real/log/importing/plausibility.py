@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import median_filter
 
+from sim2real.later import Later
 from sim2real.leaps import reach_rad
 
+ndimage = Later("scipy.ndimage")
 TURN_RAD = 2.0 * np.pi
 _SEAM = 0.2
 """A step passes the end of a turn if it differs from a turn by a smaller share."""
@@ -78,7 +79,7 @@ def glitches(t_s: np.ndarray, angle: np.ndarray, radian: float = 1.0) -> np.ndar
     period_s = float(np.median(steps_s))
     half = int(np.clip(np.ceil(_HALF_S / period_s), 3, _HALF_MAX))
     for i, column in enumerate((angle / radian).T):
-        middle = median_filter(column, 2 * half + 1, mode="reflect")
+        middle = ndimage.median_filter(column, 2 * half + 1, mode="reflect")
         fastest = max(_SLOWEST_RAD_S, 1.5 * float((np.abs(np.diff(middle)) / steps_s).max()))
         off = np.abs(column - middle)
         leap = np.abs(np.diff(column))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import jax
-import jax.numpy as jnp
-
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import ParameterTable
+from sim2real.later import jax, jnp
 from sim2real.robots.control_loop.loop import DelayParams, delay_parameters, recorded_loop
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.control_loop.simulated_devices import SimSensor

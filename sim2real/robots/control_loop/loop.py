@@ -6,14 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-import jax
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.graph.base import Base, GraphState
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, Scheduling
 from sim2real.identify.parameters import Parameter
+from sim2real.later import jax
 from sim2real.robots.roles import ROLES, Roles
 from sim2real.types import PyTree, Scalar
 
@@ -22,13 +22,13 @@ BURST = 3
 the other, so that commands come faster than its rate for a moment."""
 DELAYS = ("sensor_delay", "actuator_delay")
 """Names of the two delays: from the world to the sensor, and from the actuator to the world."""
-Draw = Callable[[jax.Array], dict[str, PyTree]]
+Draw = Callable[["jax.Array"], dict[str, PyTree]]
 """Draws dynamics and delays of an episode: key -> values by name."""
 EMPTY: Mapping[str, np.ndarray] = MappingProxyType({})
 """No samples."""
 
 
-@struct.dataclass
+@pytree.dataclass
 class DelayParams(Base):
     """Parameters of a simulated sensor or actuator.
 

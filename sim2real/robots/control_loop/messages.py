@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from flax import struct
-
+from sim2real import pytree
 from sim2real.graph.base import Base
 from sim2real.types import Array
 
 
-@struct.dataclass
+@pytree.dataclass
 class JointReading(Base):
     """A measurement.
 
@@ -21,7 +20,7 @@ class JointReading(Base):
     velocity: Array
 
 
-@struct.dataclass
+@pytree.dataclass
 class Goals(Base):
     """A command.
 
@@ -32,7 +31,7 @@ class Goals(Base):
     goal: Array
 
 
-@struct.dataclass
+@pytree.dataclass
 class Decision(Base):
     """The agent's message: a command, and the aim of the task.
 
@@ -45,7 +44,7 @@ class Decision(Base):
     aim: Array
 
 
-@struct.dataclass
+@pytree.dataclass
 class EpisodeStart(Base):
     """The start and the aim of an episode.
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
+from sim2real import pytree
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.policy.upright import Runner
@@ -59,7 +59,7 @@ class PolicyNode(BaseNode):
 
 def in_numpy(tree: PyTree) -> PyTree:
     """Return a pytree with numpy arrays for leaves: an array of JAX turns every later computation into one of JAX."""
-    return jax.tree_util.tree_map(np.asarray, tree)
+    return pytree.map(np.asarray, tree)
 
 
 def _in_numpy(make: Callable[[Any, GraphState | None], Any], rng: Any, graph_state: GraphState | None) -> PyTree:

@@ -6,15 +6,14 @@ import copy
 from collections.abc import Callable
 from typing import NamedTuple, Unpack
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseNode, NodeOptions
+from sim2real.later import jax, jnp
 from sim2real.robots.control_loop.loop import DelayParams, delay_of
 from sim2real.robots.control_loop.messages import Goals
 from sim2real.robots.roles import ROLES
@@ -110,7 +109,7 @@ def _scale(params: PyTree) -> PyTree:
     return 1.0 if noise is None else noise
 
 
-@struct.dataclass
+@pytree.dataclass
 class SensorBias(Base):
     """The constant error of a simulated sensor's readings in an episode.
 

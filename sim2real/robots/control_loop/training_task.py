@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState, StepState
+from sim2real.later import jax, jnp
 from sim2real.robots.control_loop.loop import draw_values
 from sim2real.robots.robot_parts import ConnectedParts
 from sim2real.train.environment.tasks import Rewards

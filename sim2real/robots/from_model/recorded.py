@@ -9,13 +9,12 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import ClassVar, Self
 
-import jax
-
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.later import jax
 from sim2real.robots.completeness import complete, tuple_of
 from sim2real.robots.roles import ROLES, Roles
 from sim2real.types import PyTree, Scalar

@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Unpack
 
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.arrays import namespace
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode, NodeOptions
@@ -24,7 +23,7 @@ Features = Callable[[JointReading, Array, Array], Array]
 """Returns the present part of the observation: (reading, goals, aim) -> ``(features,)``."""
 
 
-@struct.dataclass
+@pytree.dataclass
 class AgentParams(Base):
     """The agent's parameters for an episode.
 
@@ -40,7 +39,7 @@ class AgentParams(Base):
     start: Array | None = None
 
 
-@struct.dataclass
+@pytree.dataclass
 class AgentState(Base):
     """The agent's state.
 
@@ -102,19 +101,19 @@ class GoalAgent(BaseNode):
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
         """Return parameters without a policy, and zeros for aim and start."""
         del rng, graph_state
-        return AgentParams(aim=jnp.zeros(self._aims), start=jnp.zeros_like(self._low))
+        return AgentParams(aim=np.zeros(self._aims, np.float32), start=np.zeros_like(self._low))
 
     def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentState:
         """Return the goals at the start, and a history of zeros."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        start = jnp.asarray(params.start, jnp.float32)
-        past = jnp.zeros((self._history, 3 * start.size))
+        start = namespace(params.start).asarray(params.start, np.float32)
+        past = np.zeros((self._history, 3 * start.size), np.float32)
         return AgentState(goal=start, past=past, carry=first_carry(params.policy))
 
     def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Decision:
         """Return a message with the goals at the start."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return Decision(jnp.asarray(params.start, jnp.float32), jnp.asarray(params.aim, jnp.float32))
+        return Decision(*(namespace(x).asarray(x, np.float32) for x in (params.start, params.aim)))
 
     def observe(self, step_state: StepState) -> Array:
         """Return the policy's observation: the features, then the history, newest first."""
@@ -136,12 +135,12 @@ class GoalAgent(BaseNode):
         """Make a step with the policy's action."""
         policy, state = step_state.params.policy, step_state.state
         if policy is None:
-            return self.act(step_state, jnp.zeros_like(self._low))
+            return self.act(step_state, np.zeros_like(self._low))
         carry, action = decide(policy, state.carry, self.observe(step_state))
         return self.act(step_state.replace(state=state.replace(carry=carry)), action)
 
 
-@struct.dataclass
+@pytree.dataclass
 class Past(Base):
     """The last steps, newest first.
 
@@ -190,12 +189,14 @@ class DirectAgent(BaseNode):
     def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Past:
         """Return an empty history."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return Past(*(jnp.zeros((self._history, size)) for size in self._sizes), carry=first_carry(params.policy))
+        return Past(
+            *(np.zeros((self._history, size), np.float32) for size in self._sizes), carry=first_carry(params.policy)
+        )
 
     def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return a message with zeros."""
         del rng, graph_state
-        return self._message(jnp.zeros(self._sizes[1]))
+        return self._message(np.zeros(self._sizes[1], np.float32))
 
     def observe(self, step_state: StepState) -> Array:
         """Return the policy's observation: the features, then the history, newest first."""
@@ -217,7 +218,7 @@ class DirectAgent(BaseNode):
         """Make a step with the policy's action."""
         policy, past = step_state.params.policy, step_state.state
         if policy is None:
-            return self.act(step_state, jnp.zeros(self._sizes[1]))
+            return self.act(step_state, np.zeros(self._sizes[1], np.float32))
         carry, action = decide(policy, past.carry, self.observe(step_state))
         return self.act(step_state.replace(state=past.replace(carry=carry)), action)
 

@@ -8,14 +8,13 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.identify.export.card.plain import PlainSimulation, converged
 from sim2real.identify.parameters import Parameter
+from sim2real.later import jax, jnp
 from sim2real.robots.contract import RobotModel
 from sim2real.robots.control_loop.hardware import Embedded
 from sim2real.robots.control_loop.messages import EpisodeStart
@@ -24,13 +23,13 @@ from sim2real.robots.servo import parameters
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.robots.servo.payload import PAYLOAD, Hand
 from sim2real.robots.servo.servos import Servos, gear_of
-from sim2real.robots.servo.simulated_world import ServoWorld
 from sim2real.robots.servo.task import NO_AIM, Aim
 from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.composer.world import WorldParams
     from sim2real.hardware.emulation.emulated_bus import BusEmulation
+    from sim2real.robots.servo.simulated_world import ServoWorld
 
 _AT_ONCE = 1e9
 """Speed that stands for an infinite one in a document [rad/s]."""
@@ -98,6 +97,8 @@ class ComposedModel(RobotModel):
 
     def make_world(self, resumed: bool = False) -> ServoWorld:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
+        from sim2real.robots.servo.simulated_world import ServoWorld  # MJX
+
         fields, worn, roles = self.fields(self.task), self.servos.sheet.worn, self._roles
         return ServoWorld(roles.world, self.task, fields, resumed, roles.actuator, worn)
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Unpack
 
-import jax.numpy as jnp
+import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.graph.node import NodeOptions
@@ -68,7 +68,9 @@ class ServoAgent(RobotAgent):
 
     def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
         """Return the node's parameters: goals start at the joints' positions."""
-        return AgentParams(policy=policy, aim=start.aim, start=jnp.asarray(start.position, jnp.float32))
+        return AgentParams(
+            policy=policy, aim=start.aim, start=namespace(start.position).asarray(start.position, np.float32)
+        )
 
 
 def observe_all(reading: JointReading, goal: Array, aim: Array) -> Array:

@@ -9,26 +9,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.parameters import Parameter
+from sim2real.later import jax, jnp
 from sim2real.robots.servo.datasheet import DataSheet
 from sim2real.robots.servo.parts import ServoDriven
 from sim2real.robots.servo.servos import gear_of, name_of
-from sim2real.robots.servo.simulated_world import STRIBECK
 from sim2real.types import MjSpec, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.hardware.joint import Joint
 
-T = TypeVar("T", float, jax.Array)
+T = TypeVar("T", float, "jax.Array")
 _NAMES = ("gain", "damping", "armature", "friction")
 MISSES = "goal_offset"
 """Constant difference between a servo's position and its goal [rad]: of the zeros, or of worn gears."""
 _MOST_RAD = 0.05
+STRIBECK = "stribeck_rad_s"
+"""Value of the world's parameters ``(joints,)`` [rad/s]."""
 
 
 def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[str] = ("friction",)) -> list[Parameter]:

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.parameters import Parameter
+from sim2real.later import jnp
 from sim2real.robots.servo.parts import GoalTask
 from sim2real.types import MjSpec, PyTree, Scalar
 

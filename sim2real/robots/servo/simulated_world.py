@@ -14,14 +14,12 @@ from sim2real.graph.base import GraphState, Value
 from sim2real.robots.control_loop.messages import JointReading
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.robots.roles import ROLES
+from sim2real.robots.servo.parameters import STRIBECK
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.types import Array, Key, PyTree
 from sim2real.worlds.worn import WornFriction
 
 __all__ = ["ServoWorld", "SimActuator", "SimSensor"]
-
-STRIBECK = "stribeck_rad_s"
-"""Value of the world's parameters ``(joints,)`` [rad/s]."""
 
 
 class ServoWorld(ComposedWorld):

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from sim2real.later import jax, jnp
+from sim2real.random_numbers import key_of
 from sim2real.robots.contract import RobotTask
 from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
@@ -23,7 +23,7 @@ class Aim:
 
     Attributes:
         entries: Name and unit of each of the k entries.
-        draw: Returns the aim of an episode ``(k,)``.
+        draw: Returns the aim of an episode ``(k,)``; with ``random_numbers.uniform`` also without JAX.
         elements: Returns the parts of the composed task that an aim sets: name -> (elements, attribute).
         place: Returns the arrays of ``elements`` for an aim ``(k,)``.
     """
@@ -34,7 +34,7 @@ class Aim:
     place: Callable[[Array], dict[str, Array]] = lambda aim: {}
 
 
-NO_AIM = Aim((), lambda key: jnp.zeros(0))
+NO_AIM = Aim((), lambda key: np.zeros(0, np.float32))
 """The aim of a task that is the same in every episode."""
 
 
@@ -70,7 +70,7 @@ class AimTask(RobotTask):
     def at_rest(self, trial: int) -> EpisodeStart:
         """Return the start at rest with the aim of a trial."""
         rest = self._servos.at_rest
-        return EpisodeStart(rest, np.zeros_like(rest), self.aim.draw(jax.random.key(trial)))
+        return EpisodeStart(rest, np.zeros_like(rest), self.aim.draw(key_of(trial)))
 
     def moved(self, start: EpisodeStart, position: Array, velocity: Array) -> EpisodeStart:
         """Return a start with an offset, within the goals' bounds."""

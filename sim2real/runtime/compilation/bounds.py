@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode
+from sim2real.later import jnp
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Number

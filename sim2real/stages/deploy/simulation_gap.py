@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,14 +16,16 @@ from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import newest_message
+from sim2real.installation import has_jax
 from sim2real.log.ages import input_ages
 from sim2real.robots.contract import Robot
 from sim2real.robots.score_columns import as_columns, as_sent
-from sim2real.stages.deploy.simulations import States, plausible_parameters, simulate
 from sim2real.stages.deploy.trajectories import courses
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
-from sim2real.train.networks.policy import Policy
+
+if TYPE_CHECKING:
+    from sim2real.stages.deploy.simulations import States
 
 
 def compare(
@@ -48,7 +51,10 @@ def compare(
 
     # Simulate the same policy.
     simulated, timeline = None, None
-    if identification is not None:
+    if identification is not None and has_jax():
+        from sim2real.stages.deploy.simulations import plausible_parameters, simulate  # JAX programs
+        from sim2real.train.networks.policy import Policy
+
         policy = Policy.from_weights(bundle.weights, bundle.spec)
         parameters = plausible_parameters(identification, len(recordings))
         node = robot.roles.world if use_truth else robot.roles.sensor

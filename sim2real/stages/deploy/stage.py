@@ -15,7 +15,7 @@ from sim2real.robots.contract import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import check_timing, require_tilt, run_episodes
 from sim2real.stages.deploy.preflight import require_fit, require_untouched
-from sim2real.stages.deploy.show import show, show_sessions, summary_lines
+from sim2real.stages.deploy.show import show, show_sessions, summary_lines, write_page
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.find_run import warn_of_stale
 from sim2real.stages.pipeline.load_robot import moving_robot
@@ -55,6 +55,7 @@ def deploy(
     robot = moving_robot(pipeline)
     require_fit(robot, bundle)
     require_tilt(robot, config)
+    robot.task.at_rest(0)  # a task that needs JAX is refused before the robot moves
     if identification is not None:
         check_parameters(identification, pipeline)
 
@@ -111,9 +112,8 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         for i, recording in enumerate(deployment.recordings):
             for name, file in recording.timing.save(stage.folder, f"timing_{i}").items():
                 stage.output(name, file)
-        from sim2real.view.page.page import deploy_page  # matplotlib and jinja2 take 0.5 s to import
-
-        stage.output("page", deploy_page(stage.folder).name)
+        if (page := write_page(stage.folder)) is not None:
+            stage.output("page", page)
         show(deployment)
         stage.summary(summary_lines(deployment, summaries))
         check_timing(summaries, config)

@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.bundle import GOOD_SUCCESS, Bundle
-from sim2real.artifacts.deployment import Advice, Deployment, Gap, Replay
+from sim2real.artifacts.deployment import AS_HERE, Advice, Deployment, Gap, Replay
 from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError
+from sim2real.installation import has_jax
 from sim2real.stages.deploy.next_command import LATER, with_command
 from sim2real.stages.deploy.trajectories import off_course
-from sim2real.stages.estimation.replay import AS_HERE, tested
 from sim2real.stages.pipeline.pipeline import Pipeline
-from sim2real.stages.terminal.console import progress
+from sim2real.stages.terminal.console import progress, shown
 from sim2real.stages.terminal.interruption import patiently
 
 _FAULTY_RATIO = 2.0
@@ -57,6 +57,11 @@ def judge(
         return advised(deployment, Advice("not judged", (reason,)))
     # Test the model on the deployment's logs. A test that fails must not lose the deployment.
     try:
+        if not has_jax():
+            log = shown(deployment.logs[0].path)
+            raise Sim2RealError(f"a computer with JAX tests the model: `sim2real validate RUN/identify --log {log}`")
+        from sim2real.stages.estimation.replay import tested
+
         with progress(None, "test the model on the deployment"):
             replay, drift = patiently(lambda: tested(pipeline, identification, [r.episode for r in deployment.logs]))
     except (Sim2RealError, ArithmeticError, np.linalg.LinAlgError) as error:

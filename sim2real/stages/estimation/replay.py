@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.deployment import Replay
+from sim2real.artifacts.deployment import AS_HERE, Replay
 from sim2real.artifacts.estimation.drift import Drift
 from sim2real.artifacts.identification import UNFINISHED, Identification
 from sim2real.errors import Sim2RealError
@@ -22,8 +22,6 @@ from sim2real.stages.estimation import held_out_parts, promises
 from sim2real.stages.estimation.replay_problem import problem_of_logs
 from sim2real.stages.pipeline.pipeline import Pipeline
 
-AS_HERE = "as in this log"
-"""The model with the parameters fitted to the deployment's own log."""
 _NOISE = 2.0
 """Errors below this many deviations of the measurement count as noise."""
 

@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from sim2real.artifacts.run.manifest import git_state, plain, versions
@@ -17,6 +16,8 @@ from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealErr
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
 from sim2real.graph.node import BaseNode
+from sim2real.installation import has_jax
+from sim2real.later import jax
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.contract import Robot, Session
 from sim2real.runtime.asynchronous import AsyncGraph
@@ -84,7 +85,7 @@ def run_episode(
     """
     # Without an agent, as in a recording by hand, the sensor is the only node.
     graph = AsyncGraph(nodes, nodes.get(robot.roles.supervisor) or nodes[robot.roles.sensor])
-    state = graph.init(jax.random.key(0), params)
+    state = graph.init(jax.random.key(0) if has_jax() else None, params)
     graph.warmup(state)  # every program is compiled before torque goes on
     # Start the log, and run; an interrupted episode comes to rest before torque goes off.
     recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig.torque_withheld)

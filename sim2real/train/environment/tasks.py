@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import reduce
 from operator import add
-from typing import Protocol, runtime_checkable
-
-import jax
-import jax.numpy as jnp
+from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
 
 from sim2real.artifacts.bundle import REWARD as REWARD
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
+from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 
-Rewards = jax.Array | Mapping[str, jax.Array]
-"""The reward of a row, shape ``()``, or its terms by name, whose sum it is."""
+if TYPE_CHECKING:
+    Rewards: TypeAlias = jax.Array | Mapping[str, jax.Array]
+    """The reward of a row, shape ``()``, or its terms by name, whose sum it is."""
+else:
+    Rewards = PyTree
 
 
 def checked_end(ended: jax.Array, task: object) -> jax.Array:

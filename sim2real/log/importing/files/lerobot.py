@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.installation import with_extra
 from sim2real.log.importing.files.budget import (
     MAX_TEXT_BYTES,
     WHOLE,
@@ -53,9 +54,7 @@ def read_lerobot(path: Path, episode: int | None = None) -> RawSignals:
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise UsageError(
-            f"{path} is a Parquet file, which needs pyarrow", hint="pip install 'sim2real[parquet]'"
-        ) from None
+        raise UsageError(f"{path} is a Parquet file, which needs pyarrow", hint=with_extra("parquet")) from None
     # The description of the robot is in the data set, above the Parquet files.
     root = path if path.is_dir() else next((p for p in path.absolute().parents[:4] if (p / INFO).is_file()), None)
     info = _info(root / INFO) if root else {}

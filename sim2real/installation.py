@@ -1,0 +1,59 @@
+"""Which distribution is installed: ``sim2real`` with everything, or ``sim2real-robot`` for a robot's computer."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import os
+from pathlib import Path
+
+from sim2real.errors import UsageError
+
+WHOLE, ROBOT = "sim2real", "sim2real-robot"
+
+
+def version(name: str = WHOLE) -> str | None:
+    """Return the version of a distribution, ``sim2real`` under either name; None: it is not installed."""
+    from importlib import metadata  # takes 15 ms
+
+    for distribution in (WHOLE, ROBOT) if name == WHOLE else (name,):
+        try:
+            return metadata.version(distribution)
+        except metadata.PackageNotFoundError:
+            continue
+    return None
+
+
+@functools.cache
+def has_jax() -> bool:
+    """Return whether JAX is installed, without importing it."""
+    return all(importlib.util.find_spec(name) for name in ("jax", "flax"))
+
+
+def with_extra(extra: str) -> str:
+    """Return the command that installs an extra beside the installed distribution."""
+    from importlib import metadata
+
+    try:
+        name = metadata.metadata(ROBOT)["Name"]
+    except metadata.PackageNotFoundError:
+        name = WHOLE
+    return f"pip install '{name}[{extra}]'"
+
+
+def require_one(folder: Path = Path(__file__).parents[1]) -> None:
+    """Refuse two distributions in one folder: their files are the same, and the second has replaced those of the first.
+
+    Args:
+        folder: The folder of the packages.
+
+    Raises:
+        UsageError: Both are there.
+    """
+    files = os.listdir(folder)
+    prefixes = [f"{name.replace('-', '_')}-" for name in (WHOLE, ROBOT)]
+    if all(any(f.startswith(prefix) and f.endswith(".dist-info") for f in files) for prefix in prefixes):
+        raise UsageError(
+            f"both {WHOLE} and {ROBOT} are installed in {folder}: each has replaced files of the other",
+            hint=f"pip uninstall -y {WHOLE} {ROBOT}, then install one of them; {WHOLE} has everything",
+        )

@@ -1,0 +1,66 @@
+"""JAX, imported when it is first used: the modules that a robot needs are imported without it.
+
+``from sim2real.later import jax, jnp`` stands for ``import jax`` and ``import jax.numpy as jnp``. A robot's computer
+may have no JAX: there, the first use is an error that names the package.
+"""
+
+from __future__ import annotations
+
+import importlib
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sim2real.errors import NotInstalled
+from sim2real.installation import ROBOT
+
+ABSENT = ("distrax", "evosax", "flax", "jax", "jinja2", "matplotlib", "mujoco.mjx", "onnx", "optax", "scipy")
+"""Packages that only the distribution ``sim2real`` brings."""
+
+
+class Later:
+    """A module that is imported when one of its attributes is first used.
+
+    Raises:
+        NotInstalled: At that use, if its package is not installed.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name, self._module = name, None
+
+    def __getattr__(self, attribute: str) -> Any:
+        if self._module is None:
+            if attribute.startswith("__"):  # what copies, pickles and inspection look for
+                raise AttributeError(attribute)
+            try:
+                self._module = importlib.import_module(self._name)
+            except ModuleNotFoundError as error:
+                raise (not_installed(error) or error) from None
+        return getattr(self._module, attribute)
+
+
+def not_installed(error: ModuleNotFoundError) -> NotInstalled | None:
+    """Return the error for a package that only ``sim2real`` brings; None: another module is missing."""
+    package = next((p for p in ABSENT if f"{error.name}.".startswith(f"{p}.")), None)
+    if package is None:
+        return None
+    # Name the file of a robot that imports it, which this project cannot mend.
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith("<frozen")]
+    where = f" (line {frames[-1].lineno} of {frames[-1].filename})" if frames and _foreign(frames[-1].filename) else ""
+    return NotInstalled(
+        f"this needs the package {package}, which is not installed here{where}",
+        hint=f"do it on a computer with sim2real; {ROBOT} records, deploys and reads logs"
+        + ("; that file may say `from sim2real.later import jax, jnp`" if where else ""),
+    )
+
+
+def _foreign(file: str) -> bool:
+    """Return whether a file is none of this package."""
+    return not Path(file).is_relative_to(Path(__file__).parent)
+
+
+if TYPE_CHECKING:
+    import jax as jax
+    import jax.numpy as jnp
+else:
+    jax, jnp = Later("jax"), Later("jax.numpy")

@@ -1,0 +1,63 @@
+"""The two distributions: one at a time, the same packages of the same versions, and numbers drawn without JAX."""
+
+import sys
+import tomllib
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from sim2real import installation
+from sim2real.errors import NotInstalled, UsageError
+from sim2real.later import Later
+from sim2real.random_numbers import PlainKey, uniform
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def project(folder):
+    return tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def test_the_light_distribution_asks_for_packages_of_the_whole_one():
+    whole, light = project("."), project("packaging/robot")
+    assert set(light["dependencies"]) < set(whole["dependencies"])
+    assert light["scripts"] == whole["scripts"]
+    assert light["requires-python"] == whole["requires-python"]
+    extras = light["optional-dependencies"]
+    assert extras.items() <= whole["optional-dependencies"].items()
+
+
+def test_two_distributions_in_one_folder_are_refused(tmp_path):
+    (tmp_path / "sim2real-0.2.0.dist-info").mkdir()
+    (tmp_path / "sim2real_other-1.0.dist-info").mkdir()
+    installation.require_one(tmp_path)
+    (tmp_path / "sim2real_robot-0.2.0.dist-info").mkdir()
+    with pytest.raises(UsageError, match="both sim2real and sim2real-robot are installed") as caught:
+        installation.require_one(tmp_path)
+    assert "pip uninstall -y sim2real sim2real-robot" in str(caught.value.hint)
+
+
+def test_a_module_is_imported_on_its_first_use(monkeypatch):
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    module = Later("colorsys")
+    assert "colorsys" not in sys.modules
+    assert module.rgb_to_hsv(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0)
+    assert "colorsys" in sys.modules
+
+
+def test_an_absent_package_is_named_and_any_other_error_is_its_own(monkeypatch):
+    monkeypatch.setitem(sys.modules, "evosax.absent", None)
+    with pytest.raises(NotInstalled, match="needs the package evosax, which is not installed"):
+        _ = Later("evosax.absent").anything
+    with pytest.raises(ModuleNotFoundError, match="no_such_package"):
+        _ = Later("no_such_package").anything
+
+
+@pytest.mark.parametrize("seed", [0, 1, 7, 123_456, 2**31 - 1])
+def test_numbers_without_jax_are_those_of_jax(seed):
+    low, high = np.linspace(-2.0, -1.0, 7), np.linspace(0.0, 3.0, 7)
+    drawn, plain = uniform(jax.random.key(seed), low, high), uniform(PlainKey(seed), low, high)
+    assert (np.asarray(drawn).dtype, plain.dtype) == (np.float32, np.float32)
+    np.testing.assert_allclose(plain, drawn, rtol=0, atol=3e-7)  # XLA multiplies and adds with one rounding

@@ -1,0 +1,74 @@
+"""Trees of arrays without JAX: the same leaves in the same order as JAX's."""
+
+import dataclasses
+from collections import OrderedDict
+from typing import NamedTuple
+
+import jax
+import pytest
+from flax import struct
+
+from sim2real import plain_pytree as plain
+
+
+class Pair(NamedTuple):
+    b: object
+    a: object
+
+
+def message(make):
+    """Return a class of messages, made by flax or in plain Python."""
+
+    @make.dataclass
+    class Message:
+        second: object
+        first: object
+        name: object = make.field(pytree_node=False, default="constant")
+
+    return Message
+
+
+TREES = [
+    lambda make: 1.0,
+    lambda make: None,
+    lambda make: {"b": 1, "a": [2, (3, None)], "c": OrderedDict(z=4, y=5)},
+    lambda make: Pair({"x": 1}, [2]),
+    lambda make: message(make)(first=[1, 2], second={"q": 3, "p": 4}, name="n"),
+    lambda make: {"deep": [message(make)(1, message(make)(2, 3))]},
+    lambda make: [],
+]
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_leaves_are_those_of_jax_in_its_order(tree):
+    ours, theirs = tree(plain), tree(struct)
+    assert plain.leaves(ours) == jax.tree_util.tree_leaves(theirs)
+    paths = [".".join(map(str, path)) for path, _ in plain.flatten_with_path(ours)[0]]
+    names = [
+        ".".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)
+        for path, _ in jax.tree_util.tree_flatten_with_path(theirs)[0]
+    ]
+    assert paths == names
+
+
+@pytest.mark.parametrize("tree", TREES)
+def test_a_tree_is_built_from_its_leaves(tree):
+    whole = tree(plain)
+    values, structure = plain.flatten(whole)
+    assert plain.unflatten(structure, values) == whole
+    assert plain.structure(whole) == structure
+    doubled = plain.map(lambda a, b: a + b, whole, whole)
+    assert plain.leaves(doubled) == [2 * value for value in values]
+
+
+def test_trees_of_other_structure_are_refused():
+    with pytest.raises(ValueError, match="trees differ"):
+        plain.map(lambda a, b: a, {"a": 1}, {"b": 1})
+
+
+def test_constants_belong_to_the_structure():
+    kind = message(plain)
+    assert plain.structure(kind(1, 2, "n")) != plain.structure(kind(1, 2, "m"))
+    assert plain.leaves(kind(1, 2).replace(first=5)) == [1, 5]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        kind(1, 2).first = 3
