@@ -33,7 +33,8 @@ docs: $(DOCS_READY)
 
 wheel: $(READY)
 	@rm -rf dist
-	@$(BIN)/python -m build --outdir dist . > dist.log 2>&1 || { cat dist.log >&2; exit 1; }
+	@{ $(BIN)/python -m build --outdir dist . && $(BIN)/python -m build --wheel --outdir dist packaging/robot; } \
+	  > dist.log 2>&1 || { cat dist.log >&2; exit 1; }
 	@rm dist.log
 	@for file in dist/*; do echo "wrote $$file"; done
 

@@ -49,13 +49,14 @@ TABLES = {
     "view": ("view",),
     "excitation": ("excitation",),
     "twin": ("twin",),
+    "light": ("light",),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
 PAGES = (
     *("README.md", "docs/results.md", "docs/getting_started.md"),
     *(
         f"docs/guides/{name}.md"
-        for name in ("so101", "train", "safety", "compose", "deploy", "scale", "view", "record")
+        for name in ("so101", "train", "safety", "compose", "deploy", "scale", "view", "record", "robot_computer")
     ),
 )
 """Pages with tables, or with a sentence of figures."""
@@ -287,6 +288,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "view": lambda chosen: recordings.view(*chosen.values()),
         "excitation": lambda chosen: recordings.excitation(*chosen.values()),
         "twin": lambda chosen: sentences.twin(*chosen.values()),
+        "light": lambda chosen: sentences.light(*chosen.values()),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}
     chosen = {table: {name: reports[name] for name in names} for table, names in there.items()}

@@ -90,6 +90,11 @@ BENCHES = {
             *("sim2real/composer/physics/c", "sim2real/stages/config.py", "sim2real/stages/pipeline/from_model.py"),
         ),
     ),
+    "light": Bench(
+        "processor_time.light",
+        "sim2real-robot in a new environment: its size, and record's processor time until it addresses a robot",
+        ("sim2real", "!sim2real/composer/physics/mjx", "!sim2real/train", "pipelines", "packaging"),
+    ),
     "log": Bench("log", "the cost of recording for a control loop, cut files, and reading a range", ("sim2real/log",)),
     "randomise": Bench(
         "hidden.randomise",

@@ -36,6 +36,16 @@ def twin(report: Mapping[str, Any]) -> str:
     )
 
 
+def light(report: Mapping[str, Any]) -> str:
+    """Return the size of sim2real-robot, and the processor time of record there."""
+    v = values(report)
+    return (
+        f"Its packages take {v['light/packages']:.0f} MB. `record` uses {v['light/pendulum/addressed']:.2f} s of "
+        f"processor time until it addresses the pendulum,\nand {v['light/so101/addressed']:.2f} s for the SO-101 "
+        f"(`python scripts/bench.py light`).\n"
+    )
+
+
 def faults(report: Mapping[str, Any]) -> str:
     """Return the number of runs that were safe, and how late the latest one was."""
     v, kinds = values(report), report["flags"]["faults"]

@@ -1,0 +1,100 @@
+"""sim2real on a robot's computer: what works without JAX, and what is refused in words."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_robots import PATIENT, manifest_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+from benches.processor_time import light as bench
+
+from sim2real import errors
+from sim2real.log.reader import read_log
+from sim2real.policy import PolicyContract, save_bundle
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+pytestmark = pytest.mark.realtime
+
+WITHOUT_JAX = (sys.executable, str(Path(__file__).with_name("without_jax.py")))
+"""A command line that refuses what only the distribution sim2real brings."""
+
+
+def call(command, folder, *arguments):
+    """Run a command in a folder; return its exit code and its output."""
+    outside = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_"))}
+    line = [*command, *map(str, arguments)]
+    done = subprocess.run(line, cwd=folder, env=outside, capture_output=True, text=True, timeout=120)
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module", params=["pendulum", "so101"])
+def resting(request, tmp_path_factory):
+    """A robot, and a bundle whose policy rests; the aim of the SO-101 is drawn."""
+    robot = load_pipeline(request.param).load()
+    low, high = np.array([(a.low, a.high) for a in robot.agent.action]).T
+    size, actions = robot.agent.observation_size, len(low)
+    weights = {"mean": np.zeros(size), "std": np.ones(size), "low": low, "high": high, "log_std": np.zeros(actions)}
+    weights |= {"layers.0.kernel": np.zeros((size, actions)), "layers.0.bias": np.zeros(actions)}
+    terms = robot.agent.observation, robot.agent.action, robot.rate_hz
+    contract = PolicyContract(*terms, limits=dict(robot.agent.limits))
+    return request.param, save_bundle(tmp_path_factory.mktemp("bundle") / "resting", weights, contract)
+
+
+def assert_works(command, folder, robot, bundle):
+    """Record and deploy on the emulated robot, and read the log."""
+    flags = ["--duration-s", "1", "--runs", "runs", *PATIENT]
+    code, said = call(command, folder, "record", robot, *flags)
+    assert code == errors.OK, said
+    (log,) = folder.glob(f"runs/{robot}/*/record/session.mcap")
+    assert len(read_log(log).steps["sensor"]) >= 40
+    code, said = call(command, folder, "info", log)
+    assert code == errors.OK, said
+    once = ["--bundle", bundle, "--episodes", "1", "--no-measure-delay"]
+    code, said = call(command, folder, "deploy", robot, *flags, *once)
+    assert code == errors.OK, said
+    assert "no page: `sim2real report" in said
+    (deployed,) = folder.glob(f"runs/{robot}/*/deploy")
+    assert "success, deployment 0" in manifest_of(deployed)["summary"]
+
+
+def test_a_robot_is_recorded_and_moved_by_a_policy_without_jax(tmp_path, resting):
+    assert_works(WITHOUT_JAX, tmp_path, *resting)
+
+
+@pytest.mark.parametrize(
+    ("words", "package"), [(["train", "pendulum"], "jax"), (["compare", "."], "scipy"), (["check", "pendulum"], "jax")]
+)
+def test_a_command_that_needs_the_rest_says_so(tmp_path, words, package):
+    code, said = call(WITHOUT_JAX, tmp_path, *words)
+    assert code == errors.USAGE
+    assert f"needs the package {package}, which is not installed here" in said
+    assert "do it on a computer with sim2real" in said
+
+
+def test_a_robot_whose_module_imports_jax_is_named(tmp_path):
+    folder = tmp_path / "pipelines" / "mine"
+    folder.mkdir(parents=True)
+    (folder / "robot.py").write_text("import math\nimport jax\n")
+    definition = "from sim2real.stages.pipeline.pipeline import Pipeline\n"
+    (folder / "__init__.py").write_text(definition + 'PIPELINE = Pipeline("mine", "", __name__)\n')
+    code, said = call(WITHOUT_JAX, tmp_path, "record", "mine")
+    assert code == errors.USAGE
+    assert f"(line 2 of {folder / 'robot.py'})" in said
+    assert "from sim2real.later import jax, jnp" in said
+
+
+@pytest.mark.full
+@pytest.mark.slow
+def test_the_distribution_is_small_and_works(tmp_path_factory, tmp_path, resting):
+    folder = tmp_path_factory.mktemp("light")
+    command = [bench.installed(folder), "-P", "-m", "sim2real.cli"]
+    assert bench.size_mb(folder) <= 300
+    (packages,) = (folder / "env" / "lib").glob("python*/site-packages")
+    assert not [name for name in ("jax", "brax", "scipy", "onnx", "matplotlib") if (packages / name).exists()]
+    assert_works(command, tmp_path, *resting)
+    code, said = call(command, tmp_path, "view", resting[0])
+    assert (code, "pip install 'sim2real-robot[view]'" in said) == (errors.ERROR, True)
