@@ -11,6 +11,7 @@ from xml.sax.saxutils import quoteattr
 
 from sim2real.errors import HardwareLost, UsageError
 from sim2real.hardware.unitree.messages import COMMAND_TOPIC, STATE_TOPIC, LowCmd, LowState
+from sim2real.installation import with_extra
 
 try:
     from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
@@ -21,9 +22,7 @@ try:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
 except ImportError as error:
-    raise UsageError(
-        "Unitree's robots need cyclonedds, which is not installed", hint="pip install 'sim2real[unitree]'"
-    ) from error
+    raise UsageError("Unitree's robots need cyclonedds, which is not installed", hint=with_extra("unitree")) from error
 
 _HIGHEST_DOMAIN: Final = 232
 QUEUE: Final = 16
