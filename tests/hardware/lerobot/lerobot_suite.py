@@ -13,16 +13,22 @@ from unittest.mock import MagicMock
 
 # The follower imports the training library for names in annotations and for a progress bar: they take 5 GB, and no
 # robot uses them. Everything that addresses the servos is LeRobot's own.
-for unused in ("torch", "accelerate", "datasets", "datasets.utils", "datasets.utils.logging"):
-    sys.modules[unused] = MagicMock()
+UNUSED = ("torch", "accelerate", "datasets", "datasets.utils", "datasets.utils.logging")
+sys.modules |= {name: MagicMock() for name in UNUSED}
 processor: Any = ModuleType("lerobot.processor")
 processor.RobotAction = processor.RobotObservation = dict[str, Any]
 sys.modules["lerobot.processor"] = processor
+import lerobot.robots.so_follower  # noqa: E402, F401
+
+for name in UNUSED:
+    del sys.modules[name]  # SciPy looks for PyTorch's arrays
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
-from pipelines.so101.robot import SERVOS  # noqa: E402
+import sim2real  # noqa: E402
+from pipelines.so101.robot import ROBOT, SERVOS  # noqa: E402
+from sim2real import cli  # noqa: E402
 from sim2real.errors import UsageError  # noqa: E402
 from sim2real.hardware.emulation.embedded import EmbeddedRobot  # noqa: E402
 from sim2real.hardware.feetech.emulation import StsEmulation  # noqa: E402
@@ -79,3 +85,19 @@ def test_the_guide_drives_the_arm(tmp_path, monkeypatch):
 def test_an_unknown_robot_is_refused():
     with pytest.raises(UsageError, match=r"no robot 'so99'. Available: .*so101_follower"):
         LerobotSettings("so99").make("/dev/null")
+
+
+def test_an_so101_is_recorded_through_lerobot(tmp_path, monkeypatch):
+    """The device `lerobot` in place of `feetech` in the robot's drive; its positions are those of the emulated arm."""
+    calibration = Path(__file__).parents[3] / "pipelines/so101/calibration.json"
+    (tmp_path / "arm.json").write_bytes(calibration.read_bytes())
+    settings = LerobotSettings("so101_follower", "arm", tmp_path)
+    monkeypatch.setattr(ROBOT.drive, "servos", replace(SERVOS, device="lerobot"))
+    monkeypatch.setattr(ROBOT.drive, "_settings", lambda port: settings)
+    assert not cli.main(["record", "so101", "--port", "embedded", "--duration-s", "2", "--runs", str(tmp_path)])
+    (log,) = tmp_path.glob("so101/*/record/session.mcap")
+    recording = sim2real.Recording.load(log)
+    position = np.asarray(recording.episode.outputs["sensor"]["position"])
+    assert (np.ptp(position, axis=0) > 0.1).all(), "every joint moves"
+    assert (position >= np.array(SERVOS.low) - 0.1).all()
+    assert (position <= np.array(SERVOS.high) + 0.1).all()
