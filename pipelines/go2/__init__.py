@@ -1,6 +1,6 @@
 """A Unitree Go2 that walks: it follows a commanded velocity."""
 
-from sim2real.stages.config import DeployConfig, TrainConfig
+from sim2real.stages.config import DeployConfig, GateLimits, RecordConfig, TrainConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.train.config import PPOConfig
 from sim2real.train.environment.variation import VariationConfig
@@ -19,6 +19,8 @@ VARY = VariationConfig(
     push=0.6,
     push_hz=0.25,
 )
+# rad, rad/s, rad/s; each joint has its own range. A motor turns at 30 rad/s at most.
+GATE = GateLimits(limit=4.6, slew_per_s=60.0, max_speed_rad_s=40.0)
 WALK = PPOConfig(
     num_envs=4096,
     rollout_steps=24,
@@ -41,6 +43,7 @@ PIPELINE = Pipeline(
     name="go2",
     summary="quadruped with a floating base: follow a commanded velocity",
     package=__name__,
+    record=RecordConfig(amplitude=0.3, low_hz=0.2, high_hz=4.0, gate=GATE),
     train=TrainConfig(model="nominal", episode_s=10.0, timelines=256, sensitivity=False, vary=VARY, ppo=WALK),
-    deploy=DeployConfig(episodes=5, duration_s=10.0),
+    deploy=DeployConfig(episodes=5, duration_s=10.0, max_tilt_rad=1.2, gate=GATE),
 )

@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from sim2real.robots.walking.body import LeggedBody
-from sim2real.robots.walking.hidden import HiddenTwin
+from sim2real.robots.walking.plain.body import LeggedBody
+from sim2real.robots.walking.plain.hidden import HiddenTwin
 
 LEGS = ("FR", "FL", "RR", "RL")
 LYING = (0.0, 1.36, -2.65) * 4
@@ -32,13 +32,9 @@ class Go2Body(LeggedBody):
         super().__init__(Path(__file__).with_name("go2.xml"), LEGS, LYING, 0.12, hidden, place)
 
 
-def latencies(seed: int | None) -> dict[str, float]:
-    """Return latencies of the emulator with a seed [s]; None: the nominal ones."""
+def latencies(seed: int | None) -> tuple[float, float, float]:
+    """Return latency of sensing, latency and jitter of actuation of an emulator [s]; None: the nominal ones."""
     if seed is None:
-        return {"sensing_latency_s": 0.004, "actuation_latency_s": 0.006, "actuation_jitter_s": 0.0005}
+        return 0.004, 0.006, 0.0005
     draw = random.Random(seed)
-    return {
-        "sensing_latency_s": draw.uniform(0.002, 0.007),
-        "actuation_latency_s": draw.uniform(0.004, 0.010),
-        "actuation_jitter_s": draw.uniform(0.0, 0.001),
-    }
+    return draw.uniform(0.002, 0.007), draw.uniform(0.004, 0.010), draw.uniform(0.0, 0.001)

@@ -8,11 +8,14 @@ from types import MappingProxyType
 
 import jax.numpy as jnp
 
+from sim2real.robots.control_loop.hardware import Embedded
+from sim2real.robots.walking.drive import LegMotors, Place
 from sim2real.robots.walking.moment import Moment
 from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.task import Term
 
-LEGS = ("FR", "FL", "RR", "RL")
+from .plant import LEGS, LYING, latencies
+
 _BENT = (2.0, 0.5, 0.5) * 4
 """Weights of hip, thigh and calf off the stance."""
 
@@ -22,6 +25,14 @@ def _pose(now: Moment) -> jnp.ndarray:
     return (1.0 - 0.8 * now.moving) * jnp.sum(jnp.array(_BENT) * now.offset**2)
 
 
+def embedded(place: Place) -> Embedded:
+    """Return the emulated Go2, lying on the floor or in a stand, with parameters and latencies that no stage reads."""
+    from sim2real.hardware.unitree.emulation import UnitreeEmulation
+
+    seed, file = 37, Path(__file__).with_name("plant.py")
+    return Embedded(f"{file}:Go2Body", UnitreeEmulation(*latencies(seed)), {"place": place, "seed": seed})
+
+
 class Go2(ComposedRobot):
     """A Unitree Go2 that follows velocities."""
 
@@ -29,6 +40,7 @@ class Go2(ComposedRobot):
     joints = tuple(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf"))
     feet = LEGS
     stance = (-0.1, 0.8, -1.5, 0.1, 0.8, -1.5, -0.1, 1.0, -1.5, 0.1, 1.0, -1.5)
+    motors = LegMotors("unitree", LYING, embedded=embedded)
     height_m, touching_m, scale = 0.33, 0.028, 0.6
     noise = MappingProxyType(
         {"position": (0.01, 0.015), "velocity": (0.5, 0.0), "quaternion": (0.01, 0.005), "gyro": (0.1, 0.02)}

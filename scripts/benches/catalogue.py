@@ -90,6 +90,11 @@ BENCHES = {
             *("sim2real/composer/physics/c", "sim2real/stages/config.py", "sim2real/stages/pipeline/from_model.py"),
         ),
     ),
+    "legs": Bench(
+        "runs.legs",
+        "the Go2's policy over DDS with the emulator beside it: its computation, and lateness at 50 Hz",
+        ("sim2real/robots", "sim2real/hardware", "sim2real/policy", "sim2real/runtime", "pipelines/go2"),
+    ),
     "light": Bench(
         "processor_time.light",
         "sim2real-robot in a new environment: its size, and record's processor time until it addresses a robot",

@@ -19,8 +19,6 @@ from sim2real.stages.pipeline.pipeline import available, load_pipeline
 from sim2real.stages.terminal.console import note, wrote
 
 FRAMES_PER_S = 12.5
-SHIPPED = "walk"
-"""Folder of a pipeline with the bundle that comes with it."""
 _KEYS = {265: (0, 0.1), 264: (0, -0.1), 44: (1, 0.1), 46: (1, -0.1), 263: (2, 0.1), 262: (2, -0.1)}
 """Key of GLFW -> entry of the command, and its change: arrows, comma, full stop."""
 _SPACE = 32
@@ -83,13 +81,12 @@ def _chosen(config: PlayConfig) -> tuple[ComposedRobot, Path]:
         raise UsageError("play needs a pipeline, a run or a bundle", hint="sim2real play go2")
     if source in pipelines:
         pipeline = load_pipeline(source)
-        shipped = pipeline.folder / SHIPPED
         try:
             folder = newest(config.runs, source, "train").output("bundle")
         except Sim2RealError:
-            if not shipped.is_dir():
+            if not pipeline.shipped.is_dir():
                 raise
-            folder = shipped
+            folder = pipeline.shipped
     else:
         folder = find_bundle(ShipConfig(source, runs=config.runs))
         named = next((p.name for p in folder.resolve().parents if p.name in pipelines), None)

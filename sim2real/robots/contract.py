@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack, runtime_checkable
 
@@ -213,13 +213,22 @@ class Robot:
         start = self.drive.measured_start(session, self.task.at_rest(trial))
         params = {self.roles.supervisor: in_numpy(self.agent.params(start, None))}
         node = self.agent.make(self.rate_hz, delay=self.drive.expected_delay_s[1])
-        return self._on_hardware(session, PolicyNode(node, policy)), params
+        return self._on_hardware(session, PolicyNode(node, policy), lambda: self.drive.begin(session)), params
 
-    def _on_hardware(self, session: Session, agent: BaseNode) -> dict[str, BaseNode]:
+    def _on_hardware(
+        self, session: Session, agent: BaseNode, begin: Callable[[], None] | None = None
+    ) -> dict[str, BaseNode]:
         rate, rig, acting_s = self.rate_hz, session.rig, self.drive.expected_delay_s[2]
         roles, drive = self.roles, self.drive
         actuator = ServoActuator(
-            roles.actuator, rate, rig, drive.command, drive.message, roles.supervisor, delay=acting_s
+            roles.actuator,
+            rate,
+            rig,
+            drive.command,
+            drive.message,
+            roles.supervisor,
+            begin,
+            delay=acting_s,
         )
         return control_nodes(self._sensor(session), agent, actuator)
 

@@ -106,12 +106,22 @@ class RobotDrive(_Part, Protocol):
             truth_path: File for the emulated robot's true states and latencies.
         """
 
+    def connect_to_record(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:
+        """Open the robot for a recording, with torque off, such as legs that hang in a stand; default: ``connect``."""
+        return self.connect(port, limits, truth_path, seed)
+
     @abstractmethod
     def prepare(self, session: Session, settle_s: float) -> None:
         """Bring the robot to rest where the task starts; torque is off afterwards.
 
         Args:
             settle_s: Longest time to wait for rest, for each attempt [s].
+        """
+
+    def begin(self, session: Session) -> None:
+        """Bring the robot, with torque on, to the start of the task, such as legs to their stance; default: nothing.
+
+        Called before the first step of an episode.
         """
 
     def gate(self, limits: GateLimits) -> GateConfig:

@@ -38,7 +38,7 @@ class UnitreeEmulation:
         tilt_noise_rad: Deviation of the noise of the orientation, about each axis [rad].
         accelerometer_noise_m_s2: Deviation of the noise of the accelerometer [m/s^2].
         alone_after_s: Time without an intact command after which motors damp their joints [s]; None: they go on as
-            commanded last.
+            commanded last, the worst that is possible: Unitree documents no reaction.
         alone_kd: Damping of the joints then [N m s/rad].
         reply_loss: Probability that a state is not sent.
         corrupt: Probability that a state has a wrong CRC.
@@ -59,7 +59,7 @@ class UnitreeEmulation:
     gyro_noise_rad_s: float = 0.01
     tilt_noise_rad: float = 0.002
     accelerometer_noise_m_s2: float = 0.05
-    alone_after_s: float | None = 0.02
+    alone_after_s: float | None = None
     alone_kd: float = 3.0
     reply_loss: float = 0.0
     corrupt: float = 0.0

@@ -25,6 +25,7 @@ from sim2real.errors import HardwareLost
 from sim2real.hardware.emulation.emulator import StopFlag, emulate, keep_time, plant_arguments
 from sim2real.hardware.emulation.truth import Kind, TruthLog
 from sim2real.hardware.plant import load_named
+from sim2real.hardware.unitree.dds import Address
 from sim2real.hardware.unitree.emulation import STATE_HZ, EmulatedLegs, UnitreeEmulation, truth_header
 from sim2real.hardware.unitree.messages import COMMAND_TOPIC, STATE_TOPIC, LowCmd, LowState
 
@@ -38,8 +39,6 @@ _DOMAINS: Final = range(50, 230)
 """Domains of emulators; a real robot has domain 0."""
 _LOCK_PORT: Final = 29_000
 """A domain belongs to the process that has the UDP port of this number plus the domain's."""
-_LOOPBACK: Final = """<CycloneDDS><Domain Id="any"><General><Interfaces>
-<NetworkInterface name="lo" priority="default" multicast="default"/></Interfaces></General></Domain></CycloneDDS>"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -57,7 +56,8 @@ def _run(options: argparse.Namespace, config: UnitreeEmulation, stop: StopFlag) 
     body = load_named(options.plant, "plant")(**plant_arguments(options.plant_args))
     lock, domain = _free_domain()
     # DDS has threads of its own, which take no part in the real-time priority.
-    network = Domain(domain, _LOOPBACK)
+    address = Address("lo", domain)
+    network = Domain(domain, address.config)
     participant = DomainParticipant(domain)
     reader = DataReader(participant, Topic(participant, COMMAND_TOPIC, LowCmd))
     writer = DataWriter(participant, Topic(participant, STATE_TOPIC, LowState))
@@ -66,7 +66,7 @@ def _run(options: argparse.Namespace, config: UnitreeEmulation, stop: StopFlag) 
     truth = TruthLog(options.truth, truth_header(body, config, start_ns))
     try:
         legs = EmulatedLegs(body, config, truth, start_ns)
-        ready = {"port": f"lo:{domain}", "pid": os.getpid(), "truth": str(options.truth.resolve())}
+        ready = {"port": str(address), "pid": os.getpid(), "truth": str(options.truth.resolve())}
         print(json.dumps(ready), flush=True)
         parent_fd = sys.stdin.fileno() if options.until_stdin_closes else None
         _serve(legs, config, reader, _Sender(writer, config, truth), truth, start_ns, stop, parent_fd)

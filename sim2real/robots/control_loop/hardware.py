@@ -150,6 +150,7 @@ class ServoActuator(BaseNode):
         field: Field of the agent's message that is the command, shape ``(servos,)``.
         message: Makes the node's message from this command. If the device's commands have columns, it has a field of
             the shape ``(servos,)`` for each, by the column's name.
+        begin: Called after the torque is on: brings the robot to the start of the task.
         **options: Options of ``BaseNode``.
     """
 
@@ -163,10 +164,11 @@ class ServoActuator(BaseNode):
         field: str,
         message: Callable[[np.ndarray], Any],
         agent: str = ROLES.supervisor,
+        begin: Callable[[], None] | None = None,
         **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
-        self._rig, self._field, self._message, self._agent = rig, field, message, agent
+        self._rig, self._field, self._message, self._agent, self._begin = rig, field, message, agent, begin
 
     def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return a message with zeros."""
@@ -174,9 +176,11 @@ class ServoActuator(BaseNode):
         return self._message(np.zeros(len(self._rig.device.motors)))
 
     def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
-        """Switch the torque on."""
+        """Switch the torque on, and bring the robot to the start of the task."""
         del graph_state, timeout
         self._rig.start()
+        if self._begin is not None:
+            self._begin()
         return True
 
     def stop(self, timeout: float | None = None) -> bool:

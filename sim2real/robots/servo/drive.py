@@ -122,12 +122,17 @@ class ServoDrive(RobotDrive):
 
     def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
         """Return goals ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s instead of in a leap."""
-        # After its end an excitation would be 0, which may be outside of the limits: repeat the last goals.
-        signal = self.around(np.vstack([signal, np.repeat(signal[-1:], round(_HOLD_S * self.rate_hz), axis=0)]))
-        offset = session.rig.measure().position_rad - signal[0]
-        covered = np.arange(len(signal))[:, None] * HOME_RAD_S / self.rate_hz
-        return signal + np.sign(offset) * np.maximum(np.abs(offset) - covered, 0.0)
+        return approached(self.around(signal), session.rig.measure().position_rad, self.rate_hz)
 
     def measured_start(self, session: Session, start: EpisodeStart) -> EpisodeStart:
         """Return a start at the measured positions: goals start there."""
         return start.replace(position=np.asarray(session.rig.measure().position_rad, np.float32))
+
+
+def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return goals ``(N, joints)`` that begin at positions ``(joints,)`` and reach the given goals at 1 rad/s [rad]."""
+    # After its end an excitation would be 0, which may be outside of the limits: repeat the last goals.
+    goals = np.vstack([goals, np.repeat(goals[-1:], round(_HOLD_S * rate_hz), axis=0)])
+    offset = position_rad - goals[0]
+    covered = np.arange(len(goals))[:, None] * HOME_RAD_S / rate_hz
+    return goals + np.sign(offset) * np.maximum(np.abs(offset) - covered, 0.0)

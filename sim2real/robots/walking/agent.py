@@ -15,11 +15,11 @@ from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.contract import RobotAgent
-from sim2real.robots.control_loop.messages import Decision, EpisodeStart
+from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.roles import ROLES
 from sim2real.robots.servo.agent import AgentParams, decide, first_carry
 from sim2real.robots.walking.commands import Commands
-from sim2real.robots.walking.messages import BodyReading, gravity_of
+from sim2real.robots.walking.messages import BodyReading, WalkDecision, gravity_of
 from sim2real.types import Array, Key, PyTree
 
 
@@ -83,10 +83,10 @@ class WalkingNode(BaseNode):
         past = jnp.zeros((self._history, 6 + 3 * len(self._stance)))
         return WalkingState(zeros, zeros, past, first_carry(params.policy))
 
-    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Decision:
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> WalkDecision:
         """Return the targets at the start, and no velocity."""
         params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return Decision(jnp.asarray(params.start, jnp.float32), jnp.zeros(3))
+        return WalkDecision(jnp.asarray(params.start, jnp.float32), jnp.zeros(3))
 
     def command(self, step_state: StepState) -> Array:
         """Return the commanded velocity ``(3,)`` of a step: forwards, to the left [m/s], yaw rate [rad/s]."""
@@ -98,17 +98,17 @@ class WalkingNode(BaseNode):
         xp = namespace(now, state.past)
         return xp.concatenate([now, self.command(step_state), state.past.ravel()]).astype(np.float32)
 
-    def act(self, step_state: StepState, action: Array) -> tuple[StepState, Decision]:
+    def act(self, step_state: StepState, action: Array) -> tuple[StepState, WalkDecision]:
         """Return the new step state and the message for an action ``(joints,)``."""
         now, state = self._now(step_state), step_state.state
         xp = namespace(action, now, state.past)
         past = xp.concatenate([now[None], state.past])[: self._history]
         action = xp.asarray(action, np.float32)
         new = state.replace(last=action, before=state.last, past=past)
-        goal = self._stance + np.float32(self._scale) * action
-        return step_state.replace(state=new), Decision(goal, xp.asarray(self.command(step_state), np.float32))
+        targets = self._stance + np.float32(self._scale) * action
+        return step_state.replace(state=new), WalkDecision(targets, xp.asarray(self.command(step_state), np.float32))
 
-    def step(self, step_state: StepState) -> tuple[StepState, Decision]:
+    def step(self, step_state: StepState) -> tuple[StepState, WalkDecision]:
         """Make a step with the policy's action."""
         policy, state = step_state.params.policy, step_state.state
         if policy is None:

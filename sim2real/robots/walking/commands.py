@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
@@ -46,8 +46,11 @@ class Commands:
         return (drawn * (jax.random.uniform(k_stand, (self.count, 1)) >= self.stand)).ravel()
 
     def of_trial(self, trial: int) -> np.ndarray:
-        """Return the commands of a trial: the same number gives the same commands, on hardware and in simulation."""
-        return np.asarray(self.draw(jax.random.key(trial)), np.float32)
+        """Return the commands of a trial, none of them to stand still.
+
+        The same number gives the same commands, on hardware and in simulation.
+        """
+        return np.asarray(replace(self, stand=0.0).draw(jax.random.key(trial)), np.float32)
 
     def at(self, drawn: Array, t_s: Scalar) -> Array:
         """Return the command ``(3,)`` at a time of an episode [s]."""

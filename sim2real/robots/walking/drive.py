@@ -2,22 +2,76 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from sim2real.errors import UsageError
+from sim2real.errors import SafetyStop, UsageError
 from sim2real.identify.model import Channel
 from sim2real.robots.contract import RobotDrive, RobotSensor, Session
-from sim2real.robots.control_loop.messages import Goals
-from sim2real.robots.walking.messages import BodyReading
+from sim2real.robots.control_loop.hardware import Embedded, ServoSession
+from sim2real.robots.servo.drive import approached
+from sim2real.robots.walking.messages import BodyReading, LegCommand, gravity_of, leg_command
 
 if TYPE_CHECKING:
-    from sim2real.hardware.device import Reading
+    from sim2real.hardware.device import Device, Reading
+    from sim2real.hardware.safety.gate import GateConfig
     from sim2real.robots.gate_limits import GateLimits
+
+Place = Literal["floor", "stand"]
+_STILL_RAD_S = 0.3
+"""Speed below which a joint is at rest, above the noise of the motors' speeds [rad/s]."""
+_LARGEST = {"dq": 1.0, "kp": 120.0, "kd": 8.0, "tau": 1.0}
+"""Largest magnitude of each column but the target [rad/s, N m/rad, N m s/rad, N m]; kp and kd are at least 0."""
+
+
+@dataclass(frozen=True)
+class LegMotors:
+    """The motors of a walking robot on hardware.
+
+    Attributes:
+        device: Name of the device; see ``sim2real.hardware.registry``.
+        folded: Position of each joint while the robot lies on folded legs, from which it stands up [rad].
+        settings: Settings of the device.
+        embedded: Returns the emulated robot on the ``floor`` or in a ``stand``; None: there is none.
+    """
+
+    device: str
+    folded: tuple[float, ...]
+    settings: Any = None
+    embedded: Callable[[Place], Embedded] | None = None
+
+
+@dataclass(frozen=True)
+class StandUp:
+    """The start motion: fold the legs, rise to the stance, and wait there.
+
+    Attributes:
+        fold_s, rise_s, wait_s: Times of its parts [s].
+        kp, kd: Gains during the motion [N m/rad], [N m s/rad]; a weak motor with small gains does not lift the robot.
+    """
+
+    fold_s: float = 0.8
+    rise_s: float = 1.2
+    wait_s: float = 0.6
+    kp: float = 60.0
+    kd: float = 3.0
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the motion [s]."""
+        return self.fold_s + self.rise_s + self.wait_s
+
+    def targets(self, t_s: float, start: np.ndarray, folded: np.ndarray, stance: np.ndarray) -> np.ndarray:
+        """Return the joints' targets ``(joints,)`` at a time of the motion [rad]."""
+        fold, rise = (float(np.clip(x, 0.0, 1.0)) for x in (t_s / self.fold_s, (t_s - self.fold_s) / self.rise_s))
+        return start + fold * (folded - start) + rise * (stance - folded)
 
 
 class BodySensor(RobotSensor):
@@ -27,8 +81,7 @@ class BodySensor(RobotSensor):
 
     def __init__(self, joints: Sequence[str], stance: np.ndarray) -> None:
         self.channels = tuple(
-            Channel("position", "velocity", 0.002, 0.05, index=i, label=name, goal="goal")
-            for i, name in enumerate(joints)
+            Channel("position", "velocity", 0.002, 0.05, index=i, label=name, goal="q") for i, name in enumerate(joints)
         )
         self.joints = {
             name: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, name in enumerate(joints)
@@ -41,21 +94,116 @@ class BodySensor(RobotSensor):
         return BodyReading(reading.position_rad, reading.velocity_rad_s, parts["quaternion"], parts["gyro"])
 
 
-class TargetDrive(RobotDrive):
-    """Targets of all joints."""
+class WalkingDrive(RobotDrive):
+    """Targets of all joints, with the same gains for all motors.
 
-    command, units, message = "goal", MappingProxyType({"goal": "rad"}), Goals
+    Args:
+        mjcf: The model, whose ranges of the joints are those of the targets.
+        gains: kp [N m/rad] and kd [N m s/rad] while the policy runs.
+        motors: The motors; None: the robot has no device, and its policy walks on the twin alone.
+    """
+
+    command = "q"
+    units = MappingProxyType({"q": "rad", "dq": "rad/s", "kp": "N m/rad", "kd": "N m s/rad", "tau": "N m"})
     expected_delay_s = (0.002, 0.003, 0.002)
 
-    def __init__(self, robot: Any) -> None:
-        self.rate_hz = robot.policy_hz
+    def __init__(
+        self,
+        mjcf: Path,
+        joints: Sequence[str],
+        stance: Sequence[float],
+        rate_hz: float,
+        gains: tuple[float, float],
+        motors: LegMotors | None = None,
+        stand_up: StandUp | None = None,
+    ) -> None:
+        self._mjcf, self._joints, self._stance, self.rate_hz = mjcf, tuple(joints), np.asarray(stance), rate_hz
+        self._motors, self._stand_up = motors, stand_up or StandUp()
+        self.message: Callable[[Any], LegCommand] = partial(leg_command, kp=gains[0], kd=gains[1])
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:
-        """Refuse: a subclass of the robot makes the drive of a device."""
-        raise UsageError(
-            f"this robot has no device for port {port!r}",
-            hint="sim2real play lets its policy walk on the twin; `make_drive` of the robot returns a device's drive",
-        )
+    @property
+    def embedded(self) -> Embedded | None:
+        """The emulated robot on the floor, for the port ``embedded``."""
+        return self._emulated("floor")
+
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
+        """Open the motors, with torque off; see ``RobotDrive.connect``."""
+        return self._connect(port, limits, truth_path, seed, "floor")
+
+    def connect_to_record(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
+        """Open the motors of a robot in a stand, whose legs hang in the air, with torque off."""
+        return self._connect(port, limits, truth_path, seed, "stand")
+
+    def _emulated(self, place: Place) -> Embedded | None:
+        motors = self._motors
+        return motors.embedded(place) if motors is not None and motors.embedded is not None else None
+
+    def _connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, place: Place) -> ServoSession:
+        motors = self._motors
+        if motors is None:
+            raise UsageError(
+                f"this robot has no device for port {port!r}",
+                hint="sim2real play lets its policy walk on the twin; LegMotors names the device of a robot",
+            )
+        from sim2real.hardware.registry import load_device
+
+        make = load_device(motors.device)
+
+        def device(port: str) -> Device:
+            return make(port, range(len(self._joints)), motors.settings, baud_rate=0, silence_s=limits.servo_watchdog_s)
+
+        return ServoSession(port, device, self._gate(limits, device(port)), self._emulated(place), truth_path, seed)
 
     def prepare(self, session: Session, settle_s: float) -> None:
-        """Do nothing: the twin starts in its stance."""
+        """Wait, with torque off, until the robot lies still."""
+        session.rig.wait_until_still(settle_s, _STILL_RAD_S)
+
+    def around(self, signal: np.ndarray) -> np.ndarray:
+        """Return targets ``(N, joints)`` [rad] of an excitation around the stance."""
+        return signal + self._stance
+
+    def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
+        """Return targets ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s instead of in a leap."""
+        return approached(self.around(signal), session.rig.measure().position_rad, self.rate_hz)
+
+    def begin(self, session: Session) -> None:
+        """Let the robot stand up.
+
+        Raises:
+            SafetyStop: It tips over, or stands in another pose than its stance at the end.
+        """
+        rig, motion = session.rig, self._stand_up
+        if rig.torque_withheld:
+            return
+        reading, begin_s = rig.measure(), time.monotonic()
+        start = reading.position_rad
+        folded = np.asarray(start if self._motors is None else self._motors.folded)
+        while (t_s := time.monotonic() - begin_s) < motion.duration_s:
+            reading = rig.measure()
+            if gravity_of(reading.parts["quaternion"])[2] > -0.5:
+                raise SafetyStop("the robot tipped over while it stood up", hint="lay it on even ground, legs folded")
+            command = leg_command(motion.targets(t_s, start, folded, self._stance), motion.kp, motion.kd)
+            table = np.stack([getattr(command, column.name) for column in rig.device.commanded.columns], axis=-1)
+            # The gate's time ends at 0, where that of the graph starts.
+            rig.command(table, 0.0, t_s - motion.duration_s)
+        off = np.abs(reading.position_rad - self._stance)
+        if off.max() > 0.5:
+            worst = int(off.argmax())
+            raise SafetyStop(f"{self._joints[worst]} is {off[worst]:.2g} rad off the stance after standing up")
+
+    def _gate(self, limits: GateLimits, device: Device) -> GateConfig:
+        """Return the gate: a range for each target, and limits of the other columns."""
+        import mujoco
+
+        model: Any = mujoco.MjModel.from_xml_path(str(self._mjcf))  # pyright: ignore[reportAttributeAccessIssue]
+        ranges = model.jnt_range[-len(self._joints) :]
+        columns = [column.name for column in device.commanded.columns]
+        low, high = np.zeros((len(ranges), len(columns))), np.zeros((len(ranges), len(columns)))
+        for i, name in enumerate(columns):
+            most = _LARGEST.get(name, limits.limit)
+            low[:, i], high[:, i] = 0.0 if name in ("kp", "kd") else -most, most
+            if name == self.command:
+                low[:, i], high[:, i] = np.maximum(ranges[:, 0], -most), np.minimum(ranges[:, 1], most)
+        gate = limits.gate(np.inf, stale=device.commanded.stale, joints=self._joints)
+        slew = [limits.slew_per_s if name == self.command else np.inf for name in columns]
+        return replace(gate, limit=(low.tolist(), high.tolist()), slew_per_s=tuple(slew))

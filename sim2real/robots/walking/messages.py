@@ -28,6 +28,45 @@ class BodyReading(Base):
     gyro: Array
 
 
+@struct.dataclass
+class WalkDecision(Base):
+    """The agent's message.
+
+    Attributes:
+        q: Shape ``(joints,)``: targets of the joints [rad].
+        aim: Shape ``(3,)``: the commanded velocity: forwards, to the left [m/s], yaw rate [rad/s].
+    """
+
+    q: Array
+    aim: Array
+
+
+@struct.dataclass
+class LegCommand(Base):
+    """The command of the motors, each ``(joints,)``: its torque is ``tau + kp (q - position) + kd (dq - velocity)``.
+
+    Attributes:
+        q: Targets [rad].
+        dq: Velocities [rad/s].
+        kp: Gains of the position [N m/rad].
+        kd: Gains of the velocity [N m s/rad].
+        tau: Torques [N m].
+    """
+
+    q: Array
+    dq: Array
+    kp: Array
+    kd: Array
+    tau: Array
+
+
+def leg_command(q: Array, kp: float, kd: float) -> LegCommand:
+    """Return the command of targets ``(joints,)`` with the same gains for all motors."""
+    xp = namespace(q)
+    zero = xp.zeros_like(q)
+    return LegCommand(q, zero, zero + kp, zero + kd, zero)
+
+
 def into_base(quaternion: Array, vector: Any) -> Array:
     """Return a vector of the world ``(3,)`` in the axes of the base.
 

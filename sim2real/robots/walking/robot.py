@@ -20,7 +20,7 @@ from sim2real.robots.control_loop.loop import DELAYS
 from sim2real.robots.control_loop.training_task import LoopTask
 from sim2real.robots.walking.agent import WalkingAgent
 from sim2real.robots.walking.commands import Commands
-from sim2real.robots.walking.drive import BodySensor, TargetDrive
+from sim2real.robots.walking.drive import BodySensor, LegMotors, WalkingDrive
 from sim2real.robots.walking.model import ROUGHNESS, WalkingModel
 from sim2real.robots.walking.moment import Moment
 from sim2real.robots.walking.scene import Ground
@@ -41,6 +41,8 @@ class ComposedRobot(Robot):
         scale: Change of a target by the action 1 [rad].
         policy_hz: Steps of the policy per second [Hz].
         history: Earlier observations that the policy gets.
+        gains: kp [N m/rad] and kd [N m s/rad] of the motors, as in the MJCF file.
+        motors: The motors on hardware; None: the robot has no device.
         delays_s: Delays without an identification: of the sensor, of the actuator [s].
         terrain: Rough ground, on which a training with the parameter ``roughness`` takes place.
         noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
@@ -57,6 +59,8 @@ class ComposedRobot(Robot):
     policy_hz: ClassVar[float] = 50.0
     commands: ClassVar[Commands] = Commands()
     terrain: ClassVar[Terrain] = Terrain()
+    gains: ClassVar[tuple[float, float]] = (35.0, 0.6)
+    motors: ClassVar[LegMotors | None] = None
     delays_s: ClassVar[tuple[float, float]] = (0.008, 0.008)
     noise: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
 
@@ -82,8 +86,8 @@ class ComposedRobot(Robot):
         return Ground(self.mjcf, self.feet, self.touching_m, self.feet, ground)
 
     def make_drive(self) -> RobotDrive:
-        """Return the motors; default: targets, for the twin alone."""
-        return TargetDrive(self)
+        """Return the motors; default: targets of all joints, for the device of ``motors``."""
+        return WalkingDrive(self.mjcf, self.joints, self.stance, self.policy_hz, self.gains, self.motors)
 
     def nominal(self) -> dict[str, float]:
         """Return the nominal values of the model's parameters, and the delays."""

@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 
 from sim2real.robots.walking.agent import features
-from sim2real.robots.walking.hidden import HiddenTwin as HiddenTwin
-from sim2real.robots.walking.hidden import hidden_spec, hide
 from sim2real.robots.walking.messages import BodyReading, gravity_of, into_base
+from sim2real.robots.walking.plain.hidden import HiddenTwin as HiddenTwin
+from sim2real.robots.walking.plain.hidden import hidden_spec, hide
 from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.terrain import FLOOR
 
@@ -49,6 +49,9 @@ class Twin:
     Args:
         seed: Of noise, pushes and ground.
         roughness_m: Difference between the lowest and the highest point of the ground; 0: it is the model's floor [m].
+
+    Attributes:
+        sent: Targets ``(joints,)`` that were sent last [rad].
     """
 
     def __init__(
@@ -74,7 +77,7 @@ class Twin:
         _mj.mj_resetData(self.model, self.data)
         bumps_m = 0.0 if self._rough is None else float(self._rough.heights.max())
         self.data.qpos[:7] = (0, 0, self.robot.height_m + bumps_m, 1, 0, 0, 0)
-        self.data.qpos[7:], self.data.ctrl[:] = stance, stance
+        self.data.qpos[7:], self.data.ctrl[:], self.sent = stance, stance, stance
         _mj.mj_forward(self.model, self.data)
         late = max(1, round(self.hidden.sensing_s / STEP_S))
         self._past = deque([self._measured()] * (late + 1), maxlen=late + 1)
@@ -89,7 +92,8 @@ class Twin:
 
     def send(self, goal: np.ndarray) -> None:
         """Send joint targets ``(joints,)`` [rad], which arrive later."""
-        self._coming.append((self.data.time + self.hidden.acting_s, np.asarray(goal, np.float64)))
+        self.sent = np.asarray(goal, np.float64)
+        self._coming.append((self.data.time + self.hidden.acting_s, self.sent))
 
     def advance(self, seconds: float) -> None:
         """Step the physics."""

@@ -48,7 +48,7 @@ class WalkingWorld(ComposedWorld):
         loads: tuple[float, float],
         **options: Any,
     ) -> None:
-        super().__init__(ROLES.world, task, ROLES.actuator, "goal", parameters, **options)
+        super().__init__(ROLES.world, task, ROLES.actuator, "q", parameters, **options)
         model = self.environment.model
         base = model.body(task.base.full_identifier).id
         kilograms = np.linspace(*loads, _ROWS)

@@ -19,7 +19,7 @@ class DeployConfig:
     port: str = "embedded"
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
     bundle: str | None = None
-    """Folder of the policy bundle; default: the newest training of the pipeline."""
+    """Folder of the policy bundle; default: the newest training of the pipeline, or the bundle that it ships."""
     episodes: int = 2
     """Number of episodes."""
     duration_s: float = 10.0

@@ -3,21 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.run.manifest import sha256
-from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.artifacts.run.run_folder import StageFolder, newest
 from sim2real.errors import DelayChanged, Sim2RealError
 from sim2real.policy.contract import ActionTerm, ObservationTerm, PolicyContract
 from sim2real.robots.contract import Robot
 from sim2real.robots.probe import StepAnswers, Witness, measure_delay
 from sim2real.stages.deploy.config import DeployConfig
+from sim2real.stages.pipeline.find_run import warn_of_stale
+from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note
 
 _TRAIN = "train a policy for this pipeline"
+
+
+def find_bundle(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> tuple[Path, Path | None]:
+    """Return the bundle's folder and the run folder to add to.
+
+    The bundle is that of the flag, of the newest training, or the one that the pipeline ships.
+    """
+    if config.bundle is not None:
+        return Path(config.bundle), run_dir
+    try:
+        training = newest(root, pipeline.name, "train", run_dir)
+    except Sim2RealError:
+        if not pipeline.shipped.is_dir():
+            raise
+        note(f"pipeline {pipeline.name!r} has no training here: its shipped policy is deployed")
+        return pipeline.shipped, run_dir
+    training = warn_of_stale(training)
+    require_untouched(training)
+    return training.output("bundle"), run_dir or training.run_dir
 
 
 def require_untouched(training: StageFolder) -> None:

@@ -41,17 +41,26 @@ def compare(
     them. Trajectories always compare measured states.
 
     Args:
-        identification: Parameters of the simulations; None: no simulation. The first simulation of each episode has
-            the estimates, the others are draws from the posterior.
+        identification: Parameters of the simulations; None: no simulation, but for a robot that is simulated in plain
+            MuJoCo. The first simulation of each episode has the estimates, the others are draws from the posterior.
         duration_s: Length of a simulation [s].
     """
     # Take the states of the robot's episodes.
     use_truth = all(r.true_states() is not None for r in recordings)
     real = [_states(recording, robot, use_truth) for recording in recordings]
 
-    # Simulate the same policy.
+    # Simulate the same policy, in plain MuJoCo or in the compiled graph.
     simulated, timeline = None, None
-    if identification is not None and has_jax():
+    values = None if identification is None else identification.values
+    trials = list(range(len(recordings)))
+    played = None
+    if has_jax():
+        from sim2real.robots.walking.plain.episodes import plain_episodes  # JAX is in its robot
+
+        played = plain_episodes(robot, bundle.runner(None), values, trials, duration_s)
+    if played is not None:
+        simulated = [(states, states) for states in played]
+    elif identification is not None and has_jax():
         from sim2real.stages.deploy.simulations import plausible_parameters, simulate  # JAX programs
         from sim2real.train.networks.policy import Policy
 

@@ -10,14 +10,13 @@ from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import PROBE, Deployment, Scores, log_of
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import TRUTH, Recording
-from sim2real.artifacts.run.run_folder import StageFolder, finished, newest, open_stage
+from sim2real.artifacts.run.run_folder import StageFolder, finished, open_stage
 from sim2real.robots.contract import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import check_timing, require_tilt, run_episodes
-from sim2real.stages.deploy.preflight import require_fit, require_untouched
+from sim2real.stages.deploy.preflight import find_bundle, require_fit
 from sim2real.stages.deploy.show import show, show_sessions, summary_lines, write_page
 from sim2real.stages.pipeline import python_arguments
-from sim2real.stages.pipeline.find_run import warn_of_stale
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_parameters import check_parameters, open_identification
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -90,7 +89,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     """
     # Check the bundle before a folder is made.
     robot = moving_robot(pipeline)
-    path, run_dir = _find_bundle(pipeline, config, root, run_dir)
+    path, run_dir = find_bundle(pipeline, config, root, run_dir)
     bundle = Bundle.load(path)
     require_fit(robot, bundle)
     require_tilt(robot, config)
@@ -118,17 +117,6 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         stage.summary(summary_lines(deployment, summaries))
         check_timing(summaries, config)
     return stage.result
-
-
-def _find_bundle(
-    pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None
-) -> tuple[Path, Path | None]:
-    """Return the bundle's folder, that of the flag or of the newest training, and the run folder to add to."""
-    if config.bundle is not None:
-        return Path(config.bundle), run_dir
-    training = warn_of_stale(newest(root, pipeline.name, "train", run_dir))
-    require_untouched(training)
-    return training.output("bundle"), run_dir or training.run_dir
 
 
 def _identification(pipeline: Pipeline, run_dir: Path) -> Identification | None:

@@ -54,7 +54,11 @@ def judge(
     deployment = replace(deployment, trained=times)
     if identification is None:
         reason = "this run has no identification, so there is no model to compare with"
-        return advised(deployment, Advice("not judged", (reason,)))
+        if not any(deployment.simulated):
+            return advised(deployment, Advice("not judged", (reason,)))
+        # A simulation with nominal parameters judges the policy alone.
+        advice = _policy_advice(deployment, bundle) or Advice("fine", ("the policy succeeds, as in simulation",))
+        return advised(deployment, replace(advice, reasons=(*advice.reasons, reason)))
     # Test the model on the deployment's logs. A test that fails must not lose the deployment.
     try:
         if not has_jax():

@@ -35,7 +35,8 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
-    with robot.drive.connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
+    connect = robot.drive.connect_to_record if isinstance(config, RecordConfig) else robot.drive.connect
+    with connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
         _require_rig(session.rig)
         if config.dry_run:
             session.rig.withhold_torque()

@@ -66,6 +66,11 @@ class Pipeline:
         return Path(str(importlib.import_module(self.package).__file__)).parent
 
     @property
+    def shipped(self) -> Path:
+        """The folder of the policy that comes with the pipeline; most have none."""
+        return self.folder / "walk"
+
+    @property
     def latency(self) -> LatencyConfig:
         """Defaults of the test of latency."""
         return LatencyConfig.of(self.record, self.identify)

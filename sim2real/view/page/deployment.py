@@ -17,7 +17,12 @@ from sim2real.view.page.servos import DRY, servo_blocks
 from sim2real.view.page.stage_verdicts import deploy_banner
 from sim2real.view.page.timing_blocks import timing_blocks, timing_tiles
 from sim2real.view.provenance import about
-from sim2real.view.signals import Signals, pairs_of, signals_of, simulated_beside
+from sim2real.view.signals import ComparedSeries, Signals, pairs_of, signals_of, simulated_beside
+
+_MOST_PANELS = 40
+"""Largest number of panels of a figure: each takes 0.2 s to draw."""
+_SAME = 1e-6
+"""Range of values that are all the same in single precision."""
 
 
 def deploy_section(artifact: StageFolder) -> PageSection:
@@ -36,7 +41,10 @@ def deploy_section(artifact: StageFolder) -> PageSection:
     ]
     for index, pairs in enumerate(episodes):
         caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
-        blocks.append(FigureBlock(figures.deployment(pairs, units, index, f"deploy-{index}"), caption))
+        shown = _shown(pairs)
+        if len(shown) < len(pairs):
+            caption += " Speeds of the joints, and commands that do not change, are in the log."
+        blocks.append(FigureBlock(figures.deployment(shown, units, index, f"deploy-{index}"), caption))
     blocks += [*robot_blocks(artifact.run_dir, deployed, logs[0]), *tables(deployed)]
     # Fold the timing of all episodes but the first.
     for index, log in enumerate(logs):
@@ -72,6 +80,19 @@ def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> PageSection:
     tiles = [Tile("episodes", str(len(episodes)), "dry run"), *timing_tiles(episodes)]
     lead = "The policy on the robot, without torque."
     return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], DRY)
+
+
+def _shown(pairs: Sequence[ComparedSeries]) -> list[ComparedSeries]:
+    """Return the series of the figure: of a robot with many joints all but speeds and commands that do not change."""
+    if len(pairs) <= _MOST_PANELS:
+        return list(pairs)
+    names = {pair.robot.name for pair in pairs}
+    return [
+        pair
+        for pair in pairs
+        if not (pair.held and np.ptp(pair.robot.values) < _SAME)
+        and not (pair.robot.name.startswith("velocity[") and pair.robot.name.replace("velocity", "position") in names)
+    ]
 
 
 def _scores(score: Scores) -> str:

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from sim2real.hardware.unitree.body import measured_dtype
-from sim2real.robots.walking.hidden import HiddenTwin, hidden_spec, hide
+from sim2real.robots.walking.plain.hidden import HiddenTwin, hidden_spec, hide
 
 _mj: Any = mujoco
 _SETTLE_S = 3.0

@@ -1,0 +1,125 @@
+"""``sim2real deploy go2``: the shipped policy walks on the emulated Go2, over DDS, from lying to lying."""
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.go2.robot import ROBOT
+from sim2real import cli
+from sim2real.artifacts.recording import Recording
+from sim2real.errors import SafetyStop, UsageError
+from sim2real.robots.gate_limits import GateLimits
+from sim2real.robots.walking.drive import StandUp
+from sim2real.robots.walking.plain.episodes import twin_of
+
+pytest.importorskip("cyclonedds")
+
+GUIDE = Path(__file__).parents[2] / "docs/guides/walk.md"
+
+
+@pytest.mark.realtime
+def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
+    (command,) = re.findall(r"^    sim2real (deploy .*)$", GUIDE.read_text(), re.MULTILINE)
+    assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
+    output = capsys.readouterr()
+    assert "its shipped policy is deployed" in output.err
+    assert "verdict: fine" in output.err
+    (deployed,) = (tmp_path / "go2").glob("*/deploy")
+    # The report has the gap to the twin, and draws what was measured.
+    page = (deployed / "report.html").read_text()
+    assert "velocity error" in page
+    assert "yaw error" in page
+    assert page.count("<svg") >= 4
+    assert "are in the log" in page
+    result = json.loads((deployed / "result.json").read_text())
+    scores = result["episodes"][0]
+    assert scores["real"]["success"] == scores["simulation"]["success"] == 1.0
+    assert scores["real"]["velocity_error_m_s"] < 0.4
+    # The true motion: it lies, stands up, walks as commanded, and lies again.
+    recording = Recording.load(deployed / "episode_0.mcap", deployed / "truth.bin")
+    _, states = recording.truth.states()
+    height = states["base[2]"]
+    assert height[:100].max() < 0.1
+    assert height.max() > 0.28
+    assert height[-20:].max() < 0.2
+    t_s, walking = recording.true_states()
+    aim = ROBOT.commands.of_trial(0)[:3]
+    settled = (t_s > 1.0) & (t_s < 2.4)
+    mean = np.array([walking[name][settled].mean() for name in ("linear[0]", "linear[1]", "gyro[2]")])
+    assert np.abs(mean - aim).max() < 0.3
+    # The log holds all columns of the commands, within the gate.
+    sent = recording.episode.outputs["actuator"]
+    assert set(sent) == {"q", "dq", "kp", "kd", "tau"}
+    np.testing.assert_allclose(sent["kp"][50:], 35.0)
+    np.testing.assert_allclose(sent["kd"][50:], 0.6, rtol=1e-6)
+
+
+def test_the_gate_has_the_range_of_each_joint():
+    from sim2real.hardware.unitree.device import UnitreeLegs
+
+    gate = ROBOT.drive._gate(GateLimits(limit=4.6, slew_per_s=50.0), UnitreeLegs("lo:7"))
+    low, high = gate.range
+    np.testing.assert_allclose(low[:3, 0], [-1.0472, -1.5708, -2.7227])
+    np.testing.assert_allclose(high[6:9, 0], [1.0472, 4.5379, -0.83776])
+    assert list(gate.slew_per_s) == [50.0, *[np.inf] * 4]
+    assert (low[:, 2:4] == 0.0).all()
+
+
+def test_a_robot_without_a_device_is_refused(tmp_path):
+    from sim2real.robots.walking.drive import WalkingDrive
+
+    drive = WalkingDrive(ROBOT.mjcf, ROBOT.joints, ROBOT.stance, 50.0, (35.0, 0.6))
+    with pytest.raises(UsageError, match="no device for port 'eth0'"):
+        drive.connect("eth0", GateLimits(), tmp_path / "truth.bin", 0)
+
+
+def test_the_start_motion_folds_the_legs_and_rises():
+    motion, start, folded, stance = StandUp(1.0, 2.0, 0.5), np.zeros(2), np.array([1.0, -2.0]), np.array([0.5, -1.0])
+    np.testing.assert_allclose(motion.targets(0.5, start, folded, stance), folded / 2)
+    np.testing.assert_allclose(motion.targets(2.0, start, folded, stance), (folded + stance) / 2)
+    np.testing.assert_allclose(motion.targets(3.5, start, folded, stance), stance)
+    assert motion.duration_s == 3.5
+
+
+def test_a_robot_that_tips_over_is_stopped_while_it_stands_up():
+    class Rig:
+        torque_withheld = False
+
+        def measure(self):
+            from types import SimpleNamespace
+
+            return SimpleNamespace(position_rad=np.zeros(12), parts={"quaternion": np.array([0.5, 0.87, 0.0, 0.0])})
+
+    class Session:
+        rig = Rig()
+
+    with pytest.raises(SafetyStop, match="tipped over"):
+        ROBOT.drive.begin(Session())
+
+
+def test_identified_values_are_those_of_the_twin():
+    values = {**ROBOT.nominal(), "foot_friction": 0.5, "payload": 1.0, "motor_strength": 0.9, "joint_damping": 0.3}
+    twin = twin_of(ROBOT, {**values, "sensor_delay": 0.004, "actuator_delay": 0.006})
+    assert twin.model.geom_friction[0, 0] == 0.5
+    assert twin.hidden.acting_s == pytest.approx(0.009)
+    np.testing.assert_allclose(twin.model.actuator_gainprm[:, 0], 35.0 * 0.9)
+    np.testing.assert_allclose(twin.model.dof_damping[6:], 0.3)
+
+
+def test_the_score_of_a_walk_compares_at_the_times_of_the_commands():
+    t_s = np.arange(0.0, 4.0, 0.005)
+    aim = np.repeat([[0.5, 0.0, 0.2], [-0.5, 0.3, -0.4]], 100, axis=0)  # 2 s each, at 50 Hz
+    moved = np.where((t_s < 2.0)[:, None], aim[0], aim[150])
+    states = {f"aim[{i}]": aim[:, i] for i in range(3)}
+    states |= {"linear[0]": moved[:, 0], "linear[1]": moved[:, 1], "gyro[2]": moved[:, 2]}
+    states |= {f"quaternion[{i}]": np.full(len(t_s), float(i == 0)) for i in range(4)}
+    score = ROBOT.task.score(t_s, states)
+    assert score == pytest.approx({"success": 1.0, "tilt_rad": 0.0, "velocity_error_m_s": 0.0, "yaw_error_rad_s": 0.0})
+    late = ROBOT.task.score(t_s, {**states, "gyro[2]": moved[:, 2] + 0.1})
+    assert late["yaw_error_rad_s"] == pytest.approx(0.1)
+    del states["linear[0]"]
+    assert np.isnan(ROBOT.task.score(t_s, states)["velocity_error_m_s"])
