@@ -23,6 +23,8 @@ from sim2real.hardware.unitree.stream import StateStream
 
 _LOGGER = logging.getLogger(__name__)
 _OPEN_S: Final = 3.0
+_DISCOVERY_S: Final = 1.0
+"""Time in which DDS finds the writers of a robot's domain [s]."""
 _CONFIRM_S: Final = 1.0
 """Longest time in which motors confirm that they are on, or off [s]."""
 _SETTLE_S: Final = 1.5
@@ -97,6 +99,10 @@ class GuardedLegs:
             # States must come, and nothing else may command the motors.
             stream = StateStream(robot, self._max_silence_s)
             state = stream.begin(_OPEN_S)
+            # Motors that are on have a program, perhaps one that is not discovered yet: to damp would lay it down.
+            end_s = time.monotonic() + (_DISCOVERY_S if motors_on(state) else 0.0)
+            while not robot.other_writers() and time.monotonic() < end_s:
+                time.sleep(0.05)
             # A program that was killed is a writer until its lease is over.
             end_s = time.monotonic() + LEASE_S + 1.0
             while robot.other_writers() and time.monotonic() < end_s:
@@ -121,13 +127,13 @@ class GuardedLegs:
         session = self.session
         if self.halted:
             raise SafetyStop("torque stays off: the legs have been made safe", hint="open the robot again")
-        _require_alone(session.robot, SafetyStop)
         if self.withheld:
             return
         # The guardian watches before the first command.
         if self._guardian is None:
             arguments = [str(self.address), session.mark, repr(self.drive.damping), repr(self.drive.lie_s)]
             self._guardian = Guardian(_PROGRAM, self._silence_s, arguments, settle_s=self.drive.lie_s + _SETTLE_S)
+        _require_alone(session.robot, SafetyStop)
         self._guardian.arm()
         # Commands may be lost, so each state is answered with one until all motors are on.
         with self._commanding:

@@ -105,11 +105,20 @@ def test_torque_that_was_taken_off_stays_off(device):
     assert device.counters.transactions > 0
 
 
-def test_another_program_is_refused_before_torque_goes_on(device, other, monkeypatch):
+def stand(link):
+    """Let a link command the motors until they are on."""
+    standing = legs.command(np.stack([LYING, *np.tile([[0.0], [20.0], [1.0], [0.0]], 12)], axis=1))
+    end_s = time.monotonic() + 5.0
+    while time.monotonic() < end_s and not (link.next_state(1.0)).record["motor_state"]["mode"][0]:
+        link.write(standing)
+
+
+def test_another_program_is_refused_and_its_robot_stands_on(robot, device, other, monkeypatch):
     monkeypatch.setattr(guarded, "LEASE_S", -0.5)
-    other.write(legs.off())
+    stand(other)
     with pytest.raises(HardwareLost, match="another program publishes rt/lowcmd: another program"):
         device.open()
+    assert ways(robot)[0] == [CONTROLS]
 
 
 def test_another_program_that_comes_later_stops_the_robot(robot, device):
@@ -132,11 +141,7 @@ def test_motors_that_switch_off_stop_the_robot(robot, device):
 
 
 def test_a_robot_that_was_left_on_is_laid_down_first(robot, device, other):
-    end_s = time.monotonic() + 5.0
-    standing = legs.command(np.stack([LYING, *np.tile([[0.0], [20.0], [1.0], [0.0]], 12)], axis=1))
-    while not (state := other.next_state(1.0)).record["motor_state"]["mode"][0] and time.monotonic() < end_s:
-        other.write(standing)
-    assert state.record["motor_state"]["mode"][0]
+    stand(other)
     other.close()
     device.open()
     device.close()
