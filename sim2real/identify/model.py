@@ -57,6 +57,11 @@ class Channel:
         return rows if self.index is None else rows[..., self.index]
 
 
+def position_of(channel: Channel) -> str:
+    """Return the name of a channel's position among the columns."""
+    return channel.position if channel.index is None else f"{channel.position}[{channel.index}]"
+
+
 class IdentifiableModel(Protocol):
     """The interface of a robot for identification.
 

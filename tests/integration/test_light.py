@@ -1,6 +1,7 @@
 """sim2real on a robot's computer: what works without JAX, and what is refused in words."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -44,6 +45,16 @@ def resting(request, tmp_path_factory):
     return request.param, save_bundle(tmp_path_factory.mktemp("bundle") / "resting", weights, contract)
 
 
+def pipeline_of_module(folder, text):
+    """Write a pipeline whose robot's module has a text; return its name."""
+    pipeline = folder / "pipelines" / "mine"
+    pipeline.mkdir(parents=True)
+    (pipeline / "robot.py").write_text(text)
+    definition = "from sim2real.stages.pipeline.pipeline import Pipeline\n"
+    (pipeline / "__init__.py").write_text(definition + 'PIPELINE = Pipeline("mine", "", __name__)\n')
+    return "mine"
+
+
 def assert_works(command, folder, robot, bundle):
     """Record and deploy on the emulated robot, and read the log."""
     flags = ["--duration-s", "1", "--runs", "runs", *PATIENT]
@@ -53,6 +64,11 @@ def assert_works(command, folder, robot, bundle):
     assert len(read_log(log).steps["sensor"]) >= 40
     code, said = call(command, folder, "info", log)
     assert code == errors.OK, said
+    code, said = call(command, folder, "check", robot)
+    assert code == errors.USAGE
+    assert "samples in" in said
+    assert "95 % of the power of" in said
+    assert "which parameters this recording determines is computed with JAX" in said
     once = ["--bundle", bundle, "--episodes", "1", "--no-measure-delay"]
     code, said = call(command, folder, "deploy", robot, *flags, *once)
     assert code == errors.OK, said
@@ -63,6 +79,21 @@ def assert_works(command, folder, robot, bundle):
 
 def test_a_robot_is_recorded_and_moved_by_a_policy_without_jax(tmp_path, resting):
     assert_works(WITHOUT_JAX, tmp_path, *resting)
+
+
+def test_the_page_s_robot_runs_without_jax_and_trains_with_it(tmp_path):
+    """Its features on both, its reward with JAX alone."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "guides" / "robot_computer.md"
+    (code,) = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+    seen: dict = {}
+    exec(code, seen)
+    message = seen["Measurement"](np.float64(np.pi))
+    assert seen["features"](message) == pytest.approx([-1.0, 0.0])
+    assert float(seen["reward"](message)) == pytest.approx(-1.0)
+    mine = pipeline_of_module(tmp_path, f"{code}\nprint(features(Measurement(0.0)), type(Measurement).__module__)\n")
+    code, said = call(WITHOUT_JAX, tmp_path, "record", mine)
+    assert "[1. 0.] builtins" in said
+    assert "ROBOT of pipeline 'mine'" in said
 
 
 @pytest.mark.parametrize(
@@ -76,14 +107,10 @@ def test_a_command_that_needs_the_rest_says_so(tmp_path, words, package):
 
 
 def test_a_robot_whose_module_imports_jax_is_named(tmp_path):
-    folder = tmp_path / "pipelines" / "mine"
-    folder.mkdir(parents=True)
-    (folder / "robot.py").write_text("import math\nimport jax\n")
-    definition = "from sim2real.stages.pipeline.pipeline import Pipeline\n"
-    (folder / "__init__.py").write_text(definition + 'PIPELINE = Pipeline("mine", "", __name__)\n')
-    code, said = call(WITHOUT_JAX, tmp_path, "record", "mine")
+    mine = pipeline_of_module(tmp_path, "import math\nimport jax\n")
+    code, said = call(WITHOUT_JAX, tmp_path, "record", mine)
     assert code == errors.USAGE
-    assert f"(line 2 of {folder / 'robot.py'})" in said
+    assert f"(line 2 of {tmp_path / 'pipelines' / mine / 'robot.py'})" in said
     assert "from sim2real.later import jax, jnp" in said
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from sim2real.artifacts.identification import FreeRun, Prediction
 from sim2real.graph.node import TICKS_PER_S
-from sim2real.identify.model import Channel
+from sim2real.identify.model import position_of
 from sim2real.identify.problem.problem import Problem
 
 GOAL = "told"
@@ -78,11 +78,6 @@ def _goals(problem: Problem, segment: np.ndarray, into: np.ndarray) -> dict[str,
             goals[mask] = c.of(rows[s])[np.maximum(newest, 0)]
         columns[f"{position_of(c)}_{GOAL}"] = goals
     return columns
-
-
-def position_of(channel: Channel) -> str:
-    """Return the name of a channel's position among the columns."""
-    return channel.position if channel.index is None else f"{channel.position}[{channel.index}]"
 
 
 def labels(problem: Problem) -> list[str]:

@@ -10,12 +10,11 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.identification import Determined, HeldOut, Judgement, Prediction
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.model import IdentifiableModel, position_of
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.uncertainty.bounds import is_physical, way_out, way_out_of
 from sim2real.identify.uncertainty.round_trip import RoundTrip
 from sim2real.identify.uncertainty.uncertainty import Uncertainty
-from sim2real.identify.validation.prediction import position_of
 from sim2real.log.schema import unit_of
 
 Status = Literal["accepted", "not converged", "no improvement on held-out data", "not identifiable", "hit a bound"]

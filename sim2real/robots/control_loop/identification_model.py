@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from sim2real import pytree
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import ParameterTable
-from sim2real.later import jax, jnp
+from sim2real.later import jnp
 from sim2real.robots.control_loop.loop import DelayParams, delay_parameters, recorded_loop
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.control_loop.simulated_devices import SimSensor
@@ -27,7 +28,7 @@ class IdentifiableLoop:
         self.parameters = ParameterTable([*robot.model.dynamics(), *delay_parameters(max_delay_s, robot.roles)])
         self.ahead_s, self.channels = robot.model.tick_s, robot.sensor.channels
         message = robot.sim_actuator().init_output()
-        fields = jax.tree_util.tree_structure(message).unflatten(list(named_leaves(message)))
+        fields = pytree.structure(message).unflatten(list(named_leaves(message)))
         self.given: Mapping[str, PyTree] = {robot.roles.actuator: fields}
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:

@@ -153,7 +153,7 @@ class SimActuator(BaseNode):
         """Return a message with the agent's start, or with zeros."""
         del rng
         start = getattr((graph_state or GraphState()).params.get(self._agent), "start", None)
-        return self._message(jnp.zeros(self._joints) if start is None else jnp.asarray(start, jnp.float32))
+        return self._message(np.zeros(self._joints, np.float32) if start is None else jnp.asarray(start, jnp.float32))
 
     def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Return the newest command."""

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict
 
-import jax
 import numpy as np
 
+from sim2real import pytree
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.model import IdentifiableModel, position_of
 from sim2real.identify.uncertainty import recording_coverage
-from sim2real.identify.validation.prediction import position_of
 from sim2real.log.importing.signal_names import about_torque
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
@@ -64,7 +63,7 @@ def _commands(episode: Episode, model: IdentifiableModel, units: Mapping[str, st
     rows: list[dict[str, Json]] = []
     for node, message in model.given.items():
         sent_s = episode.steps[node].end / TICKS_PER_S
-        for field in jax.tree_util.tree_leaves(message):
+        for field in pytree.leaves(message):
             columns = np.asarray(episode.outputs[node][field], np.float64).reshape(len(sent_s), -1)
             for i, values in enumerate(columns.T):
                 band = recording_coverage.band(sent_s, values)

@@ -21,7 +21,7 @@ def show(checked: Mapping[str, Json]) -> None:
     """Print the fields of a result as tables, then the messages and recommendations."""
     # The recordings, then a row for each parameter.
     for recording in checked["recordings"]:
-        _show_recording(recording)
+        show_recording(recording)
     rows = [
         [
             p["name"],
@@ -41,7 +41,7 @@ def show(checked: Mapping[str, Json]) -> None:
         print(f"- {message}")
 
 
-def _show_recording(recording: Mapping[str, Json]) -> None:
+def show_recording(recording: Mapping[str, Json]) -> None:
     """Print the sampling of a recording, the ranges of its signals, the motion of its joints, its commands' bands."""
     s = recording["sampling"]
     gaps = f"{s['gaps']}, the longest {s['longest_gap_s']:.3g} s" if s["gaps"] else "none"

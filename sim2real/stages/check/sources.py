@@ -13,7 +13,6 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.robots.contract import Robot
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.excitation.played import played
-from sim2real.stages.excitation.simulated_log import simulate
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_log import open_recording
@@ -65,6 +64,8 @@ def find_source(
             f"pipeline {pipeline.name!r} has no excitation to plan a recording with", hint="name a log with --log FILE"
         )
     # Simulate the planned commands with the nominal parameters.
+    from sim2real.stages.excitation.simulated_log import simulate  # JAX programs
+
     moving = moving_robot(pipeline)
     if config.record.by_hand:
         raise UsageError(

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 
+from sim2real.errors import NotInstalled
+from sim2real.installation import has_jax
 from sim2real.robots.contract import RecordedRobot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.check.config import CheckConfig
-from sim2real.stages.check.determination import judge
+from sim2real.stages.check.coverage import coverage
 from sim2real.stages.check.result import Checked
-from sim2real.stages.check.show import show, show_json
+from sim2real.stages.check.show import show, show_json, show_recording
 from sim2real.stages.check.sources import JudgedLogs, find_source
 from sim2real.stages.estimation import recording_advice
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
@@ -45,6 +47,9 @@ def check(
         recording: One recording, or several; or the paths of their logs. None: the logs that ``config`` names, the
             newest recording in its ``runs``, or, without one, the planned excitation.
         config: A dict holds the fields that differ from the default.
+
+    Raises:
+        NotInstalled: JAX is not installed; the tables of the recordings are printed before.
     """
     # Make the model that identify would fit.
     pipeline = pipeline_of(robot)
@@ -63,7 +68,16 @@ def check(
         config = replace(config, log=tuple(str(log.path) for log in logs), plan=False)
         source = JudgedLogs([shown(log.path) for log in logs], [log.episode for log in logs], False)
 
+    if not has_jax():
+        for name, episode in zip(source.names, source.episodes, strict=True):
+            show_recording({"name": name, **coverage(episode, model, dict(robot.units))})
+        raise NotInstalled(
+            "which parameters this recording determines is computed with JAX, which is not installed here",
+            hint=f"copy it to a computer with sim2real: `sim2real check {pipeline.name} --log LOG`",
+        )
     # Judge them, and recommend the next command.
+    from sim2real.stages.check.determination import judge  # JAX programs
+
     with progress(None, "check: simulate"):
         judgement = judge(model, source, fitting, parameters, dict(robot.units))
     flags = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}

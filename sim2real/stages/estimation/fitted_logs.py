@@ -11,8 +11,7 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.manifest import sha256
 from sim2real.errors import UsageError
-from sim2real.identify.model import IdentifiableModel
-from sim2real.identify.validation.prediction import position_of
+from sim2real.identify.model import IdentifiableModel, position_of
 from sim2real.stages.terminal.console import note
 
 _PIECE = 50
