@@ -35,7 +35,7 @@ class Later:
             try:
                 self._module = importlib.import_module(self._name)
             except ModuleNotFoundError as error:
-                raise (not_installed(error) or error) from None
+                raise (not_installed(error.with_traceback(None)) or error) from None
         return getattr(self._module, attribute)
 
 

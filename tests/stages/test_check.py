@@ -117,7 +117,7 @@ def test_how_long_to_record_follows_from_the_worst_parameter(judged):
 def test_an_open_direction_ends_with_code_1_and_names_it(judged, monkeypatch, capsys):
     found = {k: v for k, v in judged[1].items() if k not in ("pipeline", "recommendation")}
     found |= {"determined": False, "undetermined": [["gain", "friction"]]}
-    monkeypatch.setattr(check_stage, "judge", lambda *_: found)
+    monkeypatch.setattr(determination, "judge", lambda *_: found)
     assert cli.main(["check", "pendulum", "--log", str(LOG)]) == 1
     said = capsys.readouterr().out
     assert "some of gain, friction would be guesses" in said

@@ -67,7 +67,8 @@ def addressed_s(python: str, robot: str, folder: Path) -> float:
     wire, end = os.openpty()
     tty.setraw(end)
     command = [python, "-m", "sim2real.cli", "record", robot, "--port", os.ttyname(end), "--runs", folder / "runs"]
-    environment = os.environ | {"SO101_CALIBRATION": str(_CALIBRATION)}
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment["SO101_CALIBRATION"] = str(_CALIBRATION)
     with subprocess.Popen(command, cwd=folder, env=environment, stderr=subprocess.PIPE) as process:
         try:
             if not select.select([wire], [], [], _PATIENCE_S)[0]:

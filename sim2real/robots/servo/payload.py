@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.arrays import namespace
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.parameters import Parameter
-from sim2real.later import jnp
 from sim2real.robots.servo.parts import GoalTask
 from sim2real.types import MjSpec, PyTree, Scalar
 
@@ -72,7 +72,8 @@ class Hand:
             values: Parameters by name; without a payload, it is 0.
             empty: The arrays of ``fields`` of an empty hand.
         """
-        payload = jnp.asarray(values.get(PAYLOAD, 0.0), jnp.float32)
-        mass, centre = empty[_MASS], empty[_CENTRE]
+        numbers = values.get(PAYLOAD, 0.0), empty[_MASS], empty[_CENTRE], self.at_m
+        xp = namespace(*numbers[:3])
+        payload, mass, centre, at_m = (xp.asarray(number, np.float32) for number in numbers)
         total = mass + payload
-        return {_MASS: total, _CENTRE: (mass * centre + payload * jnp.asarray(self.at_m)) / total}
+        return {_MASS: total, _CENTRE: (mass * centre + payload * at_m) / total}
