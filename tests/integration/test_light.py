@@ -81,6 +81,17 @@ def test_a_robot_is_recorded_and_moved_by_a_policy_without_jax(tmp_path, resting
     assert_works(WITHOUT_JAX, tmp_path, *resting)
 
 
+def test_a_motion_from_a_table_is_played(tmp_path):
+    servos = load_pipeline("so101").load("robot").SERVOS
+    t_s = np.arange(0.0, 1.5, 0.02)
+    goals = np.asarray(servos.middle) + 0.05 * np.sin(3.0 * t_s)[:, None]
+    names = ",".join(["t_s", *(f"{name}_goal_rad" for name in servos.names)])
+    np.savetxt(tmp_path / "motion.csv", np.column_stack([t_s, goals]), delimiter=",", header=names, comments="")
+    code, said = call(WITHOUT_JAX, tmp_path, "record", "so101", "--excitation", "motion.csv", *PATIENT)
+    assert code == errors.OK, said
+    assert "which parameters this motion determines is not checked" in said
+
+
 def test_the_page_s_robot_runs_without_jax_and_trains_with_it(tmp_path):
     """Its features on both, its reward with JAX alone."""
     page = Path(__file__).resolve().parents[2] / "docs" / "guides" / "robot_computer.md"

@@ -10,6 +10,7 @@ import numpy as np
 
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
+from sim2real.installation import has_jax
 from sim2real.robots.contract import Robot
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.excitation.played import played
@@ -62,10 +63,14 @@ def record(
 def _planned(config: RecordConfig, pipeline: Pipeline, robot: Robot) -> np.ndarray:
     """Return the commands to play; of a motion from a file, print first what its recording cannot determine."""
     signal = played(config, pipeline, robot, announce=True)
-    if config.motion is not None and not config.dry_run:
+    if config.motion is None or config.dry_run:
+        return signal
+    if has_jax():
         from sim2real.stages.check.stage import check  # JAX programs take seconds to compile
 
         show_open(check(pipeline, None, CheckConfig(plan=True, record=config)))
+    else:
+        note("which parameters this motion determines is not checked: JAX is not installed here")
     return signal
 
 
