@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from flax import struct
 
 from benches.figures import Report, Row, row
 from pipelines.go2.plant import LYING
@@ -34,6 +33,7 @@ from sim2real.robots.control_loop.loop import control_nodes
 from sim2real.robots.control_loop.messages import Goals, JointReading
 from sim2real.robots.control_loop.policy_node import PolicyNode
 from sim2real.robots.servo.agent import DirectAgent
+from sim2real.robots.walking.messages import LegCommand
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import realtime
 
@@ -81,19 +81,9 @@ def _see(reading: JointReading) -> Any:
     return np.concatenate([reading.position, reading.velocity]).astype(np.float32)
 
 
-@struct.dataclass
-class Controllers(Base):
-    """A command of legs: torques, and damping."""
-
-    q: Any
-    dq: Any
-    kp: Any
-    kd: Any
-    tau: Any
-
-
-def _damped(torque: Any) -> Controllers:
-    return Controllers(np.array(LYING), np.zeros(JOINTS), np.zeros(JOINTS), np.full(JOINTS, 3.0), torque)
+def _damped(torque: Any) -> LegCommand:
+    rest = np.zeros(JOINTS)
+    return LegCommand(np.array(LYING), rest, rest, np.full(JOINTS, 3.0), torque)
 
 
 def nodes_of(rig: Rig, rate_hz: float, message: Callable[[Any], Base] = Goals) -> dict[str, BaseNode]:

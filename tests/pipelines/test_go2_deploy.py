@@ -58,6 +58,23 @@ def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
     np.testing.assert_allclose(sent["kd"][50:], 0.6, rtol=1e-6)
 
 
+@pytest.mark.realtime
+def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
+    (command,) = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)
+    assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
+    (folder,) = (tmp_path / "go2").glob("*/record")
+    recording = Recording.load(folder)
+    _, states = recording.truth.states()
+    assert np.ptp(states["base[2]"]) == 0.0  # the base is fixed, in the air
+    assert states["base[2]"][0] > 0.9
+    # Every joint follows its targets, which begin where it hangs.
+    sent, measured = recording.episode.outputs["actuator"]["q"], recording.episode.outputs["sensor"]["position"]
+    assert (np.abs(sent[1] - measured[0]) < 0.1).all()
+    assert (np.ptp(sent, axis=0) > 0.2).all()
+    assert (np.ptp(measured, axis=0) > 0.1).all()
+    assert ROBOT.drive.embedded.plant_args["place"] == "floor"
+
+
 def test_the_gate_has_the_range_of_each_joint():
     from sim2real.hardware.unitree.device import UnitreeLegs
 

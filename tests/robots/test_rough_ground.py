@@ -80,6 +80,12 @@ def test_a_training_without_roughness_has_a_flat_floor():
     assert kinds[1] == (field, pytest.approx([ROBOT.terrain.start_m(0.04), 0.0, 0.37]))
 
 
+@pytest.mark.parametrize("bumps_m", [[0.0, 0.2], [-0.01, 0.04]])
+def test_roughness_that_the_ground_does_not_have_is_refused(bumps_m):
+    with pytest.raises(UsageError, match=r"roughness must lie in \[0, 0.08\] m, got "):
+        ROBOT.training(ROBOT.nominal(), {ROUGHNESS: np.array(bumps_m)}, {}, True)
+
+
 def test_rough_ground_is_harder_for_the_policy_of_flat_ground(twin):
     runner = load_bundle(ROBOT.mjcf.with_name("walk"))
     errors = [walk(t, runner, lambda _: np.array([0.6, 0.0, 0.3]), 5.0).error_m_s for t in (Twin(ROBOT, seed=1), twin)]

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 Place = Literal["floor", "stand"]
 _STILL_RAD_S = 0.3
 """Speed below which a joint is at rest, above the noise of the motors' speeds [rad/s]."""
+_HANG_S = 20.0
+"""Longest time for legs in a stand to come to rest, without torque [s]."""
 _LARGEST = {"dq": 1.0, "kp": 120.0, "kd": 8.0, "tau": 1.0}
 """Largest magnitude of each column but the target [rad/s, N m/rad, N m s/rad, N m]; kp and kd are at least 0."""
 
@@ -163,8 +165,9 @@ class WalkingDrive(RobotDrive):
         return signal + self._stance
 
     def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
-        """Return targets ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s instead of in a leap."""
-        return approached(self.around(signal), session.rig.measure().position_rad, self.rate_hz)
+        """Return targets ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s, from legs that hang at rest."""
+        hanging = session.rig.wait_until_still(_HANG_S, _STILL_RAD_S)
+        return approached(self.around(signal), hanging.position_rad, self.rate_hz)
 
     def begin(self, session: Session) -> None:
         """Let the robot stand up.

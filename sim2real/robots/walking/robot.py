@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from sim2real.artifacts.estimation.noise import Noise
+from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.robots.contract import Robot, RobotDrive
 from sim2real.robots.control_loop.loop import DELAYS
@@ -100,8 +101,14 @@ class ComposedRobot(Robot):
 
         The ground is a height field only if episodes have roughness: a plane costs less.
         """
-        robot = self
-        if ROUGHNESS in draws or values.get(ROUGHNESS, 0.0) > 0.0:
+        robot, bumps_m = self, np.asarray(draws.get(ROUGHNESS, values.get(ROUGHNESS, 0.0)))
+        if bumps_m.any():
+            low, high = float(bumps_m.min()), float(bumps_m.max())
+            if low < 0.0 or high > self.terrain.most_m:
+                raise UsageError(
+                    f"roughness must lie in [0, {self.terrain.most_m:g}] m, got {low:.3g} to {high:.3g}",
+                    hint="`terrain = Terrain(most_m=0.2)` in the robot's file makes its ground rougher",
+                )
             robot = copy.copy(self)
             robot.model = WalkingModel(partial(self.make_task, rough=True), self.height_m, self.terrain)
         nodes, task = super(ComposedRobot, robot).training(values, draws, *arguments, **options)

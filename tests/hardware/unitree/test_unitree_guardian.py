@@ -1,6 +1,5 @@
 """A control process that dies or hangs: the guardian lets the legs damp, then takes their torque off."""
 
-import os
 import signal
 import socket
 import subprocess
@@ -33,17 +32,14 @@ from sim2real.robots.control_loop.loop import control_nodes
 from sim2real.robots.control_loop.messages import Goals
 from sim2real.robots.roles import ROLES
 from sim2real.robots.walking.drive import BodySensor
+from sim2real.robots.walking.messages import leg_command
 from sim2real.runtime.asynchronous import AsyncGraph
 from pipelines.go2.plant import LYING
-from test_columns_rig import JointCommands
 
 device = UnitreeLegs({port!r}, drive=LegDrive(lie_s=3.0), silence_s=0.6, max_silence_s=1.0)
 low, high = device.reach()
 gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, command_timeout_s=2.0)
 body = BodySensor(device.motors, np.array(LYING))
-
-def controllers(goal):
-    return JointCommands(goal, np.zeros(12), np.full(12, 60.0), np.full(12, 4.0), np.zeros(12))
 
 # It stands up within 0.6 s.
 stood = np.clip(np.arange(3000) / 30.0, 0.0, 1.0)[:, None]
@@ -52,7 +48,7 @@ goals = LYING + stood * (np.array([0.0, 0.8, -1.5] * 4) - LYING)
 with Rig(device, gate) as rig:
     sensor = ServoSensor(ROLES.sensor, 50.0, rig, body.read, body.at_rest, delay=0.002)
     player = Excitation(ROLES.supervisor, 50.0, goals, Goals, delay=0.002)
-    actuator = ServoActuator(ROLES.actuator, 50.0, rig, "goal", controllers, delay=0.002)
+    actuator = ServoActuator(ROLES.actuator, 50.0, rig, "goal", lambda q: leg_command(q, 60.0, 4.0), delay=0.002)
     graph = AsyncGraph(control_nodes(sensor, player, actuator), player)
     state = graph.init(jax.random.key(0), {{}})
     graph.warmup(state)
@@ -74,14 +70,7 @@ with Rig(device, gate) as rig:
 def test_a_robot_that_stands_sinks_before_its_motors_switch_off(tmp_path, number):
     robot, log = emulated(tmp_path / "truth.bin"), tmp_path / "log.mcap"
     code = HOST.format(port=robot.port, log=str(log))
-    folder = os.path.dirname(os.path.dirname(__file__))
-    host = subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": folder},
-    )
+    host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert host.stdout.readline() == "on\n", host.stderr.read()
     time.sleep(1.2)
     end_ns = time.monotonic_ns()
