@@ -23,6 +23,12 @@ if TYPE_CHECKING:
 NO_LIMIT = 1e6
 """Value of a limit that is absent, in its unit: no robot reaches it."""
 
+_FOLLOW = (
+    *("load", "static", "drag", "bias", "damping_bias", "back_emf", "play"),
+    *("cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin"),
+)
+"""Terms that follow the state unless they are 0."""
+
 
 @struct.dataclass
 class DriveTerms(Base):
@@ -92,6 +98,16 @@ class DriveLaw:
     def __init__(self, qpos_at: np.ndarray, qvel_at: np.ndarray, others: np.ndarray) -> None:
         self._qpos_at, self._qvel_at = qpos_at, qvel_at
         self._order = np.argsort(np.concatenate([qvel_at, others]))
+
+    def steady(
+        self, values: Mapping[str, np.ndarray], control: np.ndarray
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
+        """Return the controls of all steps, and damping and friction of the model; None if a term follows the state."""
+        if any(np.any(values[name]) for name in _FOLLOW) or np.any(values["top_speed"] < NO_LIMIT):
+            return None
+        still = np.zeros((1, len(self._order)))
+        fields = self(np, values, control[:, 0], np.zeros((1, 1 + int(self._qpos_at.max()))), still)[2]
+        return control[..., : 3 * len(self._qvel_at)], fields
 
     def __call__(
         self, xp: Any, values: Mapping[str, Scalar], control: Array, qpos: Array, qvel: Array

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from sim2real.composer.physics.c.rollouts import StepLaw
 from sim2real.types import Array, PyTree, Scalar
 
 
-class WornFriction:
+class WornFriction(StepLaw):
     """Sets dry friction before every step: ``frictionloss * exp(-|velocity| / stribeck_rad_s)``.
 
     What MuJoCo's constraint holds at standstill stays exact; only how large it is follows the speed.

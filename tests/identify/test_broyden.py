@@ -49,6 +49,22 @@ def test_derivatives_that_do_not_predict_a_step_are_taken_anew():
     np.testing.assert_allclose(at(5.0, 0.0), [[10.0, 0.0], [0.0, 1.0]])  # exact: the secant is wrong by 66 %
 
 
+def test_a_known_jacobian_nearby_replaces_the_first_derivative():
+    asked = []
+    exact = lambda z: (asked.append(z), slope(z))[1]  # noqa: E731
+    near = 1.05 * TRUTH
+    f, jac = corrected(value, exact, (TRUTH, value(TRUTH), slope(TRUTH)))
+    f(near)
+    step = near - TRUTH
+    np.testing.assert_allclose(jac(near) @ step, value(near) - value(TRUTH))  # exact along the step
+    assert not asked
+    far = np.array([9.0, 4.0, 2.0])
+    f, jac = corrected(value, exact, (TRUTH, value(TRUTH), slope(TRUTH)))
+    f(far)
+    np.testing.assert_array_equal(jac(far), slope(far))
+    assert len(asked) == 1
+
+
 def test_residuals_are_evaluated_once_at_a_point():
     points = []
     f, jac = corrected(lambda z: (points.append(z), value(z))[1], slope)

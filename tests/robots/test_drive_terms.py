@@ -92,9 +92,9 @@ def by_hand(terms, goals, on, start):
     return np.array(out)
 
 
-def in_c(model_file, terms, goals, on, start):
+def in_c(model_file, terms, goals, on, start, kind=DriveLaw):
     model = driven(model_file, ("servo",), STEP_S, False, False, True, (), True)
-    law = DriveLaw(np.array([0]), np.array([0]), np.zeros(0, int))
+    law = kind(np.array([0]), np.array([0]), np.zeros(0, int))
     kp = OWN["kp"] * on
     control = np.stack([kp * goals, kp, OWN["kd"] * on, on, goals], axis=1)[:, None]
     limit = min(OWN["limit"], terms["torque"])
@@ -120,6 +120,27 @@ def test_terms_move_a_joint_as_a_simulation_by_hand(model_file, one):
     rms = lambda x: np.sqrt(np.mean(x**2))  # noqa: E731
     assert rms(found - expected) < 0.008
     assert rms(found - expected) < 0.5 * rms(found - without)
+
+
+class StepByStep(DriveLaw):
+    """The law with a call before every step, also where no term is on."""
+
+    def steady(self, values, control):
+        return None
+
+
+def test_without_terms_all_steps_are_one_call(model_file):
+    goals, on = commands(300)
+    at_once, stepped = (in_c(model_file, OFF, goals, on, (0.4, -2.0), kind) for kind in (DriveLaw, StepByStep))
+    np.testing.assert_allclose(at_once, stepped, atol=1e-12)
+
+
+@pytest.mark.parametrize("one", sorted(set(MECHANICAL) - {"tilt", "gravcomp", "torque_limit"}))
+def test_a_term_that_follows_the_state_is_called_before_every_step(one):
+    law = DriveLaw(np.array([0]), np.array([0]), np.zeros(0, int))
+    own = OFF | {what: ON[what] for what in OPTIONAL[one]}
+    values = {n: np.array([[v]]) for n, v in {**OWN, **own}.items()}
+    assert law.steady(values, np.zeros((1, 3, 5))) is None
 
 
 @pytest.fixture(scope="module")

@@ -125,7 +125,7 @@ def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
     model, length = case.model, c.settle_s + c.horizon_s
     table = held_out_parts.widest(model.parameters, c.terms)
     spans = identify.windows(episodes, length, c.spacing_s, c.initial_state == "free")
-    every = fit_model(model, episodes, spans, length, c, table)
+    every = fit_model(model, episodes, spans, length, c, table, as_start=True)
     selection = held_out_parts.chosen(every, c, list(fitted))
     fewer, values = table.with_terms(selection.names(table)), as_numbers(every.problem.table, selection.near[0].z)
     fewer = fewer.with_begin({p.name: float(np.squeeze(values[p.name])) for p in fewer if p.free})

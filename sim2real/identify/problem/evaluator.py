@@ -59,6 +59,10 @@ class Evaluator(Protocol):
         """Return the losses of a generation, in the form that ``search`` takes."""
         ...
 
+    def lively(self, data: Data) -> Data:
+        """Return the data with the segments in which the channels move most, which suffice for a start."""
+        ...
+
     def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> tuple[np.ndarray, np.ndarray]:
         """Return the residuals ``(R, K, F)`` of segments with fitted initial states, and these ``(R, 2 * channels)``.
 
@@ -113,6 +117,10 @@ class CompiledEvaluator:
         """See ``Evaluator``: traceable ``Losses``, whose data is an argument."""
         del data
         return self._residuals.losses
+
+    def lively(self, data: Data) -> Data:
+        """See ``Evaluator``: all, as a program simulates the segments without weight, too."""
+        return data
 
     def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> tuple[np.ndarray, np.ndarray]:
         """See ``Evaluator``."""

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.identify.problem.broyden import corrected
+from sim2real.identify.problem.broyden import Known, corrected
 from sim2real.identify.problem.engine import CRollouts, Outside
 from sim2real.identify.problem.evaluator import Stacked, replaced
 from sim2real.identify.problem.initial_states import InitialStates, next_shift
@@ -28,6 +28,8 @@ _FEW, _COPIES = 24, 128
 """Copies in one call of the two programs: each size compiles once. A descent evaluates one point in a call."""
 
 
+_KEPT = 2
+"""Points whose Jacobians are cached: that of a set of terms, and that of all terms around it."""
 _SEARCHED = 8
 """Fewest segments that a search simulates; at least two for each channel."""
 
@@ -43,14 +45,20 @@ class OutsideEvaluator:
         # A round keeps the derivatives of initial states, so near the minimum its slope differs from the loss's.
         self.precision = 1e-4 if self._free else 1e-5
         self._initial = InitialStates(residuals, self._errors, residuals.engine.model)
-        self._last: tuple[bytes, Data, LinearisedSegments] | None = None
+        self._last: list[tuple[np.ndarray, Data, LinearisedSegments]] = []
 
     def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
-        """See ``Evaluator``; the last point is cached, as several judgements of an estimate use it."""
+        """See ``Evaluator``; the last points are cached, as several judgements of an estimate use them.
+
+        Descents that begin there, without a part of the recordings or with a further term, need no Jacobian of theirs.
+        """
         del on_compile  # both programs compile within two seconds
-        if self._last is None or self._last[0] != z.tobytes() or self._last[1] is not data:
-            self._last = z.tobytes(), data, self._linearised(z, data)
-        return self._last[2]
+        for point, segments, there in self._last:
+            if np.array_equal(point, z) and segments is data:
+                return there
+        there = self._linearised(z, data)
+        self._last = [*self._last, (z.copy(), data, there)][-_KEPT:]
+        return there
 
     def loss(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> float:
         """See ``Evaluator``."""
@@ -84,7 +92,26 @@ class OutsideEvaluator:
             J = self._tamed_slope(raw[0])[..., None] * self._by_parameter(raw[1:] - raw[0], data, y.size)
             return np.concatenate([J.reshape(-1, y.size), self._of_prior(y)[1]])
 
-        return corrected(value, slope)
+        return corrected(value, slope, self._known(z, data))
+
+    def _known(self, z: np.ndarray, data: Data) -> Known | None:
+        """Return the cached Jacobian next to a point that covers its segments and parameters; None without one."""
+        live, present = np.asarray(data.weight) > 0.0, np.asarray(data.present)
+
+        def covers(segments: Data) -> bool:
+            fitted = np.asarray(segments.weight) > 0.0
+            same = len(fitted) == len(live) and segments.ts is data.ts and segments.fitted is data.fitted
+            return bool(same and not (live & ~fitted).any() and not (present & ~np.asarray(segments.present)).any())
+
+        near = [(point, there) for point, segments, there in self._last if covers(segments)]
+        if not near:
+            return None
+        point, there = min(near, key=lambda pair: float(np.linalg.norm((pair[0] - z)[present])))
+        # Leave out the rows of other segments, and the columns of other parameters.
+        r = np.where(live[:, None, None], there.residuals, 0.0).reshape(-1)
+        J = np.where(live[:, None, None, None] & present, there.jacobian, 0.0).reshape(-1, z.size)
+        start = np.where(present, point, z)
+        return start, np.concatenate([r, there.prior]), np.concatenate([J, there.prior_jacobian])
 
     def losses(self, candidates: np.ndarray, around: np.ndarray, data: Data) -> np.ndarray:
         """See ``Evaluator``."""
@@ -93,7 +120,7 @@ class OutsideEvaluator:
     def searched(self, data: Data) -> PyTree:
         """See ``Evaluator``: ``HostLosses`` on some segments; a block of generations keeps the states of its first."""
         states: list[InitialState | None] = [None]
-        most_moved = self._few(data)
+        most_moved = self.lively(data)
 
         def losses(candidates: np.ndarray, around: np.ndarray, pick: np.ndarray | None, fresh: bool) -> np.ndarray:
             # Losses of a batch of segments, or of those with most motion.
@@ -108,8 +135,8 @@ class OutsideEvaluator:
 
         return losses
 
-    def _few(self, data: Data) -> Data:
-        """Return the data with the segments in which the channels move most, in turn, and one of each recording.
+    def lively(self, data: Data) -> Data:
+        """See ``Evaluator``: segments of each channel in turn, and one of each recording.
 
         These suffice for a search: all 23 segments of an arm took 2.6 times as long.
         """

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from sim2real.identify.fit import Fit
-from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.parameters import INSIDE, ParameterTable
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.uncertainty import Linearised, linearise
@@ -35,8 +35,6 @@ _GAIN = 1e-3
 """Relative gain of the loss at which a descent without a part ends."""
 _CLEAR = 2.0
 """Ratio of a set's loss to the least loss from which the set is clearly worse: descents without parts are skipped."""
-_INSIDE = 0.01
-"""Distance from a bound at which the fit of a parameter begins [widths of the bounds]."""
 LITTLE = 0.01
 """Share of the loss below which a further term gains too little for refits without parts: they could not gain 5 %."""
 _LEVELS, _ACTS, _LOWER = 16, 1e-4, 2
@@ -58,16 +56,20 @@ def grown(
     table: ParameterTable,
     starts: Sequence[np.ndarray],
     limited: Limited = lambda trial, present: (),
+    needed: Sequence[int] = (),
 ) -> list[Trial]:
     """Return the fits of sets of terms: none, then larger ones as long as held-out parts are predicted better.
 
-    Each round fits sets with one or two further terms that the quadratic approximation around the smaller set proposes.
-    Then the subsets of the selected set are fitted that lack one of its terms.
+    Each round fits sets with one or two further terms that the quadratic approximation around the smaller set proposes,
+    and with the term that the fit of all terms needs most. Then the subsets of the selected set are fitted that lack
+    one of its terms.
 
     Args:
         wider: Returns the loss of each part around a fit, by the parameters of all terms.
         starts: Starts of the fit without terms, ``(P,)`` each.
         limited: A limit that does not act has no derivative, so no approximation proposes it: it gets its own starts.
+        needed: Terms that the fit of all terms needs, the most needed one first: where a model without a term ends far
+            away, as one that compensates no weight, an approximation around it proposes another term.
     """
     none = np.zeros(len(table.terms), bool)
     base = attempt(none, starts, np.inf)
@@ -75,12 +77,16 @@ def grown(
     # Add terms until the errors on held-out parts stay.
     while not base.present.all():
         stats, level = wider(base), list[Trial]()
-        for present in _proposed(stats, table, base.present):
+        first = [base.present | (np.arange(len(none)) == i) for i in needed if not base.present[i]][:1]
+        proposed = [p for p in _proposed(stats, table, base.present) if not any(np.array_equal(p, q) for q in first)]
+        for present in [*first, *proposed]:
             if len(level) > 1 and better(_best(level).ahead, base.ahead):
                 break
-            begins = [_begin(stats, table, present), opened(table, base.z, present), *starts]
+            begins = [_begin(stats, table, present), table.opened(base.z, present), *starts]
             level.append(_with_gain(attempt(present, begins, base.loss), base))
-        for i in np.flatnonzero(limits & ~base.present):
+        # Try the limits once no other term helps: the fit of one costs a descent from each of several levels.
+        helped = bool(level) and better(_best(level).ahead, base.ahead)
+        for i in () if helped else np.flatnonzero(limits & ~base.present):
             present = base.present | (np.arange(len(none)) == i)
             level.append(_with_gain(attempt(present, limited(base, present), base.loss), base))
             limits[i] = level[-1].loss < (1.0 - LITTLE) * base.loss
@@ -97,7 +103,7 @@ def grown(
             return trials
         for present in lacking:
             below = min((t for t in trials if not np.any(t.present & ~present)), key=lambda t: t.loss)
-            begins = [_begin(chosen.stats, table, present), opened(table, below.z, present)]
+            begins = [_begin(chosen.stats, table, present), table.opened(below.z, present)]
             trials.append(_with_gain(attempt(present, begins, below.loss), below))
 
 
@@ -140,21 +146,6 @@ def _begin(stats: Statistics, table: ParameterTable, present: np.ndarray) -> np.
     return table.at_scale(stats.x + stats.step(table, present, bounded=True))
 
 
-def opened(table: ParameterTable, z: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Return a point with the terms of a set near their values without effect, the others at them, ``(P,)``.
-
-    Parameters stay a little inside of their bounds, where the map to values is flat and a descent would not move them.
-    """
-    there, x = dict(zip(table.terms, present, strict=True)), table.scale(z)[0]
-    inside = _INSIDE * table.span
-    for i, column in enumerate(table.columns):
-        p = column.parameter
-        off = p.to_scale(min(max(p.without, p.low), p.high))
-        own = np.clip(x[i], table.low[i] + inside[i], table.high[i] - inside[i])
-        x[i] = off if p.term and not there[p.term] else own
-    return table.at_scale(x)
-
-
 class Trials:
     """Fits sets of terms to the problem of a fit.
 
@@ -192,7 +183,7 @@ class Trials:
         stats = self.wider(base)
         trials = [base]
         trials += [
-            _with_gain(self.attempt(one, [_begin(stats, table, one), opened(table, base.z, one)], base.loss), base)
+            _with_gain(self.attempt(one, [_begin(stats, table, one), table.opened(base.z, one)], base.loss), base)
             for one in _proposed(stats, table, present, pairs=False)
         ]
         for i in np.flatnonzero(limits & ~present):
@@ -203,14 +194,24 @@ class Trials:
     def grown(self) -> list[Trial]:
         """Return the fits of ``grown``."""
         table = self._problem.table
-        return grown(self.attempt, self.wider, table, [self._estimate.z, *table.starts()], self.limited)
+        starts = [self._estimate.z, *table.starts()]
+        return grown(self.attempt, self.wider, table, starts, self.limited, self.needed())
+
+    def needed(self) -> list[int]:
+        """Return the terms without which the fit of all terms predicts held-out parts worse, the most needed first."""
+        table, every = self._problem.table, np.ones(len(self._problem.table.terms), bool)
+        stats = statistics(self._problem, linearise(self._problem, self._estimate.z), self._masks)
+        whole = on_held_out_parts(stats, table, every)
+        lacks = [on_held_out_parts(stats, table, every & (np.arange(len(every)) != i)) for i in range(len(every))]
+        order = np.argsort([-lack.mean() for lack in lacks])
+        return [int(i) for i in order if better(whole, lacks[i])]
 
     def limited(self, trial: Trial, present: np.ndarray) -> list[np.ndarray]:
         """Return starts for a set with one more limit: the widest fit, the best level that acts, and a lower one."""
         problem, table = self._problem, self._problem.table
         new = table.of_terms(present) & ~table.of_terms(trial.present)
-        x = np.repeat(table.scale(opened(table, trial.z, present))[0][None], _LEVELS + 1, axis=0)
-        shares = np.linspace(1.0, _INSIDE, _LEVELS + 1)[:, None]
+        x = np.repeat(table.scale(table.opened(trial.z, present))[0][None], _LEVELS + 1, axis=0)
+        shares = np.linspace(1.0, INSIDE, _LEVELS + 1)[:, None]
         x[:, new] = (table.low + shares * table.span)[:, new]
         losses = problem.losses(table.at_scale(x), trial.z, problem.part(present=table.of_terms(present)))
         losses = np.nan_to_num(losses, nan=np.inf)
@@ -261,7 +262,7 @@ class Trials:
     ) -> tuple[np.ndarray, float]:
         """Return the end of the descent from the best of some starts, and its loss; see ``attempt``."""
         problem, table = self._problem, self._problem.table
-        starts = [opened(table, z, present) for z in starts]
+        starts = [table.opened(z, present) for z in starts]
         order = np.argsort(np.nan_to_num([problem.loss(z, data) for z in starts], nan=np.inf))
         ended = refine(problem, starts[order[0]][None], data, coarse=True)
         limit = bool(np.any(present & table.of_limits()))

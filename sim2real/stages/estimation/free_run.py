@@ -86,14 +86,16 @@ def fitted_to(
     table: ParameterTable,
     report: OnProgress | None = None,
     on_begin: Callable[[Problem], None] | None = None,
+    as_start: bool = False,
 ) -> Fit:
     """Return the fit of a model to logs.
 
     Args:
         windows: Segments to fit, and segments to predict.
+        as_start: Whether it only has to be a start for fits with some of the optional terms.
     """
     longer, length_s = long_spans(episodes, fitted, config), config.settle_s + config.horizon_s
-    return fit(model, list(episodes), windows, length_s, config, table, longer, report, on_begin)
+    return fit(model, list(episodes), windows, length_s, config, table, longer, report, on_begin, as_start)
 
 
 def far_off(document: Identification, positions: Sequence[Position]) -> list[tuple[Position, float, float]]:

@@ -63,11 +63,12 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
         best.begin(problem)
 
     # Fit the model with all terms that the configuration allows; terms are selected on windows, which takes less time.
-    wide = replace(config, long_s=0.0) if config.terms == "auto" else config
+    auto = config.terms == "auto"
+    wide = replace(config, long_s=0.0) if auto else config
     best.restart(table.for_recordings(len(inputs.episodes)))
     with _progress("identify", best) as report:
-        widest = patiently(lambda: fitted_to(*data, wide, table, report, on_begin))
-    if config.terms != "auto":
+        widest = patiently(lambda: fitted_to(*data, wide, table, report, on_begin, as_start=auto))
+    if not auto:
         return Fits(widest, widest, None)
     # Select the terms without which held-out parts are predicted worse.
     with progress(None, "identify: sets of terms"):

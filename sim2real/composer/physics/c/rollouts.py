@@ -61,6 +61,18 @@ class StepLaw(Protocol):
         """
         ...
 
+    def steady(
+        self, values: Mapping[str, np.ndarray], control: np.ndarray
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]] | None:
+        """Return the controls of all steps, and the fields; None if they follow the state.
+
+        Without a call between the steps, C rolls out all of them at once.
+
+        Args:
+            control: Shape ``(count, steps, n)``.
+        """
+        return None
+
 
 class OpenLoop(Protocol):
     """A world on MuJoCo whose controls do not depend on its state: its physics can run outside of a graph's program.
@@ -128,7 +140,7 @@ class Rollouts:
         model: The ``MjModel``; it is copied.
         names: Fields that differ from copy to copy.
         derives: Whether constants that follow from them are computed for each copy.
-        law: Sets controls, forces and fields before every step; it costs a call of C for each.
+        law: Sets controls, forces and fields before every step; unless it is steady, it costs a call of C for each.
 
     Raises:
         UsageError: When C does not look at a field, or only MJX has it.
@@ -221,10 +233,13 @@ class Rollouts:
         batch.bind("qacc_warmstart")[:count] = start.warmstart
         out = {n: np.empty((count, steps, *first.shape[1:])) for n, first in begun.items()}
         # Roll out, and keep the last physics step of each tick.
-        if self._law:
+        steady = self._law.steady(law, control) if self._law else (control, {})
+        if steady:
+            for name, values in steady[1].items():
+                batch.expand(name)[:count] = values
+            failed |= _failing(count, lambda: batch.rollout(steps, steady[0], record=tuple(out), ids=ids, out=out))
+        elif self._law:
             failed |= self._stepwise(self._law, law, control, out)
-        else:
-            failed |= _failing(count, lambda: batch.rollout(steps, control, record=tuple(out), ids=ids, out=out))
         failed |= batch.warning[:count, :, 1].any(axis=1)
         for name, rows in out.items():
             trajectory = np.concatenate([begun[name][:, None], rows[:, self._substeps - 1 :: self._substeps]], axis=1)
