@@ -288,6 +288,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "view": lambda chosen: recordings.view(*chosen.values()),
         "excitation": lambda chosen: recordings.excitation(*chosen.values()),
         "twin": lambda chosen: sentences.twin(*chosen.values()),
+        "walk": lambda chosen: sentences.walk(*chosen.values()),
         "light": lambda chosen: sentences.light(*chosen.values()),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}

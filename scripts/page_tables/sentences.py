@@ -26,6 +26,20 @@ def on_a_gpu(arm: Mapping[str, Any], pendulum: Mapping[str, Any]) -> str:
     )
 
 
+def walk(report: Mapping[str, Any]) -> str:
+    """Return a table of the falls and errors of a walking policy, a row for each set of twins."""
+    v = values(report)
+    about = {row["name"]: row["yardstick"] for row in report["rows"]}
+    lines = ["| twins | falls | error | error |", "| --- | ---: | ---: | ---: |"]
+    for case in [name.split("/")[1] for name in v if name.endswith("/falls")]:
+        at = f"walk/{case}"
+        delay = f", delay {case.split('_')[1]} ms" if case.endswith("_ms") else ""
+        falls, of = v[f"{at}/falls"], about[f"{at}/falls"].partition(" ")[0]
+        errors = f"{v[f'{at}/error_m_s']:.3f} m/s | {v[f'{at}/error_rad_s']:.3f} rad/s"
+        lines.append(f"| {about[f'{at}/falls']}{delay} | {falls:g} of {of} | {errors} |")
+    return "\n".join(lines) + "\n"
+
+
 def twin(report: Mapping[str, Any]) -> str:
     """Return the time of `new --like so101`, from an empty environment to an accepted twin."""
     v = values(report)
