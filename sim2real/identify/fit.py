@@ -21,6 +21,8 @@ from sim2real.identify.search.refine import Refined, refine, remaining
 from sim2real.identify.search.search import SearchResult, search
 from sim2real.identify.uncertainty.uncertainty import Uncertainty, centred, uncertainty
 
+INSIDE = 0.01
+"""Distance from a bound at which the fit of a parameter begins [widths of the bounds]."""
 _ROUGHLY = 0.05
 """Relative gain of the loss in a step at which a descent ends that only finds a start."""
 _OFF_BOUNDS = 3.0
@@ -188,6 +190,23 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
     return result
 
 
+def opened(table: ParameterTable, z: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Return a point with the terms of a set near their values without effect, the others at them, ``(P,)``.
+
+    Parameters stay a little inside of their bounds, where the map to values is flat and a descent would not move them.
+
+    Args:
+        present: Shape ``(T,)``, bool: which terms.
+    """
+    there, x = table.of_terms(present), table.scale(z)[0]
+    inside = INSIDE * table.span
+    for i, column in enumerate(table.columns):
+        p = column.parameter
+        off = p.to_scale(min(max(p.without, p.low), p.high))
+        x[i] = np.clip(x[i], table.low[i] + inside[i], table.high[i] - inside[i]) if there[i] else off
+    return table.at_scale(x)
+
+
 def _roughly(problem: Problem, starts: np.ndarray, report: OnProgress | None) -> list[Refined]:
     """Return the ends of rough descents without optional terms, and from the best one with all of them.
 
@@ -197,10 +216,13 @@ def _roughly(problem: Problem, starts: np.ndarray, report: OnProgress | None) ->
     table = problem.table
     none, every = np.zeros(len(table.terms), bool), np.ones(len(table.terms), bool)
     without = problem.part(present=table.of_terms(none))
-    begun = [table.opened(z, none) for z in starts]
+    begun = [opened(table, z, none) for z in starts]
     first = _refine(problem, np.stack(begun), report, problem.evaluator.lively(without))
     first = _refine(problem, first.z[None], report, without)
-    return [first, _refine(problem, table.opened(first.z, every)[None], report, problem.evaluator.lively(problem.data))]
+    return [
+        first,
+        _refine(problem, opened(table, first.z, every)[None], report, problem.evaluator.lively(problem.data)),
+    ]
 
 
 def _refine(problem: Problem, starts: np.ndarray, report: OnProgress | None, roughly: Data | None = None) -> Refined:

@@ -19,8 +19,6 @@ from sim2real.types import Array, PyTree
 _BELOW, _BEYOND = 4.0, 50.0
 """Factors of the bounds of a limit below and above the largest value that recordings reach. Inertia and friction that
 the model does not know add to a torque, and commands may ask for much more than the joint does."""
-INSIDE = 0.01
-"""Distance from a bound at which the fit of a parameter begins [widths of the bounds]."""
 _ABOVE = 0.1
 """Start of a search above a lower bound, as a share of the bounds' width."""
 
@@ -255,23 +253,6 @@ class ParameterTable:
         """
         chosen = dict(zip(self.terms, present, strict=True)) | {"": True}
         return np.array([chosen[c.parameter.term] for c in self.columns], bool)
-
-    def opened(self, z: np.ndarray, present: np.ndarray) -> np.ndarray:
-        """Return a point with the terms of a set near their values without effect, the others at them, ``(P,)``.
-
-        Parameters stay a little inside of their bounds, where the map to values is flat and a descent would not move
-        them.
-
-        Args:
-            present: Shape ``(T,)``, bool: which terms.
-        """
-        there, x = self.of_terms(present), self.scale(z)[0]
-        inside = INSIDE * self.span
-        for i, column in enumerate(self.columns):
-            p = column.parameter
-            off = p.to_scale(min(max(p.without, p.low), p.high))
-            x[i] = np.clip(x[i], self.low[i] + inside[i], self.high[i] - inside[i]) if there[i] else off
-        return self.at_scale(x)
 
     def of_limits(self) -> np.ndarray:
         """Return which of ``terms`` are limits, ``(T,)``, bool."""

@@ -171,7 +171,7 @@ def test_a_model_that_other_recordings_would_choose_is_kept_with_how_often(linea
 def test_a_term_that_half_of_the_parts_need_is_open(linear):
     X, rng = linear.X, np.random.default_rng(0)
     y = X @ np.array([1.0, -2.0, 0.0, 0.0, 0.0, 0.5]) + NOISE * rng.normal(size=(PARTS, ROWS))
-    y[:3] += 0.08 * X[:3, :, 2]
+    y[:3] += 0.1 * X[:3, :, 2]
     found = select(Fits(SimpleNamespace(X=X, y=y, stats=None)).grown())
     with_it = sum(w for t, w in zip(found.near, found.weight, strict=True) if t.present[0])
     assert 0.1 < with_it < 0.9

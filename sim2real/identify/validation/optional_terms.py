@@ -22,7 +22,7 @@ _RESAMPLED = 1000
 _FAR, _DIVERGED = 1.5, 1e100
 """Ratio of a set's error to that of a subset above which the set is not selected; mean square of a diverged
 prediction."""
-_ALIKE = 1.05
+_ALIKE = 1.1
 """Largest ratio of two errors that count as equal."""
 _RARE = 0.02
 """Share of selections below which a model is no alternative."""
@@ -181,7 +181,7 @@ def select(trials: Sequence[Trial]) -> Selection:
 
 
 def selected(trials: Sequence[Trial], parts: np.ndarray | None = None) -> Trial:
-    """Return the smallest set whose errors are within one standard error of the best set's, or within five percent.
+    """Return the smallest set whose errors are within one standard error of the best set's, or within ten percent.
 
     The standard error is that of the difference between parts (Breiman et al., Classification and Regression Trees,
     1984). A term that helps in a single part has a standard error as large as its gain, and is not selected. A set is

@@ -12,8 +12,8 @@ from itertools import combinations
 
 import numpy as np
 
-from sim2real.identify.fit import Fit
-from sim2real.identify.parameters import INSIDE, ParameterTable
+from sim2real.identify.fit import INSIDE, Fit, opened
+from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.uncertainty import Linearised, linearise
@@ -82,7 +82,7 @@ def grown(
         for present in [*first, *proposed]:
             if len(level) > 1 and better(_best(level).ahead, base.ahead):
                 break
-            begins = [_begin(stats, table, present), table.opened(base.z, present), *starts]
+            begins = [_begin(stats, table, present), opened(table, base.z, present), *starts]
             level.append(_with_gain(attempt(present, begins, base.loss), base))
         # Try the limits once no other term helps: the fit of one costs a descent from each of several levels.
         helped = bool(level) and better(_best(level).ahead, base.ahead)
@@ -103,7 +103,7 @@ def grown(
             return trials
         for present in lacking:
             below = min((t for t in trials if not np.any(t.present & ~present)), key=lambda t: t.loss)
-            begins = [_begin(chosen.stats, table, present), table.opened(below.z, present)]
+            begins = [_begin(chosen.stats, table, present), opened(table, below.z, present)]
             trials.append(_with_gain(attempt(present, begins, below.loss), below))
 
 
@@ -183,7 +183,7 @@ class Trials:
         stats = self.wider(base)
         trials = [base]
         trials += [
-            _with_gain(self.attempt(one, [_begin(stats, table, one), table.opened(base.z, one)], base.loss), base)
+            _with_gain(self.attempt(one, [_begin(stats, table, one), opened(table, base.z, one)], base.loss), base)
             for one in _proposed(stats, table, present, pairs=False)
         ]
         for i in np.flatnonzero(limits & ~present):
@@ -210,7 +210,7 @@ class Trials:
         """Return starts for a set with one more limit: the widest fit, the best level that acts, and a lower one."""
         problem, table = self._problem, self._problem.table
         new = table.of_terms(present) & ~table.of_terms(trial.present)
-        x = np.repeat(table.scale(table.opened(trial.z, present))[0][None], _LEVELS + 1, axis=0)
+        x = np.repeat(table.scale(opened(table, trial.z, present))[0][None], _LEVELS + 1, axis=0)
         shares = np.linspace(1.0, INSIDE, _LEVELS + 1)[:, None]
         x[:, new] = (table.low + shares * table.span)[:, new]
         losses = problem.losses(table.at_scale(x), trial.z, problem.part(present=table.of_terms(present)))
@@ -262,7 +262,7 @@ class Trials:
     ) -> tuple[np.ndarray, float]:
         """Return the end of the descent from the best of some starts, and its loss; see ``attempt``."""
         problem, table = self._problem, self._problem.table
-        starts = [table.opened(z, present) for z in starts]
+        starts = [opened(table, z, present) for z in starts]
         order = np.argsort(np.nan_to_num([problem.loss(z, data) for z in starts], nan=np.inf))
         ended = refine(problem, starts[order[0]][None], data, coarse=True)
         limit = bool(np.any(present & table.of_limits()))
