@@ -79,7 +79,7 @@ class Trial:
 
     @property
     def about(self) -> str:
-        """The disturbance in words."""
+        """The disturbance as a phrase."""
         pushed = f", {self.push_m_s:g} m/s every 5 s" if self.push_m_s else ""
         return pushed + (f", bumps of {100 * self.rough_m:g} cm" if self.rough_m else "")
 

@@ -49,7 +49,7 @@ def test_derivatives_that_do_not_predict_a_step_are_taken_anew():
     np.testing.assert_allclose(at(5.0, 0.0), [[10.0, 0.0], [0.0, 1.0]])  # exact: the secant is wrong by 66 %
 
 
-def test_a_known_jacobian_nearby_replaces_the_first_derivative():
+def test_a_jacobian_nearby_replaces_the_first_derivative():
     asked = []
     exact = lambda z: (asked.append(z), slope(z))[1]  # noqa: E731
     near = 1.05 * TRUTH

@@ -96,7 +96,7 @@ class GuardedLegs:
         mark = f"sim2real {uuid.uuid4().hex[:8]} of process {os.getpid()}"
         robot = DdsLink(self.address, mark)
         try:
-            # States must come, and nothing else may command the motors.
+            # States must come, and no other writer may command the motors.
             stream = StateStream(robot, self._max_silence_s)
             state = stream.begin(_OPEN_S)
             # Motors that are on have a program, perhaps one that is not discovered yet: to damp would lay it down.

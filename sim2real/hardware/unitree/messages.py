@@ -91,7 +91,7 @@ class _Record:
         if wire[:2] != _LITTLE_ENDIAN[:2] or len(wire) != size:
             raise ValueError(f"{len(wire)} bytes that begin with {wire[:2].hex()} are no {cls.__name__} in XCDR1")
         raw = b"".join((wire[4:cut], bytes(mode - cls._cut), wire[cut : cut + 1], bytes(3), wire[_aligned(cut + 1) :]))
-        # The CRC covers padding as zeros, whatever the sender left there.
+        # The CRC covers padding as zeros, also where the sender has other values.
         return cls((np.frombuffer(raw, np.uint8) & cls._content).view(cls.layout).reshape(()))
 
 
@@ -257,7 +257,7 @@ def _complete(message: Any, motors: str, padding: int) -> None:
     message._content = _content(message.layout)
     message.serialize = lambda self, **_: self.to_wire()
     message.deserialize = lambda data, **_: message.from_wire(data)
-    # A writer that leaves sends the key's fields, of which there are none.
+    # A writer that leaves sends the fields of a key; these messages have none.
     message.deserialize_key = lambda *_, **__: message()
 
 

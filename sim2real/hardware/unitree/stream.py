@@ -1,4 +1,4 @@
-"""The stream of states of a robot that sends them without a request: the first after a call, and what was lost."""
+"""The stream of states of a robot that sends them without a request: the first after a call, and counts of losses."""
 
 from __future__ import annotations
 

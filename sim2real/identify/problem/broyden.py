@@ -10,11 +10,11 @@ _TRUSTED = 0.3
 """Largest error of the predicted change of the residuals, as a share of it, with which a Jacobian is corrected."""
 
 
-Known = tuple[np.ndarray, np.ndarray, np.ndarray]
+Slope = tuple[np.ndarray, np.ndarray, np.ndarray]
 """A point ``(P,)``, the residuals there ``(N,)``, and their Jacobian ``(N, P)``."""
 
 
-def corrected(value: Stacked, slope: Stacked, known: Known | None = None) -> tuple[Stacked, Stacked]:
+def corrected(value: Stacked, slope: Stacked, nearby: Slope | None = None) -> tuple[Stacked, Stacked]:
     """Return the functions of a descent whose Jacobian is corrected after each step, and computed again if that fails.
 
     Broyden's rank-one correction is exact along the last step (Math. Comp. 19, 1965).
@@ -22,10 +22,10 @@ def corrected(value: Stacked, slope: Stacked, known: Known | None = None) -> tup
     Args:
         value: Residuals ``(N,)`` at a point ``(P,)``.
         slope: Their Jacobian ``(N, P)``, at the point of the last residuals.
-        known: A Jacobian nearby, which is corrected for the first point, too.
+        nearby: A Jacobian at a point nearby, which is corrected for the first point, too.
     """
     last: list[tuple[np.ndarray, np.ndarray]] = []  # the point of the last evaluation, and the residuals there
-    accepted: list[Known] = [] if known is None else [known]  # that of the last step
+    accepted: list[Slope] = [] if nearby is None else [nearby]  # that of the last step
 
     def evaluated(y: np.ndarray) -> np.ndarray:
         if not (last and np.array_equal(last[0][0], y)):
@@ -33,7 +33,7 @@ def corrected(value: Stacked, slope: Stacked, known: Known | None = None) -> tup
         return last[0][1]
 
     def differentiated(y: np.ndarray) -> np.ndarray:
-        # Differentiate at the first point, unless a Jacobian is known; correct later ones by Broyden's rule.
+        # Differentiate at the first point, unless there is a Jacobian nearby; correct later ones by Broyden's rule.
         r = evaluated(y)
         J = slope(y) if not accepted else _updated(*accepted[0], y, r)
         accepted[:] = [(y.copy(), r, slope(y) if J is None else J)]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.identify.problem.broyden import Known, corrected
+from sim2real.identify.problem.broyden import Slope, corrected
 from sim2real.identify.problem.engine import CRollouts, Outside
 from sim2real.identify.problem.evaluator import Stacked, replaced
 from sim2real.identify.problem.initial_states import InitialStates, next_shift
@@ -28,7 +28,7 @@ _FEW, _COPIES = 24, 128
 """Copies in one call of the two programs: each size compiles once. A descent evaluates one point in a call."""
 
 
-_KEPT = 2
+_CACHED = 2
 """Points whose Jacobians are cached: that of a set of terms, and that of all terms around it."""
 _SEARCHED = 8
 """Fewest segments that a search simulates; at least two for each channel."""
@@ -57,7 +57,7 @@ class OutsideEvaluator:
             if np.array_equal(point, z) and segments is data:
                 return there
         there = self._linearised(z, data)
-        self._last = [*self._last, (z.copy(), data, there)][-_KEPT:]
+        self._last = [*self._last, (z.copy(), data, there)][-_CACHED:]
         return there
 
     def loss(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> float:
@@ -92,9 +92,9 @@ class OutsideEvaluator:
             J = self._tamed_slope(raw[0])[..., None] * self._by_parameter(raw[1:] - raw[0], data, y.size)
             return np.concatenate([J.reshape(-1, y.size), self._of_prior(y)[1]])
 
-        return corrected(value, slope, self._known(z, data))
+        return corrected(value, slope, self._nearby(z, data))
 
-    def _known(self, z: np.ndarray, data: Data) -> Known | None:
+    def _nearby(self, z: np.ndarray, data: Data) -> Slope | None:
         """Return the cached Jacobian next to a point that covers its segments and parameters; None without one."""
         live, present = np.asarray(data.weight) > 0.0, np.asarray(data.present)
 

@@ -41,7 +41,7 @@ def compare(
     them. Trajectories always compare measured states.
 
     Args:
-        identification: Parameters of the simulations; None: no simulation, but for a robot that is simulated in plain
+        identification: Parameters of the simulations; None: none, except for a robot that is simulated in plain
             MuJoCo. The first simulation of each episode has the estimates, the others are draws from the posterior.
         duration_s: Length of a simulation [s].
     """

@@ -64,7 +64,7 @@ def hide(model: Any, base: int, hidden: HiddenTwin) -> None:
     """Set the hidden parameters in a model, and let MuJoCo compute the constants of the load.
 
     Args:
-        base: Number of the body that carries the load; its joints but for the motors' are free, or it has none.
+        base: Number of the body that carries the load; its joints other than the motors' are free, or it has none.
     """
     before, motors = float(model.body_mass[base]), slice(model.nv - model.nu, None)
     model.body_mass[base] = before + hidden.load_kg
