@@ -60,12 +60,12 @@ def test_a_search_is_of_the_segments_that_move_most(problem):
         ts=jnp.zeros((20, data.ts.shape[1])),
         measured={**data.measured, "position": jnp.asarray(moved)},
     )
-    picked = np.flatnonzero(evaluator._few(many).weight).tolist()
+    picked = np.flatnonzero(evaluator.lively(many).weight).tolist()
     assert len(picked) == 8
     assert {0, 19, 7, 3, 11} <= set(picked)  # the first of each recording, and those that move
     assert 5 not in picked
     few = data._replace(weight=jnp.ones(len(data.fitted)))
-    assert np.all(evaluator._few(few).weight == 1.0)
+    assert np.all(evaluator.lively(few).weight == 1.0)
 
 
 @pytest.mark.parametrize(

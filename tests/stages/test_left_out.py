@@ -110,7 +110,7 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
     values = {"gain": 1.5, "cogging": 0.4, "swing": 0.3, "bias": 0.6}
     tables = []
 
-    def fit(model, episodes, fitted, windows, config, table, tell, begins=None):
+    def fit(model, episodes, fitted, windows, config, table, tell, begins=None, as_start=False):
         tables.append((config.generations, table))
         return SimpleNamespace(values=values, problem=SimpleNamespace(table=table))
 

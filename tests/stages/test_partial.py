@@ -30,7 +30,7 @@ def pendulum():
 def interrupted(pipeline, root, monkeypatch, ending, told=True):
     """Identify, until a signal comes after two batches of generations; return the stage's folder."""
 
-    def fit(model, episodes, fitted, windows, config, table, tell=None, begins=None):
+    def fit(model, episodes, fitted, windows, config, table, tell=None, begins=None, as_start=False):
         own = table.for_recordings(1)
         for gain, loss in ((20.0, 3.0), (21.0, 1.0), (22.0, 2.0)):
             if told:
