@@ -15,10 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from benches.runs import demo
-from benches.runs import stages
 from benches.figures import Report, Row, row
+from benches.runs import demo, stages
 
 CLOSE_M = 0.02
 SETTLE_S = 0.3

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from benches.runs import stages
 from benches.figures import Report, Row, row
+from benches.runs import stages
+
 from sim2real.artifacts.recording import Recording
 from sim2real.robots.roles import ROLES
 from sim2real.stages.identify.true_values import true_values

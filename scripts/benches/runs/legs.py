@@ -7,7 +7,6 @@ import tempfile
 from dataclasses import replace
 
 import numpy as np
-
 from benches.figures import Report, Row, row
 
 QUICK = {"seconds": 1.0}

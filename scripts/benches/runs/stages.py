@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benches.figures import Row, row
+
 from sim2real.artifacts.estimation.promise import promises_table
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.manifest import plain
@@ -70,7 +71,7 @@ def nominal_run(pipeline: str, seed: int, runs: Path, run_dir: Path) -> Path:
 
 
 def estimates(identify: StageFolder) -> dict[str, Any]:
-    """Return the errors of the dynamics and of the round trip with a true value, and those on held-out data with bounds."""
+    """Return the errors of the dynamics and of the round trip with a true value, those on held-out data with bounds."""
     fresh = [promise for promise in Identification.load(identify.folder).promises if promise.fresh]
     document = json.loads(identify.output("parameters").read_text())
     by_name = {p["name"]: p for p in document["parameters"]}

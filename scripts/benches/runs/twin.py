@@ -1,6 +1,6 @@
 """From an empty environment to an accepted twin of the embedded SO-101, which a person moves by hand as asked.
 
-Installs this checkout with pip into a new environment, then runs ``sim2real new my_arm --like so101`` on the arm's port.
+Installs this checkout into a new environment, then runs ``sim2real new my_arm --like so101`` at the arm's port.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 
 from benches.figures import Report, row
 from benches.provenance import ROOT
+
 from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
