@@ -32,13 +32,7 @@ def has_jax() -> bool:
 
 def with_extra(extra: str) -> str:
     """Return the command that installs an extra beside the installed distribution."""
-    from importlib import metadata
-
-    try:
-        name = metadata.metadata(ROBOT)["Name"]
-    except metadata.PackageNotFoundError:
-        name = WHOLE
-    return f"pip install '{name}[{extra}]'"
+    return f"pip install '{ROBOT if version(ROBOT) else WHOLE}[{extra}]'"
 
 
 def require_one(folder: Path = Path(__file__).parents[1]) -> None:

@@ -101,8 +101,8 @@ class Fits:
         stats = statistics_at(self.linear.X, self.linear.y, w)
         return Trial(present, TABLE.at_scale(w), float(errors.mean()), stats, (), errors, 4.0 * errors)
 
-    def grown(self, wider=lambda trial: trial.stats):
-        return grown(self.attempt, wider, TABLE, [np.zeros(6)])
+    def grown(self, wider=lambda trial: trial.stats, **options):
+        return grown(self.attempt, wider, TABLE, [np.zeros(6)], **options)
 
 
 def test_a_term_that_all_parts_need_stays_and_one_that_none_or_one_needs_goes(linear):
@@ -132,6 +132,30 @@ def test_a_set_that_no_prediction_proposed_is_fitted_if_it_is_a_subset_of_the_ch
     found = select(fits.grown(lambda trial: trial.stats if trial.present.any() else with_idle))
     assert fits.tried[1:3] == [("idle",), ("real", "idle")]
     assert found.names(TABLE) == ("real",)
+
+
+def test_a_needed_term_is_tried_before_those_that_predictions_propose(linear):
+    fits, with_idle = Fits(linear), statistics_at(linear.X, linear.y + linear.X[..., 3], linear.stats.x)
+    needed = [TABLE.terms.index("real")]
+    grown(fits.attempt, lambda trial: with_idle, TABLE, [np.zeros(6)], needed=needed)
+    assert fits.tried[1] == ("real",)
+    assert ("idle",) not in fits.tried[:2]
+
+
+class WithLimit(ParameterTable):
+    """The table, in which ``once`` is a limit."""
+
+    def of_limits(self):
+        return terms("once")
+
+
+def test_limits_are_tried_once_no_other_term_helps(linear):
+    fits = Fits(linear)
+    limited = lambda trial, present: [np.zeros(6)]  # noqa: E731
+    grown(fits.attempt, lambda trial: trial.stats, WithLimit(TABLE), [np.zeros(6)], limited)
+    first = fits.tried.index(("real", "once"))
+    assert ("once",) not in fits.tried[:first]
+    assert ("real",) in fits.tried[:first]
 
 
 def test_steps_are_least_squares_without_the_part(linear):

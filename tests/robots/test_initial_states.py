@@ -68,6 +68,25 @@ def test_a_search_is_of_the_segments_that_move_most(problem):
     assert np.all(evaluator.lively(few).weight == 1.0)
 
 
+def test_a_descent_from_a_differentiated_point_needs_no_jacobian_of_its_own(problem, monkeypatch):
+    evaluator, z, size = problem.evaluator, problem.table.start(), len(problem.table)
+    known = evaluator.linearised(z, problem.data)
+    present = np.arange(size) < size - 1
+    rest = problem.part([0], present)
+    rolled_out, raw = [], evaluator._raw
+    monkeypatch.setattr(evaluator, "_raw", lambda y, *given: (rolled_out.append(len(y)), raw(y, *given))[1])
+    # Without a segment and a parameter: their rows and columns are 0, the others those of the point.
+    J = evaluator.around(z, rest)[1](z)
+    assert rolled_out == [1]
+    kept = (np.asarray(rest.weight) > 0.0)[:, None, None, None] & present
+    expected = np.where(kept, known.jacobian, 0.0).reshape(-1, size)
+    np.testing.assert_array_equal(J[: len(expected)], expected)
+    # A point that was differentiated without them is no base for a descent with them.
+    evaluator._last = [(z, rest, known)]
+    evaluator.around(z, problem.data)[1](z)
+    assert rolled_out == [1, 1, 1 + size]
+
+
 @pytest.mark.parametrize(
     "case",
     [

@@ -86,10 +86,11 @@ def test_roughness_that_the_ground_does_not_have_is_refused(bumps_m):
         ROBOT.training(ROBOT.nominal(), {ROUGHNESS: np.array(bumps_m)}, {}, True)
 
 
-def test_rough_ground_is_harder_for_the_shipped_policy(twin):
+def test_ground_rougher_than_that_of_training_is_harder_for_the_shipped_policy():
     runner = load_bundle(ROBOT.mjcf.with_name("walk"))
-    errors = [walk(t, runner, lambda _: np.array([0.6, 0.0, 0.3]), 5.0).error_m_s for t in (Twin(ROBOT, seed=1), twin)]
-    assert errors[1] > errors[0]
+    twins = Twin(ROBOT, seed=1), Twin(ROBOT, seed=1, roughness_m=0.08)
+    errors = [walk(twin, runner, lambda _: np.array([0.6, 0.0, 0.3]), 5.0).error_m_s for twin in twins]
+    assert errors[1] > errors[0] + 0.03
 
 
 def test_the_start_of_a_share_of_the_curriculum_has_slower_commands():

@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> Report:
         row("twin/questions", messages.count("press Enter"), "1", "", "<= 1"),
         row("twin/accepted", int(code == 0), "1", "", "1"),
     ]
-    return {"rows": rows, "messages": messages.splitlines()}
+    return {"rows": rows, "messages": messages.replace(f"{ROOT}/", "").splitlines()}
 
 
 def _install(folder: Path) -> tuple[float, float, str]:

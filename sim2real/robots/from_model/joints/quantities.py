@@ -116,7 +116,7 @@ WHOLE = (*TILT, *OPTIONAL["gravcomp"])
 """Quantities of the whole robot, without effect in a model without gravity."""
 ONLY_NAMED = ("viscous_direction", "tilt", "eccentricity", "cogging")
 """Terms that ``auto`` omits unless a parameter names them: in few robots they differ from a zero or a stiffness, and
-damping that differs by direction described 1 s of the EMPS best, and 10 s worst (6.3 mm; with ``direction`` 4.1)."""
+damping that differs by direction predicted 1 s of the EMPS best, and 10 s of it worst."""
 LIMITS = (*OPTIONAL["torque_limit"], *OPTIONAL["speed_limit"])
 """Limits of what a drive does, absent at ``NO_LIMIT``. As optional terms they get their bounds from the recordings."""
 LAWS = (*(q for term in OPTIONAL.values() for q in term if q not in (*WHOLE, "torque", "voltage")), "cogging_per_turn")
