@@ -49,6 +49,7 @@ TABLES = {
     "view": ("view",),
     "excitation": ("excitation",),
     "twin": ("twin",),
+    "walk": ("walk",),
     "light": ("light",),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
@@ -56,7 +57,18 @@ PAGES = (
     *("README.md", "docs/results.md", "docs/getting_started.md"),
     *(
         f"docs/guides/{name}.md"
-        for name in ("so101", "train", "safety", "compose", "deploy", "scale", "view", "record", "robot_computer")
+        for name in (
+            "so101",
+            "train",
+            "safety",
+            "compose",
+            "deploy",
+            "scale",
+            "view",
+            "record",
+            "walk",
+            "robot_computer",
+        )
     ),
 )
 """Pages with tables, or with a sentence of figures."""
