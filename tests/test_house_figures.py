@@ -8,13 +8,13 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 71_000,
+    "lines without composer": 74_000,
     "lines of composer": 12_330,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.0,
     "Any in 1,000 lines": 4.9,
     "words of the dialect": 11,
-    "other words of the dialect": 204,
+    "other words of the dialect": 215,
     "largest number of project imports": 18,
     "levels of robot classes": 2,
     "public members of SO101Robot": 20,
