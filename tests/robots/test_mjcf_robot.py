@@ -58,6 +58,16 @@ def test_what_a_file_says_of_its_joints(model_file):
     assert gains_of(own, "right_hip") is None
 
 
+def test_a_drive_has_no_defaults_of_the_files_servos(model_file):
+    """A new actuator in a file with default gains had this stiffness, damping and limit in addition to its own."""
+    plain = driven(model_file, JOINTS, 0.002, False, False)
+    default = '<default><position kp="35" kv="0.6" forcerange="-2 2" ctrlrange="-1 1"/></default><worldbody>'
+    model_file.write_text(model_file.read_text().replace("<worldbody>", default))
+    made = driven(model_file, JOINTS, 0.002, False, False)
+    for field in ("gainprm", "biasprm", "biastype", "gear", "ctrllimited", "forcelimited"):
+        np.testing.assert_array_equal(getattr(made, f"actuator_{field}"), getattr(plain, f"actuator_{field}"))
+
+
 @pytest.mark.parametrize(("kv", "goal", "most"), [(0.7, (0.1, -0.15), 2.9), (0.0, (0.5, -1.4), np.inf)])
 def test_drives_push_as_mujocos_own_position_servos(model_file, kv, goal, most):
     """Three actuators a joint, whose controls are force, stiffness and damping, are one servo with these gains.

@@ -85,8 +85,8 @@ def driven_spec(
     for what, gain in (("force", (1.0, 0.0, 0.0)), ("kp", (0.0, -1.0, 0.0)), ("kd", (0.0, 0.0, -1.0))):
         for joint in joints:
             part: Any = spec.add_actuator(name=f"{joint}_{what}", target=joint, trntype=mj.mjtTrn.mjTRN_JOINT)
-            part.gaintype = mj.mjtGain.mjGAIN_AFFINE
-            part.gainprm[:3] = gain
+            part.gaintype, part.gainprm[:3] = mj.mjtGain.mjGAIN_AFFINE, gain
+            _clear(part)
     for joint in joints:
         most = limits[joint] or NO_LIMIT
         spec.joint(joint).actfrclimited, spec.joint(joint).actfrcrange = True, [-most, most]
@@ -105,6 +105,13 @@ def driven_spec(
     if not contacts:
         option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
     return spec
+
+
+def _clear(part: Any) -> None:
+    """Leave an actuator its gain alone: a new one has bias and limits of the file's default servos."""
+    part.biastype, part.dyntype, part.biasprm[:] = mj.mjtBias.mjBIAS_NONE, mj.mjtDyn.mjDYN_NONE, 0.0
+    part.gear[:] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    part.ctrllimited = part.forcelimited = False
 
 
 def stick(spec: MjSpec, joints: Sequence[str], step_s: float) -> None:
