@@ -11,8 +11,6 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from sim2real import moved
-
 _NAMES_OF_MODULE = {
     "sim2real.artifacts.bundle": ("Bundle",),
     "sim2real.artifacts.deployment": ("Deployment",),
@@ -84,7 +82,6 @@ class _CallablePackage(ModuleType):
 
 
 sys.modules[__name__].__class__ = _Package
-moved.install()
 
 
 def callable_package(name: str) -> None:

@@ -46,10 +46,9 @@ os.environ["XLA_FLAGS"] = " ".join(
 # dozens of processes: kept from 0.02 s on, tests/integration/test_stages.py takes 15 % less than from 0.3 s on.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.02")
-# Where Python may leave no bytecode beside its sources, it goes there, too: without any, each of hundreds of processes
-# spends 2 s on reading JAX's sources again.
+# Where Python is to leave no bytecode, it does: each of hundreds of processes would spend 2 s on reading sources again.
+# It lies beside the sources, where pip has put that of packages: in a folder of its own, that would be made again, too.
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", ""):
-    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix = str(REPOSITORY / ".cache" / "bytecode")
     sys.dont_write_bytecode = False
 
 # A machine with two busy cores misses hypothesis's deadlines without anything being wrong.

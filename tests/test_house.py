@@ -16,7 +16,7 @@ ROOMS = [
     "view", "stages", "interop", "commands", "cli",
 ]  # fmt: skip
 EVERYWHERE = {
-    *("arrays", "callable_package", "errors", "installation", "later", "leaps", "moved", "plain_pytree", "pytree"),
+    *("arrays", "callable_package", "errors", "installation", "later", "leaps", "plain_pytree", "pytree"),
     *("random_numbers", "types"),
 }
 STAGES = {path.parent.name for path in (PACKAGE / "stages").glob("*/stage.py")}

@@ -11,7 +11,6 @@ from types import ModuleType
 import pytest
 
 import sim2real
-from sim2real.moved import MOVED
 
 STAGES = ["check", "deploy", "export", "identify", "record", "report", "run", "train", "validate"]
 
@@ -41,7 +40,6 @@ def test_a_room_stays_importable_beside_the_function_of_its_name(room):
     module = {"identify": "parameters", "train": "sweep"}[room]
     code = f"""
 import sim2real
-from sim2real.moved import MOVED
 import sim2real.{room}.{module}
 from sim2real.{room} import {module} as found
 import sim2real.{room}.{module} as named
@@ -53,15 +51,6 @@ assert {room}.config is sim2real.{room}.config
     subprocess.run([sys.executable, "-c", code], check=True)
     assert isinstance(importlib.import_module(f"sim2real.{room}"), ModuleType)
     assert not isinstance(getattr(sim2real, room), ModuleType)
-
-
-def test_modules_that_moved_are_found_under_their_old_names_with_a_warning():
-    for old, new in MOVED.items():
-        sys.modules.pop(f"sim2real.{old}", None)  # another test may have imported it
-        with pytest.warns(FutureWarning, match=rf"sim2real\.{old} is now sim2real\.{new}"):
-            found = importlib.import_module(f"sim2real.{old}")
-        assert found is importlib.import_module(f"sim2real.{new}")
-        assert found.__name__ == found.__spec__.name == f"sim2real.{new}"
 
 
 def test_a_name_that_does_not_exist_is_an_attribute_error():

@@ -11,13 +11,13 @@ NAMES = {
         "ModelWrapperEntity", "NullTask", "Observables", "ObservationPadding", "Physics", "PhysicsError", "PropPlacer",
         "Robot", "SENSOR_SITES_GROUP", "Task", "Variation", "abstract_observable", "cached_property", "observable",
     ],
-    "composer.engine": ["Camera", "MovableCamera", "TextOverlay"],
+    "composer.physics.engine": ["Camera", "MovableCamera", "TextOverlay"],
     "composer.mjcf": [
         "Asset", "Binding", "Element", "PREFIX_SEPARATOR", "Physics", "RootElement", "commit_defaults", "element",
         "export_with_assets", "export_with_assets_as_zip", "from_file", "from_path", "from_xml_string",
         "get_attachment_frame", "get_frame_freejoint", "get_frame_joints", "get_freejoint",
     ],
-    "composer.mjx": ["JaxRandomState", "MjxEnvironment", "MjxPhysics", "State"],
+    "composer.physics.mjx": ["JaxRandomState", "MjxEnvironment", "MjxPhysics", "State"],
     "composer.initializers": ["JointStaticIsolator", "PropPlacer", "ToolCenterPointInitializer"],
     "composer.observation": [
         "DEFAULT_BUFFER_SIZE", "DEFAULT_DELAY", "DEFAULT_UPDATE_INTERVAL", "Updater", "observable",
@@ -28,7 +28,7 @@ NAMES = {
     "composer.variation": ["MJCFVariator", "PhysicsVariator", "Variation", "evaluate"],
 }  # fmt: skip
 MODULES = [
-    "arena", "constants", "define", "engine", "entity", "environment", "initializer", "robot", "task", "mjcf.element",
+    "arena", "define", "entity", "environment", "initializer", "robot", "task", "mjcf.element",
     "initializers.prop_initializer", "initializers.tcp_initializer", "initializers.utils",
     "observation.observable.base", "observation.observable.mjcf", "observation.updater",
     *(f"variation.{name}" for name in (

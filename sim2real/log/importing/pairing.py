@@ -47,12 +47,48 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None, joint
     series = [
         s for s in signals if s.values.ndim == 2 and s.width and s.meaning.quantity != "stamp" and len(s.values) > 2
     ]
+    varying = [s for s in series if _varies(s)] or series
+    measured, command = _by_names(series, varying, path, joints)
+    if measured is not None and command is not None:
+        names = f"{measured.name!r} is measured and {command.name!r} commanded, by their names"
+        return Pair(measured, command, _kind(command), (names,))
+    unnamed = [s for s in varying if s.meaning == Meaning(label=s.meaning.label) and s is not measured and _moves(s)]
+    if measured is None and command is None:
+        return _by_data(_together(unnamed), path, rate_hz, signals)
+    # One of both has a name: search the other among unnamed signals that correlate with it.
+    named_signal, side = (measured, "command") if measured is not None else (command or varying[0], "measured position")
+    followers = [
+        s for s in _together(unnamed) if s.width == named_signal.width and len(s.values) == len(named_signal.values)
+    ]
+    linked = [s for s in followers if _link(s, named_signal, signals, path, rate_hz)[0] > _SURE]
+    other = _one(linked, side, path)
+    if other is None:
+        named = [s for s in varying if s.meaning.quantity in ("torque", "duty") and s.meaning.side == ""]
+        other = _one(named, side, path) if measured is not None else None
+    if other is None:
+        torques = [s for s in varying if (s.meaning.side, s.meaning.quantity) == ("measured", "torque")]
+        no_command = f". A measured torque is no command: {_names(torques)}" if torques and side == "command" else ""
+        raise UsageError(
+            f"no signal of {path} is a {side} by its name or by the data{no_command}. Available: {_names(signals)}",
+            hint="write quantity and side into the names of columns, as in q_rad and goal_rad, or write a mapping",
+        )
+    r, _ = _link(other, named_signal, signals, path, rate_hz)
+    if measured is None:
+        note = f"{other.name!r} follows {named_signal.name!r} (r {r:.2f}), so it is measured"
+        return Pair(other, named_signal, _kind(named_signal), (note,))
+    note = f"{measured.name!r} follows {other.name!r} (r {r:.2f}), which is the command"
+    return Pair(measured, other, _kind(other), (note,))
+
+
+def _by_names(
+    series: Sequence[Signal], varying: Sequence[Signal], path: str, joints: Sequence[str]
+) -> tuple[Signal | None, Signal | None]:
+    """Return measured positions and commands that have names of such; None for each without one."""
     positions = [s for s in series if s.meaning.quantity == "position" and s.meaning.side != "command"]
     positions = positions or [s for s in series if s.meaning.side == "measured" and not s.meaning.quantity]
     named = [s for s in series if s.meaning.side == "command" and s.meaning.quantity in ("", *_KINDS)]
-    series = [s for s in series if _varies(s)] or series
     # Take a command that never changes if there is no other: `check` reports it.
-    commands = [s for s in named if any(s is other for other in series)] or named
+    commands = [s for s in named if any(s is other for other in varying)] or named
     # Prefer goals: a feed-forward beside a goal is no separate command.
     goals = [s for s in commands if s.meaning.quantity in ("", "position")]
     if not joints and len(goals or commands) == 1:
@@ -66,35 +102,7 @@ def find_pair(signals: Sequence[Signal], path: str, rate_hz: float | None, joint
                 f"{chosen.name!r} in {path} is in {chosen.meaning.unit} by its name",
                 hint="convert it to radians or degrees, or write a mapping with a scale",
             )
-    if measured is not None and command is not None:
-        names = f"{measured.name!r} is measured and {command.name!r} commanded, by their names"
-        return Pair(measured, command, _kind(command), (names,))
-    unnamed = [s for s in series if s.meaning == Meaning(label=s.meaning.label) and s is not measured and _moves(s)]
-    if measured is None and command is None:
-        return _by_data(_together(unnamed), path, rate_hz, signals)
-    # One of both has a name: search the other among unnamed signals that correlate with it.
-    named_signal, side = (measured, "command") if measured is not None else (command or series[0], "measured position")
-    followers = [
-        s for s in _together(unnamed) if s.width == named_signal.width and len(s.values) == len(named_signal.values)
-    ]
-    linked = [s for s in followers if _link(s, named_signal, signals, path, rate_hz)[0] > _SURE]
-    other = _one(linked, side, path)
-    if other is None:
-        named = [s for s in series if s.meaning.quantity in ("torque", "duty") and s.meaning.side == ""]
-        other = _one(named, side, path) if measured is not None else None
-    if other is None:
-        torques = [s for s in series if (s.meaning.side, s.meaning.quantity) == ("measured", "torque")]
-        no_command = f". A measured torque is no command: {_names(torques)}" if torques and side == "command" else ""
-        raise UsageError(
-            f"no signal of {path} is a {side} by its name or by the data{no_command}. Available: {_names(signals)}",
-            hint="write quantity and side into the names of columns, as in q_rad and goal_rad, or write a mapping",
-        )
-    r, _ = _link(other, named_signal, signals, path, rate_hz)
-    if measured is None:
-        note = f"{other.name!r} follows {named_signal.name!r} (r {r:.2f}), so it is measured"
-        return Pair(other, named_signal, _kind(named_signal), (note,))
-    note = f"{measured.name!r} follows {other.name!r} (r {r:.2f}), which is the command"
-    return Pair(measured, other, _kind(other), (note,))
+    return measured, command
 
 
 def _kind(command: Signal) -> str:

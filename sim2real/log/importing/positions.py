@@ -206,6 +206,11 @@ def radian(
         return others[0]
     if by_ranges := _by_ranges(q, hints):
         return by_ranges
+    return _by_size(measured, q, t_s, path, usual)
+
+
+def _by_size(measured: Signal, q: np.ndarray, t_s: np.ndarray, path: str, usual: str) -> tuple[float, str]:
+    """Return the number of units in a radian from the size and speed of positions, and the reason."""
     largest = float(np.abs(q).max())
     speed = float(np.quantile(np.abs(np.diff(q, axis=0)) / np.diff(t_s)[:, None], 0.99))
     way, slow = float(np.ptp(q, axis=0).max()), speed <= _FAST_RAD_S or largest <= _SMALL_RAD

@@ -57,7 +57,7 @@ def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[st
 
 
 def offsets(joints: Sequence[Joint | str]) -> list[Parameter]:
-    """Return the offset of each servo from its goals, for ``ServoRobot.dynamics``."""
+    """Return the offset of each servo from its goals, for ``dynamics``."""
     about = "rest position without load, from its goal"
     names = [f"{MISSES}_{name_of(joint)}" for joint in joints]
     return [Parameter(name, "rad", 0.0, -_MOST_RAD, _MOST_RAD, "linear", about=about) for name in names]
