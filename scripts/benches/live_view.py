@@ -1,8 +1,12 @@
 """The cost of ``--view`` for a control loop of twelve joints.
 
 The yardstick is the same loop in the same seconds: the viewer's processes are stopped and continued in turn, by SIGSTOP
-and SIGCONT, so that other programs of the machine disturb both alike. When they are continued they also catch up on the
-rows of the time before. The cost for the loop is processor time of its process as a share of the time, and lateness.
+and SIGCONT, so that other programs of the machine disturb both alike. A viewer that continues first catches up on the
+rows of the time before: these windows count apart. The cost for the loop is processor time of its process as a share of
+the time, and lateness.
+
+``other_log_share`` is the part of this cost that comes from the shared processor: the viewer has the same work, but
+follows a log that the loop does not write. ``writes_added`` are calls of the loop's process that write.
 """
 
 from __future__ import annotations
@@ -11,6 +15,8 @@ import argparse
 import os
 import random
 import signal
+import subprocess
+import sys
 import sysconfig
 import tempfile
 import time
@@ -38,7 +44,18 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import realtime
 from sim2real.stages.live.viewer import live_view
 
-QUICK = {"seconds": 2.0, "window": 0.5, "targets": ["file"]}
+QUICK = {"seconds": 3.0, "window": 0.5, "targets": ["file"]}
+OFF, CATCHING_UP, ON = range(3)
+_GROW = """
+import sys, time
+data, begin, sent = open(sys.argv[1], "rb").read(), time.monotonic(), 0
+with open(sys.argv[2], "wb", 0) as stream:
+    while sent < len(data):
+        due = min(len(data), int(len(data) * (time.monotonic() - begin) / float(sys.argv[3])))
+        sent += stream.write(data[sent:due])
+        time.sleep(0.2)
+"""
+"""Writes a log a second time, as fast as it grew, every 0.2 s as the writer of a log."""
 
 
 @dataclass(frozen=True)
@@ -46,16 +63,18 @@ class Loop:
     """One run of the loop, cut into windows with and without a viewer, in turn.
 
     Attributes:
-        on: Whether the viewer ran ``(W,)``.
+        state: ``OFF``, ``CATCHING_UP`` or ``ON`` in each window ``(W,)``.
         cores: Processor time of the loop's process in each window ``(W,)`` [s per s].
         viewer_cores: Processor time of the viewer's processes ``(W,)`` [s per s].
+        writes: Writing calls of the loop's process ``(W,)`` [1/s].
         late_ms: Lateness of each step of all nodes ``(S,)`` [ms].
         of_window: Window of each step ``(S,)``.
     """
 
-    on: np.ndarray
+    state: np.ndarray
     cores: np.ndarray
     viewer_cores: np.ndarray
+    writes: np.ndarray
     late_ms: np.ndarray
     of_window: np.ndarray
 
@@ -71,24 +90,36 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Run the loop beside each viewer."""
+    """Run the loop beside each viewer: on its own log, and on another one."""
     rows: list[Row] = []
     for target in options.targets:
-        rows += _rows(target, _loop(target, options.rate, options.seconds, options.window))
+        with tempfile.TemporaryDirectory() as folder:
+            log = Path(folder) / "session.mcap"
+            rows += _rows(target, _loop(target, options, log))
+            other = _loop(target, options, Path(folder) / "again.mcap", other=log)
+            rows.append(_share(f"view/{target}/other_log_share", other, ON))
     return {"rows": rows}
+
+
+def _share(name: str, loop: Loop, state: int, goal: str = "") -> Row:
+    """Return the processor time of the loop's process in windows of a state, more than without a viewer."""
+    share, error = _difference(100.0 * loop.cores[loop.state == state], 100.0 * loop.cores[loop.state == OFF])
+    return row(name, round(share, 2), "% of the time", f"stopped viewer, +-{error:.2f}", goal)
 
 
 def _rows(target: str, loop: Loop) -> list[Row]:
     """Return the figures of a viewer: with it, without it, and the difference."""
-    what, on = f"view/{target}", loop.on
-    share, share_error = _difference(100.0 * loop.cores[on], 100.0 * loop.cores[~on])
+    what, on, off = f"view/{target}", loop.state == ON, loop.state == OFF
     late, without = (
         float(np.quantile(loop.late_ms[np.isin(loop.of_window, np.flatnonzero(windows))], 0.99))
-        for windows in (on, ~on)
+        for windows in (on, off)
     )
     added = late - without
+    writes, writes_error = _difference(loop.writes[on], loop.writes[off])
     return [
-        row(f"{what}/loop_share", round(share, 2), "% of the time", f"stopped viewer, +-{share_error:.2f}", "< 1"),
+        _share(f"{what}/loop_share", loop, ON, "< 1"),
+        _share(f"{what}/loop_share_catching_up", loop, CATCHING_UP),
+        row(f"{what}/writes_added", round(writes, 2), "1/s", f"{loop.writes[off].mean():.0f}, +-{writes_error:.2f}"),
         row(f"{what}/lateness_p99_ms", round(late, 3), "ms", f"stopped viewer: {without:.3f}"),
         row(f"{what}/lateness_p99_added_ms", round(added, 3), "ms", f"stopped viewer, +-{_spread(loop):.3f}", "< 0.1"),
         row(f"{what}/viewer_cores", round(float(loop.viewer_cores[on].mean()), 3), "cores, at low priority"),
@@ -97,12 +128,13 @@ def _rows(target: str, loop: Loop) -> list[Row]:
 
 def _spread(loop: Loop, draws: int = 200) -> float:
     """Return the standard error of the difference of the lateness' quantiles, by drawing pairs of windows again."""
-    rng, pairs = np.random.default_rng(0), len(loop.on) // 2
-    late = [loop.late_ms[loop.of_window == i] for i in range(2 * pairs)]
+    rng = np.random.default_rng(0)
+    sides = [[loop.late_ms[loop.of_window == i] for i in np.flatnonzero(loop.state == s)] for s in (ON, OFF)]
+    pairs = min(map(len, sides))
     differences = []
     for _ in range(draws):
-        drawn = 2 * rng.integers(0, pairs, pairs)
-        with_viewer, without = (np.concatenate([late[i + side] for i in drawn]) for side in (0, 1))
+        drawn = rng.integers(0, pairs, pairs)
+        with_viewer, without = (np.concatenate([late[i] for i in drawn]) for late in sides)
         differences.append(np.quantile(with_viewer, 0.99) - np.quantile(without, 0.99))
     return float(np.std(differences))
 
@@ -113,13 +145,15 @@ def _difference(on: np.ndarray, off: np.ndarray) -> tuple[float, float]:
     return float(pairs.mean()), float(pairs.std() / np.sqrt(len(pairs)))
 
 
-def _loop(target: str, rate_hz: float, seconds: float, window_s: float) -> Loop:
-    """Run the loop beside an emulated bus, with its log and a viewer."""
+def _loop(target: str, options: argparse.Namespace, log: Path, other: Path | None = None) -> Loop:
+    """Run the loop beside an emulated bus, with its log and a viewer of this log, or of another log that grows."""
+    rate_hz, window_s = options.rate, options.window
+    windows = round(options.seconds / window_s)
     plant = f"{Path(__file__).with_name('twelve_joints.py')}:TwelveJoints"
     config = EmulatorConfig(baud_rate=BAUD, return_delay_us=0, plant_step_s=0.001)
     with (
         tempfile.TemporaryDirectory() as folder,
-        _viewed(target, Path(folder)) as port,
+        _viewed(target, Path(folder) if other else log.parent) as port,
         EmbeddedRobot(plant, config, None, Path(folder) / "truth.bin") as robot,
     ):
         bus = BusConfig(robot.port, baud_rate=BAUD, silence_s=1.0, max_silence_s=1.0)
@@ -129,26 +163,48 @@ def _loop(target: str, rate_hz: float, seconds: float, window_s: float) -> Loop:
             graph = AsyncGraph(nodes, nodes["agent"])
             state = graph.init(jax.random.key(0))
             graph.warmup(state)
-            graph.recorder = recorder = _recorder(Path(folder) / "session.mcap", nodes, rate_hz, state.aux["outputs"])
-            on, cores, viewer_cores = [], [], []
-            with graph:
+            graph.recorder = recorder = _recorder(log, nodes, rate_hz, state.aux["outputs"])
+            counted = []
+            with graph, _grown(other, Path(folder) / "session.mcap", windows * window_s):
                 graph.start(state)
-                for i in range(round(seconds / window_s)):
-                    on.append(i % 2 == 0)
+                for i in range(windows):
                     processes = _processes(port)
                     for process in processes:
-                        os.kill(process, signal.SIGCONT if on[-1] else signal.SIGSTOP)
-                    before = time.process_time(), sum(processes.values())
+                        os.kill(process, signal.SIGSTOP if _state(i) == OFF else signal.SIGCONT)
+                    before = time.process_time(), sum(processes.values()), _writes()
                     graph.run_for(window_s)
-                    cores.append((time.process_time() - before[0]) / window_s)
-                    viewer_cores.append((sum(_processes(port).values()) - before[1]) / window_s)
+                    after = time.process_time(), sum(_processes(port).values()), _writes()
+                    counted.append((np.array(after) - before) / window_s)
             for process in _processes(port):
                 os.kill(process, signal.SIGCONT)
             recorder.close()
-        steps = read_log(Path(folder) / "session.mcap").steps.values()
+        steps = read_log(log).steps.values()
     woken_s = np.concatenate([s.woken for s in steps]) / 1e6
     late_ms = np.concatenate([s.woken - s.start for s in steps]) / 1e3
-    return Loop(np.array(on), np.array(cores), np.array(viewer_cores), late_ms, (woken_s / window_s).astype(int))
+    states = np.array([_state(i) for i in range(windows)])
+    return Loop(states, *np.array(counted).T, late_ms, (woken_s / window_s).astype(int))
+
+
+def _state(window: int) -> int:
+    return (CATCHING_UP, ON, OFF)[window % 3]
+
+
+def _writes() -> int:
+    """Return the number of writing calls of this process."""
+    return int(Path("/proc/self/io").read_text().partition("syscw:")[2].split()[0])
+
+
+@contextmanager
+def _grown(source: Path | None, target: Path, seconds: float) -> Iterator[None]:
+    """Let a copy of a log grow, in a process of its own, while the block runs."""
+    if source is None:
+        yield
+        return
+    with subprocess.Popen([sys.executable, "-c", _GROW, str(source), str(target), str(seconds)]) as process:
+        try:
+            yield
+        finally:
+            process.kill()
 
 
 @contextmanager

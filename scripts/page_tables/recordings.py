@@ -15,19 +15,15 @@ def view(report: Mapping[str, Any]) -> str:
         "",
     ]
     lines += [
-        "| viewer | processor time of the loop [%] | p99 lateness [ms] | more than without it [ms] | viewer [cores] |"
+        "| viewer | processor time of the loop [%] | the same viewer on another log [%] | writes [1/s] "
+        "| p99 lateness [ms] | viewer [cores] |",
+        "|---|---|---|---|---|---|",
     ]
-    lines += ["|---|---|---|---|---|"]
     for target in report["flags"]["targets"]:
-        share, late, added, cores = (
-            rows[f"{target}/{name}"]
-            for name in ("loop_share", "lateness_p99_ms", "lateness_p99_added_ms", "viewer_cores")
-        )
-        spread, late_spread = (figure["yardstick"].rpartition("+-")[2] for figure in (share, added))
-        lines.append(
-            f"| {target} | {share['value']:+.2f} (s.e. {spread}) | {late['value']:.3f} | "
-            f"{added['value']:+.3f} (s.e. {late_spread}) | {cores['value']:.2f} |"
-        )
+        names = ("loop_share", "other_log_share", "writes_added", "lateness_p99_added_ms")
+        added = (rows[f"{target}/{name}"] for name in names)
+        cells = [f"{row['value']:+.3g} (s.e. {row['yardstick'].rpartition('+-')[2]})" for row in added]
+        lines.append(f"| {target} | {' | '.join(cells)} | {rows[f'{target}/viewer_cores']['value']:.2f} |")
     return "\n".join([*lines, ""])
 
 

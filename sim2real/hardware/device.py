@@ -249,6 +249,13 @@ class Device(ABC):
     def without_host(self) -> tuple[WithoutHost, ...]:
         """Return the reaction of the motors to the death of this process, each motor in one entry."""
 
+    def facts(self) -> Mapping[str, Mapping[str, str]]:
+        """Return ``firmware``, ``voltage`` and ``temperature`` of each motor, as text, read from the open device.
+
+        Logs and model cards contain them. Default: none, for a device that does not report them.
+        """
+        return {}
+
     @abstractmethod
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest command that the motors follow, each of shape (n,) or (n, k).

@@ -174,6 +174,9 @@ class DeviceConformance(ABC):
             shape = (len(device.motors), len(columns)) if columns else (len(device.motors),)
             assert all(limit.shape == shape for limit in device.reach())
             require_parts(device.measure().parts, device.parts)
+            facts = device.facts()
+            assert set(facts) <= {"firmware", "voltage", "temperature"}
+            assert all(isinstance(text, str) and text for values in facts.values() for text in values.values())
         robot.stop()
         modes = robot.truth().of(Kind.EFFECT)["values"][:, 0]
         assert set(modes.tolist()) <= {OperatingMode.OFF}

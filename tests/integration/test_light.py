@@ -1,5 +1,6 @@
 """sim2real on a robot's computer: what works without JAX, and what is refused in words."""
 
+import json
 import os
 import re
 import subprocess
@@ -61,7 +62,9 @@ def assert_works(command, folder, robot, bundle):
     code, said = call(command, folder, "record", robot, *flags)
     assert code == errors.OK, said
     (log,) = folder.glob(f"runs/{robot}/*/record/session.mcap")
-    assert len(read_log(log).steps["sensor"]) >= 40
+    recorded = read_log(log)
+    assert len(recorded.steps["sensor"]) >= 40
+    assert set(recorded.metadata["hardware"]["voltage"].values()) == {"12.0 V"}
     code, said = call(command, folder, "info", log)
     assert code == errors.OK, said
     code, said = call(command, folder, "check", robot)
@@ -90,6 +93,32 @@ def test_a_motion_from_a_table_is_played(tmp_path):
     code, said = call(WITHOUT_JAX, tmp_path, "record", "so101", "--excitation", "motion.csv", *PATIENT)
     assert code == errors.OK, said
     assert "which parameters this motion determines is not checked" in said
+
+
+def test_a_motion_by_hand_is_recorded_and_seen_and_check_refuses_it(tmp_path):
+    hand = ["--excitation", "hand", "--duration-s", "1", "--view", "live.rrd", *PATIENT]
+    code, said = call(WITHOUT_JAX, tmp_path, "record", "so101", *hand)
+    assert code == errors.OK, said
+    assert "torque is off: move the robot by hand" in said
+    assert (tmp_path / "live.rrd").stat().st_size > 1000
+    (log,) = tmp_path.glob("runs/so101/*/record/session.mcap")
+    code, said = call(WITHOUT_JAX, tmp_path, "check", "so101", "--log", log)
+    assert code == errors.ERROR
+    assert "was guided by hand: torque was off" in said
+    assert "hint: play it and record that" in said
+    code, said = call(WITHOUT_JAX, tmp_path, "view", log.parents[1], "--save", "run.rrd")
+    assert code == errors.OK, said
+    assert (tmp_path / "run.rrd").stat().st_size > 1000
+
+
+def test_check_prints_a_recording_as_json_and_the_reason_why_it_ends_there(tmp_path):
+    log = Path(__file__).resolve().parents[2] / "datasets" / "pendulum" / "multisine.mcap"
+    command = [*WITHOUT_JAX, "check", "pendulum", "--json", "--log", str(log)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == errors.USAGE
+    (recording,) = json.loads(done.stdout)["recordings"]
+    assert recording["sampling"]["samples"] > 1000
+    assert "hint: copy it to a computer with sim2real" in done.stderr
 
 
 def test_the_page_s_robot_runs_without_jax_and_trains_with_it(tmp_path):

@@ -1,5 +1,6 @@
 """The folder of a model card: plain MuJoCo, without sim2real and JAX, computes each of its figures within 1 %."""
 
+import json
 import os
 import re
 import subprocess
@@ -12,9 +13,10 @@ import numpy as np
 import pytest
 
 from sim2real import cli, errors
+from sim2real.artifacts.estimation.links import Link, Ranged
 from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.commands.export.card import write_model_card
+from sim2real.commands.export.card import facts_of, write_model_card
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.problem import Problem
@@ -201,7 +203,7 @@ def test_the_card_of_a_run(finished_run_dir, tmp_path, monkeypatch, capsys):
     code, lines = alone(folder)
     assert code == 0, "\n".join(lines)
     page = (folder / "card.html").read_text()
-    for words in ("SHA-256", "Not known", "temperature: not in the log", "command_delay_s", "95 % interval"):
+    for words in ("SHA-256", "Not known", "temperature: not recorded", "command_delay_s", "95 % interval"):
         assert words in page, words
     assert str(tmp_path) not in page
     assert not re.search(r'(src|href)="http', page)
@@ -212,6 +214,46 @@ def test_the_card_of_a_run(finished_run_dir, tmp_path, monkeypatch, capsys):
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     assert cli.main(["export", "identified", source, "--to", "card", "--out", "mine"]) == errors.USAGE
     assert "holds no model card" in capsys.readouterr().err
+
+
+def test_the_distribution_of_a_link_s_delay_is_on_the_card(tmp_path):
+    """As ``--links`` estimates it; the script computes mean and percentile from the shares."""
+    robot, episode = two_links(tmp_path, PLAIN, ("goal",))
+    found = known(robot, episode, {**PLAIN, "delay": 0.0131}, (2.0, 3.0))
+    delays, share = np.linspace(0.005, 0.025, 41), np.full(41, 1 / 41)
+    number, open_ = Ranged(0.015, 0.0145, 0.0155), Ranged(None, None, None)
+    link = Link("delay", ("delay",), number, open_, Ranged(0.024225, 0.024, 0.0245), open_, open_, open_, delays, share)
+    folder = card_of(robot, replace(found, links=(link,)), tmp_path / "card")
+    card = (folder / "card.json").read_text()
+    assert json.loads(card)["links"][0]["mean"]["low95"] == 0.0145
+    assert "Delays of messages, estimated from the motion" in (folder / "card.html").read_text()
+    code, lines = alone(folder)
+    assert code == 0, "\n".join(lines)
+    assert {"delay, mean of the messages", "delay, q95 of the messages"} <= {row.partition(":")[0] for row in lines}
+    (folder / "card.json").write_text(card.replace('"value": 0.015,', '"value": 0.016,'))
+    assert alone(folder)[0] == 1
+
+
+def test_facts_about_the_hardware_come_from_the_log():
+    """A servo's registers when the recording begins; a measurement during it takes their place."""
+    registers = {
+        "firmware": {"servo 1": "3.9", "servo 2": "3.10", "servo 3": "3.9"},
+        "voltage": {"servo 1": "7.4 V", "servo 2": "7.4 V", "servo 3": "7.4 V"},
+    }
+    measured = {"battery_voltage": np.array([29.6, 28.1]), "position": np.zeros(2)}
+    units = {"sensor": {"battery_voltage": "V"}}
+    servos = Episode(steps={}, messages={}, outputs={}, metadata={"hardware": registers})
+    assert facts_of(servos, "sensor") == {
+        "firmware": "3.9: servo 1, servo 3; 3.10: servo 2",
+        "voltage": "7.4 V, all motors",
+        "temperature": "not recorded",
+    }
+    legs = Episode(steps={}, messages={}, outputs={"sensor": measured}, metadata={}, units=units)
+    assert facts_of(legs, "sensor") == {
+        "firmware": "not recorded",
+        "temperature": "not recorded",
+        "battery_voltage": "28.1 to 29.6 V",
+    }
 
 
 def test_a_card_without_a_simulation_has_the_reason(tmp_path):

@@ -127,7 +127,8 @@ def test_view(run):
     pytest.importorskip("rerun")
     found = names(run("view"))
     assert found == {f"view/file/{n}" for n in (
-        "loop_share", "lateness_p99_ms", "lateness_p99_added_ms", "viewer_cores"
+        "loop_share", "loop_share_catching_up", "other_log_share", "writes_added",
+        "lateness_p99_ms", "lateness_p99_added_ms", "viewer_cores",
     )}  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.manifest import sha256
 from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
 from sim2real.identify.export.card.card import differing, write_card
 from sim2real.identify.export.card.signals import all_signals
 from sim2real.identify.export.terms import Terms, find_delays, values_of
@@ -16,6 +17,7 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.log.reader import read_log
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.terminal.console import note
+from sim2real.types import Json
 
 _SESSION: tuple[str, ...] = ("firmware", "voltage", "temperature")
 """Facts about the hardware that a log may hold, in its metadata or as a measurement."""
@@ -53,22 +55,40 @@ def write_model_card(
         note(sentence)
     from sim2real.view.page.model_card import model_card_page  # matplotlib and jinja2 take 0.5 s to import
 
-    model_card_page(card, signals, folder)
+    model_card_page(card, signals, folder, identification.links)
 
 
 def _session(identification: Identification, sensor: str, run_dir: Path | None) -> dict[str, str]:
     """Return firmware, supply voltage and temperature in the first log, as text."""
-    facts: dict[str, str] = dict.fromkeys(_SESSION, "not in the log")
     source = identification.logs[0] if identification.logs else None
     path = run_dir / source.path if source is not None and run_dir is not None else None
     if source is None or path is None or not path.is_file() or sha256(path) != source.sha256:
         return dict.fromkeys(_SESSION, "the log is not beside the identification")
-    if path.suffix != ".mcap":
-        return facts
-    episode = read_log(path)
+    return facts_of(read_log(path), sensor) if path.suffix == ".mcap" else dict.fromkeys(_SESSION, "not recorded")
+
+
+def facts_of(episode: Episode, sensor: str) -> dict[str, str]:
+    """Return firmware, supply voltage and temperature in a log, as text, from its metadata and measurements."""
+    facts: dict[str, str] = dict.fromkeys(_SESSION, "not recorded")
     hardware = episode.metadata.get("hardware")
-    facts |= {n: str(v) for n, v in hardware.items()} if isinstance(hardware, dict) else {}
+    facts |= {n: _of_motors(v) for n, v in hardware.items()} if isinstance(hardware, dict) else {}
+    # A measurement is better than the value at the begin of the recording, and has its place.
     for name, rows in episode.outputs.get(sensor, {}).items():
-        if rows.size and any(fact in name for fact in _SESSION):
-            facts[name] = f"{np.min(rows):.4g} to {np.max(rows):.4g}"
+        for fact in _SESSION:
+            if rows.size and fact in name:
+                unit = episode.units.get(sensor, {}).get(name, "")
+                facts.pop(fact, None)
+                facts[name] = f"{np.min(rows):.4g} to {np.max(rows):.4g} {unit}".rstrip()
     return facts
+
+
+def _of_motors(values: Json) -> str:
+    """Return a fact of each motor as text: one value, or each value with its motors."""
+    if not isinstance(values, dict):
+        return str(values)
+    motors: dict[str, list[str]] = {}
+    for motor, value in values.items():
+        motors.setdefault(str(value), []).append(motor)
+    if len(motors) == 1:
+        return f"{next(iter(motors))}, all motors" if len(values) > 1 else next(iter(motors))
+    return "; ".join(f"{value}: {', '.join(names)}" for value, names in motors.items())

@@ -67,6 +67,9 @@ class MemoryTable:
         torque: The register that holds 0 while torque is off.
         goals: The registers that can move the motor while torque is on.
         return_delay: The register of the time between instruction and answer, in units of 2 us.
+        firmware: The registers of the firmware's version, major number first.
+        voltage: The register of the supply voltage, in units of 0.1 V.
+        temperature: The register of the motor's temperature [deg C].
     """
 
     named: Iterable[object]
@@ -77,6 +80,9 @@ class MemoryTable:
     servo_id: Register
     return_delay: Register
     position: Register
+    firmware: tuple[Register, ...]
+    voltage: Register
+    temperature: Register
     registers: dict[int, Register] = field(init=False)
     """Address -> register."""
 

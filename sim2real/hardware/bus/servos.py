@@ -148,6 +148,17 @@ class GuardedServos(Generic[L]):
             kinds.setdefault(model, []).append(f"servo {servo_id}")
         return tuple(m.without_host(self.silence_s, tuple(motors)) for m, motors in kinds.items())
 
+    def facts(self) -> dict[str, dict[str, str]]:
+        """Return firmware, supply voltage and temperature of each servo; see `Device.facts`."""
+        link, table = self.link, self.link.table
+        facts: dict[str, dict[str, str]] = {"firmware": {}, "voltage": {}, "temperature": {}}
+        for servo_id, motor in zip(self.ids, self.motors, strict=True):
+            numbers = [link.read(servo_id, r, despite_error=True) for r in (*table.firmware, table.voltage)]
+            facts["firmware"][motor] = ".".join(map(str, numbers[:-1]))
+            facts["voltage"][motor] = f"{0.1 * numbers[-1]:.1f} V"
+            facts["temperature"][motor] = f"{link.read(servo_id, table.temperature, despite_error=True)} °C"
+        return facts
+
     def withhold_torque(self) -> None:
         """Send neither "torque on" nor any goal from now until the bus is opened again, for a dry run.
 

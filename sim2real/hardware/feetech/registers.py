@@ -40,6 +40,8 @@ class Mode(IntEnum):
     STEP = 3
 
 
+FIRMWARE_MAJOR = Register("firmware_major", 0, 1, default=3, eeprom=True)
+FIRMWARE_MINOR = Register("firmware_minor", 1, 1, default=10, eeprom=True)
 MODEL_NUMBER = Register("model_number", 3, 2, default=777, eeprom=True)
 ID = eeprom("id", 5, 1, 0, 253, 1)
 BAUD_RATE = eeprom("baud_rate", 6, 1, 0, 7, 0)
@@ -90,6 +92,9 @@ TABLE: Final = MemoryTable(
     ID,
     RETURN_DELAY_TIME,
     PRESENT_POSITION,
+    (FIRMWARE_MAJOR, FIRMWARE_MINOR),
+    PRESENT_VOLTAGE,
+    PRESENT_TEMPERATURE,
 )
 
 

@@ -114,6 +114,19 @@ class LerobotServos(GuardedServos[Any], Device):
             self.close()
             raise
 
+    def facts(self) -> dict[str, dict[str, str]]:
+        """Return firmware, supply voltage and temperature of each motor, by LeRobot's names of the registers."""
+        names = ("Firmware_Major_Version", "Firmware_Minor_Version", "Present_Voltage", "Present_Temperature")
+        bus = self.link.bus
+        rows = [self.link.call(lambda name=name: bus.sync_read(name, normalize=False))[0] for name in names]
+        major, minor, tenths_v, celsius = ([row[motor] for motor in self._names] for row in rows)
+        texts = {
+            "firmware": [f"{a}.{b}" for a, b in zip(major, minor, strict=True)],
+            "voltage": [f"{0.1 * x:.1f} V" for x in tenths_v],
+            "temperature": [f"{x} °C" for x in celsius],
+        }
+        return {fact: dict(zip(self.motors, row, strict=True)) for fact, row in texts.items()}
+
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest angles of the joints [rad], each ``(n,)``."""
         return self._low.copy(), self._high.copy()

@@ -113,6 +113,14 @@ class UnitreeLegs(GuardedLegs, Device):
         """Return the worst reaction, as none is documented."""
         return (WithoutHost("Go2", self.motors, Alone.GOES_ON, math.inf, _SOURCE, "no other reaction is documented"),)
 
+    def facts(self) -> dict[str, dict[str, str]]:
+        """Return the versions that the robot's states have; voltage and temperatures are parts of each reading."""
+        record = self.session.stream.next()[0].record
+        bms = record["bms_state"]
+        numbers = {"LowState": record["version"].tolist(), "battery": [bms["version_high"], bms["version_low"]]}
+        versions = {name: ".".join(map(str, pair)) for name, pair in numbers.items() if any(pair)}
+        return {"firmware": versions} if versions else {}
+
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest q, dq, kp, kd and tau, each ``(12, 5)``."""
         low, high = self.drive.reach

@@ -155,7 +155,8 @@ class EmulatedLegs:
         imu["quaternion"], imu["rpy"] = quaternion, _roll_pitch_yaw(quaternion)
         imu["gyroscope"] = measured["gyroscope"] + config.gyro_noise_rad_s * draw(size=3)
         imu["accelerometer"] = measured["accelerometer"] + config.accelerometer_noise_m_s2 * draw(size=3)
-        record["foot_force"], record["power_v"], record["bms_state"]["soc"] = measured["foot_force"], 29.6, 90
+        record["foot_force"], record["power_v"], battery = measured["foot_force"], 29.6, record["bms_state"]
+        battery["soc"], battery["version_high"], battery["version_low"] = 90, 1, 4
         message.sign()
         return message
 

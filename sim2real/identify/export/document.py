@@ -31,5 +31,6 @@ def json_document(
         "parameters": [{n: getattr(p, n) for n in _COLUMNS} for p in identification.parameters],
         "posterior": identification.posterior,
         "delays_s": delays,
+        "links": identification.links,
         "mujoco": {n: getattr(terms, n) for n in mujoco} if terms else None,
     }

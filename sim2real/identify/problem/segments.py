@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
@@ -205,7 +206,7 @@ def check_log(episode: Episode, model: IdentifiableModel) -> None:
                 f"the log has no steps of node {name!r}. Available: {', '.join(episode.steps) or 'none'}", hint=hint
             )
     wanted = [(model.sensor, f) for c in model.channels for f, _ in c.fields]
-    wanted += [(node, f) for node, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
+    wanted += [(node, f) for node, tree in model.given.items() for f in pytree.leaves(tree)]
     for node, field in wanted:
         data = episode.outputs[node].get(field)
         if data is None:

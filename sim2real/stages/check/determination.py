@@ -13,7 +13,7 @@ from sim2real.graph.episode import Episode
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span, check_log
+from sim2real.identify.problem.segments import Span
 from sim2real.identify.uncertainty import identifiability, uncertainty
 from sim2real.identify.uncertainty.round_trip import SURE_S
 from sim2real.stages.check.coverage import coverage
@@ -39,8 +39,6 @@ def judge(
     Args:
         units: Field -> unit.
     """
-    for episode in source.episodes:
-        check_log(episode, model)
     # Simulate all segments at the nominal values, with derivatives.
     spans, length_s = cut_segments(source.episodes, config)
     problem = Problem(model, source.episodes, spans, length_s, config, parameters)

@@ -41,6 +41,15 @@ def show(checked: Mapping[str, Json]) -> None:
         print(f"- {message}")
 
 
+def show_recordings(recordings: Sequence[Mapping[str, Json]], as_json: bool) -> None:
+    """Print the recordings alone, as tables or as JSON."""
+    if as_json:
+        print(json.dumps(plain({"recordings": recordings}), indent=1))
+    else:
+        for recording in recordings:
+            show_recording(recording)
+
+
 def show_recording(recording: Mapping[str, Json]) -> None:
     """Print the sampling of a recording, the ranges of its signals, the motion of its joints, its commands' bands."""
     s = recording["sampling"]

@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 
 from sim2real.errors import NotInstalled
+from sim2real.identify.problem.segments import check_log
 from sim2real.installation import has_jax
 from sim2real.robots.contract import RecordedRobot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.check.coverage import coverage
 from sim2real.stages.check.result import Checked
-from sim2real.stages.check.show import show, show_json, show_recording
+from sim2real.stages.check.show import show, show_json, show_recordings
 from sim2real.stages.check.sources import JudgedLogs, find_source
 from sim2real.stages.estimation import recording_advice
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
@@ -68,9 +69,16 @@ def check(
         config = replace(config, log=tuple(str(log.path) for log in logs), plan=False)
         source = JudgedLogs([shown(log.path) for log in logs], [log.episode for log in logs], False)
 
+    for episode in source.episodes:
+        check_log(episode, model)
     if not has_jax():
-        for name, episode in zip(source.names, source.episodes, strict=True):
-            show_recording({"name": name, **coverage(episode, model, dict(robot.units))})
+        show_recordings(
+            [
+                {"name": name, **coverage(episode, model, dict(robot.units))}
+                for name, episode in zip(source.names, source.episodes, strict=True)
+            ],
+            config.json,
+        )
         raise NotInstalled(
             "which parameters this recording determines is computed with JAX, which is not installed here",
             hint=f"copy it to a computer with sim2real: `sim2real check {pipeline.name} --log LOG`",

@@ -16,6 +16,7 @@ from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealErr
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
 from sim2real.graph.node import BaseNode
+from sim2real.hardware.safety.rig import Rig
 from sim2real.installation import has_jax
 from sim2real.later import jax
 from sim2real.log.writer import McapRecorder
@@ -88,7 +89,7 @@ def run_episode(
     state = graph.init(jax.random.key(0) if has_jax() else None, params)
     graph.warmup(state)  # every program is compiled before torque goes on
     # Start the log, and run; an interrupted episode comes to rest before torque goes off.
-    recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig.torque_withheld)
+    recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig)
     watch = Watch(recorder)
     graph.recorder = watch
     try:
@@ -164,7 +165,7 @@ def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str, 
 
 
 def _recorder(
-    pipeline: Pipeline, robot: Robot, graph: AsyncGraph, state: GraphState, log: Path, config: Any, dry: bool
+    pipeline: Pipeline, robot: Robot, graph: AsyncGraph, state: GraphState, log: Path, config: Any, rig: Rig
 ) -> McapRecorder:
     """Return the log's writer, whose metadata describes the session; a dry run comes first."""
     # The graph as the log's metadata describes it.
@@ -183,7 +184,7 @@ def _recorder(
     }
     metadata = {
         "pipeline": pipeline.name,
-        "dry_run": dry,
+        "dry_run": rig.torque_withheld,
         "config": plain(asdict(config)),
         "graph": topology,
         "roles": asdict(robot.roles),
@@ -191,12 +192,13 @@ def _recorder(
         "git": plain(git_state()),
         "seed": config.seed,
         "port": config.port,
+        "hardware": rig.device.facts(),
     }
     # The writer, which starts with a mark if the run is dry.
     inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
     joints, units = {robot.roles.sensor: robot.sensor.joints}, dict.fromkeys(graph.nodes, robot.units)
     recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
-    if dry:
+    if rig.torque_withheld:
         recorder.write_event(
             "dry run", "torque was withheld: no command in this log was sent, and no motor moved a joint"
         )

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
+from sim2real.artifacts.estimation.links import Link
 from sim2real.artifacts.summary import ArtifactTable, Interval
 from sim2real.types import Json
 from sim2real.view import style
 from sim2real.view.blocks import Banner, Block, FigureBlock, ListBlock, NoteBlock, PageSection, TableBlock
+from sim2real.view.identification.links import link_blocks
 from sim2real.view.page.page import write_page
 from sim2real.view.style import BLUE, new_figure, styled, to_svg
 
@@ -20,6 +22,7 @@ _RECIPES = {
     "error": "{measure} of simulation less measurement of {field}, segments {run}, settle_s to {horizon_s:g} s later",
     "quantile": "quantile {q:g} of {signal}",
     "interval": "{scale} scale: mean {mean:.6g}, {deviations:+g} times the deviation {deviation:.4g}",
+    "distribution": "link {link}: mean of delays with their share, or the delay at q = {q}",
     "sum": "estimates of {parameters} added",
     "speed": "quantile {q:g} of the differences of {signal} over those of stamps",
     "model": "{field} of the joint {joint} in model.xml",
@@ -27,12 +30,15 @@ _RECIPES = {
 """Kind of a recipe -> its text."""
 
 
-def model_card_page(card: Mapping[str, Json], signals: Mapping[str, np.ndarray], folder: Path) -> Path:
+def model_card_page(
+    card: Mapping[str, Json], signals: Mapping[str, np.ndarray], folder: Path, links: Sequence[Link] = ()
+) -> Path:
     """Write the page of a card into its folder.
 
     Args:
         card: The document of ``card.json``.
         signals: Arrays of ``signals.npz``.
+        links: Links whose delays' distribution was estimated.
     """
     about, status = card["about"], card["verdict"]["status"]
     blocks: list[Block] = [NoteBlock(text) for text in card["notes"]]
@@ -42,6 +48,7 @@ def model_card_page(card: Mapping[str, Json], signals: Mapping[str, np.ndarray],
         for p in card["parameters"]
     ]
     blocks.append(TableBlock.of("Parameters", ArtifactTable(headers, rows)))
+    blocks += link_blocks(links)
     times = {n.removeprefix("times/"): v for n, v in signals.items() if n.startswith("times/")}
     if times:
         blocks.append(FigureBlock(times_figure(times), "Distribution of the recorded times in the log."))

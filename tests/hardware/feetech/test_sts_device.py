@@ -44,6 +44,18 @@ def test_it_moves_and_measures(serve, connect):
     assert [robot.bus.servos[i].get(reg.TORQUE_ENABLE) for i in IDS] == [0, 0, 0]
 
 
+def test_facts_for_a_log_are_those_of_the_registers(serve, connect):
+    robot = serve(ids=[4], start_rad=[0.0])
+    for register, value in ((reg.FIRMWARE_MINOR, 9), (reg.PRESENT_VOLTAGE, 74), (reg.PRESENT_TEMPERATURE, 41)):
+        robot.bus.servos[4].put(register, value)
+    facts = connect(robot, ids=(4,)).facts()
+    assert facts == {
+        "firmware": {"servo 4": "3.9"},
+        "voltage": {"servo 4": "7.4 V"},
+        "temperature": {"servo 4": "41 °C"},
+    }
+
+
 def test_one_servo_confirms_its_goals(serve, connect):
     device = connect(serve(ids=[4], start_rad=[0.0]), ids=(4,))
     device.enable()

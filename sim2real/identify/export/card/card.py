@@ -54,6 +54,7 @@ def write_card(
     intervals = list(figures.intervals(identification))
     listed = list(figures.errors(identification, [run for run in RUNS if f"{run}/into" in signals]))
     listed += [*figures.quantiles(signals, identification.units), *figures.sums(identification), *intervals]
+    listed += figures.distributions(identification)
     if plain is not None:
         (folder / MODEL).write_text(plain.mjcf, encoding="utf-8")
         listed += figures.of_joints(plain)

@@ -60,6 +60,16 @@ def sums(identification: Identification) -> Iterator[dict[str, Json]]:
         yield figure("sum of the delays", p.estimate, "s", {"kind": "sum", "parameters": parts})
 
 
+def distributions(identification: Identification) -> Iterator[dict[str, Json]]:
+    """Yield mean and 95th percentile of the delays of links, which ``--links`` estimates from the motion."""
+    for link in identification.links:
+        total = " + ".join(link.parts)
+        for label, q, number in (("mean", None, link.mean), ("q95", 0.95, link.p95)):
+            if number.value is not None:
+                recipe = {"kind": "distribution", "link": link.name, "q": q}
+                yield figure(f"{total}, {label} of the messages", number.value, "s", recipe)
+
+
 def of_joints(plain: PlainSimulation) -> Iterator[dict[str, Json]]:
     """Yield the joints' numbers in the model, for a check of ``model.xml``."""
     model = _mj.MjModel.from_xml_string(plain.mjcf)

@@ -204,6 +204,13 @@ class Card:
         values = self.signals[recipe["signal"]]
         return np.quantile(values[np.isfinite(values)], recipe["q"])
 
+    def _distribution(self, recipe: Untyped) -> float:
+        """Mean of the delays of a link, or the delay that a share ``q`` of the messages does not exceed."""
+        delays, share = (self.signals[f"link/{recipe['link']}/{name}"] for name in ("delays", "share"))
+        if recipe["q"] is None:
+            return share @ delays
+        return np.interp(recipe["q"], np.cumsum(share) - 0.5 * share, delays)
+
     def _speed(self, recipe: Untyped) -> float:
         """Quantile of the speed between two measurements of a field, without gaps of the log."""
         took, moved = np.diff(self.signals["stamps"]), np.diff(self.signals[recipe["signal"]])

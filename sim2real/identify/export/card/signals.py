@@ -71,11 +71,18 @@ def held_out_signals(identification: Identification, plain: PlainSimulation) -> 
 
 
 def recorded_signals(identification: Identification) -> dict[str, np.ndarray]:
-    """Return ``log/FIELD``, each measurement once, their ``stamps`` [s], and ``times/KIND/NODE``, in order [s]."""
+    """Return ``log/FIELD``, each measurement once, their ``stamps`` [s], and ``times/KIND/NODE``, in order [s].
+
+    Also ``link/NAME/delays`` [s] and ``link/NAME/share``, the distribution of a link's delay.
+    """
     signals: dict[str, np.ndarray] = {}
+    for link in identification.links:
+        signals |= {f"link/{link.name}/delays": link.delays, f"link/{link.name}/share": link.share}
     if identification.samples:
         once = identification.disjoint()
-        signals = {f"log/{field}": identification.samples[f"{field}_measured"][once] for field in identification.fields}
+        signals |= {
+            f"log/{field}": identification.samples[f"{field}_measured"][once] for field in identification.fields
+        }
         signals["stamps"] = identification.samples["t"][once]
     timing = identification.timing
     if timing is not None:
