@@ -27,20 +27,22 @@ class FigureBlock:
     Attributes:
         svg: The figure as SVG.
         narrow: Whether two such figures fit side by side.
+        phone: The same panels in one column, as SVG, which a telephone shows instead; "" for none.
         kind: Kind of block, for the template.
     """
 
     svg: str
     caption: str
     narrow: bool = False
+    phone: str = ""
     kind: str = "figure"
 
     @property
     def layout(self) -> str:
-        """Class for the style: a ``wide`` figure scrolls on a telephone, where any other one is scaled to fit."""
+        """Class for the style: on a telephone a ``wide`` figure scrolls, and any other one is scaled to fit."""
         drawn = _SVG_WIDTH.search(self.svg)
         wide = drawn is not None and float(drawn[1]) > _WIDE_PT
-        return "narrow" if self.narrow else "wide" if wide else ""
+        return "narrow" if self.narrow else "twice" if self.phone else "wide" if wide else ""
 
 
 @dataclass(frozen=True)

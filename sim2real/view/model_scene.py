@@ -29,6 +29,7 @@ class ModelScene:
         if self._model.nkey:
             self._mj.mj_resetDataKeyframe(self._model, self._data, 0)
         self._places: dict[int, str] = {}
+        self._shapes: dict[bool, dict[int, tuple[Any, Any]]] = {}
         for i in range(self._model.njnt):
             full = self._model.joint(i).name
             name = full if full in columns else full.removesuffix("/joint").rsplit("/", 1)[-1]
@@ -45,13 +46,12 @@ class ModelScene:
             return
         rec.log(entity, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         # Shapes stand still on their bodies.
-        model = self._model
-        drawn = [g for g in range(model.ngeom) if model.geom_rgba[g, 3] > 0.0 and model.geom_group[g] in _GROUPS]
-        shapes = {g: shape for g in drawn if (shape := self._shape(g, ghost)) is not None}
-        for g, shape in shapes.items():
-            at = f"{entity}/body_{self._model.geom_bodyid[g]}/geom_{g}"
-            rec.log(at, rr.Transform3D(**_pose(self._model.geom_pos[g], self._model.geom_quat[g])), static=True)
-            rec.log(at, shape, static=True)
+        if ghost not in self._shapes:
+            self._shapes[ghost] = self._drawn(ghost)
+        shapes = self._shapes[ghost]
+        for g, parts in shapes.items():
+            for part in parts:
+                rec.log(f"{entity}/body_{self._model.geom_bodyid[g]}/geom_{g}", part, static=True)
         # Bodies move, each in the world's frame.
         bodies = sorted({int(self._model.geom_bodyid[g]) for g in shapes} - {0})
         at_m, turned = np.empty((len(t_s), len(bodies), 3)), np.empty((len(t_s), len(bodies), 4))
@@ -64,6 +64,18 @@ class ModelScene:
         for i, body in enumerate(bodies):
             moved = rr.Transform3D.columns(translation=at_m[:, i], quaternion=turned[:, i])
             rec.send_columns(f"{entity}/body_{body}", [time], moved)
+
+    def _drawn(self, ghost: bool) -> dict[int, tuple[Any, Any]]:
+        """Return geometry -> its pose and its shape, which a live view sends once but would make for each call."""
+        import rerun as rr
+
+        model = self._model
+        drawn = [g for g in range(model.ngeom) if model.geom_rgba[g, 3] > 0.0 and model.geom_group[g] in _GROUPS]
+        return {
+            g: (rr.Transform3D(**_pose(model.geom_pos[g], model.geom_quat[g])), shape)
+            for g in drawn
+            if (shape := self._shape(g, ghost)) is not None
+        }
 
     def _shape(self, geom: int, ghost: bool) -> Any:
         """Return a geometry to log; None for planes, height fields and distance fields."""

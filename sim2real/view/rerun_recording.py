@@ -91,10 +91,25 @@ def build(recording: Any, tabs: Sequence[Tab], name: str, scene: Scene | None = 
 
 def send_curve(recording: Any, curve: Curve) -> None:
     """Send a curve and its style."""
-    rr = rerun_module()
-    looks = rr.SeriesLines(names=curve.label, colors=_COLORS.get(curve.look), widths=_WIDTHS.get(curve.look, 1.4))
+    send_style(recording, curve)
+    send_values(recording, curve, time_column(curve.t_s))
+
+
+def send_style(recording: Any, curve: Curve) -> None:
+    """Send the style of a curve, which Rerun needs once."""
+    looks = rerun_module().SeriesLines(
+        names=curve.label, colors=_COLORS.get(curve.look), widths=_WIDTHS.get(curve.look, 1.4)
+    )
     recording.log(curve.entity, looks, static=True)
-    recording.send_columns(curve.entity, [_time(curve.t_s)], rr.Scalars.columns(scalars=curve.values))
+
+
+def send_values(recording: Any, curve: Curve, time: Any) -> None:
+    """Send the values of a curve.
+
+    Args:
+        time: Its times, see ``time_column``.
+    """
+    recording.send_columns(curve.entity, [time], rerun_module().Scalars.columns(scalars=curve.values))
 
 
 def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
@@ -116,14 +131,14 @@ def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
         )
         recording.log(lane, named, static=True)
         times, states = states_of(steps)
-        recording.send_columns(lane, [_time(times)], rr.StateChange.columns(state=states))
+        recording.send_columns(lane, [time_column(times)], rr.StateChange.columns(state=states))
         lines = {f"lateness/{node}": (node, (steps.woken - steps.start) / 1e3)}
         for name, age_s in input_ages(episode, node).items():
             lines[f"age/{node}/{name}"] = f"{name} in {node}", 1e3 * age_s
         for entity, (label, values) in lines.items():
             looks = rr.SeriesLines(names=label, widths=1.2, colors=color)
             recording.log(f"{folder}/{entity}", looks, static=True)
-            times = _time(steps.woken / TICKS_PER_S)
+            times = time_column(steps.woken / TICKS_PER_S)
             recording.send_columns(f"{folder}/{entity}", [times], rr.Scalars.columns(scalars=values))
 
 
@@ -201,5 +216,6 @@ def _page(tab: Tab, with_scene: bool) -> Any:
     return rrb.Horizontal(left, rrb.Vertical(*side, row_shares=shares), column_shares=[3, 2], name=tab.title)
 
 
-def _time(t_s: np.ndarray) -> Any:
+def time_column(t_s: np.ndarray) -> Any:
+    """Return times ``(N,)`` [s] on the only timeline."""
     return rerun_module().TimeColumn(TIMELINE, duration=t_s)

@@ -346,6 +346,7 @@ def test_a_quantity_says_its_unit():
 def test_only_a_wide_figure_scrolls_on_a_telephone(width_pt, narrow, layout):
     svg = f'<svg role="img" aria-label="gain" width="{width_pt}pt" height="90pt"></svg>'
     assert FigureBlock(svg, "caption", narrow).layout == layout
+    assert FigureBlock(svg, "caption", phone=svg).layout == "twice"
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")

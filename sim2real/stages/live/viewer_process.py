@@ -19,8 +19,8 @@ from sim2real.types import Json
 from sim2real.view.live.follower import Follower
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
 
-PERIOD_S = 0.1
-"""Time between two reads; the writer of a log flushes every 0.2 s."""
+PERIOD_S = 0.2
+"""Time between two reads: that of the flushes of a log's writer."""
 NICENESS = 10
 
 

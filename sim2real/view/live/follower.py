@@ -11,7 +11,7 @@ from sim2real.artifacts.progress import BEST_FIT, PROGRESS
 from sim2real.view.live.log_source import LogSource
 from sim2real.view.live.stage_sources import FitSource, ProgressSource
 from sim2real.view.rerun_content import Tab
-from sim2real.view.rerun_recording import Scene, blueprint_of, send_curve
+from sim2real.view.rerun_recording import Scene, blueprint_of, send_style, send_values, time_column
 
 _PATIENCE_S = 0.5
 """The viewer is behind if it does not take the rows of one round within this time [s]; then rows are dropped."""
@@ -42,6 +42,7 @@ class Follower:
         self._sources: dict[Path, GrowingFile] = {}
         self._tabs: dict[Path, Tab] = {}
         self._curves: dict[Path, set[str]] = {}
+        self._styled: set[str] = set()
         self._first_ns: int | None = None
         self._dropped = 0
 
@@ -77,8 +78,15 @@ class Follower:
         if not curves <= self._curves.get(path, set()):
             self._curves[path], self._tabs[path] = curves, tab
             self._recording.send_blueprint(blueprint_of(list(self._tabs.values()), self._scene is not None))
+        # Curves of a node share their times. A column of times, or a style, takes longer to make than to send.
+        columns: dict[int, Any] = {}
         for curve in (c for curves in tab.plots.values() for c in curves):
-            send_curve(self._once, curve)
+            if curve.entity not in self._styled:
+                self._styled.add(curve.entity)
+                send_style(self._recording, curve)
+            if id(curve.t_s) not in columns:
+                columns[id(curve.t_s)] = time_column(curve.t_s)
+            send_values(self._recording, curve, columns[id(curve.t_s)])
         for motion in tab.motions if self._scene else ():
             if self._scene and len(motion.t_s):
                 self._scene(self._once, motion.t_s, motion.columns, motion.entity, motion.ghost)

@@ -73,6 +73,8 @@ def _thinned(episode: Episode) -> tuple[Episode, dict[str, np.ndarray]]:
 
 
 def _moved(tab: Tab, offset_s: float) -> Tab:
-    """Return a tab with all times moved."""
-    plots = {title: [replace(c, t_s=c.t_s + offset_s) for c in curves] for title, curves in tab.plots.items()}
+    """Return a tab with all times moved; curves that share their times still do."""
+    every = {id(c.t_s): c.t_s for curves in tab.plots.values() for c in curves}
+    moved = {number: t_s + offset_s for number, t_s in every.items()}
+    plots = {title: [replace(c, t_s=moved[id(c.t_s)]) for c in curves] for title, curves in tab.plots.items()}
     return replace(tab, plots=plots, motions=[replace(m, t_s=m.t_s + offset_s) for m in tab.motions])

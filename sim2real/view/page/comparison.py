@@ -25,7 +25,8 @@ def comparison_page(comparison: Comparison, path: Path) -> Path:
     blocks: list[Block] = []
     if comparison.parameters:
         caption = "Estimates with 95 % intervals. A parameter with an orange title differs beyond chance."
-        blocks.append(FigureBlock(parameters_figure(comparison, "comparison"), caption))
+        wide, phone = (parameters_figure(comparison, f"comparison-{n}", n) for n in (_COLUMNS, 1))
+        blocks.append(FigureBlock(wide, caption, phone=phone))
     blocks.append(TableBlock.of("Verdicts, errors and scores", comparison.figures()))
     blocks.append(TableBlock.of("Parameters: estimate and half-width of the 95 % interval", comparison.rows()))
     names = ", ".join(run.name for run in comparison.runs)
@@ -33,10 +34,10 @@ def comparison_page(comparison: Comparison, path: Path) -> Path:
     return write_page(path, "comparison", [section])
 
 
-def parameters_figure(comparison: Comparison, name: str) -> str:
+def parameters_figure(comparison: Comparison, name: str, columns: int) -> str:
     """Draw a panel for each parameter with the estimate and interval of each run, as SVG."""
     count = len(comparison.parameters)
-    columns = min(_COLUMNS, count)
+    columns = min(columns, count)
     rows = -(-count // columns)
     with styled():
         figure = new_figure(0.6 + rows * (0.7 + 0.16 * len(comparison.runs)), style.WIDTH_IN * columns / _COLUMNS)

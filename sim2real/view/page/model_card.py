@@ -12,12 +12,13 @@ from sim2real.artifacts.estimation.links import Link
 from sim2real.artifacts.summary import ArtifactTable, Interval
 from sim2real.types import Json
 from sim2real.view import style
-from sim2real.view.blocks import Banner, Block, FigureBlock, ListBlock, NoteBlock, PageSection, TableBlock
+from sim2real.view.blocks import Banner, Block, FigureBlock, ListBlock, NoteBlock, PageSection, TableBlock, sentence
 from sim2real.view.identification.links import link_blocks
 from sim2real.view.page.page import write_page
 from sim2real.view.style import BLUE, new_figure, styled, to_svg
 
 PAGE = "card.html"
+_COLUMNS = 3
 _RECIPES = {
     "error": "{measure} of simulation less measurement of {field}, segments {run}, settle_s to {horizon_s:g} s later",
     "quantile": "quantile {q:g} of {signal}",
@@ -51,7 +52,8 @@ def model_card_page(
     blocks += link_blocks(links)
     times = {n.removeprefix("times/"): v for n, v in signals.items() if n.startswith("times/")}
     if times:
-        blocks.append(FigureBlock(times_figure(times), "Distribution of the recorded times in the log."))
+        wide, phone = (times_figure(times, columns) for columns in (_COLUMNS, 1))
+        blocks.append(FigureBlock(wide, "Distribution of the recorded times in the log.", phone=phone))
     blocks.append(ListBlock("Not known", card["unknown"] or ["every parameter of the model was identified"]))
     blocks.append(ListBlock("Firmware, supply and temperature", [f"{n}: {v}" for n, v in card["session"].items()]))
     if card["simulation"]:
@@ -61,11 +63,12 @@ def model_card_page(
     figures: list[list[Json]] = [[f["name"], f["value"], f["unit"], recipe_text(f["recipe"])] for f in card["figures"]]
     caption = "Figures: the motion and times that the log covers, and errors to expect"
     blocks.append(TableBlock.of(caption, ArtifactTable(("figure", "value", "unit", "recipe"), figures)))
+    reasons = [sentence(reason) for reason in card["verdict"]["reasons"]]
     tone = "good" if status == "accepted" else "doubt"
     lead = (
         "python reproduce.py computes each figure again with numpy and MuJoCo alone, from the files beside this page."
     )
-    section = PageSection("card", "Model card", lead, (), blocks, Banner(tone, status, card["verdict"]["reasons"]))
+    section = PageSection("card", "Model card", lead, (), blocks, Banner(tone, status.capitalize(), reasons))
     return write_page(folder / PAGE, about["pipeline"], [section], version=about["sim2real"])
 
 
@@ -75,12 +78,12 @@ def recipe_text(recipe: Mapping[str, Json]) -> str:
     return _RECIPES[recipe["kind"]].format(**texts)
 
 
-def times_figure(times: Mapping[str, np.ndarray]) -> str:
+def times_figure(times: Mapping[str, np.ndarray], columns: int) -> str:
     """Draw a histogram of each series of times, as SVG."""
-    names, columns = list(times), min(3, len(times))
+    names, columns = list(times), min(columns, len(times))
     rows = -(-len(names) // columns)
     with styled():
-        figure = new_figure(0.4 + 1.2 * rows, style.WIDTH_IN * columns / 3)
+        figure = new_figure(0.4 + 1.2 * rows, style.WIDTH_IN * columns / _COLUMNS)
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
         for axes in grid[len(names) :]:
             axes.set_visible(False)
@@ -90,7 +93,7 @@ def times_figure(times: Mapping[str, np.ndarray]) -> str:
             axes.set_xlabel("ms")
             axes.set_yticks([])
             axes.xaxis.set_major_locator(MaxNLocator(4))
-        return to_svg(figure, "card-times", f"Histograms of {', '.join(names)}")
+        return to_svg(figure, f"card-times-{columns}", f"Histograms of {', '.join(names)}")
 
 
 def _numbers(simulation: Mapping[str, Json]) -> ArtifactTable:
