@@ -142,6 +142,16 @@ def test_a_needed_term_is_tried_before_those_that_predictions_propose(linear):
     assert ("idle",) not in fits.tried[:2]
 
 
+@pytest.mark.parametrize(("share", "tried"), [(0.4, ("real", "once")), (0.6, ("real",))])
+def test_a_model_that_is_clearly_worse_is_tried_with_all_needed_terms_at_a_time(linear, share, tried):
+    fits, needed = Fits(linear), [TABLE.terms.index(n) for n in ("real", "once")]
+    worst = fits.attempt(terms(), [np.zeros(6)], np.inf).loss
+    fits.tried.clear()
+    assert select(fits.grown(needed=needed, least=share * worst)).names(TABLE) == ("real",)
+    assert fits.tried[1] == tried
+    assert ("real",) in fits.tried
+
+
 class WithLimit(ParameterTable):
     """The table, in which ``once`` is a limit."""
 

@@ -9,6 +9,7 @@ import pytest
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.fit import fit
 from sim2real.identify.problem.segments import Span
+from sim2real.identify.validation import folds, thinned
 from sim2real.identify.validation.folds import folds_of
 from sim2real.identify.validation.optional_terms import select
 from sim2real.identify.validation.refits import Refits
@@ -55,14 +56,24 @@ def recorded(tmp_path_factory):
     return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
 
 
-def test_auto_finds_that_the_controller_carries_the_weight(recorded):
+@pytest.mark.parametrize("kept", [5, 3])
+def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch, kept):
+    """Sets of terms are compared on fewer segments where all would take long: a part has as many errors as ever."""
     robot, episode = recorded
     config = IdentifyConfig(terms="auto", generations=0, folds=3, max_delay_s=0.02, free_run_s=0.0)
     model = held_out_parts.offering(robot, "gravcomp").identifiable(0.02)
     table = model.parameters.with_terms(["gravcomp"])
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     widest = fit(model, [episode], spans, 0.6, config, table)
-    every = Trials(widest, folds_of(widest.problem, 3), config.settle_s, config.free_run_s, Refits()).grown()
+    monkeypatch.setattr(thinned, "MOST_STEPS", kept * 0.6 / STEP_S * len(widest.problem.table) + 1)
+    parts, sets = folds_of(widest.problem, 3), []
+    trials = Trials(widest, parts, config.settle_s, config.free_run_s, Refits(), sets.append)
+    simulated, ahead = [], folds._ahead
+    monkeypatch.setattr(folds, "_ahead", lambda windows, *rest: (simulated.append(windows), ahead(windows, *rest))[1])
+    every = trials.grown()
+    assert trials.segments == kept
+    assert sets[:2] == ["no term", "gravcomp"]
+    assert {len(windows.train) for windows in simulated} == {5}
     chosen = select(every)
     assert chosen.names(table) == ("gravcomp",)
     values = table.decode(chosen.near[0].z, table.of_terms(chosen.near[0].present))

@@ -59,8 +59,12 @@ class Evaluator(Protocol):
         """Return the losses of a generation, in the form that ``search`` takes."""
         ...
 
-    def lively(self, data: Data) -> Data:
-        """Return the data with the segments in which the channels move most, which suffice for a start."""
+    def lively(self, data: Data, most: int | None = None) -> Data:
+        """Return the data with the segments in which the channels move most.
+
+        Args:
+            most: Number of segments; default: as many as suffice for a start.
+        """
         ...
 
     def predict(self, values: Any, eps: np.ndarray, fit_s: np.ndarray, data: Data) -> tuple[np.ndarray, np.ndarray]:
@@ -118,7 +122,7 @@ class CompiledEvaluator:
         del data
         return self._residuals.losses
 
-    def lively(self, data: Data) -> Data:
+    def lively(self, data: Data, most: int | None = None) -> Data:
         """See ``Evaluator``: all, as a program simulates the segments without weight, too."""
         return data
 

@@ -135,7 +135,7 @@ class OutsideEvaluator:
 
         return losses
 
-    def lively(self, data: Data) -> Data:
+    def lively(self, data: Data, most: int | None = None) -> Data:
         """See ``Evaluator``: segments of each channel in turn, and one of each recording.
 
         These suffice for a search: all 23 segments of an arm took 2.6 times as long.
@@ -152,9 +152,9 @@ class OutsideEvaluator:
         recordings = np.asarray(data.recording)[segments]
         firsts = np.unique(recordings, return_index=True)[1]
         turns = dict.fromkeys([*firsts.tolist(), *order.tolist()])
-        most = max(_SEARCHED, 2 * len(reaches), len(firsts))
+        count = max(most or max(_SEARCHED, 2 * len(reaches)), len(firsts))
         weight = np.zeros(len(data.fitted), np.float32)
-        weight[live[list(turns)[:most]]] = 1.0
+        weight[live[list(turns)[:count]]] = 1.0
         return data._replace(weight=weight)
 
     def losses_with(self, candidates: np.ndarray, states: InitialState | None, data: Data) -> np.ndarray:

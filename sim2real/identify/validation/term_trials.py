@@ -28,6 +28,7 @@ from sim2real.identify.validation.optional_terms import (
 )
 from sim2real.identify.validation.prediction import labels
 from sim2real.identify.validation.refits import Refits
+from sim2real.identify.validation.thinned import thinned
 
 _SHARES = (1.0, 0.25, 0.06)
 """Shares of the linear step without a part that are simulated; the best begins the descent without that part."""
@@ -57,11 +58,12 @@ def grown(
     starts: Sequence[np.ndarray],
     limited: Limited = lambda trial, present: (),
     needed: Sequence[int] = (),
+    least: float = np.inf,
 ) -> list[Trial]:
     """Return the fits of sets of terms: none, then larger ones as long as held-out parts are predicted better.
 
     Each round fits sets with one or two further terms that the quadratic approximation around the smaller set proposes,
-    and with the term that the fit of all terms needs most. Then the subsets of the selected set are fitted that lack
+    and with the terms that the fit of all terms needs. Then the subsets of the selected set are fitted that lack
     one of its terms.
 
     Args:
@@ -70,6 +72,7 @@ def grown(
         limited: A limit that does not act has no derivative, so no approximation proposes it: it gets its own starts.
         needed: Terms that the fit of all terms needs, the most needed one first: where a model without a term ends far
             away, as one that compensates no weight, an approximation around it proposes another term.
+        least: Loss of the fit of all terms; a set that is clearly worse is tried with all needed terms at a time.
     """
     none = np.zeros(len(table.terms), bool)
     base = attempt(none, starts, np.inf)
@@ -77,7 +80,9 @@ def grown(
     # Add terms until the errors on held-out parts stay.
     while not base.present.all():
         stats, level = wider(base), list[Trial]()
-        first = [base.present | (np.arange(len(none)) == i) for i in needed if not base.present[i]][:1]
+        lacks = [i for i in needed if not base.present[i]]
+        first = [base.present | np.isin(np.arange(len(none)), some) for some in (lacks, lacks[:1]) if some]
+        first = first if len(lacks) > 1 and base.loss > _CLEAR * least else first[1:]
         proposed = [p for p in _proposed(stats, table, base.present) if not any(np.array_equal(p, q) for q in first)]
         for present in [*first, *proposed]:
             if len(level) > 1 and better(_best(level).ahead, base.ahead):
@@ -155,6 +160,7 @@ class Trials:
         settle_s: First part of a prediction, to which its initial state is fitted [s].
         free_run_s: Longest free run [s]; 0 skips the free runs.
         refits: Finished refits; None: estimates without a part are linear steps, which suffices to rank terms.
+        on_set: Called with the names of each set before it is fitted.
     """
 
     def __init__(
@@ -164,12 +170,20 @@ class Trials:
         settle_s: float,
         free_run_s: float,
         refits: Refits | None = None,
+        on_set: Callable[[str], None] = lambda names: None,
     ) -> None:
+        self._on_set = on_set
         self._estimate, self._parts, self._times = estimate, parts, (settle_s, free_run_s)
         self._refits = refits
-        self._problem, self._masks = estimate.problem, folds.masks(estimate.problem, parts)
-        self._least = estimate.loss
+        self._problem = thinned(estimate.problem, parts)
+        self._masks = folds.masks(self._problem, parts)
+        self._least = estimate.loss if self._problem is estimate.problem else self._problem.loss(estimate.z)
         self._sigma = dict(zip(labels(self._problem), (s for _, s, _ in self._problem.fields), strict=True))
+
+    @property
+    def segments(self) -> int:
+        """Number of segments that sets are fitted to: fewer than all where these would take long."""
+        return len(self._problem.train)
 
     def singles(self, z: np.ndarray, present: np.ndarray) -> list[Trial]:
         """Return the fit of a set of terms, and those with the further terms that may help most, one each.
@@ -195,7 +209,7 @@ class Trials:
         """Return the fits of ``grown``."""
         table = self._problem.table
         starts = [self._estimate.z, *table.starts()]
-        return grown(self.attempt, self.wider, table, starts, self.limited, self.needed())
+        return grown(self.attempt, self.wider, table, starts, self.limited, self.needed(), self._least)
 
     def needed(self) -> list[int]:
         """Return the terms without which the fit of all terms predicts held-out parts worse, the most needed first."""
@@ -234,6 +248,7 @@ class Trials:
         problem, table = self._problem, self._problem.table
         columns = table.of_terms(present)
         data, names = problem.part(present=columns), self._names(present)
+        self._on_set(", ".join(names) or "no term")
         stored = self._refits.whole(names, problem, data) if self._refits else None
         z, loss = stored or self._descended(present, starts, most, data)
         at = linearise(problem, z, data)

@@ -50,6 +50,7 @@ from sim2real.robots.from_model.mjcf_parameters import (
     tilted,
 )
 from sim2real.robots.from_model.plain import driven_simulation
+from sim2real.robots.from_model.ranges import beyond_ranges
 from sim2real.robots.from_model.reached import Recordings, reached
 from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
 from sim2real.types import PyTree, Scalar
@@ -203,9 +204,14 @@ class MjcfRobot(LoggedRobot):
         return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
 
     def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
-        """Return a sentence on recorded positions at which a loop of the model cannot close."""
-        position = np.asarray(outputs[self.roles.sensor]["position"], np.float64)
-        return open_loops(self.make_nodes()[2].gaps, position, self.config.joints, self.config.model.name)
+        """Return a sentence on recorded positions beyond a joint's range, or at which a loop of the model cannot close.
+
+        Raises:
+            UsageError: When a joint moves further than its range is wide.
+        """
+        position, file = np.asarray(outputs[self.roles.sensor]["position"], np.float64), self.config.model.name
+        beyond = beyond_ranges(self.model, self.config.joints, position, file)
+        return [*beyond, *open_loops(self.make_nodes()[2].gaps, position, self.config.joints, file)]
 
     def with_optional_terms(self, wanted: str = "all") -> MjcfRobot:
         """Return the robot with optional terms to choose from; a step of its simulation then takes longer.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -70,7 +70,11 @@ def having(robot: RecordedRobot, names: Sequence[str]) -> RecordedRobot:
 
 
 def chosen(
-    estimate: Fit, config: IdentifyConfig, names: Sequence[str], refits: Refits | None = None
+    estimate: Fit,
+    config: IdentifyConfig,
+    names: Sequence[str],
+    refits: Refits | None = None,
+    on_set: Callable[[str], None] = lambda names: None,
 ) -> optional_terms.Selection:
     """Return the optional terms without which held-out parts are predicted worse.
 
@@ -78,9 +82,14 @@ def chosen(
         estimate: The fit with all optional terms.
         names: A name for each recording; recordings of different names are different parts.
         refits: Finished refits, which are not computed again.
+        on_set: Called with the names of each set of terms before it is fitted.
     """
     parts = parts_of(estimate, config, names, _LEAST_TO_CHOOSE)
-    trials = Trials(estimate, parts, config.settle_s, config.free_run_s, refits or Refits())
+    trials = Trials(estimate, parts, config.settle_s, config.free_run_s, refits or Refits(), on_set)
+    if trials.segments < (count := len(estimate.problem.train)):
+        note(
+            f"sets of terms are compared on {trials.segments} of {count} segments, those with most motion"
+        )
     return optional_terms.select(trials.grown())
 
 

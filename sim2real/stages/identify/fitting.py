@@ -71,8 +71,9 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     if not auto:
         return Fits(widest, widest, None)
     # Select the terms without which held-out parts are predicted worse.
-    with progress(None, "identify: sets of terms"):
-        selection = patiently(lambda: held_out_parts.chosen(widest, config, inputs.names, inputs.refits))
+    with progress(None, "identify: sets of terms") as bar:
+        on_set = bar.set_postfix_str
+        selection = patiently(lambda: held_out_parts.chosen(widest, config, inputs.names, inputs.refits, on_set))
     terms: Sequence[str] = selection.names(widest.problem.table)
     # Refine the model with the selected terms. A value fixed by a flag stays fixed, in whichever term the parameter is;
     # the parameters of all other terms have their values without the term.

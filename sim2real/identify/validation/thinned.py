@@ -1,0 +1,47 @@
+"""Fewer segments for fits that are compared with each other, where a Jacobian of all of them takes long."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
+from sim2real.identify.validation.folds import Fold, masks
+
+MOST_STEPS = 5e6
+"""Steps of single joints in a Jacobian from which segments are left out: about 5 s on two cores."""
+_FEWEST = 2
+"""Fewest segments of a channel that are kept."""
+
+
+def thinned(problem: Problem, parts: Sequence[Fold]) -> Problem:
+    """Return a problem with the segments of each part in which the channels move most, if all would take long.
+
+    Args:
+        parts: Held out one at a time; each keeps a segment at least.
+    """
+    model, channels = problem.engine.model, len(problem.channels)
+    if model is None:  # a program simulates segments without weight, too
+        return problem
+    steps = problem.segment_s / float(model.opt.timestep) * int(model.nv) * len(problem.table)
+    keep = max(int(MOST_STEPS / steps), _FEWEST * channels, len(parts))
+    if keep >= len(problem.train):
+        return problem
+    return problem.recut(_liveliest(problem, parts, keep), problem.segment_s)
+
+
+def _liveliest(problem: Problem, parts: Sequence[Fold], keep: int) -> list[Span]:
+    """Return the spans of about ``keep`` segments, as many of each part, and those that are not fitted."""
+    place = np.arange(len(problem.train))
+    kept = np.zeros(len(place), bool)
+    for touched in masks(problem, parts):
+        others = problem.train[~touched]
+        weight = np.asarray(problem.evaluator.lively(problem.part(others), -(-keep // len(parts))).weight)
+        kept |= weight[: len(place)] > 0.0
+    return [problem.spans[i] for i in sorted({*problem.train[kept].tolist(), *_held_out(problem)})]
+
+
+def _held_out(problem: Problem) -> list[int]:
+    return [i for i, span in enumerate(problem.spans) if not span.fitted]

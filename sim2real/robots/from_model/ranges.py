@@ -1,0 +1,41 @@
+"""Recorded positions beyond the ranges of a model's joints, where its limits would push them back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.types import MjModel
+
+_WIDER = 1.1
+"""Ratio of a joint's motion to its range from which the range is wrong, whichever zero the log has."""
+_BEYOND, _OFTEN = 0.1, 0.05
+"""How far beyond a range positions count, as a share of its width; share of samples there from which they do."""
+
+
+def beyond_ranges(model: MjModel, joints: Sequence[str], position: np.ndarray, file: str) -> list[str]:
+    """Return a sentence on joints whose recorded positions ``(N, joints)`` often lie beyond the model's range.
+
+    Raises:
+        UsageError: When a joint moves further than its range is wide.
+    """
+    sentences = []
+    for i, joint in enumerate(joints):
+        number = model.joint(joint).id
+        low, high = model.jnt_range[number]
+        if not model.jnt_limited[number]:
+            continue
+        first, last = np.nanquantile(position[:, i], (0.02, 0.98))
+        moves = f"{joint} goes from {first:.3g} to {last:.3g} in the log, and its range in {file} is {low:.3g} to"
+        if last - first > _WIDER * (high - low):
+            raise UsageError(
+                f"{moves} {high:.3g}: the model cannot move that far",
+                hint='MJCF takes ranges in degrees, unless it has <compiler angle="radian"/>; or check the log\'s unit',
+            )
+        room = _BEYOND * (high - low)
+        often = float(np.mean((position[:, i] < low - room) | (position[:, i] > high + room)))
+        if often > _OFTEN:
+            sentences.append(f"{moves} {high:.3g}: it lies beyond in {often:.0%} of the samples; check zero and sign")
+    return sentences
