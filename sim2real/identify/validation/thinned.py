@@ -11,7 +11,7 @@ from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.folds import Fold, masks
 
 MOST_STEPS = 5e6
-"""Steps of single joints in a Jacobian from which segments are left out: about 5 s on two cores."""
+"""Steps of single joints in a Jacobian from which fewer segments are taken: about 5 s on two cores."""
 _FEWEST = 2
 """Fewest segments of a channel that are kept."""
 

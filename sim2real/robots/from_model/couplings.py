@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +10,6 @@ import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.types import MjModel
-
-_CHECKED, _OPEN = 100, 5e-3
-"""Number of recorded positions at which loops must close, and the largest error of a closed one [m or rad]."""
 
 
 @dataclass(frozen=True)
@@ -126,18 +123,3 @@ def _named(kind: str, element: Any) -> str:
     return (
         f"{kind} {element.name!r}" if element.name else f"{'an' if kind[0] in 'aeiou' else 'a'} {kind} without a name"
     )
-
-
-def open_loops(
-    gaps_of: Callable[[np.ndarray], np.ndarray], position: np.ndarray, joints: Sequence[str], file: str
-) -> list[str]:
-    """Return a sentence on recorded positions ``(N, joints)`` at which a loop of the model cannot close."""
-    some = position[:: max(len(position) // _CHECKED, 1)]
-    gaps = gaps_of(some)
-    if not (stays := gaps > _OPEN).any():
-        return []
-    worst = ", ".join(f"{n} {x:.3g}" for n, x in zip(joints, some[gaps.argmax()], strict=True))
-    return [
-        f"the loops of {file} cannot close at {stays.mean():.0%} of the recorded positions; the largest gap is "
-        f"{gaps.max():.3g} (m or rad), at {worst}: check order, signs, units and zeros of the joints"
-    ]

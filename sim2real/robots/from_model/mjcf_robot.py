@@ -18,7 +18,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.log.toml_text import toml_value
-from sim2real.robots.from_model.couplings import open_loops
+from sim2real.robots.from_model.doubts import beyond_ranges, open_loops
 from sim2real.robots.from_model.encoders import EncoderParams, Encoders
 from sim2real.robots.from_model.holding import Holding
 from sim2real.robots.from_model.mjcf import (
@@ -50,7 +50,6 @@ from sim2real.robots.from_model.mjcf_parameters import (
     tilted,
 )
 from sim2real.robots.from_model.plain import driven_simulation
-from sim2real.robots.from_model.ranges import beyond_ranges
 from sim2real.robots.from_model.reached import Recordings, reached
 from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
 from sim2real.types import PyTree, Scalar

@@ -87,9 +87,7 @@ def chosen(
     parts = parts_of(estimate, config, names, _LEAST_TO_CHOOSE)
     trials = Trials(estimate, parts, config.settle_s, config.free_run_s, refits or Refits(), on_set)
     if trials.segments < (count := len(estimate.problem.train)):
-        note(
-            f"sets of terms are compared on {trials.segments} of {count} segments, those with most motion"
-        )
+        note(f"sets of terms are compared on {trials.segments} of {count} segments, those with most motion")
     return optional_terms.select(trials.grown())
 
 

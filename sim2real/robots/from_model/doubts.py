@@ -1,14 +1,16 @@
-"""Recorded positions beyond the ranges of a model's joints, where its limits would push them back."""
+"""Recorded positions that a model cannot have: beyond the ranges of joints, or where a loop is open."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.types import MjModel
 
+_CHECKED, _OPEN = 100, 5e-3
+"""Number of recorded positions at which loops must close, and the largest error of a closed one [m or rad]."""
 _WIDER = 1.1
 """Ratio of a joint's motion to its range from which the range is wrong, whichever zero the log has."""
 _BEYOND, _OFTEN = 0.1, 0.05
@@ -39,3 +41,18 @@ def beyond_ranges(model: MjModel, joints: Sequence[str], position: np.ndarray, f
         if often > _OFTEN:
             sentences.append(f"{moves} {high:.3g}: it lies beyond in {often:.0%} of the samples; check zero and sign")
     return sentences
+
+
+def open_loops(
+    gaps_of: Callable[[np.ndarray], np.ndarray], position: np.ndarray, joints: Sequence[str], file: str
+) -> list[str]:
+    """Return a sentence on recorded positions ``(N, joints)`` at which a loop of the model cannot close."""
+    some = position[:: max(len(position) // _CHECKED, 1)]
+    gaps = gaps_of(some)
+    if not (stays := gaps > _OPEN).any():
+        return []
+    worst = ", ".join(f"{n} {x:.3g}" for n, x in zip(joints, some[gaps.argmax()], strict=True))
+    return [
+        f"the loops of {file} cannot close at {stays.mean():.0%} of the recorded positions; the largest gap is "
+        f"{gaps.max():.3g} (m or rad), at {worst}: check order, signs, units and zeros of the joints"
+    ]
