@@ -84,6 +84,7 @@ class Course:
         moved: Range of the column in the first and in the second half of the episode.
         least: Smallest range of any simulation in each half.
         most: Largest range of any simulation in each half.
+        paused_s: Time that the nodes lost in steps of at least two periods [s]; simulations have no such steps.
     """
 
     episode: int
@@ -92,6 +93,7 @@ class Course:
     moved: tuple[float, ...]
     least: tuple[float, ...]
     most: tuple[float, ...]
+    paused_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 
 pytestmark = pytest.mark.realtime
@@ -39,3 +40,13 @@ def test_misses_in_a_row_are_no_lost_bus_while_they_are_short(start_robot, open_
     robot = start_robot(config=EmulatorConfig(reply_loss=0.7, seed=1))
     bus = open_bus(robot, max_silence_s=0.2)
     assert max(bus.read_state().transaction.retries for _ in range(12)) >= 5
+
+
+def test_a_late_answer_is_not_that_of_another_register(start_robot, open_bus):
+    """Registers of one, two and four bytes in turn: the answer to a repeated read has the length of the next one's."""
+    robot = start_robot(config=EmulatorConfig(late=0.5, late_s=0.03, seed=2))
+    bus = open_bus(robot, max_silence_s=3.0)
+    registers = (reg.MODEL_NUMBER, reg.FIRMWARE_VERSION, reg.PWM_LIMIT, reg.ID, reg.VELOCITY_LIMIT)
+    for register in registers * 5:
+        assert bus.read(1, register) == register.default, register.name
+    assert bus.counters.late_replies >= 3

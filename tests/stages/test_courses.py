@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.deployment import Deployment, Replay, Scores
-from sim2real.stages.deploy.trajectories import courses, off_course
+from sim2real.graph.episode import Episode, Steps
+from sim2real.stages.deploy.trajectories import courses, lost_s, off_course
 
 T = np.arange(0.0, 10.0, 0.02)
 ROW = Replay("hinge", "rad", 0.1, {}, 0.007, column="th", free_run=0.01)
@@ -21,8 +22,8 @@ def swing(rest, late_s=0.0, creep=0.0, sign=1.0):
 
 
 def sentences(real, simulated, row=ROW, column="th"):
-    own = courses([(T, {column: real})], [(T, {column: s}) for s in simulated], UNITS)
-    return list(off_course(Deployment((Scores({}),), (), replay=(replace(row, column=column),), courses=own)))
+    own = courses([(T, {column: real})], [(T, {column: s}) for s in simulated], UNITS, [0.0])
+    return list(off_course(Deployment((Scores({}),), (), replay=(replace(row, column=column),), courses=own), False))
 
 
 SIMULATED = [swing(rest, late_s) for rest, late_s in ((0.0, 0.0), (0.01, 0.02), (0.02, 0.04), (0.015, 0.01))]
@@ -60,13 +61,25 @@ def test_a_slide_has_no_turns():
 
 @pytest.mark.parametrize("row", [replace(ROW, promised=None), replace(ROW, column="other")])
 def test_without_a_promise_nothing_is_judged(row):
-    own = courses([(T, {"th": swing(0.5)})], [(T, {"th": s}) for s in SIMULATED], UNITS)
-    assert not list(off_course(Deployment((Scores({}),), (), replay=(row,), courses=own)))
+    own = courses([(T, {"th": swing(0.5)})], [(T, {"th": s}) for s in SIMULATED], UNITS, [0.0])
+    assert not list(off_course(Deployment((Scores({}),), (), replay=(row,), courses=own), False))
+
+
+def test_time_is_lost_in_steps_of_two_periods_or_more():
+    at = np.arange(0, 4_000_000, 20_000)
+    late = np.where(at >= 2_000_000, at + 400_000, at + 5_000 * (at == 1_000_000))  # one pause, and one late step
+    nodes = {
+        name: Steps(scheduled=t, start=t, woken=t, ts_overwrite=0 * t - 1, end=t + 1000, drift=0 * t)
+        for name, t in (("sensor", at), ("agent", late))
+    }
+    recorded = Episode(steps=nodes, messages={}, outputs={})
+    assert lost_s(recorded, ["sensor"]) == 0.0
+    assert lost_s(recorded, ["sensor", "agent"]) == pytest.approx(0.4)
 
 
 def test_each_episode_is_beside_its_own_simulations():
     real = [(T, {"th": swing(rest)}) for rest in (0.0, 1.0)]
     simulated = [(T[::2] + 0.005, {"th": swing(float(k % 2))[::2], "thdot": T[::2]}) for k in range(8)]
-    rows = courses(real, simulated, UNITS)
+    rows = courses(real, simulated, UNITS, [0.0] * len(real))
     assert [r.episode for r in rows] == [0, 1]
     assert max(r.beside for r in rows) < 0.01

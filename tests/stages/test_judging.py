@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.deployment import Advice, Deployment, Gap, Replay, Scores
+from sim2real.artifacts.deployment import Advice, Course, Deployment, Gap, Replay, Scores
 from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
@@ -66,6 +66,23 @@ def test_one_finding_decides(found, status, said):
     assert told.status == status
     assert said in told.reasons[0]
     assert told.joint == ("hinge" if status == "look at this joint" else "")
+
+
+def test_an_episode_that_paused_is_no_evidence_against_the_model(folder):
+    """Its simulations have no pauses; another one that differs as much without a pause is evidence."""
+    off = Course(1, "th", 0.2, (1.0, 1.0), (1.0, 1.0), (1.0, 1.0), paused_s=0.41)
+    found = replace(deployed(), replay=(replace(deployed().replay[0], column="th"),), courses=(off,))
+    told = verdict.verdict(found, BUNDLE)
+    assert told.status == "not judged"
+    assert told.reasons[0] == "episode 1 lost 0.41 s to pauses of its nodes, and no simulation has such pauses"
+    assert "hinge in episode 1 is 0.2 rad or more beside all simulations" in told.reasons[1]
+    again = with_command(told, load_pipeline("pendulum"), IDENTIFIED, folder, found)
+    assert again.next == "sim2real deploy pendulum --run runs/pendulum/T"
+    slow = replace(deployed(took_s=0.004), replay=found.replay, courses=(off,))
+    assert verdict.verdict(slow, BUNDLE).status == "re-train"
+    for paused_s in (0.0, 0.09):
+        short = replace(found, courses=(replace(off, paused_s=paused_s), replace(off, episode=0)))
+        assert verdict.verdict(short, BUNDLE).status == "re-identify"
 
 
 def test_what_has_most_likely_changed_is_said_where_the_model_is_off_and_no_test_is_sure():

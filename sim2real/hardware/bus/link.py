@@ -31,7 +31,8 @@ _FORCED_ATTEMPTS: Final = 5
 _MIN_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
 _PADS: Final = 4
 _SCANNED: Final = 20
-_CONFIRMING_BYTES: Final = 14  # no other read is as long, so a late answer to another read cannot confirm
+_CONFIRMING_BYTES: Final = 17  # no other read is as long, so a late answer to another read cannot confirm
+_BARRIER_BYTES: Final = (18, 19)  # in turn, so that a late answer to the barrier before is none to this one
 
 
 class ServoLink(ABC):
@@ -64,7 +65,8 @@ class ServoLink(ABC):
         self._lock = threading.Lock()
         self._parser = Parser(self.form)
         self._waiting: list[Packet] = []
-        self._pad = 0
+        self._pad = self._barriers = 0
+        self._unheard: set[int] = set()  # lengths of answers that are missing and may still come
         self._sent_ns = 0
         self._serial = open_port(config)
         self.fd = cast(int, self._serial.fileno())
@@ -227,7 +229,10 @@ class ServoLink(ABC):
                     self.guardian.beat()
                 packet, length = instruction()
                 try:
-                    answers = self._attempt(packet, servo_ids, length)
+                    answers = None
+                    if not servo_ids or length not in self._unheard or self._passed(servo_ids[-1]):
+                        answers = self._attempt(packet, servo_ids, length)
+                        self._unheard |= {length} if answers is None else set()
                 except OSError as failure:
                     self._require_watching()
                     raise HardwareLost(f"{self.config.port} failed during {request}: {failure}") from failure
@@ -247,6 +252,16 @@ class ServoLink(ABC):
             if answer.error and not despite_error:
                 self.require_fine(answer, what)
         return answers, transaction
+
+    def _passed(self, servo_id: int) -> bool:
+        """Read as many bytes as no other read; the line keeps the order, so no late answer comes after them."""
+        self._barriers += 1
+        length = _BARRIER_BYTES[self._barriers % len(_BARRIER_BYTES)]
+        query = self.form.read((servo_id,), self.table.torque.address, length)
+        if self._attempt(query, (servo_id,), length) is None:
+            return False
+        self._unheard.clear()
+        return True
 
     def _ping(self, servo_id: int) -> tuple[bytes, tuple[int], int]:
         return self.form.build(servo_id, Instruction.PING), (servo_id,), self.ping_bytes

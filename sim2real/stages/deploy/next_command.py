@@ -12,6 +12,7 @@ from sim2real.artifacts.estimation.drift import Drift
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.manifest import MANIFEST
 from sim2real.robots.worlds import in_world
+from sim2real.stages.deploy.trajectories import PAUSED
 from sim2real.stages.estimation import recording_advice
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import shown
@@ -43,6 +44,8 @@ def with_command(
         return replace(advice, next=shlex.join(["sim2real", "identify", *pipeline.words, *run]))
     logs = logs_to_identify([r.path for r in deployment.logs], deployment.drift, identification, folder)
     terms = terms_to_identify(pipeline.identify.terms, pipeline, identification, deployment.drift)
+    if advice.status == "not judged" and any(PAUSED in reason for reason in advice.reasons):
+        return replace(advice, next=shlex.join(["sim2real", "deploy", *pipeline.words, *run]))
     # Without logs that suffice the robot is recorded first.
     if advice.status == "not judged" or not logs:
         record = shlex.join(["sim2real", "record", *pipeline.words])

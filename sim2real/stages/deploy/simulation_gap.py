@@ -20,7 +20,7 @@ from sim2real.installation import has_jax
 from sim2real.log.ages import input_ages
 from sim2real.robots.contract import Robot
 from sim2real.robots.score_columns import as_columns, as_sent
-from sim2real.stages.deploy.trajectories import courses
+from sim2real.stages.deploy.trajectories import courses, lost_s
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 
@@ -81,7 +81,8 @@ def compare(
     columns = [{"t": t, **states} for t, states in measured[: len(recordings)]]
     columns += [{}] * (len(recordings) - len(columns))
     sensed = [(r.episode.steps[robot.roles.sensor].begun_s, _sensed(robot, r.episode)) for r in recordings]
-    trajectories = courses(sensed, measured, robot.units)
+    nodes = (robot.roles.sensor, robot.roles.supervisor, robot.roles.actuator)
+    trajectories = courses(sensed, measured, robot.units, [lost_s(r.episode, nodes) for r in recordings])
     units = dict(robot.units)
     return Deployment(scores, tuple(gap), units, tuple(columns), tuple(recordings), courses=trajectories)
 

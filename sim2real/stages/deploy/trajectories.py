@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sim2real.artifacts.deployment import Course, Deployment, Replay
+from sim2real.graph.episode import Episode
 from sim2real.log.schema import unit_of
 
 _MAX_SHIFT_S = 0.1
-"""A simulation may be early or late by this time; simulations differ from each other by whole swings."""
+"""A simulation may be early or late by this time; simulations differ from each other by whole swings. An episode that
+lost more time in pauses differs from them whatever its parameters are."""
+PAUSED = "to pauses of its nodes"
+"""Words of the reason for another deployment."""
 _IGNORED_SHARE = 0.1
 """Share of an episode with the largest distances, which the distance of the episode ignores."""
 _MIN_SAMPLES = 10
@@ -21,10 +26,13 @@ Columns = tuple[np.ndarray, Mapping[str, np.ndarray]]
 """Times ``(N,)`` [s] and columns ``(N,)``."""
 
 
-def courses(real: Sequence[Columns], simulated: Sequence[Columns], units: Mapping[str, str]) -> tuple[Course, ...]:
+def courses(
+    real: Sequence[Columns], simulated: Sequence[Columns], units: Mapping[str, str], paused_s: Sequence[float]
+) -> tuple[Course, ...]:
     """Compare each measured column of each episode with its simulations.
 
     Args:
+        paused_s: Time that each episode lost in pauses [s], see ``lost_s``.
         simulated: The simulations of all episodes; simulation e is of episode ``e % len(real)``.
         units: Field -> unit.
     """
@@ -34,20 +42,40 @@ def courses(real: Sequence[Columns], simulated: Sequence[Columns], units: Mappin
         names = [n for n, v in columns.items() if v.dtype.kind == "f" and all(n in c for _, c in same_episode)]
         for name in names if same_episode and len(t_s) >= _MIN_SAMPLES else ():
             beside = np.stack([np.interp(t_s, t, c[name]) for t, c in same_episode])
-            rows.append(_course(number, name, t_s, columns[name], beside, unit_of(name, units) == "rad"))
+            course = _course(number, name, t_s, columns[name], beside, unit_of(name, units) == "rad")
+            rows.append(replace(course, paused_s=paused_s[number]))
     return tuple(rows)
 
 
-def off_course(deployed: Deployment) -> Iterator[str]:
+def lost_s(episode: Episode, nodes: Sequence[str]) -> float:
+    """Return the time that the slowest of some nodes lost between steps that are two periods or more apart [s]."""
+    lost = [0.0]
+    for node in nodes:
+        gaps_s = np.diff(episode.steps[node].begun_s)
+        if gaps_s.size:
+            period_s = float(np.median(gaps_s))
+            lost.append(float(np.sum(gaps_s[gaps_s >= 2.0 * period_s] - period_s)))
+    return max(lost)
+
+
+def off_course(deployed: Deployment, paused: bool) -> Iterator[str]:
     """Return sentences about joints whose episodes differ from all simulations.
 
     Args:
         deployed: With courses, and the promised error of each position.
+        paused: Whether to judge the episodes that lost more than 0.1 s in pauses, or the others.
     """
     promised = {row.column: row for row in deployed.replay if row.promised is not None}
     for course in deployed.courses:
-        if row := promised.get(course.column):
+        row = promised.get(course.column)
+        if row is not None and (course.paused_s > _MAX_SHIFT_S) is paused:
             yield from _sentences(course, row)
+
+
+def longest_pause(deployed: Deployment) -> str:
+    """Return a sentence about the episode that lost the most time in pauses."""
+    worst = max(deployed.courses, key=lambda course: course.paused_s)
+    return f"episode {worst.episode} lost {worst.paused_s:.2g} s {PAUSED}, and no simulation has such pauses"
 
 
 def _course(number: int, name: str, t_s: np.ndarray, real: np.ndarray, beside: np.ndarray, angle: bool) -> Course:

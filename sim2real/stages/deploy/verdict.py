@@ -18,7 +18,7 @@ from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError
 from sim2real.installation import has_jax
 from sim2real.stages.deploy.next_command import LATER, with_command
-from sim2real.stages.deploy.trajectories import off_course
+from sim2real.stages.deploy.trajectories import longest_pause, off_course
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import progress, shown
 from sim2real.stages.terminal.interruption import patiently
@@ -92,10 +92,15 @@ def verdict(deployment: Deployment, bundle: Bundle) -> Advice:
     """
     if advice := model_advice(deployment.replay, deployment.drift):
         return advice
-    if differences := tuple(off_course(deployment)):
-        horizon_s = max(row.horizon_s for row in deployment.replay)
-        holds = f"commands played again hold {horizon_s:g} s ahead, though"
+    horizon_s = max((row.horizon_s for row in deployment.replay), default=0.0)
+    holds = f"commands played again hold {horizon_s:g} s ahead, though"
+    if differences := tuple(off_course(deployment, paused=False)):
         return Advice("re-identify", (*differences[:_MAX_REASONS], holds))
+    if differences := tuple(off_course(deployment, paused=True)):
+        # The model is not to blame. If such steps are frequent, training needs them too.
+        late = _late_nodes(deployment, bundle)
+        reasons = (longest_pause(deployment), *differences[:_MAX_REASONS], holds)
+        return Advice("re-train" if late else "not judged", (*late, *reasons))
     if advice := _policy_advice(deployment, bundle):
         return replace(advice, reasons=(*advice.reasons, "the model holds"))
     return Advice("fine", ("the robot is the one that was identified, and as fast as in training",))
