@@ -32,9 +32,9 @@ def courses(
     """Compare each measured column of each episode with its simulations.
 
     Args:
-        paused_s: Time that each episode lost in pauses [s], see ``lost_s``.
         simulated: The simulations of all episodes; simulation e is of episode ``e % len(real)``.
         units: Field -> unit.
+        paused_s: Time that each episode lost in pauses [s], see ``lost_s``.
     """
     rows = []
     for number, (t_s, columns) in enumerate(real):
