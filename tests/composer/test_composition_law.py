@@ -184,7 +184,14 @@ def swap(models, row):
         one.name = "own"
 
 
-@pytest.mark.parametrize("row", ROWS, ids="-".join)
+FEW = {row[1] + row[-1]: row for row in ROWS if "material" not in row[-1]}
+FEW = {row[0] + target_kind(row[-1]): row for row in FEW.values()}.values()
+of_rows = pytest.mark.parametrize(
+    "row", [r if r in FEW else pytest.param(r, marks=pytest.mark.full) for r in ROWS], ids="-".join
+)
+
+
+@of_rows
 def test_every_reference_across_models_is_that_of_dm_control(oracle, row):
     mine = world(mjcf, row)["outer"]
     kind = row[1] if row[0] in ("body", "contact", "asset") else row[0]
@@ -202,13 +209,7 @@ def test_every_reference_across_models_is_that_of_dm_control(oracle, row):
     assert not differing_arrays(model, theirs)
 
 
-FEW = {row[1] + row[-1]: row for row in ROWS if "material" not in row[-1]}
-FEW = {row[0] + target_kind(row[-1]): row for row in FEW.values()}.values()
-
-
-@pytest.mark.parametrize(
-    "row", [r if r in FEW else pytest.param(r, marks=pytest.mark.full) for r in ROWS], ids="-".join
-)
+@of_rows
 def test_references_by_text_follow_elements_that_swap_their_names(oracle, row):
     mine = world(mjcf, row, by_text=True)
     swap(mine, row)

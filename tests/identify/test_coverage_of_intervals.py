@@ -46,7 +46,7 @@ def asynchronous_log(rng):
     return Episode(steps=log, messages={}, outputs=outputs)
 
 
-@pytest.fixture(scope="module", params=["free", "rest"])
+@pytest.fixture(scope="module", params=[pytest.param("free", marks=pytest.mark.full), "rest"])
 def fitted(request, repetitions):
     """Problem, and at each noise's estimate ``(N, P)`` the linearisation: starts unknown, or known and at rest."""
     model = load_pipeline("pendulum").load().identifiable(MAX_DELAY_S)

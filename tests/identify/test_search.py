@@ -74,7 +74,10 @@ def test_when_nothing_can_be_simulated():
         search(bad, np.zeros(2), replace(CONFIG, strategy="SNES", generations=10))
 
 
-@pytest.mark.parametrize("strategy", strategies())
+@pytest.mark.parametrize(
+    "strategy",
+    [s if s in (*STANDARD, *INCOMPLETE, "LM_MA_ES") else pytest.param(s, marks=pytest.mark.full) for s in strategies()],
+)
 def test_every_strategy_runs_or_says_why_not(strategy):
     config = FitConfig(strategy=strategy, population=8, generations=10, std=0.7)
     if strategy in INCOMPLETE:
@@ -242,7 +245,7 @@ import numpy as np
 from test_search import CONFIG, bowl
 from sim2real.identify.search.search import search
 
-config, programs, found = replace(CONFIG, generations=40, restarts=2), {}, []
+config, programs, found = replace(CONFIG, generations=40), {}, []
 for devices in (1, 2):
     programs = {}
     found.append(search(bowl, np.zeros(2), replace(config, devices=devices), programs=programs))

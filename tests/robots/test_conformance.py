@@ -13,7 +13,8 @@ pytestmark = pytest.mark.realtime
 
 
 @pytest.mark.parametrize(
-    "name", ["pendulum", "arm", pytest.param("so101", marks=pytest.mark.full), "disk", "xl330", "so101_log"]
+    "name",
+    ["pendulum", *(pytest.param(n, marks=pytest.mark.full) for n in ("arm", "so101")), "disk", "xl330", "so101_log"],
 )
 def test_every_pipeline_here_has_a_robot(name, tmp_path):
     pipeline = load_pipeline(name)

@@ -103,7 +103,7 @@ def test_the_pendulum_of_a_real_recording(tmp_path):
     check(card_of(robot, found, tmp_path / "card"), 15)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_so101_whose_friction_wears_off_with_speed(tmp_path):
     """A log of the model at other parameters than those of the card, read in counts."""
     pipeline = load_pipeline("so101")
@@ -153,7 +153,10 @@ def two_links(folder, own, commands):
 
 @pytest.mark.parametrize(
     ("own", "commands"),
-    [(PLAIN, ("goal",)), (PLAIN | TERMS, ("goal", "kp", "enabled", "torque", "goal_velocity"))],
+    [
+        pytest.param(PLAIN, ("goal",), marks=pytest.mark.full),
+        (PLAIN | TERMS, ("goal", "kp", "enabled", "torque", "goal_velocity")),
+    ],
     ids=["plain", "every term"],
 )
 def test_a_robot_that_only_its_file_describes(own, commands, tmp_path):
@@ -162,7 +165,7 @@ def test_a_robot_that_only_its_file_describes(own, commands, tmp_path):
     check(card_of(robot, found, tmp_path / "card"), 20)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_go2_of_the_public_recording(tmp_path):
     """The robot and its estimates: twelve joints that follow chirps in the air."""
     if not (DATA / "go2" / "chirp_fit.npz").is_file():

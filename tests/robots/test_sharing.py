@@ -16,7 +16,7 @@ from sim2real.stages.estimation import held_out_parts
 
 GO2 = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
 ARM = ["shoulder_pan", "shoulder_lift", "elbow_flex", "gripper"]
-STEP_S, PERIOD, SECONDS, NOISE, KP, DAMPING = 0.002, 5, 4.0, 2e-4, (12.0, 24.0), 0.4
+STEP_S, PERIOD, SECONDS, NOISE, KP, DAMPING = 0.002, 5, 2.8, 2e-4, (12.0, 24.0), 0.4
 XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
   <body><joint name="pan" axis="0 1 0" damping="0.4" armature="0.02"/>
   <inertial pos="0 0 -0.1" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/></body>

@@ -67,6 +67,7 @@ def test_an_observation_alone_tells_no_action(learnt):
         learnt.best.get_action(jnp.zeros(2))
 
 
+@pytest.mark.full  # `make test` resumes a training without memory: test_checkpoint.py
 def test_it_is_resumed_in_the_middle_of_episodes(tmp_path):
     config = dataclasses.replace(CONFIG, total_steps=2 * 16 * 64, evaluations=2, hidden=(4,), epochs=1)
     file, whole = tmp_path / "checkpoint", train(Sign(), config, jax.random.key(2))

@@ -66,7 +66,7 @@ def test_a_seed_does_not_depend_on_its_neighbours(bandit):
     assert not np.allclose(result.history["entropy"][-1, 0], result.history["entropy"][-1, 1])
 
 
-@pytest.mark.parametrize("rollout_steps", [2, 8])
+@pytest.mark.parametrize("rollout_steps", [2, pytest.param(8, marks=pytest.mark.full)])
 def test_a_test_within_training_plays_one_whole_episode_per_copy(rollout_steps):
     """Also where it takes several rollouts, and where episodes for training are cut before."""
     config = dataclasses.replace(TINY, rollout_steps=rollout_steps, eval_steps=5, evaluations=2)
@@ -99,7 +99,7 @@ def blind_value(length, window, gamma):
         pytest.param(
             Constant(ends="truncated", rows_per_step=2), 10.0, id="rows without a policy step", marks=pytest.mark.full
         ),
-        pytest.param(Constant(ends="terminated"), blind_value(8, 16, 0.9), id="termination"),
+        pytest.param(Constant(ends="terminated"), blind_value(8, 16, 0.9), id="termination", marks=pytest.mark.full),
     ],
 )
 def test_value_of_a_constant_reward(env, value):
@@ -113,7 +113,7 @@ def test_value_of_a_constant_reward(env, value):
     ("wrong", "message"),
     [
         ("observation", r"entries \[0\] of the observation are not finite \(seed 0"),
-        ("reward", "the reward is not finite"),
+        pytest.param("reward", "the reward is not finite", marks=pytest.mark.full),
     ],
 )
 def test_what_is_no_number_is_named(wrong, message):
@@ -234,6 +234,7 @@ def test_a_target_without_a_success_is_refused():
         train(Constant(), dataclasses.replace(TINY, target=0.5), jax.random.key(0))
 
 
+@pytest.mark.full  # `make test` says in test_optimiser.py how the rate moves
 def test_an_adaptive_step_size_keeps_the_policy_near_its_target():
     config = dataclasses.replace(SMALL, schedule="adaptive", target_kl=0.02, learning_rate=1e-5, epochs=8)
     result = train(Bandit(), config, jax.random.key(0))
