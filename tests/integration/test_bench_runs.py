@@ -50,6 +50,7 @@ def test_demo(commands, tmp_path):
     assert len(rows["demo/upright/identified"]) == len(report["seeds"][0]["deployments"]) == 1
 
 
+@pytest.mark.full
 def test_demo_beside_the_nominal_model(commands, tmp_path):
     path = tmp_path / "report.json"
     keep = tmp_path / "runs"
@@ -60,7 +61,7 @@ def test_demo_beside_the_nominal_model(commands, tmp_path):
     assert (keep / "seed4" / "nominal").is_dir()
 
 
-@pytest.mark.parametrize("name", ["arm", "so101"])
+@pytest.mark.parametrize("name", ["arm", pytest.param("so101", marks=pytest.mark.full)])
 def test_arm(name, commands, tmp_path, monkeypatch):
     # The run at hand is the pendulum's: it has a success where the arm has a distance.
     monkeypatch.setattr(arm.stages, "deployed", lambda folder, quantity: [0.01, 0.03])
@@ -73,6 +74,7 @@ def test_arm(name, commands, tmp_path, monkeypatch):
     assert rows[f"{name}/distance/identified"] == [20.0]
 
 
+@pytest.mark.full
 def test_the_arms_training_alone(commands, finished_run_dir, tmp_path):
     path = tmp_path / "report.json"
     flags = ["--ppo.num-envs", "1024"]

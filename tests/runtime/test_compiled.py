@@ -104,7 +104,8 @@ def test_a_pattern_of_ticks_and_steps_equals_rows(topology, compiled):
     check_pattern(graph)
 
 
-@pytest.mark.parametrize("seed", [PATTERNS[-1], *(pytest.param(s, marks=pytest.mark.full) for s in PATTERNS[:-1])])
+@pytest.mark.full  # `make test` takes the pattern of a topology, above
+@pytest.mark.parametrize("seed", PATTERNS)
 def test_a_random_pattern_equals_rows(seed):
     nodes, supervisor = topologies.random_pattern(seed, jax_hash_node)
     check_pattern(CompiledGraph(nodes, supervisor, draw(nodes, 0.7, 2, seed)))

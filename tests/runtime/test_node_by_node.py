@@ -152,7 +152,7 @@ PHASES = [Phase.explicit, Phase.reuse, Phase.generate]
 
 
 def test_hashes_of_all_that_is_heard_are_equal(repetitions):
-    @settings(max_examples=repetitions(3, 8), derandomize=True, phases=PHASES)
+    @settings(max_examples=repetitions(2, 8), derandomize=True, phases=PHASES)
     @given(graphs(jax_hash_node), st.booleans())
     def equal(case, held):
         check(case, held, np.testing.assert_array_equal)
@@ -161,7 +161,7 @@ def test_hashes_of_all_that_is_heard_are_equal(repetitions):
 
 
 def test_outputs_are_equal_at_delays_of_every_interpolation(repetitions):
-    @settings(max_examples=repetitions(4, 14), derandomize=True, phases=PHASES)
+    @settings(max_examples=repetitions(2, 14), derandomize=True, phases=PHASES)
     @given(
         graphs(seer, ("zoh", "linear", "linear_real_only", "zoh_mean"), ("zoh", "linear", "linear_real_only")),
         st.booleans(),

@@ -63,7 +63,7 @@ def when_recording(root, action, told):
     return thread
 
 
-@pytest.mark.parametrize("pipeline", ["pendulum", "so101"])
+@pytest.mark.parametrize("pipeline", ["pendulum", pytest.param("so101", marks=pytest.mark.full)])
 def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline):
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader

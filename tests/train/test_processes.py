@@ -100,7 +100,7 @@ def told(tmp_path_factory):
     return [json.loads((folder / f"{i}.json").read_text()) for i in (0, 1)]
 
 
-@pytest.mark.slow
+@pytest.mark.full  # `make test` divides a training among devices: test_devices.py
 def test_two_processes_learn_what_one_learns_and_go_on_where_they_were_interrupted(told):
     one = train(Bandit(), CONFIG, jax.random.key(3))
     expected = [*jax.tree.leaves(jax.device_get(one.policies)), *one.history.values()]
@@ -110,18 +110,18 @@ def test_two_processes_learn_what_one_learns_and_go_on_where_they_were_interrupt
             np.testing.assert_allclose(found, np.ravel(own), rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_the_first_process_alone_leads_and_writes(told):
     assert [(t["leads"], t["wrote"]) for t in told] == [(True, True), (False, False)]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_processes_that_were_started_differently_say_in_what(told):
     for process in told:
         assert "the processes were not started alike: clip = 0.1 in process 0 and 0.2 in process 1" in process["differ"]
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_who_loses_another_process_says_so(told):
     assert told[0]["lost"].startswith("process 0 of 2 lost another one of this training: ")
     assert "--resume newest" in told[0]["lost"]
