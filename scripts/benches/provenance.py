@@ -7,6 +7,7 @@ for people, and names the files that have changed since.
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import io
 import subprocess
@@ -51,6 +52,14 @@ def files(paths: Sequence[str], root: Path) -> list[Path]:
 
 def essence(file: Path) -> str:
     """Return the part of a file that can change a figure: the lines of Python without comments and docstrings."""
+    at = file.stat()
+    return _essence(file, at.st_mtime_ns, at.st_size)
+
+
+@functools.cache
+def _essence(file: Path, mtime_ns: int, size: int) -> str:
+    """Return the essence of a file as it is at a time: the digests of a process share most files."""
+    del mtime_ns, size
     content = file.read_bytes()
     if file.suffix != ".py":
         return hashlib.sha256(content).hexdigest()

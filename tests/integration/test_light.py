@@ -33,7 +33,7 @@ def call(command, folder, *arguments):
     return done.returncode, done.stdout + done.stderr
 
 
-@pytest.fixture(scope="module", params=["pendulum", "so101"])
+@pytest.fixture(scope="module", params=["pendulum", pytest.param("so101", marks=pytest.mark.full)])
 def resting(request, tmp_path_factory):
     """A robot, and a bundle whose policy rests; the aim of the SO-101 is drawn."""
     robot = load_pipeline(request.param).load()

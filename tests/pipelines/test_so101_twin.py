@@ -33,7 +33,7 @@ def new(arm, folder, answer):
     return done.returncode, done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.full  # `make test` calibrates by hand in test_so101_calibration.py, without the minute of waiting
 @pytest.mark.realtime
 def test_without_an_answer_nothing_moves_and_the_pipeline_is_there(arm, tmp_path):
     code, told = new(arm, tmp_path, "")

@@ -250,6 +250,7 @@ def servo(tmp_path_factory):
     return folder.parent
 
 
+@pytest.mark.full
 def test_league(run, servo, tmp_path):
     pytest.importorskip("mujoco.sysid")
     kept = tmp_path / "kept.jsonl"
