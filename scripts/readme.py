@@ -50,6 +50,7 @@ TABLES = {
     "excitation": ("excitation",),
     "twin": ("twin",),
     "walk": ("walk",),
+    "legs_identify": ("legs_identify",),
     "light": ("light",),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
@@ -301,6 +302,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "excitation": lambda chosen: recordings.excitation(*chosen.values()),
         "twin": lambda chosen: sentences.twin(*chosen.values()),
         "walk": lambda chosen: sentences.walk(*chosen.values()),
+        "legs_identify": lambda chosen: sentences.legs_identify(*chosen.values()),
         "light": lambda chosen: sentences.light(*chosen.values()),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}

@@ -55,6 +55,10 @@ class DelayChanged(SafetyStop):
     """The robot's delay differs from that of its policy's training, and the policy moved no joint (exit code 3)."""
 
 
+class OtherMotion(Sim2RealError):  # noqa: N818
+    """A log is of a motion that the identified model does not describe, such as a walk beside a model in a stand."""
+
+
 class HardwareLost(Sim2RealError):  # noqa: N818
     """A port or a device does not answer (exit code 4)."""
 

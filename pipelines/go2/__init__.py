@@ -1,6 +1,6 @@
 """A Unitree Go2 that walks: it follows a commanded velocity."""
 
-from sim2real.stages.config import DeployConfig, GateLimits, RecordConfig, TrainConfig
+from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.train.config import PPOConfig
 from sim2real.train.environment.variation import VariationConfig
@@ -10,7 +10,7 @@ VARY = VariationConfig(
         "foot_friction": (0.4, 1.3),
         "payload": (-1.0, 2.5),
         "motor_strength": (0.85, 1.15),
-        "joint_damping": (0.02, 0.4),
+        **{f"{part}_damping": (0.02, 0.4) for part in ("hip", "thigh", "calf")},
         "sensor_delay": (0.007, 0.009),
         "actuator_delay": (0.0, 0.018),
     },
@@ -44,7 +44,8 @@ PIPELINE = Pipeline(
     name="go2",
     summary="quadruped with a floating base: follow a commanded velocity",
     package=__name__,
-    record=RecordConfig(amplitude=0.3, low_hz=0.2, high_hz=4.0, gate=GATE),
+    record=RecordConfig(duration_s=12.0, amplitude=0.3, low_hz=0.2, high_hz=4.0, gate=GATE),
+    identify=IdentifyConfig(generations=0, folds=0),
     train=TrainConfig(model="nominal", episode_s=10.0, timelines=256, sensitivity=False, vary=VARY, ppo=WALK),
     deploy=DeployConfig(episodes=5, duration_s=10.0, max_tilt_rad=1.2, gate=GATE),
 )

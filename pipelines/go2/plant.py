@@ -12,7 +12,7 @@ import numpy as np
 from sim2real.robots.walking.plain.body import LeggedBody
 from sim2real.robots.walking.plain.hidden import HiddenTwin
 
-LEGS = ("FR", "FL", "RR", "RL")
+LEGS, PARTS = ("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf")
 LYING = (0.0, 1.36, -2.65) * 4
 """Folded legs, as the Go2 lies [rad]."""
 
@@ -30,6 +30,18 @@ class Go2Body(LeggedBody):
         # The latencies are the emulator's.
         hidden = replace(drawn, sensing_s=0.0, acting_s=0.0)
         super().__init__(Path(__file__).with_name("go2.xml"), LEGS, LYING, 0.12, hidden, place)
+
+    def truth(self) -> dict[str, object]:
+        """Return the hidden parameters by the names of an identification."""
+        hidden, motors = self.hidden, [f"{leg}_{part}" for leg in LEGS for part in PARTS]
+        each = {"damping": hidden.damping, "friction": hidden.dry, "armature": hidden.armature}
+        return {
+            "foot_friction": hidden.friction,
+            "payload": hidden.load_kg,
+            **{f"{part}_{name}": value for part in PARTS for name, value in each.items()},
+            **{f"{motor}_strength": float(x) for motor, x in zip(motors, hidden.strength, strict=True)},
+            **{f"{motor}_zero": float(x) for motor, x in zip(motors, hidden.bias_rad, strict=True)},
+        }
 
 
 def latencies(seed: int | None) -> tuple[float, float, float]:

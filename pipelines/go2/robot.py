@@ -14,7 +14,7 @@ from sim2real.robots.walking.moment import Moment
 from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.task import Term
 
-from .plant import LEGS, LYING, latencies
+from .plant import LEGS, LYING, PARTS, latencies
 
 _BENT = (2.0, 0.5, 0.5) * 4
 """Weights of hip, thigh and calf off the stance."""
@@ -37,8 +37,9 @@ class Go2(ComposedRobot):
     """A Unitree Go2 that follows velocities."""
 
     mjcf = Path(__file__).with_name("go2.xml")
-    joints = tuple(f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf"))
+    joints = tuple(f"{leg}_{part}" for leg in LEGS for part in PARTS)
     feet = LEGS
+    groups = MappingProxyType({part: tuple(range(i, 12, 3)) for i, part in enumerate(PARTS)})
     stance = (-0.1, 0.8, -1.5, 0.1, 0.8, -1.5, -0.1, 1.0, -1.5, 0.1, 1.0, -1.5)
     motors = LegMotors("unitree", LYING, embedded=embedded)
     height_m, touching_m, scale = 0.33, 0.028, 0.6

@@ -95,6 +95,11 @@ BENCHES = {
         "the Go2's policy over DDS with the emulator beside it: its computation, and lateness at 50 Hz",
         ("sim2real/robots", "sim2real/hardware", "sim2real/policy", "sim2real/runtime", "pipelines/go2"),
     ),
+    "legs-identify": Bench(
+        "runs.legs_identify",
+        "hidden Go2s in a stand: the errors of identified parameters and delays, and the time of an identification",
+        (*_IDENTIFY, "pipelines/go2", "scripts/benches/hidden/legs.py"),
+    ),
     "light": Bench(
         "processor_time.light",
         "sim2real-robot in a new environment: its size, and record's processor time until it addresses a robot",

@@ -40,6 +40,29 @@ def walk(report: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def legs_identify(report: Mapping[str, Any]) -> str:
+    """Return a table of the errors of identified Go2s, a row for each kind of parameter."""
+    v = values(report)
+    about = {row["name"]: row["yardstick"] for row in report["rows"]}
+    counted = lambda name: about[f"legs_identify/{name}"].split(" ")  # noqa: E731
+    lines = ["| | within 10 % | worst |", "| --- | ---: | ---: |"]
+    for kind in ("damping", "friction", "armature", "strength"):
+        near, _, of, *_ = counted(f"{kind}/close")
+        label = "strength of a motor" if kind == "strength" else f"{kind} of a group"
+        lines.append(f"| {label} | {near} of {of} | {v[f'legs_identify/{kind}/worst']:.2g} % |")
+    near, _, of, *_ = counted("delay/close")
+    lines.append(f"| sum of the delays, within 1 ms | {near} of {of} | {v['legs_identify/delay/worst']:.2f} ms |")
+    (yes, _, twins, *_), whole = counted("accepted"), about["legs_identify/all_close"]
+    interval = whole.rpartition("; ")[2].replace("95 % interval ", "")
+    held, _, of, *_ = counted("intervals")
+    text = (
+        f"{yes} of {twins} identifications are accepted; in {whole.split(' ')[0]} all parameters are within 10 % (95 % "
+        f"interval of that share: {interval}).\nThe 95 % intervals hold the truth in {held} of {of} cases. "
+        f"An identification takes {v['legs_identify/cpu_s']:.0f} s of a processor at most.\n"
+    )
+    return "\n".join([*lines, "", text])
+
+
 def twin(report: Mapping[str, Any]) -> str:
     """Return the time of `new --like so101`, from an empty environment to an accepted twin."""
     v = values(report)

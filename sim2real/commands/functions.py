@@ -98,7 +98,7 @@ def run(
     # Turn names and dicts into objects; each stage then runs as from the command line.
     pipeline, root = pipeline_of(robot), folder_of(runs, "runs")
     settings = {"record": record, "identify": identify, "train": train, "deploy": deploy}
-    configs: dict[str, Any] = {n: config_of(c, getattr(pipeline, n), n) for n, c in settings.items()}
+    configs: dict[str, Any] = {n: config_of(settings[n], c, n) for n, c in pipeline.in_a_run.items()}
     home = None if resume is None else find_run(root, folder_of(resume, "resume"), pipeline.name)
 
     def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:

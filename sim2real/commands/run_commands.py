@@ -20,12 +20,11 @@ F = TypeVar("F", bound="TargetFlags")
 
 def run(command: str, arguments: list[str]) -> None:
     """``sim2real run PIPELINE [FLAGS]``."""
-    from sim2real.artifacts.run.run_folder import STAGES
     from sim2real.commands import flags
 
     # The flags of all stages, with the pipeline's defaults.
     pipeline, rest = split_pipeline(command, arguments)
-    default = flags.RunFlags(**{stage: getattr(pipeline, stage) for stage in STAGES})
+    default = flags.RunFlags(**pipeline.in_a_run)
     texts = {
         "prog": f"sim2real run {pipeline.name}",
         "description": "Record, identify, train and deploy, one after the other.",
@@ -44,7 +43,6 @@ def run(command: str, arguments: list[str]) -> None:
 
 def demo(command: str, arguments: list[str]) -> None:
     """``sim2real demo [FLAGS]``."""
-    from sim2real.artifacts.run.run_folder import STAGES
     from sim2real.commands import flags
     from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -56,8 +54,8 @@ def demo(command: str, arguments: list[str]) -> None:
         epilog=epilog("sim2real demo --seed 1", f"sim2real run {DEMO_PIPELINE} --help"),
     )
     pipeline = load_pipeline(DEMO_PIPELINE)
-    stages = {stage: getattr(pipeline, stage) for stage in STAGES}
-    run_flags = flags.RunFlags(parsed.seed, parsed.runs, parsed.resume, parsed.cache, parsed.verbose, **stages)
+    common = (parsed.seed, parsed.runs, parsed.resume, parsed.cache, parsed.verbose)
+    run_flags = flags.RunFlags(*common, **pipeline.in_a_run)
     _run_stages(pipeline, run_flags if parsed.seed is None else _with_seed(run_flags, parsed.seed))
 
 

@@ -66,6 +66,7 @@ class IdentifiableModel(Protocol):
     """The interface of a robot for identification.
 
     Attributes:
+        undetermined: Parameters of training that no log determines.
         sensor: Node whose outputs are predicted.
         given: Nodes whose recorded outputs drive the model: node -> a message with field names as its leaves.
         channels: Initial states have a position and a velocity for each.
@@ -75,6 +76,7 @@ class IdentifiableModel(Protocol):
     """
 
     parameters: ParameterTable
+    undetermined: tuple[str, ...]
     sensor: str
     given: Mapping[str, PyTree]
     channels: tuple[Channel, ...]
@@ -86,6 +88,10 @@ class IdentifiableModel(Protocol):
 
     def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
         """Return limit -> the largest value that recordings reach, of limits among the optional terms."""
+        ...
+
+    def check(self, episode: Episode) -> None:
+        """Raise a ``Sim2RealError`` if a log is of a motion that the model does not describe."""
         ...
 
     def params(self, values: Mapping[str, Array], start: Array) -> dict[str, PyTree]:

@@ -159,11 +159,11 @@ class Robot:
         """Return the nominal values of the model's parameters, without delays."""
         return {p.name: p.nominal for p in self.model.dynamics()}
 
-    def identifiable(self, max_delay_s: float) -> IdentifiableLoop:
+    def identifiable(self, max_delay_s: float) -> IdentifiableModel:
         """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
         return IdentifiableLoop(self, max_delay_s)
 
-    def watched(self, max_delay_s: float) -> IdentifiableLoop:
+    def watched(self, max_delay_s: float) -> IdentifiableModel:
         """Return the model with all parameters that may change between deployments."""
         loop = self.identifiable(max_delay_s)
         loop.parameters = loop.parameters.with_terms([*loop.parameters.terms, *self.model.watched_terms])

@@ -247,6 +247,7 @@ class RobotModel(_Part, Protocol):
         lead_s: Time that the world adds to the actuator's delay [s]; see ``ServoWorld.init_delays``.
         watched_terms: Optional terms that may change between deployments.
         profile_rad_s, causes, export_lead_s: See ``RecordedRobot``.
+        needs_gpu: Whether a training takes hours without a GPU.
     """
 
     tick_s: float
@@ -255,6 +256,7 @@ class RobotModel(_Part, Protocol):
     profile_rad_s: float = math.inf
     causes: Mapping[str, Mapping[str, float]] = MappingProxyType({})
     export_lead_s: float = 0.0
+    needs_gpu: bool = False
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
@@ -267,6 +269,10 @@ class RobotModel(_Part, Protocol):
     @abstractmethod
     def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> PyTree:
         """Return the world's parameters for an episode, from values by name."""
+
+    def unidentified(self) -> dict[str, float]:
+        """Return parameters of training that no log determines, with their nominal values; default: none."""
+        return {}
 
     def true_state(self, state: PyTree) -> PyTree:
         """Return the part of the world's state that a value function may observe in simulation; default: all of it."""

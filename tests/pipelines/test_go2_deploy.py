@@ -10,6 +10,8 @@ import pytest
 
 from pipelines.go2.robot import ROBOT
 from sim2real import cli
+from sim2real.artifacts.deployment import Deployment
+from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.robots.gate_limits import GateLimits
@@ -60,7 +62,7 @@ def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
 
 @pytest.mark.realtime
 def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
-    (command,) = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)
+    command, _ = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
     (folder,) = (tmp_path / "go2").glob("*/record")
     recording = Recording.load(folder)
@@ -73,6 +75,29 @@ def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
     assert (np.ptp(sent, axis=0) > 0.2).all()
     assert (np.ptp(measured, axis=0) > 0.1).all()
     assert ROBOT.drive.embedded.plant_args["place"] == "floor"
+
+
+@pytest.mark.full
+@pytest.mark.realtime
+def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsys):
+    """The smaller tests are those of the model in a stand, of the run's stages, and of the deployment above."""
+    (command,) = re.findall(r"^    sim2real (run go2.*)$", GUIDE.read_text(), re.MULTILINE)
+    assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
+    output = capsys.readouterr()
+    assert "takes hours to train without a GPU" in output.err
+    (run,) = (tmp_path / "go2").iterdir()
+    found = Identification.load(run / "identify")
+    assert found.verdict.status == "accepted"
+    assert "not determined by this log: foot_friction, payload, roughness" in found.verdict.reasons
+    names = [p for p in found.parameters if p.kind == "dynamics" and p.verdict != "fixed"]
+    assert len(names) == 21
+    for p in names:
+        assert p.estimate == pytest.approx(p.truth, rel=0.1), p.name
+    trip = next(p for p in found.parameters if p.name == ROUND_TRIP)
+    assert trip.estimate == pytest.approx(trip.truth, abs=0.001)
+    advice = Deployment.read(run / "deploy").advice
+    assert advice.status == "fine"
+    assert "does not test the model" in advice.reasons[-1]
 
 
 def test_the_gate_has_the_range_of_each_joint():

@@ -9,7 +9,7 @@ from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.errors import UsageError
-from sim2real.train.environment.draws import COUNT, draw_robots, widen_posterior
+from sim2real.train.environment.draws import COUNT, draw_robots, widen_posterior, without_default_ranges
 from sim2real.train.environment.variation import VariationConfig
 
 NAMES = ("gain", "gravity", "sensor_delay", "actuator_delay", "zero")
@@ -44,6 +44,14 @@ def found():
 def drawn(found, randomise=1.0, **options):
     values = found.values if found else {"gain": 2.0, "payload": 0.0}
     return draw_robots(values, found, VariationConfig(**options), randomise, np.random.default_rng(0))
+
+
+def test_a_pipelines_own_range_ends_where_the_parameter_was_identified():
+    own = VariationConfig(range={"gain": (1.0, 3.0), "payload": (0.0, 1.0)})
+    kept = without_default_ranges(own, own, {"gain": 2.0})
+    assert kept.range == {"payload": (0.0, 1.0)}
+    users = VariationConfig(range={**own.range, "gain": (1.5, 3.0)})
+    assert without_default_ranges(users, own, {"gain": 2.0}) == users
 
 
 def test_draws_are_as_correlated_and_as_narrow_as_the_posterior(found):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from sim2real.artifacts.run.iterations import Iteration, Iterations, Plan
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts
 from sim2real.artifacts.run.stage_status import stage_status, why_stale
+from sim2real.commands.loop.shipped import why_shipped
 from sim2real.errors import DelayChanged, Sim2RealError, UsageError
 from sim2real.stages.pipeline import find_run
 from sim2real.stages.terminal import console
@@ -36,6 +37,9 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None
         )
     run_dir = find_run.find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
     plan = None if run_dir is None else Iterations.load(run_dir).plan
+    shipped = why_shipped(pipeline)
+    if flags.iterations > 1 and shipped:
+        raise UsageError(f"{shipped}, and iterations train another one", hint="run without --iterations")
     if flags.iterations > 1:
         return _run_iterations(pipeline, flags, call, run_dir, plan)
     if plan is not None:
@@ -43,6 +47,9 @@ def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None
     # Skip the stages with a current result. After a stage that runs, the results of all later stages are out of date.
     rerun = False
     for number, stage in enumerate(STAGES, 1):
+        if stage == "train" and shipped:
+            console.note(f"train ({number}/{len(STAGES)}): skipped, as {shipped}")
+            continue
         status = None if rerun or run_dir is None else stage_status(run_dir).get(stage)
         if status is not None and not status.stale:
             console.note(f"{stage} ({number}/{len(STAGES)}): finished before, skipped")

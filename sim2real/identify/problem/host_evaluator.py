@@ -16,12 +16,13 @@ import numpy as np
 from sim2real.identify.problem.broyden import Slope, corrected
 from sim2real.identify.problem.engine import CRollouts, Outside
 from sim2real.identify.problem.evaluator import Stacked, replaced
-from sim2real.identify.problem.initial_states import InitialStates, next_shift
+from sim2real.identify.problem.initial_states import InitialStates, next_shift, trees_are_apart
 from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.residuals import InitialState, LinearisedSegments, SegmentResiduals
 from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.problem.sizes import padded
+from sim2real.identify.problem.together import Together
 from sim2real.types import PyTree
 
 _FEW, _COPIES = 24, 128
@@ -45,6 +46,7 @@ class OutsideEvaluator:
         # A round keeps the derivatives of initial states, so near the minimum its slope differs from the loss's.
         self.precision = 1e-4 if self._free else 1e-5
         self._initial = InitialStates(residuals, self._errors, residuals.engine.model)
+        self._together = Together(trees_are_apart(residuals.engine.model))
         self._last: list[tuple[np.ndarray, Data, LinearisedSegments]] = []
 
     def linearised(self, z: np.ndarray, data: Data, on_compile: OnCompile | None = None) -> LinearisedSegments:
@@ -87,9 +89,9 @@ class OutsideEvaluator:
 
         def slope(y: np.ndarray) -> np.ndarray:
             # Differences along each parameter, with the initial states of ``z``.
-            moved = self._moves(y, data)
-            raw = self._raw(np.concatenate([y[None], y + moved]), states, data)
-            J = self._tamed_slope(raw[0])[..., None] * self._by_parameter(raw[1:] - raw[0], data, y.size)
+            groups = self._together.groups(np.asarray(data.present))
+            raw = self._raw(np.concatenate([y[None], y + self._moves(groups, y.size)]), states, data)
+            J = self._tamed_slope(raw[0])[..., None] * self._by_parameter(raw[1:] - raw[0], groups, y.size)
             return np.concatenate([J.reshape(-1, y.size), self._of_prior(y)[1]])
 
         return corrected(value, slope, self._nearby(z, data))
@@ -217,19 +219,18 @@ class OutsideEvaluator:
 
     def _slope(self, z: np.ndarray, states: InitialState | None, data: Data) -> np.ndarray:
         """Return d residual / d z without the robust loss, ``(S, K, F, P)``, by central differences."""
-        moves = self._moves(z, data)
+        groups = self._together.groups(np.asarray(data.present))
+        moves = self._moves(groups, z.size)
         raw = self._raw(np.concatenate([z + moves, z - moves]), states, data)
-        return self._by_parameter((raw[: len(moves)] - raw[len(moves) :]) / 2.0, data, z.size)
+        return self._by_parameter((raw[: len(moves)] - raw[len(moves) :]) / 2.0, groups, z.size)
 
-    def _moves(self, z: np.ndarray, data: Data) -> np.ndarray:
-        """Return the steps of finite differences, one row for each parameter that is part of the model."""
-        return self._residuals.config.difference * np.eye(z.size)[np.asarray(data.present)]
+    def _moves(self, groups: list[list[int]], size: int) -> np.ndarray:
+        """Return the steps of finite differences, one row for each group of parameters."""
+        return self._residuals.config.difference * np.array([np.eye(size)[group].sum(axis=0) for group in groups])
 
-    def _by_parameter(self, changes: np.ndarray, data: Data, size: int) -> np.ndarray:
+    def _by_parameter(self, changes: np.ndarray, groups: list[list[int]], size: int) -> np.ndarray:
         """Return derivatives ``(S, K, F, P)`` from the changes of the residuals by each of ``_moves``."""
-        J = np.zeros((*changes.shape[1:], size))
-        J[..., np.asarray(data.present)] = np.moveaxis(changes, 0, -1) / self._residuals.config.difference
-        return J
+        return self._together.jacobian(changes / self._residuals.config.difference, groups, size)
 
     def _errors(self, values: Mapping[str, np.ndarray], eps: np.ndarray, shift: np.ndarray, data: Data) -> np.ndarray:
         """Return the residuals of segments ``eps (N,)`` with shifted initial states ``(N, n)``, ``(N, K, F)``."""

@@ -34,7 +34,7 @@ class InitialStates:
 
     def __init__(self, residuals: SegmentResiduals, errors: Errors, model: MjModel) -> None:
         self._errors, self._n = errors, len(residuals.prior)
-        self._groups: list[tuple[int, ...]] | None = None if _trees_are_apart(model) else _each(self._n)
+        self._groups: list[tuple[int, ...]] | None = None if trees_are_apart(model) else _each(self._n)
         self._responds = np.ones((self._n, len(residuals.fields)), bool)
         self._last: list[tuple[bytes, Data, bool, InitialState]] = []
 
@@ -171,7 +171,7 @@ def _each(n: int) -> list[tuple[int, ...]]:
     return [(i,) for i in range(n)]
 
 
-def _trees_are_apart(model: MjModel) -> bool:
+def trees_are_apart(model: MjModel) -> bool:
     """Return whether only bodies couple joints: there is no contact, equality or tendon."""
     contacts = model.opt.disableflags & mj.mjtDisableBit.mjDSBL_CONTACT == 0
     touching = contacts and (model.npair > 0 or bool(np.any(model.geom_contype) and np.any(model.geom_conaffinity)))

@@ -221,6 +221,7 @@ def check_log(episode: Episode, model: IdentifiableModel) -> None:
                 f"{int(np.argmin(finite))}",
                 hint="record again: a NaN cannot be identified from",
             )
+    model.check(episode)
 
 
 def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:

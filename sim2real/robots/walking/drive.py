@@ -83,7 +83,7 @@ class BodySensor(RobotSensor):
 
     def __init__(self, joints: Sequence[str], stance: np.ndarray) -> None:
         self.channels = tuple(
-            Channel("position", "velocity", 0.002, 0.05, index=i, label=name, goal="q") for i, name in enumerate(joints)
+            Channel("position", "velocity", 5e-4, 0.03, index=i, label=name, goal="q") for i, name in enumerate(joints)
         )
         self.joints = {
             name: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, name in enumerate(joints)

@@ -12,32 +12,38 @@ from sim2real.composer.world import WorldParams
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.contract import RobotModel
 from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.walking.joints import STRENGTH as MOTOR_STRENGTH
+from sim2real.robots.walking.joints import JointParameters
 from sim2real.robots.walking.scene import Ground
 from sim2real.robots.walking.terrain import Terrain
-from sim2real.robots.walking.world import PAYLOAD, WalkingWorld
+from sim2real.robots.walking.world import ARMATURE, PAYLOAD, WalkingWorld
 from sim2real.types import PyTree, Scalar
 
-FRICTION, STRENGTH, DAMPING, ROUGHNESS = "foot_friction", "motor_strength", "joint_damping", "roughness"
+FRICTION, STRENGTH, ROUGHNESS = "foot_friction", "motor_strength", "roughness"
 
 
 class WalkingModel(RobotModel):
     """A composed task on MJX: on Warp if JAX computes on a GPU, as MJX's JAX is 20 times slower with contacts there.
 
     Args:
+        joints: Parameters of the joints, in the order of the actuators.
         height_m: Height of the base at the start of an episode [m].
         terrain: Largest roughness, and where in the task's ground it is.
         rooms: Contacts and rows of constraints that Warp has room for in a copy.
     """
 
+    needs_gpu = True
+
     def __init__(
         self,
         make_task: Callable[[], Ground],
+        joints: JointParameters,
         height_m: float,
         terrain: Terrain,
         loads: tuple[float, float] = (-1.0, 3.0),
         rooms: tuple[int, int] = (16, 96),
     ) -> None:
-        self._make_task, self._height_m, self._terrain = make_task, height_m, terrain
+        self._make_task, self.joints, self._height_m, self._terrain = make_task, joints, height_m, terrain
         self._loads, self._rooms = loads, rooms
 
     @cached_property
@@ -51,12 +57,19 @@ class WalkingModel(RobotModel):
         return float(self.task.control_timestep)
 
     def dynamics(self) -> list[Parameter]:
-        """Return friction of feet, load, strength of motors, damping of joints, and roughness of the ground."""
+        """Return friction of feet, load, strength of motors, roughness of the ground, and parameters of joints."""
+        return [*self.around(), *self.joints.dynamics()]
+
+    def unidentified(self) -> dict[str, float]:
+        """Return friction of the feet, load and roughness of the ground: legs in a stand determine none of them."""
+        return {p.name: p.nominal for p in self.around() if p.name != STRENGTH}
+
+    def around(self) -> list[Parameter]:
+        """Return the parameters that are of no joint: legs in the air determine none of them."""
         return [
             Parameter(FRICTION, "1", 0.8, 0.2, 2.0, about="friction of the feet on the ground"),
             Parameter(PAYLOAD, "kg", 0.0, *self._loads, "linear", about="load in the base"),
             Parameter(STRENGTH, "1", 1.0, 0.5, 1.5, about="factor on the motors' gains"),
-            Parameter(DAMPING, "N m s/rad", 0.1, 0.01, 2.0, about="damping of each joint"),
             Parameter(ROUGHNESS, "m", 0.0, 0.0, self._terrain.most_m, "linear", about="height of bumps of the ground"),
         ]
 
@@ -68,7 +81,8 @@ class WalkingModel(RobotModel):
             FRICTION: (task.foot_geoms, "friction"),
             "gain": (task.actuators, "gainprm"),
             "bias": (task.actuators, "biasprm"),
-            DAMPING: (task.joints, "damping"),
+            "damping": (task.joints, "damping"),
+            "friction": (task.joints, "frictionloss"),
         }
         options = {"impl": "warp", "nconmax": self._rooms[0], "njmax": self._rooms[1]} if on_gpu else {}
         return WalkingWorld(task, places, self._loads, **options)
@@ -78,13 +92,15 @@ class WalkingModel(RobotModel):
 
         On rough ground the base starts at the place that has the roughness, above the highest bump there.
         """
-        usual = self._world_params.values
-        strength = jnp.asarray(values[STRENGTH], jnp.float32)
+        usual, joints = self._world_params.values, self.joints
+        strength = jnp.asarray(values[STRENGTH], jnp.float32) * joints.of_motor(values, MOTOR_STRENGTH, jnp)
         placed = {
             FRICTION: usual[FRICTION].at[..., 0].set(values[FRICTION]),
-            "gain": usual["gain"] * strength,
-            "bias": usual["bias"] * strength,
-            DAMPING: jnp.full_like(usual[DAMPING], values[DAMPING]),
+            "gain": usual["gain"] * strength[:, None],
+            "bias": usual["bias"] * strength[:, None],
+            "damping": joints.of_group(values, "damping", jnp),
+            "friction": joints.of_group(values, "friction", jnp),
+            ARMATURE: joints.of_group(values, "armature", jnp),
             PAYLOAD: jnp.asarray(values[PAYLOAD], jnp.float32),
         }
         bumps_m = jnp.asarray(values[ROUGHNESS] if self.task.rough else 0.0, jnp.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -22,9 +23,11 @@ from sim2real.robots.control_loop.training_task import LoopTask
 from sim2real.robots.walking.agent import WalkingAgent
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.drive import BodySensor, LegMotors, WalkingDrive
-from sim2real.robots.walking.model import ROUGHNESS, WalkingModel
+from sim2real.robots.walking.joints import JointParameters
+from sim2real.robots.walking.model import ROUGHNESS, STRENGTH, WalkingModel
 from sim2real.robots.walking.moment import Moment
 from sim2real.robots.walking.scene import Ground
+from sim2real.robots.walking.stand import LegsInAStand
 from sim2real.robots.walking.task import Term, WalkingTask
 from sim2real.robots.walking.terrain import Terrain
 
@@ -46,6 +49,8 @@ class ComposedRobot(Robot):
         motors: The motors on hardware; None: the robot has no device.
         delays_s: Delays without an identification: of the sensor, of the actuator [s].
         terrain: Rough ground, on which a training with the parameter ``roughness`` takes place.
+        groups: Name of a group -> numbers of its joints, which have one damping, dry friction and armature; empty: all
+            joints are of the group ``joint``.
         noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
     """
 
@@ -63,6 +68,7 @@ class ComposedRobot(Robot):
     gains: ClassVar[tuple[float, float]] = (35.0, 0.6)
     motors: ClassVar[LegMotors | None] = None
     delays_s: ClassVar[tuple[float, float]] = (0.008, 0.008)
+    groups: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
     noise: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType({})
 
     def __init__(self) -> None:
@@ -70,7 +76,8 @@ class ComposedRobot(Robot):
         self.sensor = BodySensor(self.joints, stance)
         self.drive: RobotDrive = self.make_drive()
         self.agent = WalkingAgent(self.joints, stance, self.scale, self.history, self.commands)
-        self.model = WalkingModel(self.make_task, self.height_m, self.terrain)
+        self.walking = WalkingModel(self.make_task, self._parameters(), self.height_m, self.terrain)
+        self.model = self.walking
         self.task = WalkingTask(self.commands, stance, 1.0 / self.rate_hz, self.terms(), self.falls)
 
     @abstractmethod
@@ -94,6 +101,17 @@ class ComposedRobot(Robot):
         """Return the nominal values of the model's parameters, and the delays."""
         return super().nominal() | dict(zip(DELAYS, self.delays_s, strict=True))
 
+    def _parameters(self) -> JointParameters:
+        return JointParameters(self.joints, self.groups or {"joint": range(len(self.joints))})
+
+    def identifiable(self, max_delay_s: float) -> LegsInAStand:
+        """Return the model to identify: the robot in a stand, as ``record`` expects it."""
+        # The strengths of the motors take the place of a factor on all of them.
+        fixed = [replace(p, free=False) for p in self.walking.around() if p.name == STRENGTH]
+        loop = self.sensor.channels, self.rate_hz, self.gains[1]
+        open_ = tuple(self.walking.unidentified())
+        return LegsInAStand(self.mjcf, self.walking.joints, fixed, open_, *loop, max_delay_s)
+
     def training(
         self, values: Mapping[str, float], draws: Mapping[str, np.ndarray], *arguments: Any, **options: Any
     ) -> tuple[dict[str, BaseNode], LoopTask]:
@@ -110,7 +128,8 @@ class ComposedRobot(Robot):
                     hint="`terrain = Terrain(most_m=0.2)` in the robot's file makes its ground rougher",
                 )
             robot = copy.copy(self)
-            robot.model = WalkingModel(partial(self.make_task, rough=True), self.height_m, self.terrain)
+            make_rough = partial(self.make_task, rough=True)
+            robot.model = WalkingModel(make_rough, self._parameters(), self.height_m, self.terrain)
         nodes, task = super(ComposedRobot, robot).training(values, draws, *arguments, **options)
         sensor: Any = nodes[self.roles.sensor]
         sizes = {field: len(np.ravel(getattr(self.sensor.at_rest, field))) for field in self.noise}

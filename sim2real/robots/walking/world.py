@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sim2real.composer.physics.mjx.environment import State
     from sim2real.composer.physics.mjx.physics import MjxPhysics
 
-PAYLOAD = "payload"
+PAYLOAD, ARMATURE = "payload", "armature"
 _ROWS = 9
 """Loads that the table of models has; between them the constants are interpolated."""
 _LOADED = ("body_mass", "body_ipos", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0")
@@ -63,11 +63,19 @@ class WalkingWorld(ComposedWorld):
     def init_params(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> WorldParams:
         """Return the parameters' compiled values, and no load."""
         params = super().init_params(rng, graph_state)
-        return params.replace(values={**params.values, PAYLOAD: jnp.float32(0.0)})
+        if self._table is None:  # while it is made
+            return params
+        armature = jnp.asarray(self.environment.model.dof_armature[np.asarray(self._qvel)], jnp.float32)
+        return params.replace(values={**params.values, PAYLOAD: jnp.float32(0.0), ARMATURE: armature})
 
     def _set(self, physics: MjxPhysics, params: WorldParams) -> None:
         super()._set(physics, params)
-        for name, (loads, rows) in (self._table or {}).items():
+        if self._table is None:
+            return
+        # MuJoCo's constants that follow from an armature only condition its solver, so they stay as compiled.
+        armature = physics.mjx_model.dof_armature.at[self._qvel].set(params.values[ARMATURE])
+        physics.replace("model", "dof_armature", armature)
+        for name, (loads, rows) in self._table.items():
             place = (params.values[PAYLOAD] - loads[0]) / (loads[1] - loads[0])
             low = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, len(loads) - 2)
             table = jnp.asarray(rows, jnp.float32)

@@ -15,7 +15,7 @@ from sim2real.artifacts.estimation.drift import Changed, Drift
 from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.timing import Timing
-from sim2real.errors import Sim2RealError
+from sim2real.errors import OtherMotion, Sim2RealError
 from sim2real.installation import has_jax
 from sim2real.stages.deploy.next_command import LATER, with_command
 from sim2real.stages.deploy.trajectories import longest_pause, off_course
@@ -68,6 +68,11 @@ def judge(
 
         with progress(None, "test the model on the deployment"):
             replay, drift = patiently(lambda: tested(pipeline, identification, [r.episode for r in deployment.logs]))
+    except OtherMotion as error:
+        # The policy alone is judged, beside its simulation with identified parameters.
+        advice = _policy_advice(deployment, bundle) or Advice("fine", ("the policy succeeds, as in simulation",))
+        reason = f"the deployment does not test the model: {error.args[0]}"
+        return advised(deployment, replace(advice, reasons=(*advice.reasons, reason)))
     except (Sim2RealError, ArithmeticError, np.linalg.LinAlgError) as error:
         advice, reason = _policy_advice(deployment, bundle), str(error.args[0])
         if advice is None:

@@ -7,7 +7,7 @@ import importlib.util
 import reprlib
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
@@ -69,6 +69,12 @@ class Pipeline:
     def shipped(self) -> Path:
         """The folder of the policy that comes with the pipeline; most have none."""
         return self.folder / "walk"
+
+    @property
+    def in_a_run(self) -> dict[str, Any]:
+        """Defaults of the stages of a run, in which a policy is trained on the run's identification."""
+        train = replace(self.train, model="identified")
+        return {"record": self.record, "identify": self.identify, "train": train, "deploy": self.deploy}
 
     @property
     def latency(self) -> LatencyConfig:

@@ -40,7 +40,11 @@ def set_start(task: LoopTask, config: TrainConfig) -> None:
 
 
 def set_noise(sensor: BaseNode, identification: Identification | None, config: TrainConfig) -> tuple[Noise, ...]:
-    """Give the simulated sensor the noise of the log; return it."""
+    """Give the simulated sensor the noise of the log; return it.
+
+    Readings that no log determines, such as the orientation of a robot in a stand, keep the robot's nominal noise. So
+    do biases, which are constant in a log.
+    """
     factor = config.vary.noise
     if identification is None or not identification.noise or not factor:
         return ()
@@ -54,8 +58,11 @@ def set_noise(sensor: BaseNode, identification: Identification | None, config: T
             "sim2real.robots.control_loop.simulated_devices.SimSensor does"
         )
         return ()
-    sensor.noise = noise
-    return noise
+    nominal, logged = {n.column: n for n in sensor.noise}, {n.column for n in noise}
+    biases = {column: factor * n.bias for column, n in nominal.items()}
+    biased = [replace(n, bias=max(n.bias, biases.get(n.column, 0.0))) for n in noise]
+    sensor.noise = (*biased, *(n for column, n in nominal.items() if column not in logged))
+    return sensor.noise
 
 
 def episodes_of(

@@ -19,7 +19,7 @@ from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.episode_variation import episodes_of, set_noise, set_start, with_disturbances
 from sim2real.stages.train.inputs import check_identification, timing_of, world_of
-from sim2real.train.environment.draws import draw_robots
+from sim2real.train.environment.draws import draw_robots, without_default_ranges
 from sim2real.train.environment.graph_environment import GraphEnvironment
 from sim2real.train.environment.pushes import Pushes
 from sim2real.train.environment.timelines import RecordedTiming, draw_timelines
@@ -63,9 +63,13 @@ def prepare(
 
     # Draw parameters and delays.
     has_posterior = identification is not None and identification.posterior is not None
-    values = _replaced(identification.values if identification and has_posterior else robot.nominal(), changed or {})
+    identified = identification.values if identification and has_posterior else None
+    values = _replaced(
+        robot.nominal() if identified is None else robot.model.unidentified() | identified, changed or {}
+    )
     rng = np.random.default_rng(config.seed)
-    draws = draw_robots(values, identification, config.vary, config.randomise, rng)
+    vary = config.vary if identified is None else without_default_ranges(config.vary, pipeline.train.vary, identified)
+    draws = draw_robots(values, identification, vary, config.randomise, rng)
     draws = {n: d for n, d in draws.items() if n not in (changed or ())}
 
     # Make the nodes, with the robot's computation times, transport times and noise.

@@ -49,6 +49,19 @@ def draw_robots(
     return draws | {n: rng.uniform(low, high, COUNT) for n, (low, high) in vary.range.items()}
 
 
+def without_default_ranges(
+    vary: VariationConfig, defaults: VariationConfig, identified: Mapping[str, float]
+) -> VariationConfig:
+    """Return a variation without the ranges of a pipeline for parameters that were identified; a user's stay.
+
+    Args:
+        defaults: The pipeline's variation.
+        identified: Parameter -> estimate, or the value at which it was held.
+    """
+    ranges = {n: r for n, r in vary.range.items() if n not in identified or defaults.range.get(n) != r}
+    return replace(vary, range=ranges)
+
+
 def widen_posterior(identification: Identification, posterior: Posterior, factor: float) -> Posterior:
     """Return the identification's posterior, and its alternatives, with deviations times a factor.
 

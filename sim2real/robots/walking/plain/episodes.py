@@ -9,8 +9,9 @@ import numpy as np
 from sim2real.policy.upright import Runner
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.robots.walking.joints import STRENGTH as MOTOR_STRENGTH
 from sim2real.robots.walking.messages import into_base
-from sim2real.robots.walking.model import DAMPING, FRICTION, STRENGTH
+from sim2real.robots.walking.model import FRICTION, STRENGTH
 from sim2real.robots.walking.plain.hidden import HiddenTwin
 from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.twin import Twin, walk
@@ -35,15 +36,17 @@ def plain_episodes(
 
 def twin_of(robot: ComposedRobot, values: Mapping[str, float], seed: int = 0) -> Twin:
     """Return the twin with parameters and delays by name; the policy's computation adds to the actuator's delay."""
-    joints = len(robot.joints)
+    joints = robot.walking.joints
     hidden = HiddenTwin(
         friction=values[FRICTION],
         load_kg=values[PAYLOAD],
-        strength=np.full(joints, values[STRENGTH]),
-        damping=values[DAMPING],
+        strength=values[STRENGTH] * joints.of_motor(values, MOTOR_STRENGTH),
+        damping=joints.of_group(values, "damping"),
+        dry=joints.of_group(values, "friction"),
+        armature=joints.of_group(values, "armature"),
         sensing_s=values[DELAYS[0]],
         acting_s=values[DELAYS[1]] + robot.drive.expected_delay_s[1],
-        bias_rad=np.zeros(joints),
+        bias_rad=np.zeros(len(robot.joints)),
     )
     return Twin(robot, hidden, seed)
 

@@ -20,7 +20,7 @@ class HiddenTwin:
         friction: Of feet and floor.
         load_kg: In the base.
         strength: Factor on the torque of each motor.
-        damping, dry, armature: Of each joint [N m s/rad], [N m], [kg m^2].
+        damping, dry, armature: Of each joint, or of all [N m s/rad], [N m], [kg m^2].
         sensing_s: Time from the motion to the observation [s].
         acting_s: Time from the observation to the motors' new target: computation and transport [s].
         bias_rad: Of each encoder.
@@ -29,12 +29,12 @@ class HiddenTwin:
     friction: float = 0.8
     load_kg: float = 0.0
     strength: np.ndarray = field(default_factory=lambda: np.ones(12))
-    damping: float = 0.1
-    dry: float = 0.2
+    damping: float | np.ndarray = 0.1
+    dry: float | np.ndarray = 0.2
     sensing_s: float = 0.008
     acting_s: float = 0.011
     bias_rad: np.ndarray = field(default_factory=lambda: np.zeros(12))
-    armature: float = 0.01
+    armature: float | np.ndarray = 0.01
 
     @staticmethod
     def draw(rng: np.random.Generator, joints: int) -> HiddenTwin:

@@ -1,0 +1,71 @@
+"""Hidden Go2s in a stand, on the emulator's own clock: its motors, noise and latencies, without DDS and real time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benches.hidden.robots import one_after_another, write_log
+
+HANG_S = 4.0
+"""Time in which legs without torque come to rest [s]."""
+_TOOK_S = {"sensor": 5e-4, "agent": 2e-4, "actuator": 3e-4}
+"""Mean durations of the steps of a loop on a computer [s]."""
+
+
+def record(path: Path, seed: int, seconds: float) -> None:
+    """Write the log of the excitation of ``record go2``, played to a hidden robot.
+
+    Args:
+        seed: Of the robot, of its latencies and of its noise.
+        seconds: Length of the excitation, before the legs' way to it [s].
+    """
+    from dataclasses import replace
+
+    from sim2real.hardware.emulation.truth import TruthLog
+    from sim2real.hardware.plant import load_named
+    from sim2real.hardware.unitree.emulation import EmulatedLegs, UnitreeEmulation, truth_header
+    from sim2real.hardware.unitree.legs import command
+    from sim2real.robots.servo.drive import approached
+    from sim2real.robots.walking.messages import BodyReading
+    from sim2real.stages.excitation.signals import excitation
+    from sim2real.stages.pipeline.pipeline import load_pipeline
+
+    pipeline = load_pipeline("go2")
+    robot: Any = pipeline.load()
+    plant = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:Go2Body", "plant")
+    latencies = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:latencies", "plant")
+    body, config = plant("stand", seed), UnitreeEmulation(*latencies(seed), seed=seed)
+    truth = TruthLog(path.with_suffix(".truth.bin"), truth_header(body, config, 0))
+    legs = EmulatedLegs(body, config, truth, 0)
+    # Let the legs hang, then plan the way to the excitation from there.
+    begin_ns = round(1e9 * HANG_S)
+    legs.advance(begin_ns)
+    config_of = replace(pipeline.record, duration_s=seconds, seed=seed)
+    hanging = legs.state(begin_ns).record["motor_state"]["q"][:12]
+    signal = excitation(config_of, robot.rate_hz, len(robot.joints))
+    goals = approached(robot.drive.around(signal), hanging, robot.rate_hz)
+    # The times of the loop's steps; a measurement is the first state after its step's start.
+    rng, count = np.random.default_rng([20261126, seed]), len(goals)
+    took = {name: mean * rng.gamma(4.0, 0.25, count) for name, mean in _TOOK_S.items()}
+    arrives = rng.uniform(0.0, 0.002, count)
+    took["sensor"] += arrives
+    *starts, sent = one_after_another(count, took, robot.rate_hz)
+    starts = dict(zip(("sensor", "agent", "actuator"), starts, strict=True))
+    readings, commands = [], []
+    for k, goal in enumerate(goals):
+        at_ns = begin_ns + round(1e9 * (starts["sensor"][k] + arrives[k]))
+        legs.advance(at_ns)
+        state = legs.state(at_ns).record
+        motors, imu = state["motor_state"][:12], state["imu_state"]
+        parts = (motors["q"], motors["dq"], imu["quaternion"], imu["gyroscope"])
+        readings.append(BodyReading(*(np.array(part, np.float32) for part in parts)))
+        commands.append(robot.drive.message(np.asarray(goal, np.float32)))
+        table = np.stack([getattr(commands[-1], n) for n in ("q", "dq", "kp", "kd", "tau")], axis=-1)
+        legs.receive(command(table), begin_ns + round(1e9 * sent[k]))
+    truth.close()
+    ends = {name: starts[name] + took[name] for name in starts}
+    starts["sensor"] = starts["sensor"] + arrives
+    write_log(path, "go2", (starts, ends), readings, commands, robot.units)

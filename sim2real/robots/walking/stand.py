@@ -1,0 +1,154 @@
+"""Legs in a stand as a model to identify: the base is fixed, the feet are in the air."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from sim2real.errors import OtherMotion
+from sim2real.graph.base import GraphState, Value
+from sim2real.graph.episode import Episode
+from sim2real.graph.node import BaseNode
+from sim2real.identify.model import Channel
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.robots.control_loop.loop import DelayParams, delay_of, delay_parameters, recorded_loop
+from sim2real.robots.from_model.encoders import EncoderParams, Encoders
+from sim2real.robots.from_model.mjcf import driven_spec, read_spec
+from sim2real.robots.roles import ROLES
+from sim2real.robots.walking.joints import STRENGTH, JointParameters
+from sim2real.types import Array, Key, MjModel, PyTree, Scalar
+from sim2real.worlds.driven import DriveCommand, DrivenWorld
+from sim2real.worlds.mjx import MjxState
+from sim2real.worlds.recorded import RecordedActuator
+
+STEP_S, FINE_S = 0.002, 0.001
+"""Time step of the simulation, and the shorter one for which parameters hold [s]: a step acts as armature, of half the
+step times the damping, so the longer step gets less armature. It halves the time of a fit."""
+_STILL_RAD_S = 0.04
+"""Largest deviation of the gyro in a stand [rad/s]."""
+
+
+class LegsInAStand:
+    """Simulates what the encoders of legs in a stand measure; an ``identify.model.IdentifiableModel``.
+
+    Args:
+        fixed: Parameters of training that the log of a stand replaces by others.
+        undetermined: Parameters of training that the log of a stand does not determine.
+        kd: Gain of the velocity with which logs are recorded [N m s/rad].
+        max_delay_s: Upper bound of each delay [s].
+    """
+
+    def __init__(
+        self,
+        mjcf: Path,
+        joints: JointParameters,
+        fixed: Sequence[Parameter],
+        undetermined: tuple[str, ...],
+        channels: tuple[Channel, ...],
+        rate_hz: float,
+        kd: float,
+        max_delay_s: float,
+    ) -> None:
+        self.sensor, self.channels, self.ahead_s, self._rate_hz = ROLES.sensor, channels, STEP_S, rate_hz
+        self.undetermined = undetermined
+        self._joints, self._model, self._kd = joints, stand_model(mjcf), kd
+        rows = [*joints.dynamics(), *fixed, *joints.zeros(), *delay_parameters(max_delay_s)]
+        self.parameters = ParameterTable(rows)
+        columns = DriveCommand(goal="q", goal_velocity="dq", torque="tau", kp="kp", kd="kd")
+        self.given: Mapping[str, PyTree] = {ROLES.actuator: columns}
+        self._world = self._make_world()
+        self._plain = self._world.init_params()
+
+    def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
+        """Return sensor, actuator and world, connected with delays of up to ``max_delay_s`` [s]."""
+        world, still = self._make_world(), jnp.zeros(len(self._joints.motors))
+        sensor = _Sensor(ROLES.sensor, self._rate_hz, world, velocity=True)
+        command = DriveCommand(goal=still, goal_velocity=still, torque=still, kp=still, kd=still)
+        actuator = RecordedActuator(ROLES.actuator, self._rate_hz, command)
+        return recorded_loop(sensor, actuator, world, max_delay_s, self.ahead_s, world.lead_s)
+
+    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
+        """Return an empty dict: there are no limits among the optional terms."""
+        del recordings
+        return {}
+
+    def check(self, episode: Episode) -> None:
+        """Refuse a log in which the base turns: it was not in a stand.
+
+        Raises:
+            OtherMotion: The gyro measured rotation.
+        """
+        gyro = np.asarray(episode.outputs[self.sensor].get("gyro", np.zeros((1, 3))), np.float64)
+        if (turning := float(gyro.std(axis=0).max())) > _STILL_RAD_S:
+            raise OtherMotion(
+                f"the base of the robot moved (its gyro varies by {turning:.2g} rad/s), and this model is of legs in a "
+                "stand",
+                hint="record the robot in a stand, with its legs in the air",
+            )
+
+    def params(self, values: Mapping[str, Scalar], start: Array) -> dict[str, PyTree]:
+        """Return the nodes' parameters.
+
+        Args:
+            start: Shape ``(2 * joints,)``: positions as measured, then velocities.
+        """
+        joints, dofs, count = self._joints, self._world.qvel_at, len(self._joints.motors)
+        places = {"dof_damping": "damping", "dof_frictionloss": "friction", "dof_armature": "armature"}
+        fields = {
+            field: getattr(self._plain.model, field).at[dofs].set(joints.of_group(values, quantity, jnp))
+            for field, quantity in places.items()
+        }
+        # A motor's strength is a factor on its whole law.
+        strength, zero = (joints.of_motor(values, name, jnp) for name in (STRENGTH, "zero"))
+        damping = fields["dof_damping"].at[dofs].add(self._kd * strength)
+        fields["dof_armature"] -= 0.5 * (STEP_S - FINE_S) * damping
+        still = jnp.zeros(count)
+        drive = {"kp": strength, "kd": strength, "gain": strength, "zero": zero, "released": still, "voltage": still}
+        world = self._plain.replace(model=self._plain.model.tree_replace(fields), **drive)
+        late_s = values["sensor_delay"] + self.ahead_s
+        return {
+            ROLES.world: self._world.started(world, start[:count] - zero, start[count:]),
+            ROLES.sensor: _SensorParams(zero=zero, delay=late_s),
+            ROLES.actuator: DelayParams(values["actuator_delay"]),
+        }
+
+    def _make_world(self) -> DrivenWorld:
+        return _World(ROLES.world, 1.0 / STEP_S, self._model)
+
+
+def stand_model(mjcf: Path) -> MjModel:
+    """Return the model of a walking robot whose base is fixed, with a drive on each joint with an actuator."""
+    joints = [actuator.target for actuator in read_spec(mjcf).actuators]
+    spec = driven_spec(mjcf, joints, STEP_S, fix_base=True, contacts=False)
+    for geom in spec.geoms:  # MJX knows no collision of some kinds, even where contacts are off
+        geom.contype = geom.conaffinity = 0
+    return spec.compile()
+
+
+class _World(DrivenWorld):
+    """The legs, with velocities as of the shorter step."""
+
+    def message(self, state: PyTree, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> MjxState:
+        # MuJoCo's velocities are half a step older than its positions.
+        return super().message(state, qpos, qvel + 0.5 * (STEP_S - FINE_S) * qacc, qacc)
+
+
+@struct.dataclass
+class _SensorParams(EncoderParams):
+    delay: Value | None = None
+
+
+class _Sensor(Encoders):
+    """Encoders with a delay."""
+
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> _SensorParams:
+        return _SensorParams(super().init_params(rng, graph_state).zero)
+
+    def init_delays(self, rng: Key | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
+        del rng
+        return delay_of(self.name, ROLES.world, graph_state)

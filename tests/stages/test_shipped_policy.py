@@ -1,0 +1,48 @@
+"""A run of a robot that needs a GPU to train: without one it deploys the policy that its pipeline ships."""
+
+from types import SimpleNamespace
+
+import jax
+import pytest
+
+from sim2real.commands.flags import RunFlags
+from sim2real.commands.loop.run_loop import run_all
+from sim2real.commands.loop.shipped import why_shipped
+from sim2real.errors import UsageError
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+
+@pytest.fixture
+def go(tmp_path):
+    """Return the stages that a run of the Go2 calls, with their configurations."""
+
+    def run(**flags):
+        pipeline, called = load_pipeline("go2"), {}
+
+        def call(stage, config, run_dir):
+            called[stage] = config
+            return SimpleNamespace(run_dir=tmp_path if run_dir is None else run_dir)
+
+        run_all(pipeline, RunFlags(runs=tmp_path, **pipeline.in_a_run, **flags), call)
+        return called
+
+    return run
+
+
+def test_without_a_gpu_the_shipped_policy_is_deployed(go, capsys):
+    assert list(go()) == ["record", "identify", "deploy"]
+    assert "takes hours to train without a GPU" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="without a GPU"):
+        go(iterations=2)
+
+
+def test_with_a_gpu_a_policy_is_trained_on_the_identification(go, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    called = go()
+    assert list(called) == ["record", "identify", "train", "deploy"]
+    assert called["train"].model == "identified"
+    assert load_pipeline("go2").train.model == "nominal"
+
+
+def test_a_robot_that_a_processor_trains_is_trained():
+    assert why_shipped(load_pipeline("pendulum")) == ""
