@@ -144,7 +144,8 @@ def test_a_robot_that_tips_over_is_stopped_while_it_stands_up():
 
 
 def test_identified_values_are_those_of_the_twin():
-    values = {**ROBOT.nominal(), "foot_friction": 0.5, "payload": 1.0, "motor_strength": 0.9, "joint_damping": 0.3}
+    values = {**ROBOT.nominal(), "foot_friction": 0.5, "payload": 1.0, "motor_strength": 0.9}
+    values |= {f"{part}_damping": 0.3 for part in ROBOT.groups}
     twin = twin_of(ROBOT, {**values, "sensor_delay": 0.004, "actuator_delay": 0.006})
     assert twin.model.geom_friction[0, 0] == 0.5
     assert twin.hidden.acting_s == pytest.approx(0.009)
