@@ -139,6 +139,18 @@ def frozen():
     gc.freeze()
 
 
+@pytest.fixture(autouse=True, scope="module")
+def figures_as_data(request):
+    """Draw one picture a module of the rooms that make whole pages, of which tests read texts and figures' titles."""
+    if request.path.parent.name not in ("integration", "stages", "robots", "pipelines"):
+        yield
+        return
+    from sketches import sketched  # matplotlib is imported for tests that need it
+
+    with sketched(pictures=1):
+        yield
+
+
 @pytest.fixture(scope="session")
 def repetitions(request):
     """Return a function of two values: `make test` gets the first, `make test-all` the second.

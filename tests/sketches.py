@@ -12,6 +12,8 @@ from matplotlib.text import Text
 
 from sim2real.view import style
 
+DRAW = style.render
+
 
 def texts(figure: Figure) -> list[str]:
     """Return the texts of a figure: titles, labels, legends, annotations and the labels of ticks."""
@@ -36,11 +38,10 @@ def sketched(pictures: int = 0) -> Iterator[list[Figure]]:
         pictures: The number of figures that are drawn nevertheless, the first ones.
     """
     figures: list[Figure] = []
-    draw = style.render
 
     def render(figure: Figure) -> str:
         figures.append(figure)
-        return draw(figure) if len(figures) <= pictures else sketch(figure)
+        return DRAW(figure) if len(figures) <= pictures else sketch(figure)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "render", render)

@@ -98,6 +98,7 @@ def test_it_is_recorded_by_its_device(log):
     assert effects["values"][-1, 0] == OperatingMode.OFF
 
 
+@pytest.mark.full  # `make test` fits it in the plug-in's own tests, above
 def test_it_is_identified_in_a_world_of_its_own(call, log):
     call("-c", IDENTIFY.format(log=str(log)))
     found = Identification.load(call.folder / "found")

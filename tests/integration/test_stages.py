@@ -65,6 +65,7 @@ def test_resuming_a_finished_run_does_nothing(run_copy, capsys):
     assert before == {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
 
 
+@pytest.mark.full  # `make test` numbers attempts in test_an_interrupted_stage_is_run_again
 def test_deploying_again_keeps_the_first_deployment(finished_run_dir, tmp_path):
     run_dir = tmp_path / "runs" / "pendulum" / "copy"
     copied(finished_run_dir, run_dir)
@@ -79,6 +80,7 @@ def test_deploying_again_keeps_the_first_deployment(finished_run_dir, tmp_path):
     assert len(strict_json(again / "result.json")["episodes"]) == 2
 
 
+@pytest.mark.full  # `make test` moves a run folder in test_run_folder.py
 def test_a_run_that_was_copied_goes_on_without_its_origin(finished_run_dir, tmp_path, monkeypatch):
     """Neither the log nor anything outside of the run folder is needed to train, deploy, report and look at it."""
     run_dir = tmp_path / "elsewhere" / "pendulum" / "copy"

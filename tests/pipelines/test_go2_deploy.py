@@ -60,6 +60,7 @@ def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
     np.testing.assert_allclose(sent["kd"][50:], 0.6, rtol=1e-6)
 
 
+@pytest.mark.full  # `make test` records a deployment of it, above
 @pytest.mark.realtime
 def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
     command, _ = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)

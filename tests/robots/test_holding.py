@@ -267,7 +267,10 @@ SUM = '<joint joint="crank" coef="1"/><joint joint="rocker" coef="-2"/>'
     [
         (COUPLER.format('<joint name="p" type="ball"/>'), "", f"<equality>{PIN}</equality>", 1.0),
         pytest.param("", FREED, f"<equality>{PIN}{PINNED}</equality>", 1.0, marks=pytest.mark.full),
-        ("", "", f'<tendon><fixed name="t">{SUM}</fixed></tendon><equality><tendon tendon1="t"/></equality>', 0.5),
+        pytest.param(
+            "", "", f'<tendon><fixed name="t">{SUM}</fixed></tendon><equality><tendon tendon1="t"/></equality>', 0.5,
+            marks=pytest.mark.full,
+        ),
         ("", "", '<equality><joint joint1="rocker" joint2="crank" polycoef="0 0 1 0 0"/></equality>', 0.4),
     ],
 )  # fmt: skip

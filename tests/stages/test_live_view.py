@@ -86,7 +86,11 @@ def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline)
 
 
 @pytest.mark.parametrize(
-    ("number", "problem"), [(signal.SIGKILL, "its process ended early"), (signal.SIGSTOP, "its process hangs")]
+    ("number", "problem"),
+    [
+        pytest.param(signal.SIGKILL, "its process ended early", marks=pytest.mark.full),
+        (signal.SIGSTOP, "its process hangs"),
+    ],
 )
 def test_a_viewer_that_dies_or_hangs_costs_no_row(tmp_path, capsys, number, problem):
     told = []
@@ -98,6 +102,7 @@ def test_a_viewer_that_dies_or_hangs_costs_no_row(tmp_path, capsys, number, prob
     assert viewers() == []
 
 
+@pytest.mark.full  # `make test` stops a viewer's process, above
 def test_a_viewer_that_reads_nothing_costs_no_row(tmp_path, capsys):
     with socket.socket() as deaf:
         deaf.bind(("127.0.0.1", 0))
