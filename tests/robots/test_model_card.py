@@ -251,6 +251,8 @@ def test_facts_about_the_hardware_come_from_the_log():
         "voltage": "7.4 V, all motors",
         "temperature": "not recorded",
     }
+    alone = {"hardware": {"firmware": {"battery": "1.4"}}}
+    assert facts_of(Episode(steps={}, messages={}, outputs={}, metadata=alone), "sensor")["firmware"] == "1.4: battery"
     legs = Episode(steps={}, messages={}, outputs={"sensor": measured}, metadata={}, units=units)
     assert facts_of(legs, "sensor") == {
         "firmware": "not recorded",

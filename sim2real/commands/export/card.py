@@ -89,6 +89,6 @@ def _of_motors(values: Json) -> str:
     motors: dict[str, list[str]] = {}
     for motor, value in values.items():
         motors.setdefault(str(value), []).append(motor)
-    if len(motors) == 1:
-        return f"{next(iter(motors))}, all motors" if len(values) > 1 else next(iter(motors))
+    if len(motors) == 1 and len(values) > 1:
+        return f"{next(iter(motors))}, all motors"
     return "; ".join(f"{value}: {', '.join(names)}" for value, names in motors.items())

@@ -114,12 +114,17 @@ class UnitreeLegs(GuardedLegs, Device):
         return (WithoutHost("Go2", self.motors, Alone.GOES_ON, math.inf, _SOURCE, "no other reaction is documented"),)
 
     def facts(self) -> dict[str, dict[str, str]]:
-        """Return the versions that the robot's states have; voltage and temperatures are parts of each reading."""
+        """Return the versions that the robot's state has, the battery's voltage and the motors' temperatures."""
         record = self.session.stream.next()[0].record
         bms = record["bms_state"]
         numbers = {"LowState": record["version"].tolist(), "battery": [bms["version_high"], bms["version_low"]]}
         versions = {name: ".".join(map(str, pair)) for name, pair in numbers.items() if any(pair)}
-        return {"firmware": versions} if versions else {}
+        warm = record["motor_state"]["temperature"][self._places].tolist()
+        return {
+            **({"firmware": versions} if versions else {}),
+            "voltage": {"battery": f"{float(record['power_v']):.1f} V"},
+            "temperature": {motor: f"{celsius} °C" for motor, celsius in zip(self.motors, warm, strict=True)},
+        }
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest q, dq, kp, kd and tau, each ``(12, 5)``."""

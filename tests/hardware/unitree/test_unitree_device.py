@@ -47,6 +47,14 @@ def other(robot):
     link.close()
 
 
+def test_facts_for_a_log_are_those_of_a_state(robot, device):
+    with device:
+        facts = device.facts()
+    assert (facts["firmware"], facts["voltage"]) == ({"battery": "1.4"}, {"battery": "29.6 V"})
+    assert list(facts["temperature"]) == list(device.motors)
+    assert set(facts["temperature"].values()) == {"35 °C"}
+
+
 def run(device, command, seconds, each=lambda: None):
     """Command and measure."""
     end_s = time.monotonic() + seconds
