@@ -95,8 +95,7 @@ _CARRIED = '<body name="carried" pos="0.0981 0 0"><inertial pos="0 0 0" mass="{}
 class SO101Plant:
     """An SO-101 on a table: six STS3215 in position mode; any other mode is torque off.
 
-    What the stages' model lacks: each joint's own speed at which friction wears off, errors in whole counts, the stops,
-    and the table.
+    What the stages' model lacks: that the jaw's friction wears off, errors in whole counts, the stops, and the table.
 
     Args:
         start: Joint angles at the beginning [rad]; default: folded, as it was put away.
@@ -189,6 +188,7 @@ class SO101Plant:
             "armature": _ARMATURE,
             **{f"damping_{j}": d for j, d in zip(joints, _DAMPING, strict=True)},
             **{f"friction_{j}": f for j, f in zip(joints, self._levels, strict=True)},
+            **{f"stribeck_{j}": s for j, s in zip(joints[:-1], _STRIBECK_RAD_S, strict=False)},
             **{f"goal_offset_{j}": b for j, b in zip(joints, _BIAS_RAD, strict=True)},
             "saturation": _SATURATION_RAD[0],
             **{f"saturation_{j}": _SATURATION_RAD[joints.index(j)] for j in ("wrist_roll", "gripper")},

@@ -110,7 +110,10 @@ def calibrated(port: str, calibration: Path | None = None) -> StsDrive:
 
 def dynamics() -> list[Parameter]:
     """Return the parameters: servos of one model, each with its own friction and damping."""
-    of_servos = parameters.parameters(SHEET, JOINTS, own=("damping", "friction")) + parameters.offsets(JOINTS)
+    own = ("damping", "friction", "stribeck")
+    of_servos = parameters.parameters(SHEET, JOINTS, own=own) + parameters.offsets(JOINTS)
+    # The jaw has so little friction that no recording shows at which speed it wears off: it keeps it at all speeds.
+    of_servos = [p for p in of_servos if p.name != "stribeck_gripper"]
     full, about = SHEET.full_rad, "error from which on it pushes no harder"
     limit = Parameter("saturation", "rad", full, full / 10, full * 2, about=about, limits=True)
     # A search that begins at the data sheet's limit, which no motion reaches, often stays there.

@@ -151,10 +151,9 @@ def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
 
 def test_what_is_true_goes_by_the_same_names_and_lies_within_the_bounds():
     truth = PLANT.SO101Plant().truth()
-    # Where friction wears off each of its joints has a speed of its own: the model's one is none of them.
-    assert set(truth) | {"stribeck"} == {p.name for p in ROBOT.model.dynamics()} == set(ROBOT.nominal())
+    assert set(truth) == {p.name for p in ROBOT.model.dynamics()} == set(ROBOT.nominal())
     for p in ROBOT.model.dynamics():
-        assert p.low < truth.get(p.name, 0.33) < p.high, p.name
+        assert p.low < truth[p.name] < p.high, p.name
 
 
 def trajectory(angles, aim):

@@ -139,9 +139,8 @@ class ComposedModel(RobotModel):
         numbers = {"profile_rad_s": np.array([min(x.profile_rad_s, _AT_ONCE) for x in task.robot.servos])}
         if s.sheet.worn:
             widths = np.full(model.nv, _AT_ONCE)
-            for (_, dof), joint, width in zip(
-                at, s.joints, parameters.of_joints(values, "stribeck", s.joints), strict=True
-            ):
+            worn = parameters.of_joints(values, "stribeck", s.joints, _AT_ONCE)
+            for (_, dof), joint, width in zip(at, s.joints, worn, strict=True):
                 widths[dof] = float(width) / gear_of(joint)
             numbers["stribeck_rad_s"] = widths
 

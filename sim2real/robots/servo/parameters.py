@@ -34,7 +34,7 @@ STRIBECK = "stribeck_rad_s"
 def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[str] = ("friction",)) -> list[Parameter]:
     """Return gain, damping, rotor inertia and friction, bounded to factors of 3 to 10 of the data sheet.
 
-    If friction decreases with speed, the width of this decrease is a parameter that all joints share.
+    If friction decreases with speed, the width of this decrease, ``stribeck``, is a parameter.
 
     Args:
         own: Quantities with a value for each joint, named as ``friction_JOINT``; joints share the others.
@@ -52,7 +52,8 @@ def parameters(sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[st
         rows += [Parameter(n, unit, value, value / factor, value * factor, about=about, vanishes=gone) for n in names]
     if (width := sheet.stribeck_rad_s) is not None:
         about = "speed at which 1/e of the dry friction is left"
-        rows.append(Parameter("stribeck", "rad/s", width, width / 10, width * 10, about=about))
+        names = [f"stribeck_{name_of(j)}" for j in joints] if "stribeck" in own else ["stribeck"]
+        rows += [Parameter(n, "rad/s", width, width / 10, width * 10, about=about) for n in names]
     return rows
 
 
