@@ -5,6 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+_COSTS = {
+    "loop_share": "processor time of the loop [%]",
+    "other_log_share": "the same beside a viewer of another log [%]",
+    "writes_added": "more writes [1/s]",
+    "lateness_p99_ms": "p99 lateness [ms]",
+    "lateness_p99_added_ms": "more than without it [ms]",
+    "viewer_cores": "viewer [cores]",
+}
+"""Figures of a report, those that it has -> header of their column."""
+
 
 def view(report: Mapping[str, Any]) -> str:
     """Return the cost of a live viewer for a control loop."""
@@ -14,16 +24,14 @@ def view(report: Mapping[str, Any]) -> str:
         f"12 joints at {report['flags']['rate']:g} Hz beside an emulated bus; {report['machine']['cores']} CPU cores.",
         "",
     ]
-    lines += [
-        "| viewer | processor time of the loop [%] | the same viewer on another log [%] | writes [1/s] "
-        "| p99 lateness [ms] | viewer [cores] |",
-        "|---|---|---|---|---|---|",
-    ]
+    names = [n for n in _COSTS if all(f"{target}/{n}" in rows for target in report["flags"]["targets"])]
+    lines += [f"| viewer | {' | '.join(_COSTS[n] for n in names)} |", "|---" * (1 + len(names)) + "|"]
     for target in report["flags"]["targets"]:
-        names = ("loop_share", "other_log_share", "writes_added", "lateness_p99_added_ms")
-        added = (rows[f"{target}/{name}"] for name in names)
-        cells = [f"{row['value']:+.3g} (s.e. {row['yardstick'].rpartition('+-')[2]})" for row in added]
-        lines.append(f"| {target} | {' | '.join(cells)} | {rows[f'{target}/viewer_cores']['value']:.2f} |")
+        cells = []
+        for figure in (rows[f"{target}/{name}"] for name in names):
+            _, added, error = figure["yardstick"].rpartition("+-")
+            cells.append(f"{figure['value']:+.3g} (s.e. {error})" if added else f"{figure['value']:.3g}")
+        lines.append(f"| {target} | {' | '.join(cells)} |")
     return "\n".join([*lines, ""])
 
 
