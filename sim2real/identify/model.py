@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -66,7 +66,6 @@ class IdentifiableModel(Protocol):
     """The interface of a robot for identification.
 
     Attributes:
-        undetermined: Parameters of training that no log determines.
         sensor: Node whose outputs are predicted.
         given: Nodes whose recorded outputs drive the model: node -> a message with field names as its leaves.
         channels: Initial states have a position and a velocity for each.
@@ -76,7 +75,6 @@ class IdentifiableModel(Protocol):
     """
 
     parameters: ParameterTable
-    undetermined: tuple[str, ...]
     sensor: str
     given: Mapping[str, PyTree]
     channels: tuple[Channel, ...]
@@ -90,10 +88,15 @@ class IdentifiableModel(Protocol):
         """Return limit -> the largest value that recordings reach, of limits among the optional terms."""
         ...
 
-    def check(self, episode: Episode) -> None:
-        """Raise a ``Sim2RealError`` if a log is of a motion that the model does not describe."""
-        ...
-
     def params(self, values: Mapping[str, Array], start: Array) -> dict[str, PyTree]:
         """Return node parameters for values and an initial state ``(2 * channels,)``: positions, then velocities."""
+        ...
+
+
+@runtime_checkable
+class ChecksLogs(Protocol):
+    """A model that does not describe the motion of all logs."""
+
+    def check(self, episode: Episode) -> None:
+        """Raise a ``Sim2RealError`` if a log is of another motion, such as a walk beside a model of legs in a stand."""
         ...

@@ -91,5 +91,7 @@ def one(seed: int, options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _share(name: str, count: int, of: int, about: str) -> Row:
+    if not of:  # a fit that did not converge has no interval
+        return row(name, 0.0, "1", f"0 of 0 {about}", "1")
     part, low, high = share(count, of)
     return row(name, four_digits(part), "1", f"{count} of {of} {about}; 95 % interval {low:.2f} to {high:.2f}", "1")

@@ -23,8 +23,6 @@ class IdentifiableLoop:
         max_delay_s: Upper bound of each of the two delays [s].
     """
 
-    undetermined = ()
-
     def __init__(self, robot: ConnectedParts, max_delay_s: float) -> None:
         self._robot, self.sensor = robot, robot.roles.sensor
         self.parameters = ParameterTable([*robot.model.dynamics(), *delay_parameters(max_delay_s, robot.roles)])
@@ -43,10 +41,6 @@ class IdentifiableLoop:
         """Return an empty dict: there are no limits among the optional terms."""
         del recordings
         return {}
-
-    def check(self, episode: Episode) -> None:
-        """Accept all logs."""
-        del episode
 
     def params(self, values: Mapping[str, Scalar], start: Array) -> dict[str, PyTree]:
         """Return the nodes' parameters.

@@ -101,7 +101,7 @@ class IdentifiableRecording:
         max_delay_s: Upper bound of the delay [s].
     """
 
-    ahead_s, undetermined = 0.0, ()
+    ahead_s = 0.0
 
     def __init__(self, robot: LoggedRobot, max_delay_s: float) -> None:
         self._robot, self.sensor, self.channels = robot, robot.roles.sensor, robot.channels
@@ -131,10 +131,6 @@ class IdentifiableRecording:
         """Return an empty dict: there are no limits among the optional terms."""
         del recordings
         return {}
-
-    def check(self, episode: Episode) -> None:
-        """Accept all logs."""
-        del episode
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.

@@ -109,8 +109,7 @@ class ComposedRobot(Robot):
         # The strengths of the motors take the place of a factor on all of them.
         fixed = [replace(p, free=False) for p in self.walking.around() if p.name == STRENGTH]
         loop = self.sensor.channels, self.rate_hz, self.gains[1]
-        open_ = tuple(self.walking.unidentified())
-        return LegsInAStand(self.mjcf, self.walking.joints, fixed, open_, *loop, max_delay_s)
+        return LegsInAStand(self.mjcf, self.walking.joints, fixed, *loop, max_delay_s)
 
     def training(
         self, values: Mapping[str, float], draws: Mapping[str, np.ndarray], *arguments: Any, **options: Any

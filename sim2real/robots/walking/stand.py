@@ -38,7 +38,6 @@ class LegsInAStand:
 
     Args:
         fixed: Parameters of training that the log of a stand replaces by others.
-        undetermined: Parameters of training that the log of a stand does not determine.
         kd: Gain of the velocity with which logs are recorded [N m s/rad].
         max_delay_s: Upper bound of each delay [s].
     """
@@ -48,14 +47,12 @@ class LegsInAStand:
         mjcf: Path,
         joints: JointParameters,
         fixed: Sequence[Parameter],
-        undetermined: tuple[str, ...],
         channels: tuple[Channel, ...],
         rate_hz: float,
         kd: float,
         max_delay_s: float,
     ) -> None:
         self.sensor, self.channels, self.ahead_s, self._rate_hz = ROLES.sensor, channels, STEP_S, rate_hz
-        self.undetermined = undetermined
         self._joints, self._model, self._kd = joints, stand_model(mjcf), kd
         rows = [*joints.dynamics(), *fixed, *joints.zeros(), *delay_parameters(max_delay_s)]
         self.parameters = ParameterTable(rows)

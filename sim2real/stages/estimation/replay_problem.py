@@ -9,7 +9,7 @@ import numpy as np
 from sim2real.artifacts.identification import Identification
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.model import ChecksLogs, IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
@@ -31,11 +31,13 @@ def problem_of_logs(
     """Return later logs in short segments, with the identified parameters, and the horizon of the predictions [s].
 
     Raises:
-        Sim2RealError: When the logs are too short, or parameters differ between recordings.
+        Sim2RealError: When the logs are too short or of another motion, or parameters differ between recordings.
     """
     model = robot.watched(config.max_delay_s)
     if separate := [p.name for p in model.parameters if p.free and p.per_recording]:
         raise Sim2RealError(f"{', '.join(separate)} differ between recordings: a new log has no values for them")
+    for episode in episodes if isinstance(model, ChecksLogs) else ():
+        model.check(episode)
 
     # Choose the length of segments and the horizon.
     horizons = sorted({p.horizon_s for p in identification.prediction})

@@ -16,7 +16,7 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.refits import REFITS, Refits
-from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.contract import RecordedRobot, Robot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.fitted_logs import require_apart
@@ -50,6 +50,11 @@ class Inputs:
     fitted: int
     windows: list[Span]
     refits: Refits = field(default_factory=Refits)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Parameters of training that no log of the robot determines."""
+        return tuple(self.robot.model.unidentified()) if isinstance(self.robot, Robot) else ()
 
     @property
     def digest(self) -> str:

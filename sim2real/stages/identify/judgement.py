@@ -79,7 +79,7 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
             document = replace(document, tried=of_selection(fits.selection, fits.widest.problem.table))
         document, lacks = patiently(lambda: lack(document, inputs, fit))
     document, outside = with_promises(document, inputs, fit, parts)
-    open_ = [f"not determined by this log: {', '.join(names)}"] if (names := inputs.model.undetermined) else []
+    open_ = [f"not determined by this log: {', '.join(names)}"] if (names := inputs.undetermined) else []
     return estimate.judged(document, findings, inputs.units, config.max_delay_s, [*outside, *held, *open_], lacks)
 
 
