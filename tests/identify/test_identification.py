@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Steps
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.uncertainty.uncertainty import centred, sum_of
@@ -121,3 +122,19 @@ def test_logs_that_lack_something_are_errors(fitted):
     model = fitted.problem.model
     with pytest.raises(UsageError, match="too few to start a segment"):
         Problem(model, [episode], [Span(0, 1.0), Span(0, episode.duration_s + 3.0)], fitted.problem.segment_s)
+
+
+def test_a_segment_that_would_start_in_a_gap_is_left_out(fitted):
+    """As where a busy computer paused the recording: the rest of the log is of use."""
+    episode, model = fitted.episode, fitted.problem.model
+    steps = episode.steps["sensor"]
+    rows = np.flatnonzero((steps.start < 3_000_000) | (steps.start > 4_000_000))
+    kept = Steps(*(getattr(steps, name)[rows] for name in Steps.__dataclass_fields__))
+    outputs = {n: v[rows] for n, v in episode.outputs["sensor"].items()}
+    paused = replace(
+        episode, steps={**episode.steps, "sensor": kept}, outputs={**episode.outputs, "sensor": outputs}, messages={}
+    )
+    problem = Problem(model, [paused], [Span(0, b) for b in (1.0, 3.5, 5.0)], fitted.problem.segment_s)
+    assert [s.begin_s for s in problem.spans] == [1.0, 5.0]
+    with pytest.raises(UsageError, match="each segment would start in a gap"):
+        Problem(model, [paused], [Span(0, 3.5)], fitted.problem.segment_s)

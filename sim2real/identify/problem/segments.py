@@ -19,6 +19,8 @@ from sim2real.identify.problem.sizes import padded, rounded
 from sim2real.later import jax, jnp
 from sim2real.types import Array, PyTree
 
+_LEAST_SAMPLES = 4
+"""Smallest number of samples around the start of a segment."""
 Retimed = Callable[[Timeline], Timeline]
 """Recorded timing of segments -> changed timing."""
 
@@ -132,7 +134,7 @@ def cut(
     """Cut recordings into segments.
 
     Args:
-        spans: The segments, recording by recording.
+        spans: The segments, recording by recording; those that start in a gap of the samples are left out.
         length_s: Length of a segment [s].
         lead_s: Time before a segment from which commands are kept, as they still act in it [s].
 
@@ -144,7 +146,8 @@ def cut(
     # Cut the recorded timing, recording by recording.
     timelines, firsts, ordered = [], [], []
     for r, episode in enumerate(recordings):
-        parts_of = [s for s in spans if s.recording == r]
+        t = episode.steps[model.sensor].begun_s if model.sensor in episode.steps else np.zeros(0)
+        parts_of = [s for s in spans if s.recording == r and not _in_gap(t, s.begin_s)]
         if not parts_of:
             continue
         check_log(episode, model)
@@ -154,6 +157,8 @@ def cut(
         timelines.append(parts)
         firsts += [(r, {n: int(f[i]) for n, f in first.items()}) for i in range(len(parts_of))]
         ordered += parts_of
+    if not ordered:
+        raise UsageError("each segment would start in a gap of the log", hint="record again")
     # Stack the recordings, and take the messages of each segment from its first step on.
     timeline = Timeline.stack(timelines)
     start = timeline.vertices[model.sensor].start / TICKS_PER_S
@@ -230,14 +235,23 @@ def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:
     return recorded[np.minimum(first + np.arange(width), len(recorded) - 1)]
 
 
-def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np.ndarray:
-    """Fit a cubic in time to each channel's samples around a start; shape ``(channels, 4)``."""
-    # Take the eight samples nearest to a point one period after the start.
-    t = episode.steps[model.sensor].begun_s
+def _near(t: np.ndarray, begin_s: float) -> np.ndarray:
+    """Return the indices of up to eight samples near a start, from which its state is estimated; ``t`` ``(N,)`` [s]."""
     period = float(np.median(np.diff(t)))
     near = np.sort(np.argsort(np.abs(t - begin_s - period), kind="stable")[:8])
-    near = near[np.abs(t[near] - begin_s) < 12 * period]
-    if near.size < 4:
+    return near[np.abs(t[near] - begin_s) < 12 * period]
+
+
+def _in_gap(t: np.ndarray, begin_s: float) -> bool:
+    """Return whether a start within a log has too few samples around it."""
+    return t.size > 1 and bool(t[0] <= begin_s <= t[-1]) and _near(t, begin_s).size < _LEAST_SAMPLES
+
+
+def _local_fit(episode: Episode, model: IdentifiableModel, begin_s: float) -> np.ndarray:
+    """Fit a cubic in time to each channel's samples around a start; shape ``(channels, 4)``."""
+    t = episode.steps[model.sensor].begun_s
+    near = _near(t, begin_s)
+    if near.size < _LEAST_SAMPLES:
         raise UsageError(f"the log has {near.size} measurements around {begin_s:.3f} s, too few to start a segment")
     # Fit positions, and velocities if they are measured, weighted by their deviations.
     x = (t[near] - begin_s)[:, None]

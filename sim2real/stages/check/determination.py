@@ -59,7 +59,7 @@ def judge(
         "recordings": [
             {"name": n, **coverage(e, model, units)} for n, e in zip(source.names, source.episodes, strict=True)
         ],
-        "segments": len(spans),
+        "segments": problem.segments,
         "segment_s": length_s,
         "condition": determined.condition,
         "determined": not open_groups,
