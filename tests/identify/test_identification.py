@@ -124,7 +124,7 @@ def test_logs_that_lack_something_are_errors(fitted):
         Problem(model, [episode], [Span(0, 1.0), Span(0, episode.duration_s + 3.0)], fitted.problem.segment_s)
 
 
-def test_a_segment_that_would_start_in_a_gap_is_left_out(fitted):
+def test_a_segment_that_would_start_in_a_gap_is_skipped(fitted):
     """As where a busy computer paused the recording: the rest of the log is of use."""
     episode, model = fitted.episode, fitted.problem.model
     steps = episode.steps["sensor"]

@@ -134,7 +134,7 @@ def cut(
     """Cut recordings into segments.
 
     Args:
-        spans: The segments, recording by recording; those that start in a gap of the samples are left out.
+        spans: The segments, recording by recording; those that start in a gap of the samples are skipped.
         length_s: Length of a segment [s].
         lead_s: Time before a segment from which commands are kept, as they still act in it [s].
 
