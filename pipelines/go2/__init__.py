@@ -19,6 +19,8 @@ VARY = VariationConfig(
     push=0.6,
     push_hz=0.25,
 )
+AFTER_S = 2.0
+"""Time in which legs leave their stops and each other, and reach the excitation [s]: no identification models that."""
 # rad, rad/s, rad/s, s; each joint has its own range. A motor turns at 30 rad/s at most. On two busy cores this process
 # paused for 0.11 s: with the usual 0.1 s the guardian would let a walking robot sink.
 GATE = GateLimits(limit=4.6, slew_per_s=60.0, max_speed_rad_s=40.0, servo_watchdog_s=0.25)
@@ -45,7 +47,7 @@ PIPELINE = Pipeline(
     summary="quadruped with a floating base: follow a commanded velocity",
     package=__name__,
     record=RecordConfig(duration_s=12.0, amplitude=0.3, low_hz=0.2, high_hz=4.0, gate=GATE),
-    identify=IdentifyConfig(generations=0, folds=0),
+    identify=IdentifyConfig(generations=0, folds=0, after_s=AFTER_S),
     train=TrainConfig(model="nominal", episode_s=10.0, timelines=256, sensitivity=False, vary=VARY, ppo=WALK),
     deploy=DeployConfig(episodes=5, duration_s=10.0, max_tilt_rad=1.2, gate=GATE),
 )

@@ -154,8 +154,8 @@ def two_links(folder, own, commands):
 @pytest.mark.parametrize(
     ("own", "commands"),
     [
-        pytest.param(PLAIN, ("goal",), marks=pytest.mark.full),
-        (PLAIN | TERMS, ("goal", "kp", "enabled", "torque", "goal_velocity")),
+        (PLAIN, ("goal",)),
+        pytest.param(PLAIN | TERMS, ("goal", "kp", "enabled", "torque", "goal_velocity"), marks=pytest.mark.full),
     ],
     ids=["plain", "every term"],
 )

@@ -1,6 +1,7 @@
 """Legs in a stand: the model to identify is the emulator's, and a log of a robot that moves is refused."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -19,6 +20,8 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.prediction import labels
 from sim2real.robots.walking.plain.episodes import twin_of
+from sim2real.stages.estimation.segment_split import spans
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SEED, SECONDS, SEGMENT_S = 5, 2.0, 0.8
 
@@ -38,8 +41,8 @@ def log(tmp_path_factory):
 def test_with_the_true_parameters_the_model_predicts_the_log_to_its_noise(log):
     episode, truth = log
     model = ROBOT.identifiable(0.06)
-    spans = [Span(0, begin) for begin in (1.2, 2.0)]
-    problem = Problem(model, [episode], spans, SEGMENT_S, FitConfig(generations=0))
+    cut = [Span(0, begin) for begin in (1.6, 2.0)]
+    problem = Problem(model, [episode], cut, SEGMENT_S, FitConfig(generations=0))
     assert problem.engine.name == "c"
     values = {p.name: np.full(2, truth.get(p.name, p.nominal)) for p in problem.table}
     errors, _ = problem.simulated(values, np.arange(2), np.full(2, SEGMENT_S))
@@ -69,6 +72,15 @@ def test_a_log_of_a_robot_that_moves_is_refused(log):
     with pytest.raises(OtherMotion, match="base of the robot moved") as refused:
         model.check(walking)
     assert "stand" in refused.value.hint
+
+
+def test_the_way_of_the_legs_to_the_excitation_is_not_fitted(log):
+    episode, _ = log
+    config = replace(load_pipeline("go2").identify, settle_s=0.1, horizon_s=0.2)
+    assert config.after_s == 2.0
+    for after_s, begin_s in ((0.7, 0.7), (0.0, 0.3)):
+        cut = spans([episode], 1, replace(config, after_s=after_s), 0.3)
+        assert min(span.begin_s for span in cut) == begin_s
 
 
 def test_the_emulator_names_its_parameters_as_an_identification_does(log):

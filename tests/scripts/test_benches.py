@@ -1,7 +1,7 @@
 """Every bench runs with --quick, and its report says what it is of; figures are not looked at.
 
 Those that train, search or trace MJX for ten seconds are ``full``. In `make test` the others say that ``bench.main``
-makes a report of rows, ``train`` and ``graph`` that a training and a graph can be measured, and
+makes a report of rows, ``train`` that a training can be measured, and
 ``test_help_shows_the_flags_of_a_bench`` that each module can be imported and has its flags and its quick ones.
 """
 
@@ -75,6 +75,7 @@ def names(report):
     return {row["name"] for row in report["rows"]}
 
 
+@pytest.mark.full
 def test_graph(run, traced):
     found = names(run("graph", "--name", "h200"))
     assert {"graph/h200/hiccups/2/over_hand", "graph/h200/mjx_arm/2/over_bare", "graph/bytes_per_copy"} <= found

@@ -46,6 +46,7 @@ def test_a_search_streams_its_loss_and_its_best_fit(run_copy, tmp_path):
     assert (run_copy / "identify.2" / "best_fit.npz").is_file()
 
 
+@pytest.mark.full  # `make test` streams a search, above
 def test_a_training_streams_its_curves_and_a_viewer_joins_it(run_copy, tmp_path):
     file = tmp_path / "train.rrd"
     home = ["--run", str(run_copy), "--runs", str(run_copy.parent.parent)]

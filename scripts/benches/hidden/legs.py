@@ -52,8 +52,8 @@ def record(path: Path, seed: int, seconds: float) -> None:
     took = {name: mean * rng.gamma(4.0, 0.25, count) for name, mean in _TOOK_S.items()}
     arrives = rng.uniform(0.0, 0.002, count)
     took["sensor"] += arrives
-    *starts, sent = one_after_another(count, took, robot.rate_hz)
-    starts = dict(zip(("sensor", "agent", "actuator"), starts, strict=True))
+    *begun, sent = one_after_another(count, took, robot.rate_hz)
+    starts = dict(zip(took, begun, strict=True))
     readings, commands = [], []
     for k, goal in enumerate(goals):
         at_ns = begin_ns + round(1e9 * (starts["sensor"][k] + arrives[k]))

@@ -56,8 +56,8 @@ class LegsInAStand:
         self._joints, self._model, self._kd = joints, stand_model(mjcf), kd
         rows = [*joints.dynamics(), *fixed, *joints.zeros(), *delay_parameters(max_delay_s)]
         self.parameters = ParameterTable(rows)
-        columns = DriveCommand(goal="q", goal_velocity="dq", torque="tau", kp="kp", kd="kd")
-        self.given: Mapping[str, PyTree] = {ROLES.actuator: columns}
+        columns: dict[str, PyTree] = {"goal": "q", "goal_velocity": "dq", "torque": "tau", "kp": "kp", "kd": "kd"}
+        self.given: Mapping[str, PyTree] = {ROLES.actuator: DriveCommand(**columns)}
         self._world = self._make_world()
         self._plain = self._world.init_params()
 
@@ -104,12 +104,12 @@ class LegsInAStand:
         strength, zero = (joints.of_motor(values, name, jnp) for name in (STRENGTH, "zero"))
         damping = fields["dof_damping"].at[dofs].add(self._kd * strength)
         fields["dof_armature"] -= 0.5 * (STEP_S - FINE_S) * damping
-        still = jnp.zeros(count)
+        still, state = jnp.zeros(count), jnp.asarray(start)
         drive = {"kp": strength, "kd": strength, "gain": strength, "zero": zero, "released": still, "voltage": still}
         world = self._plain.replace(model=self._plain.model.tree_replace(fields), **drive)
         late_s = values["sensor_delay"] + self.ahead_s
         return {
-            ROLES.world: self._world.started(world, start[:count] - zero, start[count:]),
+            ROLES.world: self._world.started(world, state[:count] - zero, state[count:]),
             ROLES.sensor: _SensorParams(zero=zero, delay=late_s),
             ROLES.actuator: DelayParams(values["actuator_delay"]),
         }
@@ -137,7 +137,7 @@ class _World(DrivenWorld):
 
 @struct.dataclass
 class _SensorParams(EncoderParams):
-    delay: Value | None = None
+    delay: Scalar | None = None
 
 
 class _Sensor(Encoders):

@@ -92,8 +92,8 @@ def reach(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
     An estimate of an initial state needs samples before and after the start of the segment.
     """
     if config.initial_state != "free":
-        return 0.0, episode.duration_s
-    return _EDGES_S[0], episode.duration_s - _EDGES_S[1]
+        return config.after_s, episode.duration_s
+    return max(_EDGES_S[0], config.after_s), episode.duration_s - _EDGES_S[1]
 
 
 def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:

@@ -31,6 +31,8 @@ class IdentifyConfig(FitConfig):
     """Rest of a segment: the horizon of its prediction [s]."""
     spacing_s: float = 0.0
     """Distance between the starts of fitted segments [s]; 0 puts them side by side."""
+    after_s: float = 0.0
+    """First part of each log that is not used, such as the way of hanging legs to their excitation [s]."""
     held_out: float = 0.25
     """Share of each log, at its end, that is held out; 0 if whole logs are held out."""
     free_run_s: float = 10.0
@@ -72,8 +74,8 @@ class IdentifyConfig(FitConfig):
                 "settle_s must lie in [0, 10] s and horizon_s in [0.2, 600] s, "
                 f"got {self.settle_s} and {self.horizon_s}"
             )
-        if self.spacing_s < 0.0:
-            raise UsageError(f"spacing_s must not be negative, got {self.spacing_s}")
+        if min(self.spacing_s, self.after_s) < 0.0:
+            raise UsageError(f"spacing_s and after_s must not be negative, got {self.spacing_s} and {self.after_s}")
         if not 0.0 <= self.free_run_s <= 3600.0:
             raise UsageError(f"free_run_s must lie in [0, 3600] s, got {self.free_run_s}")
         if self.folds < 0 or self.folds == 1 or (self.terms == "auto" and not self.folds):
