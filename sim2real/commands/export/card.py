@@ -86,6 +86,7 @@ def _of_motors(values: Json) -> str:
     """Return a fact of each motor as text: one value, or each value with its motors."""
     if not isinstance(values, dict):
         return str(values)
+    # Group the motors by their value, as most robots have motors of one kind.
     motors: dict[str, list[str]] = {}
     for motor, value in values.items():
         motors.setdefault(str(value), []).append(motor)

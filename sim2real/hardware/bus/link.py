@@ -255,6 +255,7 @@ class ServoLink(ABC):
 
     def _passed(self, servo_id: int) -> bool:
         """Read as many bytes as no other read; the line keeps the order, so no late answer comes after them."""
+        # Ask the last servo that is read: those before it have answered by then.
         self._barriers += 1
         length = _BARRIER_BYTES[self._barriers % len(_BARRIER_BYTES)]
         query = self.form.read((servo_id,), self.table.torque.address, length)

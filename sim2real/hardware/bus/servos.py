@@ -152,6 +152,7 @@ class GuardedServos(Generic[L]):
         """Return firmware, supply voltage and temperature of each servo; see `Device.facts`."""
         link, table = self.link, self.link.table
         facts: dict[str, dict[str, str]] = {"firmware": {}, "voltage": {}, "temperature": {}}
+        # An error of a servo, such as an alarm, does not keep its facts from the log.
         for servo_id, motor in zip(self.ids, self.motors, strict=True):
             numbers = [link.read(servo_id, r, despite_error=True) for r in (*table.firmware, table.voltage)]
             facts["firmware"][motor] = ".".join(map(str, numbers[:-1]))

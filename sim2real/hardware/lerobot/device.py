@@ -117,6 +117,7 @@ class LerobotServos(GuardedServos[Any], Device):
     def facts(self) -> dict[str, dict[str, str]]:
         """Return firmware, supply voltage and temperature of each motor, by LeRobot's names of the registers."""
         names = ("Firmware_Major_Version", "Firmware_Minor_Version", "Present_Voltage", "Present_Temperature")
+        # Read each register of all motors at once, in counts.
         bus = self.link.bus
         rows = [self.link.call(lambda name=name: bus.sync_read(name, normalize=False))[0] for name in names]
         major, minor, tenths_v, celsius = ([row[motor] for motor in self._names] for row in rows)

@@ -115,6 +115,7 @@ class UnitreeLegs(GuardedLegs, Device):
 
     def facts(self) -> dict[str, dict[str, str]]:
         """Return the versions that the robot's state has, the battery's voltage and the motors' temperatures."""
+        # Versions of 0 are those that the robot does not report.
         record = self.session.stream.next()[0].record
         bms = record["bms_state"]
         numbers = {"LowState": record["version"].tolist(), "battery": [bms["version_high"], bms["version_low"]]}

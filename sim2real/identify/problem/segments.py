@@ -237,6 +237,7 @@ def _rows(recorded: np.ndarray, first: int, width: int) -> np.ndarray:
 
 def _near(t: np.ndarray, begin_s: float) -> np.ndarray:
     """Return the indices of up to eight samples near a start, from which its state is estimated; ``t`` ``(N,)`` [s]."""
+    # Take the eight samples nearest to a point one period after the start.
     period = float(np.median(np.diff(t)))
     near = np.sort(np.argsort(np.abs(t - begin_s - period), kind="stable")[:8])
     return near[np.abs(t[near] - begin_s) < 12 * period]

@@ -69,6 +69,7 @@ def check(
         config = replace(config, log=tuple(str(log.path) for log in logs), plan=False)
         source = JudgedLogs([shown(log.path) for log in logs], [log.episode for log in logs], False)
 
+    # Refuse logs that no parameter can be determined from, also without JAX.
     for episode in source.episodes:
         check_log(episode, model)
     if not has_jax():

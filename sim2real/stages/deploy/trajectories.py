@@ -51,6 +51,7 @@ def lost_s(episode: Episode, nodes: Sequence[str]) -> float:
     """Return the time that the slowest of some nodes lost between steps that are two periods or more apart [s]."""
     lost = [0.0]
     for node in nodes:
+        # A step that is a little late is no pause: the node returns to its schedule.
         gaps_s = np.diff(episode.steps[node].begun_s)
         if gaps_s.size:
             period_s = float(np.median(gaps_s))

@@ -74,6 +74,7 @@ def _thinned(episode: Episode) -> tuple[Episode, dict[str, np.ndarray]]:
 
 def _moved(tab: Tab, offset_s: float) -> Tab:
     """Return a tab with all times moved; curves that share their times still do."""
+    # Move each array of times once: the receiver makes one column of each.
     every = {id(c.t_s): c.t_s for curves in tab.plots.values() for c in curves}
     moved = {number: t_s + offset_s for number, t_s in every.items()}
     plots = {title: [replace(c, t_s=moved[id(c.t_s)]) for c in curves] for title, curves in tab.plots.items()}
