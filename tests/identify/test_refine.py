@@ -1,5 +1,7 @@
 """Refinement: from any start to the same minimum, never away from it, and it says whether it got there."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,7 +52,8 @@ class Stub:
         held=None,
         **options,
     ):
-        self.table, self.channels, self.data, self.segment_s = table or table_of(2), (), None, 1.0
+        self.table, self.channels, self.segment_s = table or table_of(2), (), 1.0
+        self.data = SimpleNamespace(present=np.ones(len(self.table), bool))
         self.config = FitConfig(**{"initial_state": "rest", "refine_steps": 60, **options})
         self.evaluator, self._held = self, held or (lambda r, x, begun: r)
         self.fresh, self.precision = held is None, 1e-6
@@ -70,6 +73,9 @@ class Stub:
 
     def loss(self, z, data=None, on_compile=None):
         return self.at(z).loss
+
+    def losses(self, candidates, around, data=None):
+        return np.array([self.loss(z) for z in candidates])
 
     def around(self, z, data):
         """Return what a round sees: residuals and those of priors, and their derivative."""
@@ -257,6 +263,25 @@ def test_starts_that_cannot_be_simulated_are_passed_over(minimum):
 def test_a_descent_gets_past_what_cannot_be_simulated(minimum):
     holed = Stub(lambda x: jnp.where(jnp.abs(x[0] - 2.0) < 0.3, jnp.nan, valley(x)))
     np.testing.assert_allclose(holed.values(holed.refined([3.0, -2.0]).z), minimum.x, atol=2e-3)
+
+
+@pytest.mark.parametrize("share", [1.0001, 1.1])
+@pytest.mark.parametrize("weight", [1.0, 5.0])
+def test_a_friction_without_effect_comes_back(minimum, share, weight):
+    """Next to its bound it has hardly a derivative, so a step would have to be long, and the others move first."""
+    low, dry = 1e-5, 1.2
+    table = ParameterTable([*table_of(2), Parameter("dry", "1", 1.0, low, 10.0, "log")])
+    problem = Stub(lambda x: jnp.concatenate([valley(x[:2]), weight * (jnp.exp(x[2:]) - dry)]), table)
+    values = problem.values(problem.refined([-1.2, 1.0, np.log(share * low)], settle=False).z)
+    np.testing.assert_allclose(values[:2], minimum.x, atol=2e-3)
+    assert np.exp(values[2]) == pytest.approx(dry, rel=1e-2)
+
+
+def test_an_absent_effect_stays_at_its_bound():
+    table = ParameterTable([Parameter(name, "1", 1.0, 0.0, 10.0, "linear") for name in ("dry", "viscous")])
+    problem = Stub(lambda x: jnp.stack([x[0] - 1.2, 3.0 * (x[1] + 0.1)]), table)
+    values = problem.values(problem.refined([2.0, 0.0], settle=False).z)
+    np.testing.assert_allclose(values, [1.2, 0.0], atol=2e-3)
 
 
 def test_priors_take_part():

@@ -44,6 +44,9 @@ _POLLED, _REACH, _BETTER = 12, 0.5, 1e-3
 """Points that are tried around a descent that ended with more left; how far away [standard errors]; and by which share
 their loss must be lower. Where friction sticks, the derivative at a point does not describe the points around it."""
 _TRIES = 3
+_FLAT, _INWARDS = 0.05, (0.25, 0.5, 0.75)
+"""Distance from a bound within which a parameter hardly acts, and the distances at which it is tried [widths of the
+bounds]: there the map to values is flat, and a friction has no effect, so a descent does not come back."""
 OnStep = Callable[[float, np.ndarray], None]
 """Called with the best loss and point ``(P,)`` so far, after every evaluation."""
 
@@ -178,6 +181,7 @@ class _Descent:
         loss = self.at(z)
         # Rounds of Levenberg-Marquardt; a round that ends worse goes half way back.
         for _ in range(1 if self._problem.evaluator.fresh else _ROUNDS):
+            z, loss = self._off_bounds(z, loss)
             end = self._round(z, gain, pin)
             after = self.at(end)
             for _ in range(_BACK):
@@ -203,6 +207,33 @@ class _Descent:
             if self.at(there) < (1.0 - _BETTER) * loss:
                 return there
         return None
+
+    def _off_bounds(self, z: np.ndarray, loss: float) -> tuple[np.ndarray, float]:
+        """Return a point with parameters next to bounds moved inwards, where that lowers the loss; and its loss."""
+        table = self._problem.table
+        x = table.scale(z)[0]
+        share = (x - table.low) / table.span
+        near = (share < _FLAT) | (share > 1.0 - _FLAT)
+        flat = np.flatnonzero(near & np.asarray(self._data.present))
+        if not len(flat):
+            return z, loss
+        # Move each alone.
+        inwards = np.where(share[flat, None] < 0.5, _INWARDS, 1.0 - np.array(_INWARDS))
+        to = table.low[flat, None] + inwards * table.span[flat, None]
+        rows = np.repeat(x[None], to.size, axis=0)
+        rows[np.arange(to.size), np.repeat(flat, to.shape[1])] = to.reshape(-1)
+        losses = self._problem.losses(table.at_scale(rows), z, self._data).reshape(to.shape)
+        losses = np.nan_to_num(losses, nan=np.inf)
+        best, helps = losses.argmin(axis=1), losses.min(axis=1) < (1.0 - _BETTER) * loss
+        # Move the one that helps most, or all that help.
+        order = [i for i in np.argsort(losses.min(axis=1)) if helps[i]]
+        for some in (order, order[:1]) if order else ():
+            moved = x.copy()
+            moved[flat[some]] = to[some, best[some]]
+            there = table.at_scale(moved)
+            if (lower := self.at(there)) < loss:
+                return there, lower
+        return z, loss
 
     def _round(self, z: np.ndarray, gain: float, pin: float) -> np.ndarray:
         """Return where least squares ends from a point."""

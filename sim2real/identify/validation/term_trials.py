@@ -251,17 +251,22 @@ class Trials:
         self._on_set(", ".join(names) or "no term")
         stored = self._refits.whole(names, problem, data) if self._refits else None
         z, loss = stored or self._descended(present, starts, most, data)
+        # Refit without each part, unless the set is clearly worse, or hardly better than a smaller one: then the linear
+        # steps are near enough to the whole fit.
+        self._least = min(self._least, loss)
+        refits = self._refits if loss <= min(_CLEAR * self._least, (1.0 - LITTLE) * most) else None
+        if refits and not stored:  # to the end, as each refit would have to descend that far, too
+            further = refine(problem, z[None], data, settle=False, gain=_GAIN)
+            z, loss = further.z, further.loss
+            self._least = min(self._least, loss)
         at = linearise(problem, z, data)
         stats = statistics(problem, at, self._masks)
         ends = self._without_each(z, at, stats, present)
-        # Descend without each part, unless the set is clearly worse, or hardly better than a smaller one: then the
-        # linear steps are near enough to the whole fit.
-        self._least = min(self._least, loss)
-        if self._refits and loss <= min(_CLEAR * self._least, (1.0 - LITTLE) * most):
-            self._refits.begin(names, z, loss)
+        if refits:
+            refits.begin(names, z, loss)
             rest = [problem.part(problem.train[touched], columns) for touched in self._masks]
             ends = [
-                folds.refitted(self._refits, names, part, problem, end, one, gain=_GAIN)
+                folds.refitted(refits, names, part, problem, end, one, gain=_GAIN)
                 for part, end, one in zip(self._parts, ends, rest, strict=True)
             ]
         rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(ends), list(ends), *self._times)
