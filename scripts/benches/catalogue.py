@@ -33,6 +33,11 @@ class Bench:
 BENCHES = {
     "arm": Bench("runs.arm", "the arm's whole run, or its training alone", (*_STAGES, "pipelines/arm")),
     "async": Bench("graph.asynchronous", "the simulated clock's speed, and the wall clock's lateness", _GRAPH),
+    "carried": Bench(
+        "identify.carried",
+        "a simulated arm of seven joints whose controller carries its weight, from two logs to a verdict",
+        _IDENTIFY,
+    ),
     "compose": Bench(
         "compose.bench",
         "control steps of composed worlds against dm_control, and tasks on Warp against bare steps",

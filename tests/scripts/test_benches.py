@@ -326,3 +326,11 @@ def test_legs(run):
     rows = {row["name"]: row["value"] for row in run("legs")["rows"]}
     assert list(rows) == ["legs/policy_p99", *(f"legs/lateness/{node}_p99" for node in ("sensor", "agent", "actuator"))]
     assert rows["legs/policy_p99"] > 0
+
+
+@pytest.mark.full
+def test_carried(run):
+    rows = {row["name"]: row["value"] for row in run("carried")["rows"]}
+    assert "gravcomp" in rows["carried/terms"]
+    assert rows["carried/gravcomp"] == pytest.approx(1.0, abs=0.1)
+    assert rows["carried/stiffness_error"] < 8.0  # percent: the model's gains are off by up to 8
