@@ -53,11 +53,13 @@ def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
     settled = (t_s > 1.0) & (t_s < 2.4)
     mean = np.array([walking[name][settled].mean() for name in ("linear[0]", "linear[1]", "gyro[2]")])
     assert np.abs(mean - aim).max() < 0.3
-    # The log holds all columns of the commands, within the gate.
+    # The log holds all columns of the commands, within the gate; on a busy machine a late command is replaced.
     sent = recording.episode.outputs["actuator"]
     assert set(sent) == {"q", "dq", "kp", "kd", "tau"}
-    np.testing.assert_allclose(sent["kp"][50:], 35.0)
-    np.testing.assert_allclose(sent["kd"][50:], 0.6, rtol=1e-6)
+    driven = 50 + np.flatnonzero((sent["kp"][50:] > 0.0).all(axis=1))
+    assert len(driven) > 0.95 * (len(sent["kp"]) - 50)
+    np.testing.assert_allclose(sent["kp"][driven], 35.0)
+    np.testing.assert_allclose(sent["kd"][driven], 0.6, rtol=1e-6)
 
 
 @pytest.mark.full  # `make test` records a deployment of it, above
