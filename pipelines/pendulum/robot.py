@@ -102,15 +102,13 @@ class HingeDrive(RobotDrive):
 
     def make_device(self, port: str, silence_s: float) -> DynamixelServos:
         """Return the servo on a port, not opened yet; ``silence_s``: longest silence while torque is on [s]."""
-        from sim2real.hardware.bus.port import lost_after_s
         from sim2real.hardware.dynamixel.bus import BusConfig
         from sim2real.hardware.dynamixel.device import DynamixelServos
         from sim2real.hardware.dynamixel.drive import VoltageDrive
 
         from .plant import SUPPLY_V
 
-        bus = BusConfig(port, max_silence_s=lost_after_s(silence_s), silence_s=silence_s)
-        return DynamixelServos(bus, [SERVO_ID], VoltageDrive(SUPPLY_V))
+        return DynamixelServos(BusConfig(port, silence_s=silence_s), [SERVO_ID], VoltageDrive(SUPPLY_V))
 
     def gate(self, limits: GateLimits) -> GateConfig:
         """Return a gate that falls back to 0 V."""

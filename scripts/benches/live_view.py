@@ -182,8 +182,7 @@ def _loop(target: str, options: argparse.Namespace, log: Path, other: Path | Non
     woken_s = np.concatenate([s.woken for s in steps]) / 1e6
     late_ms = np.concatenate([s.woken - s.start for s in steps]) / 1e3
     states = np.array([_state(i) for i in range(windows)])
-    cores, viewer_cores, writes = np.array(counted).T
-    return Loop(states, cores, viewer_cores, writes, late_ms, (woken_s / window_s).astype(int))
+    return Loop(states, *np.array(counted).T, late_ms, (woken_s / window_s).astype(int))
 
 
 def _state(window: int) -> int:

@@ -56,11 +56,6 @@ class LinkConfig:
             raise UsageError(f"silence_s = {self.silence_s} is outside [0, {self.longest_silence_s}]")
 
 
-def lost_after_s(silence_s: float) -> float:
-    """Return ``max_silence_s`` for a ``silence_s``: a host that may be silent for long may also wait as long [s]."""
-    return max(LinkConfig.max_silence_s, silence_s)
-
-
 def open_port(config: LinkConfig) -> serial.Serial:
     """Return the open port, exclusively; raise HardwareLost if it cannot be opened, or another process uses it."""
     try:

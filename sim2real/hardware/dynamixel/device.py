@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim2real.hardware.bus.port import lost_after_s
 from sim2real.hardware.device import CommandKind, Device, Reading, Transaction
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.drive import Drive
@@ -68,5 +67,4 @@ class DynamixelServos(ServoBus, Device):
 
 def servos(port: str, ids: Sequence[int], drive: Drive, *, baud_rate: int, silence_s: float) -> DynamixelServos:
     """Return servos on a port, not opened yet: the device of the name ``dynamixel``; see ``DeviceFactory``."""
-    bus = BusConfig(port, baud_rate, max_silence_s=lost_after_s(silence_s), silence_s=silence_s)
-    return DynamixelServos(bus, ids, drive)
+    return DynamixelServos(BusConfig(port, baud_rate, silence_s=silence_s), ids, drive)

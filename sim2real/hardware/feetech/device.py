@@ -12,7 +12,7 @@ import numpy as np
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.bus.link import ServoLink
 from sim2real.hardware.bus.packets import Answer
-from sim2real.hardware.bus.port import LinkConfig, lost_after_s
+from sim2real.hardware.bus.port import LinkConfig
 from sim2real.hardware.bus.servos import GuardedServos
 from sim2real.hardware.device import POSITION, CommandKind, Device, Reading, Transaction
 from sim2real.hardware.feetech import registers as reg
@@ -252,5 +252,4 @@ def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, si
     """Return servos on a port, not opened yet: the device of the name ``feetech``; see ``DeviceFactory``."""
     joints = {joint.servo_id: joint for joint in drive.joints}
     selected = [joints.get(i) or CalibratedJoint(f"servo {i}", i) for i in ids]
-    bus = StsConfig(port, baud_rate, max_silence_s=lost_after_s(silence_s), silence_s=silence_s)
-    return StsServos(bus, selected, drive)
+    return StsServos(StsConfig(port, baud_rate, silence_s=silence_s), selected, drive)

@@ -26,6 +26,8 @@ T = TypeVar("T", float, "jax.Array")
 _NAMES = ("gain", "damping", "armature", "friction")
 MISSES = "goal_offset"
 """Constant difference between a servo's position and its goal [rad]: of the zeros, or of worn gears."""
+_NEVER_RAD_S = 1e6
+"""Speed at which friction has worn off, where it does not."""
 _MOST_RAD = 0.05
 STRIBECK = "stribeck_rad_s"
 """Value of the world's parameters ``(joints,)`` [rad/s]."""
@@ -110,7 +112,7 @@ def place(
         jnp.stack([jnp.asarray(v, jnp.float32) for v in of_joints(values, name, joints, otherwise)])
         for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", sheet.full_rad), (MISSES, 0.0))
     )
-    worn = {STRIBECK: jnp.stack(of_joints(values, "stribeck", joints, jnp.inf)) / gear} if sheet.worn else {}
+    worn = {STRIBECK: jnp.stack(of_joints(values, "stribeck", joints, _NEVER_RAD_S)) / gear} if sheet.worn else {}
     armature = jnp.maximum(_beside_damping(inertia, damping, step_s), 0.0)
     return {
         "gain": jnp.zeros((n, 10)).at[:, 0].set(gain * gear**2),
