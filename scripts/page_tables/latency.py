@@ -17,7 +17,7 @@ def latency(report: Mapping[str, Any]) -> str:
     """Return a line for each link, one for the intervals, and a sentence on the links that another method wins."""
     values = {r["name"].removeprefix("latency/"): r for r in report["rows"]}
     methods = [m for m in METHODS if f"all/{m}/seconds" in values]
-    lines = [("link: mean / 95th percentile [ms]", "true", *(METHODS[m] for m in methods))]
+    lines: list[tuple[str, ...]] = [("link: mean / 95th percentile [ms]", "true", *(METHODS[m] for m in methods))]
     lines.append(("---", *["---:"] * (1 + len(methods))))
     lost, beaten = [], []
     for kind, true in report["truth"].items():

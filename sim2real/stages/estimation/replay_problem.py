@@ -36,9 +36,9 @@ def problem_of_logs(
     model = robot.watched(config.max_delay_s)
     if separate := [p.name for p in model.parameters if p.free and p.per_recording]:
         raise Sim2RealError(f"{', '.join(separate)} differ between recordings: a new log has no values for them")
-    for episode in episodes if isinstance(model, ChecksLogs) else ():
-        model.check(episode)
-
+    if isinstance(model, ChecksLogs):
+        for episode in episodes:
+            model.check(episode)
     # Choose the length of segments and the horizon.
     horizons = sorted({p.horizon_s for p in identification.prediction})
     length_s = max(_SEGMENT_S, config.settle_s + (horizons[0] if horizons else 0.0))
