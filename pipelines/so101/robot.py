@@ -114,6 +114,7 @@ def dynamics() -> list[Parameter]:
     of_servos = parameters.parameters(SHEET, JOINTS, own=own) + parameters.offsets(JOINTS)
     # The jaw has so little friction that no recording shows at which speed it wears off: it keeps it at all speeds.
     of_servos = [p for p in of_servos if p.name != "stribeck_gripper"]
+    of_servos = [replace(p, low=p.low / 10) if p.name == "friction_gripper" else p for p in of_servos]
     full, about = SHEET.full_rad, "error from which on it pushes no harder"
     limit = Parameter("saturation", "rad", full, full / 10, full * 2, about=about, limits=True)
     # A search that begins at the data sheet's limit, which no motion reaches, often stays there.
