@@ -13,8 +13,11 @@ from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.residuals import LinearisedSegments, SegmentResiduals
 from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
+from sim2real.identify.problem.sizes import padded
 from sim2real.types import Array, PyTree
 
+_COMPARED = 16
+"""Candidates in a call of the program of losses, or a multiple of it."""
 Stacked = Callable[[np.ndarray], np.ndarray]
 
 
@@ -115,7 +118,9 @@ class CompiledEvaluator:
     def losses(self, candidates: np.ndarray, around: np.ndarray, data: Data) -> np.ndarray:
         """See ``Evaluator``."""
         program = self._residuals.program("losses", self._residuals.losses)
-        return np.asarray(program(_single(candidates), _single(around), data), np.float64)
+        # Pad the candidates: each number of them compiles once.
+        points = padded(candidates, -(-len(candidates) // _COMPARED) * _COMPARED)
+        return np.asarray(program(_single(points), _single(around), data), np.float64)[: len(candidates)]
 
     def searched(self, data: Data) -> PyTree:
         """See ``Evaluator``: traceable ``Losses``, whose data is an argument."""

@@ -226,7 +226,10 @@ class OutsideEvaluator:
 
     def _moves(self, groups: list[list[int]], size: int) -> np.ndarray:
         """Return the steps of finite differences, one row for each group of parameters."""
-        return self._residuals.config.difference * np.array([np.eye(size)[group].sum(axis=0) for group in groups])
+        moved = np.zeros((len(groups), size))
+        for row, group in zip(moved, groups, strict=True):
+            row[group] = self._residuals.config.difference
+        return moved
 
     def _by_parameter(self, changes: np.ndarray, groups: list[list[int]], size: int) -> np.ndarray:
         """Return derivatives ``(S, K, F, P)`` from the changes of the residuals by each of ``_moves``."""
