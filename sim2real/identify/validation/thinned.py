@@ -13,7 +13,7 @@ from sim2real.identify.validation.folds import Fold, masks
 MOST_STEPS = 5e6
 """Steps of single joints in a Jacobian from which fewer segments are taken: about 4 s on two cores."""
 _FEWEST = 2
-"""Fewest segments of a channel that are kept."""
+"""Fewest segments of a channel that are live."""
 
 
 def thinned(problem: Problem, parts: Sequence[Fold]) -> Problem:
@@ -34,8 +34,8 @@ def thinned(problem: Problem, parts: Sequence[Fold]) -> Problem:
 
 def _liveliest(problem: Problem, parts: Sequence[Fold], keep: int) -> list[Span]:
     """Return the spans of about ``keep`` fitted segments, as many of each part."""
-    kept = np.zeros(len(problem.train), bool)
+    live = np.zeros(len(problem.train), bool)
     for touched in masks(problem, parts):
         rest = problem.part(problem.train[~touched])
-        kept |= np.asarray(problem.evaluator.lively(rest, -(-keep // len(parts))).weight)[: len(kept)] > 0.0
-    return [problem.spans[i] for i in problem.train[kept]]
+        live |= np.asarray(problem.evaluator.lively(rest, -(-keep // len(parts))).weight)[: len(live)] > 0.0
+    return [problem.spans[i] for i in problem.train[live]]
