@@ -334,3 +334,13 @@ def test_carried(run):
     assert set(rows) == {"seconds", "terms", "gravcomp", "stiffness_error", "verdict"}
     assert rows["terms"] == "gravcomp"
     assert 0.0 < rows["gravcomp"] <= 1.5
+
+
+@pytest.mark.full
+def test_legs_identify(run):
+    report = run("legs-identify")
+    (twin,) = report["twins"]
+    assert set(twin["errors"]) == {"damping", "friction", "armature", "strength"}
+    assert len(twin["errors"]["strength"]) == 12
+    rows = {row["name"]: row["value"] for row in report["rows"]}
+    assert rows["legs_identify/strength/worst"] == pytest.approx(100 * max(twin["errors"]["strength"]), rel=1e-3)

@@ -14,7 +14,7 @@ from benches.figures import Report, Row, four_digits, row, share
 from benches.hidden import legs
 from benches.jobs import each
 
-QUICK = {"twins": 1, "seconds": 3.0, "settings": "quick"}
+QUICK = {"twins": 1, "seconds": 12.0, "settings": "quick"}
 SETTINGS: dict[str, dict[str, Any]] = {
     "own": {},
     "quick": {"settle_s": 0.1, "horizon_s": 0.5, "refine_steps": 1},
