@@ -38,7 +38,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> Report:
     """Record and identify each case."""
-    pipeline, rows = load_pipeline("so101"), []
+    pipeline, rows, joints = load_pipeline("so101"), [], {}
     truth = _plant(pipeline).SO101Plant().truth()
     settings = {
         **{name: getattr(options, name) for name in ("generations", "population", "refine_steps")},
@@ -51,7 +51,10 @@ def run(options: argparse.Namespace) -> Report:
             recording = sim2real.record(pipeline, Path(folder) / "record", config)
             estimate = sim2real.identify(pipeline, recording, settings)
         rows += _rows(case, estimate, truth)
-    return {"rows": rows}
+        joints[case] = {
+            p.name: [p.estimate, truth[p.name]] for p in estimate.parameters if p.name.startswith("friction_")
+        }
+    return {"rows": rows, "estimate_and_truth": joints}
 
 
 def person(low: np.ndarray, high: np.ndarray, seconds: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
