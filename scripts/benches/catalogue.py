@@ -8,6 +8,8 @@ from dataclasses import dataclass
 _GRAPH = ("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "pipelines/pendulum")
 _COMMON = ("scripts/benches/figures.py",)
 _STAGES = ("sim2real", "!sim2real/view")
+_WALK = ("sim2real/robots/walking", "sim2real/policy", "pipelines/go2")
+_LEARN = ("sim2real/graph", "sim2real/runtime", "sim2real/composer", "sim2real/train")
 _IDENTIFY = (
     *("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "sim2real/identify"),
     *("sim2real/artifacts", "sim2real/log", "scripts/benches/identify"),
@@ -153,7 +155,17 @@ BENCHES = {
     "walk": Bench(
         "walk",
         "a walking policy on hidden twins in C MuJoCo: falls and errors; with pushes, and on rough ground",
-        ("sim2real/robots/walking", "sim2real/policy", "pipelines/go2"),
+        _WALK,
+    ),
+    "walk-delays": Bench(
+        "walking.delays",
+        "falls and errors over the true delay of policies trained without delays, with wide and with identified ones",
+        (*_WALK, *_LEARN, "scripts/benches/walk.py", "scripts/benches/hidden/legs.py"),
+    ),
+    "walk-train": Bench(
+        "walking.train",
+        "a walking policy on one GPU: its graph over bare steps, learnt steps a second, time to a policy that stays up",
+        (*_WALK, *_LEARN, "scripts/benches/walk.py"),
     ),
 }
 

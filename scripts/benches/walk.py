@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,26 +38,31 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> Report:
     """Let the policy walk on all twins, without and with pushes."""
-    workers = min(os.cpu_count() or 1, options.twins)
     calm = Trial(options.pipeline, options.bundle, options.seconds)
     pushed = replace(calm, push_m_s=options.push)
     trials = {"calm": calm, "pushed": pushed, "rough": replace(calm, rough_m=options.rough_m)}
     trials |= {f"pushed_{ms:g}_ms": replace(pushed, delay_s=ms / 1e3) for ms in options.delays_ms}
+    return {"rows": judged(trials, options.twins, "walk")}
+
+
+def judged(trials: Mapping[str, Trial], twins: int, prefix: str) -> list[Row]:
+    """Return falls, errors and the judge's time for each trial, by its name behind the prefix."""
+    workers = min(os.cpu_count() or 1, twins)
     rows: list[Row] = []
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         for name, trial in trials.items():
             begin = time.perf_counter()
-            played = pool.map(partial(one, trial), range(options.twins))
+            played = pool.map(partial(one, trial), range(twins))
             fell, *errors = (np.array(column) for column in zip(*played, strict=True))
-            about = f"{options.twins} twins, {trial.seconds:g} s{trial.about}"
+            about = f"{twins} twins, {trial.seconds:g} s{trial.about}"
             goal = "2" if trial.rough_m else "0"
-            rows.append(row(f"walk/{name}/falls", int(fell.sum()), f"of {options.twins}", about, goal))
+            rows.append(row(f"{prefix}/{name}/falls", int(fell.sum()), f"of {twins}", about, goal))
             for (figure, unit, goal), values in zip(ERRORS, errors, strict=True):
                 worst = f"worst twin {values.max():.3f}"
-                rows.append(row(f"walk/{name}/{figure}", four_digits(values.mean()), unit, worst, goal))
+                rows.append(row(f"{prefix}/{name}/{figure}", four_digits(values.mean()), unit, worst, goal))
             took_s = round(time.perf_counter() - begin, 1)
-            rows.append(row(f"walk/{name}/judge_s", took_s, "s", f"{workers} processes"))
-    return {"rows": rows}
+            rows.append(row(f"{prefix}/{name}/judge_s", took_s, "s", f"{workers} processes"))
+    return rows
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ class Trial:
         bundle: Folder of the policy; None: the pipeline's.
         push_m_s: Size of a push every 5 s [m/s].
         rough_m: Height of the bumps of the ground; 0: it is flat [m].
-        delay_s: Delay of the twin, a third of it on the sensors' side [s]; None: the twin's own.
+        delay_s: Delay of the twin, about a third of it on the sensors' side [s]; None: the twin's own.
     """
 
     pipeline: str
@@ -87,7 +93,7 @@ class Trial:
 def one(trial: Trial, seed: int) -> tuple[bool, float, float]:
     """Walk on a hidden twin; return whether it fell, and the errors [m/s], [rad/s]."""
     from sim2real.policy.bundle import load_bundle
-    from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
+    from sim2real.robots.walking.twin import STEP_S, HiddenTwin, Twin, walk
     from sim2real.stages.pipeline.pipeline import load_pipeline
 
     found = load_pipeline(trial.pipeline)
@@ -95,7 +101,8 @@ def one(trial: Trial, seed: int) -> tuple[bool, float, float]:
     rng = np.random.default_rng(seed)
     hidden = HiddenTwin.draw(np.random.default_rng(1000 + seed), len(robot.joints))
     if trial.delay_s is not None:
-        hidden = replace(hidden, sensing_s=trial.delay_s / 3, acting_s=trial.delay_s * 2 / 3)
+        sensing_s = round(trial.delay_s / 3 / STEP_S) * STEP_S  # whole steps of the twin: the sum stays exact
+        hidden = replace(hidden, sensing_s=sensing_s, acting_s=trial.delay_s - sensing_s)
     twin = Twin(robot, hidden, seed, trial.rough_m)
     count = int(trial.seconds / EVERY_S) + 1
     commands = (

@@ -344,3 +344,16 @@ def test_legs_identify(run):
     assert len(twin["errors"]["strength"]) == 12
     rows = {row["name"]: row["value"] for row in report["rows"]}
     assert rows["legs_identify/strength/worst"] == pytest.approx(100 * max(twin["errors"]["strength"]), rel=1e-3)
+
+
+@pytest.mark.parametrize("flags", [("walk-train",), ("walk-delays", "--policies", "wide", "--delays-ms")])
+def test_a_training_on_warp_is_refused_without_a_gpu(capsys, flags):
+    assert bench.main([*flags, "--quick"]) == 2
+    assert "needs a GPU, and JAX has none here\n\nhint: " in capsys.readouterr().err
+
+
+def test_walk_delays(run):
+    """The policy that the pipeline ships, which needs no training, on one twin."""
+    rows = {r["name"].removeprefix("walk_delays/shipped/10_ms/"): r["value"] for r in run("walk-delays")["rows"]}
+    assert set(rows) == {"falls", "error_m_s", "error_rad_s", "judge_s"}
+    assert rows["falls"] == 0

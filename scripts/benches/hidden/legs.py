@@ -15,12 +15,13 @@ _TOOK_S = {"sensor": 5e-4, "agent": 2e-4, "actuator": 3e-4}
 """Mean durations of the steps of a loop on a computer [s]."""
 
 
-def record(path: Path, seed: int, seconds: float) -> None:
+def record(path: Path, seed: int, seconds: float, latencies_s: tuple[float, float, float] | None = None) -> None:
     """Write the log of the excitation of ``record go2``, played to a hidden robot.
 
     Args:
         seed: Of the robot, of its latencies and of its noise.
         seconds: Length of the excitation, before the legs' way to it [s].
+        latencies_s: Latency of sensing, latency and jitter of actuation [s]; None: those of the seed.
     """
     from dataclasses import replace
 
@@ -36,8 +37,8 @@ def record(path: Path, seed: int, seconds: float) -> None:
     pipeline = load_pipeline("go2")
     robot: Any = pipeline.load()
     plant = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:Go2Body", "plant")
-    latencies = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:latencies", "plant")
-    body, config = plant("stand", seed), UnitreeEmulation(*latencies(seed), seed=seed)
+    drawn = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:latencies", "plant")
+    body, config = plant("stand", seed), UnitreeEmulation(*(latencies_s or drawn(seed)), seed=seed)
     truth = TruthLog(path.with_suffix(".truth.bin"), truth_header(body, config, 0))
     legs = EmulatedLegs(body, config, truth, 0)
     # Let the legs hang, then plan the way to the excitation from there.

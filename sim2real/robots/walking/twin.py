@@ -79,7 +79,7 @@ class Twin:
         self.data.qpos[:7] = (0, 0, self.robot.height_m + bumps_m, 1, 0, 0, 0)
         self.data.qpos[7:], self.data.ctrl[:], self.sent = stance, stance, stance
         _mj.mj_forward(self.model, self.data)
-        late = max(1, round(self.hidden.sensing_s / STEP_S))
+        late = round(self.hidden.sensing_s / STEP_S)
         self._past = deque([self._measured()] * (late + 1), maxlen=late + 1)
         self._coming: deque[tuple[float, np.ndarray]] = deque()
 

@@ -1,0 +1,1 @@
+"""Trainings of a walking robot on a GPU."""

@@ -1,0 +1,132 @@
+"""Falls and errors over the true delay, with pushes: of policies trained without, with wide and with identified delays.
+
+All trainings have the same steps and settings, noise, pushes and starts. ``nominal`` has one robot and no delay.
+``wide`` draws the pipeline's parameters, and delays of 0 to 46 ms. ``identified_30`` draws the same parameters, and
+delays around the estimate of `identify` from the log of an emulated Go2 with a delay of 30 ms. ``shipped`` is the
+pipeline's policy.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benches.figures import Report
+from benches.jobs import each
+from benches.walk import Trial, judged
+from benches.walking.training import PIPELINE, require_gpu, settings, train
+
+QUICK = {"policies": ["shipped"], "delays_ms": [10.0], "twins": 1, "seconds": 0.2, "push": 0.1}
+SHIPPED, IDENTIFIED = "shipped", "identified_"
+WIDE_MS = {"sensor_delay": (0.0, 4.0), "actuator_delay": (0.0, 42.0)}
+SEED, STAND_S = 37, 12.0
+"""The emulated Go2 of the logs, and the length of their excitation [s]."""
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this bench."""
+    delays = (0.0, 10.0, 20.0, 30.0, 40.0)
+    parser.add_argument("--policies", nargs="+", help="nominal, wide, shipped, identified_MS; default: all but shipped")
+    parser.add_argument("--delays-ms", type=float, nargs="*", default=delays, help="true delays of all twins [ms]")
+    parser.add_argument("--work", type=Path, help="folder of estimates and policies; those in it are used again")
+    parser.add_argument("--jobs", type=int, default=1, help="identifications at once")
+    parser.add_argument("--trainings", type=int, default=1, help="trainings at once, which share the GPU")
+    parser.add_argument("--copies", type=int, default=8192, help="copies of the robot")
+    parser.add_argument("--steps", type=int, default=60_000_000, help="steps of each training")
+    parser.add_argument("--minibatches", type=int, default=8, help="minibatches in a pass of PPO")
+    parser.add_argument("--twins", type=int, default=50, help="hidden twins for each delay")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of an episode [s]")
+    parser.add_argument("--push", type=float, default=0.5, help="size of a push every 5 s [m/s]")
+
+
+def run(options: argparse.Namespace) -> Report:
+    """Identify delays, train policies, and judge them at all delays; finished parts in the folder are used again."""
+    of_delays = [f"{IDENTIFIED}{ms:g}" for ms in options.delays_ms]
+    names = options.policies or ["nominal", "wide", *of_delays]
+    with tempfile.TemporaryDirectory() as scratch:
+        work = options.work or Path(scratch)
+        work.mkdir(parents=True, exist_ok=True)
+        # Identify what the policies need, then train those that are missing.
+        needed = sorted(float(name.removeprefix(IDENTIFIED)) for name in names if name.startswith(IDENTIFIED))
+        estimates = {ms: work / f"estimate_{ms:g}.json" for ms in needed}
+        missing = [(ms, str(file)) for ms, file in estimates.items() if not file.is_file()]
+        for _ in each(estimate, missing, options):
+            pass
+        found = {ms: json.loads(file.read_text()) for ms, file in estimates.items()}
+        new = [name for name in names if name != SHIPPED and not (work / name / "training.json").is_file()]
+        device = require_gpu("walk-delays") if new else ""
+        with ThreadPoolExecutor(options.trainings) as pool:
+            list(pool.map(lambda name: trained(name, device, found, work, options), new))
+        # Judge all of them at all delays.
+        rows, trainings = [], {}
+        for name in names:
+            bundle = None if name == SHIPPED else work / name / "bundle"
+            trials = {
+                f"{ms:g}_ms": Trial(PIPELINE, bundle, options.seconds, options.push, delay_s=ms / 1e3)
+                for ms in options.delays_ms
+            }
+            rows += judged(trials, options.twins, f"walk_delays/{name}")
+            if bundle is not None:
+                trainings[name] = json.loads((work / name / "training.json").read_text())
+    return {"rows": rows, "estimates": list(found.values()), "trainings": trainings}
+
+
+def estimate(ms: float, file: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Write the delay that `identify` estimates from the log of an emulated Go2 with a true delay [ms]."""
+    from benches.hidden import legs
+    from sim2real.artifacts.identification import ROUND_TRIP
+    from sim2real.stages.identify.stage import identify
+
+    del options
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "session.mcap"
+        legs.record(log, SEED, STAND_S, (ms / 3e3, ms / 1.5e3, 0.0))
+        identification = identify(PIPELINE, log)
+    delay = next(p for p in identification.parameters if p.name == ROUND_TRIP)
+    found = {"true_ms": ms, "estimate_ms": 1e3 * delay.estimate, "verdict": identification.verdict.status}
+    found["deviation_ms"] = 1e3 * (delay.standard_error or 0.0)
+    Path(file).write_text(json.dumps(found, indent=1))
+    return found
+
+
+def differences(name: str, estimates: Mapping[float, Mapping[str, float]]) -> list[str]:
+    """Return the flags of the parameters and delays that differ between the episodes of a policy's training."""
+    from sim2real.stages.pipeline.pipeline import load_pipeline
+
+    if name.startswith(IDENTIFIED):
+        # A uniform draw within sqrt(3) deviations has the estimate's deviation.
+        found = estimates[float(name.removeprefix(IDENTIFIED))]
+        reach_ms = max(3**0.5 * found["deviation_ms"], 1e-3)
+        low, high = max(0.0, found["estimate_ms"] - reach_ms), max(0.0, found["estimate_ms"]) + reach_ms
+        ranges = {"sensor_delay": (0.0, 1e-6), "actuator_delay": (low / 1e3, high / 1e3)}
+    elif name == "wide":
+        ranges = {n: (low / 1e3, high / 1e3) for n, (low, high) in WIDE_MS.items()}
+    else:
+        pipeline = load_pipeline(PIPELINE)
+        usual: dict[str, float] = pipeline.load().nominal() | dict.fromkeys(WIDE_MS, 0.0)
+        ranges = {n: (usual[n], usual[n] + 1e-6) for n in pipeline.train.vary.range}
+    return [word for n, (low, high) in ranges.items() for word in ("--vary.range", n, f"{low:.7f}", f"{high:.7f}")]
+
+
+def trained(
+    name: str,
+    device: str,
+    estimates: Mapping[float, Mapping[str, float]],
+    work: Path,
+    options: argparse.Namespace,
+) -> None:
+    """Train a policy, and write its bundle and the facts of its training into the folder."""
+    flags = [*settings(options.copies, options.steps, options.minibatches), *differences(name, estimates)]
+    share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.8 / options.trainings:.2f}"}
+    with tempfile.TemporaryDirectory() as runs:
+        done = train(flags, Path(runs), share)
+        shutil.copytree(done.folder / "bundle", work / name / "bundle", dirs_exist_ok=True)
+    about = {**asdict(done), "folder": name, "flags": flags, "device": device, "at_once": options.trainings}
+    (work / name / "training.json").write_text(json.dumps(about, indent=1))

@@ -1,0 +1,79 @@
+"""Trainings of the Go2 by the command line, each in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sim2real.errors import Sim2RealError, UsageError
+
+PIPELINE = "go2"
+_OWN_MEMORY = "XLA_PYTHON_CLIENT_PREALLOCATE"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A finished training.
+
+    Attributes:
+        folder: Folder of the stage, with the bundle.
+        command_s: Time from the start of the command to its end [s].
+    """
+
+    folder: Path
+    command_s: float
+    compile_s: float
+    train_s: float
+    steps: int
+    learnt_steps_per_s: float
+
+
+def require_gpu(bench: str) -> str:
+    """Return the name of the GPU; raise a ``UsageError`` without one.
+
+    JAX takes little of its memory in this process: the trainings have processes of their own.
+    """
+    os.environ.setdefault(_OWN_MEMORY, "false")
+    import jax
+
+    if jax.default_backend() != "gpu":
+        raise UsageError(
+            f"{bench} trains on MuJoCo Warp, which needs a GPU, and JAX has none here",
+            hint="`bench.py walk` judges a policy without a GPU",
+        )
+    return jax.devices()[0].device_kind
+
+
+def settings(copies: int, steps: int, minibatches: int) -> list[str]:
+    """Return the flags of a training: copies of the robot, steps in all, minibatches in a pass of PPO."""
+    sizes = [f"--ppo.num-envs={copies}", f"--ppo.total-steps={steps}", f"--ppo.minibatches={minibatches}"]
+    return [*sizes, f"--ppo.eval-envs={min(256, copies)}", "--ppo.evaluations=3"]
+
+
+def train(flags: Sequence[str], runs: Path, environment: Mapping[str, str]) -> Trained:
+    """Run ``sim2real train go2`` with flags; return its bundle and its times.
+
+    Args:
+        runs: A new folder of runs.
+        environment: Variables of the process beside those of this one.
+    """
+    from sim2real.artifacts.bundle import Bundle
+
+    inherited = {name: value for name, value in os.environ.items() if name != _OWN_MEMORY}
+    command = [sys.executable, "-m", "sim2real.cli", "train", PIPELINE, "--runs", str(runs), *flags]
+    begin = time.perf_counter()
+    done = subprocess.run(command, env={**inherited, **environment}, capture_output=True, text=True)
+    took_s = time.perf_counter() - begin
+    if done.returncode:
+        text = done.stderr[-3000:]
+        raise Sim2RealError(f"`sim2real train {PIPELINE}` ended with exit code {done.returncode}:\n{text}")
+    (folder,) = runs.glob(f"{PIPELINE}/*/train")
+    history = Bundle.load(folder).history
+    assert history is not None
+    steps = int(history.steps[-1])
+    return Trained(folder, took_s, history.compile_s, history.train_s, steps, history.env_steps_per_s)
