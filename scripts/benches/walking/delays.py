@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -21,7 +22,7 @@ from typing import Any
 from benches.figures import Report
 from benches.jobs import each
 from benches.walk import Trial, judged
-from benches.walking.training import PIPELINE, require_gpu, settings, train
+from benches.walking.training import PIPELINE, add_training_flags, require_gpu, train
 
 QUICK = {"policies": ["shipped"], "delays_ms": [10.0], "twins": 1, "seconds": 0.2, "push": 0.1}
 SHIPPED, IDENTIFIED = "shipped", "identified_"
@@ -32,18 +33,14 @@ SEED, STAND_S = 37, 12.0
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
+    add_training_flags(parser)
     delays = (0.0, 10.0, 20.0, 30.0, 40.0)
     parser.add_argument("--policies", nargs="+", help="nominal, wide, shipped, identified_MS; default: all but shipped")
     parser.add_argument("--delays-ms", type=float, nargs="*", default=delays, help="true delays of all twins [ms]")
     parser.add_argument("--work", type=Path, help="folder of estimates and policies; those in it are used again")
     parser.add_argument("--jobs", type=int, default=1, help="identifications at once")
     parser.add_argument("--trainings", type=int, default=1, help="trainings at once, which share the GPU")
-    parser.add_argument("--copies", type=int, default=8192, help="copies of the robot")
     parser.add_argument("--steps", type=int, default=60_000_000, help="steps of each training")
-    parser.add_argument("--minibatches", type=int, default=8, help="minibatches in a pass of PPO")
-    parser.add_argument("--twins", type=int, default=50, help="hidden twins for each delay")
-    parser.add_argument("--seconds", type=float, default=20.0, help="length of an episode [s]")
-    parser.add_argument("--push", type=float, default=0.5, help="size of a push every 5 s [m/s]")
 
 
 def run(options: argparse.Namespace) -> Report:
@@ -123,10 +120,10 @@ def trained(
     options: argparse.Namespace,
 ) -> None:
     """Train a policy, and write its bundle and the facts of its training into the folder."""
-    flags = [*settings(options.copies, options.steps, options.minibatches), *differences(name, estimates)]
+    flags = [*shlex.split(options.flags), *differences(name, estimates)]
     share = {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.8 / options.trainings:.2f}"}
     with tempfile.TemporaryDirectory() as runs:
-        done = train(flags, Path(runs), share)
+        done = train(options.steps, flags, Path(runs), share)
         shutil.copytree(done.folder / "bundle", work / name / "bundle", dirs_exist_ok=True)
     about = {**asdict(done), "folder": name, "flags": flags, "device": device, "at_once": options.trainings}
     (work / name / "training.json").write_text(json.dumps(about, indent=1))

@@ -9,6 +9,9 @@ from benches.figures import Row, medians, row
 from benches.walking.training import PIPELINE
 from sim2real.types import Array, PyTree
 
+ROOMS = (16, 96)
+"""Contacts and rows of constraints that Warp has room for in a copy, as in training."""
+
 
 def first_step() -> float:
     """Return the time until a copy's graph has made one step, in a new process: import, trace, compile, kernels [s]."""
@@ -76,14 +79,13 @@ def _programs(copies: int, steps: int) -> tuple[dict[str, tuple[Any, PyTree]], i
     keys = jax.random.split(jax.random.key(0), copies)
     states, _ = jax.jit(jax.vmap(env.reset))(keys)
     data = states.graph.state["world"].data
-    model, ticks = world.environment.model, env.graph.wiring.ticks
-    on_warp, (contacts, rows) = mjx.put_model(model, impl="warp"), (16, 96)
-    blank = mjx.make_data(model, impl="warp", naconmax=copies * contacts, njmax=rows)
+    world_model, ticks, (contacts, rows) = world.environment.mjx_model, env.graph.wiring.ticks, ROOMS
+    blank = mjx.make_data(world.environment.model, impl="warp", naconmax=copies * contacts, njmax=rows)
 
     def bare(starts: PyTree) -> Any:
         def one(start: PyTree) -> Any:
             moved = blank.replace(qpos=start[0], qvel=start[1], ctrl=start[2])
-            return jax.lax.scan(lambda d, _: (mjx.step(on_warp, d), None), moved, length=ticks * steps)[0].qpos
+            return jax.lax.scan(lambda d, _: (mjx.step(world_model, d), None), moved, length=ticks * steps)[0].qpos
 
         return jax.vmap(one)(starts)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
@@ -49,23 +50,28 @@ def require_gpu(bench: str) -> str:
     return jax.devices()[0].device_kind
 
 
-def settings(copies: int, steps: int, minibatches: int) -> list[str]:
-    """Return the flags of a training: copies of the robot, steps in all, minibatches in a pass of PPO."""
-    sizes = [f"--ppo.num-envs={copies}", f"--ppo.total-steps={steps}", f"--ppo.minibatches={minibatches}"]
-    return [*sizes, f"--ppo.eval-envs={min(256, copies)}", "--ppo.evaluations=3"]
+def add_training_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of a bench that trains and judges policies."""
+    usual = "--ppo.num-envs=8192 --ppo.minibatches=16 --ppo.evaluations=1"
+    parser.add_argument("--flags", default=usual, help="flags of `sim2real train go2`, in one word")
+    parser.add_argument("--twins", type=int, default=50, help="hidden twins that judge a policy")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of an episode of a twin [s]")
+    parser.add_argument("--push", type=float, default=0.5, help="size of a push every 5 s [m/s]")
 
 
-def train(flags: Sequence[str], runs: Path, environment: Mapping[str, str]) -> Trained:
+def train(steps: int, flags: Sequence[str], runs: Path, environment: Mapping[str, str]) -> Trained:
     """Run ``sim2real train go2`` with flags; return its bundle and its times.
 
     Args:
+        steps: Steps in all copies together.
         runs: A new folder of runs.
         environment: Variables of the process beside those of this one.
     """
     from sim2real.artifacts.bundle import Bundle
 
     inherited = {name: value for name, value in os.environ.items() if name != _OWN_MEMORY}
-    command = [sys.executable, "-m", "sim2real.cli", "train", PIPELINE, "--runs", str(runs), *flags]
+    command = [sys.executable, "-m", "sim2real.cli", "train", PIPELINE, "--runs", str(runs)]
+    command += [f"--ppo.total-steps={steps}", *flags]
     begin = time.perf_counter()
     done = subprocess.run(command, env={**inherited, **environment}, capture_output=True, text=True)
     took_s = time.perf_counter() - begin
