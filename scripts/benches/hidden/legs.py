@@ -38,7 +38,8 @@ def record(path: Path, seed: int, seconds: float, latencies_s: tuple[float, floa
     robot: Any = pipeline.load()
     plant = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:Go2Body", "plant")
     drawn = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:latencies", "plant")
-    body, config = plant("stand", seed), UnitreeEmulation(*(latencies_s or drawn(seed)), seed=seed)
+    sensing_s, acting_s, jitter_s = latencies_s or drawn(seed)
+    body, config = plant("stand", seed), UnitreeEmulation(sensing_s, acting_s, jitter_s, seed=seed)
     truth = TruthLog(path.with_suffix(".truth.bin"), truth_header(body, config, 0))
     legs = EmulatedLegs(body, config, truth, 0)
     # Let the legs hang, then plan the way to the excitation from there.

@@ -107,7 +107,8 @@ def differences(name: str, estimates: Mapping[float, Mapping[str, float]]) -> li
         ranges = {n: (low / 1e3, high / 1e3) for n, (low, high) in WIDE_MS.items()}
     else:
         pipeline = load_pipeline(PIPELINE)
-        usual: dict[str, float] = pipeline.load().nominal() | dict.fromkeys(WIDE_MS, 0.0)
+        robot: Any = pipeline.load()
+        usual = robot.nominal() | dict.fromkeys(WIDE_MS, 0.0)
         ranges = {n: (usual[n], usual[n] + 1e-6) for n in pipeline.train.vary.range}
     return [word for n, (low, high) in ranges.items() for word in ("--vary.range", n, f"{low:.7f}", f"{high:.7f}")]
 

@@ -81,5 +81,7 @@ def train(steps: int, flags: Sequence[str], runs: Path, environment: Mapping[str
     (folder,) = runs.glob(f"{PIPELINE}/*/train")
     history = Bundle.load(folder).history
     assert history is not None
-    steps = int(history.steps[-1])
-    return Trained(folder, took_s, history.compile_s, history.train_s, steps, history.env_steps_per_s)
+    times = history.compile_s, history.train_s, history.env_steps_per_s
+    compile_s, train_s, steps_per_s = (float(t or 0.0) for t in times)
+    steps_done = int(history.steps[-1])
+    return Trained(folder, took_s, compile_s, train_s, steps_done, steps_per_s)
