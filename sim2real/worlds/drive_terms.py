@@ -6,6 +6,7 @@ lines run in MJX and, on arrays of copies, between the steps of C MuJoCo.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -98,6 +99,15 @@ class DriveLaw:
     def __init__(self, qpos_at: np.ndarray, qvel_at: np.ndarray, others: np.ndarray) -> None:
         self._qpos_at, self._qvel_at = qpos_at, qvel_at
         self._order = np.argsort(np.concatenate([qvel_at, others]))
+        self._absent: frozenset[str] = frozenset()
+
+    def among(self, values: Mapping[str, np.ndarray]) -> DriveLaw:
+        """Return the law without the terms that no copy has: in numpy they take as long as a step in C."""
+        law = copy.copy(self)
+        law._absent = frozenset(name for name in _FOLLOW if not np.any(values[name]))
+        if not np.any(values["top_speed"] < NO_LIMIT):
+            law._absent |= {"top_speed"}
+        return law
 
     def steady(
         self, values: Mapping[str, np.ndarray], control: np.ndarray
@@ -125,32 +135,53 @@ class DriveLaw:
         v, count = values, len(self._qvel_at)
         force, kp, kd, on, goal = (control[..., i * count : (i + 1) * count] for i in range(5))
         angle, speed = qpos[..., self._qpos_at], qvel[..., self._qvel_at]
-        fast = xp.abs(speed)
-        beyond = v["eccentric_cos"] * xp.cos(angle) + v["eccentric_sin"] * xp.sin(angle)
+        braked = on * v["back_emf"] if self._has("back_emf") else 0.0
+        if self._has("eccentric_cos", "eccentric_sin", "play", "top_speed"):
+            force = self._force(xp, v, (force, kp, kd, goal), angle, braked)
+        # Damping of each joint; one that differs by direction stays 0 or more: a negative one would drive the joint.
+        damping = v["damping"] + v["damping_bias"] * xp.sign(speed) if self._has("damping_bias") else v["damping"]
+        damping, fast = xp.maximum(damping, 0.0) + braked, xp.abs(speed)
+        if self._has("drag"):
+            damping = damping + v["drag"] * fast
+        # Dry friction of each joint.
+        friction = v["frictionloss"]
+        if self._has("static"):
+            friction = friction + v["static"] * xp.exp(-fast / v["stribeck_rad_s"])
+        if self._has("load"):
+            drive = xp.clip(force - kp * angle - kd * speed, -v["limit"], v["limit"]) - braked * speed
+            friction = friction + v["load"] * xp.abs(drive)
+        # Friction that differs by direction is a mean friction and a constant torque: it sticks in the same band.
+        applied = 0.0 * speed - v["bias"]
+        if self._has("cogging_cos", "cogging_sin"):
+            phase = v["cogging_per_turn"] * angle
+            applied = applied - v["cogging_cos"] * xp.cos(phase) - v["cogging_sin"] * xp.sin(phase)
+        # Add the joints without a drive, in the model's order.
+        rows = (damping, friction, applied)
+        if len(self._order) > count:
+            still = 0.0 * applied[..., :1]
+            beside = (v["other_damping"] + still, v["other_frictionloss"] + still, 0.0 * v["other_damping"] + still)
+            rows = tuple(xp.concatenate(pair, axis=-1) for pair in zip(rows, beside, strict=True))
+        rows = [(0.0 * applied[..., :1] + row)[..., self._order] for row in rows]
+        controls = xp.concatenate([force, kp, kd], axis=-1)
+        return controls, rows[2], dict(zip(self.fields, rows, strict=False))
+
+    def _has(self, *names: str) -> bool:
+        """Return whether one of some terms is present."""
+        return not self._absent.issuperset(names)
+
+    def _force(self, xp: Any, v: Mapping[str, Scalar], control: tuple[Array, ...], angle: Array, braked: Scalar) -> Any:
+        """Return the forces with what encoder, dead zone and largest speed change.
+
+        Args:
+            control: Forces, stiffnesses, dampings and goals.
+            braked: What the motor's voltage takes off the torque per speed [N m s/rad].
+        """
         # A servo's error is that of its encoder; it does not correct an error within its dead zone.
-        braked, error = on * v["back_emf"], goal - angle - beyond
+        force, kp, kd, goal = control
+        beyond = v["eccentric_cos"] * xp.cos(angle) + v["eccentric_sin"] * xp.sin(angle)
+        error = goal - angle - beyond
         dead = xp.clip(error, -v["play"], v["play"])
         # A push beyond that of the largest speed is cut off: at that speed damping takes all of it.
         top = v["top_speed"]
         push, most = kp * (error - dead), xp.where(top < NO_LIMIT, top * (kd + v["damping"] + braked), xp.inf)
-        force = force - kp * (beyond + dead) - push + xp.clip(push, -most, most)
-        drive = xp.clip(force - kp * angle - kd * speed, -v["limit"], v["limit"]) - braked * speed
-        # Friction and damping of each joint.
-        stuck = v["static"] * xp.exp(-fast / v["stribeck_rad_s"])
-        # Damping that differs by direction stays 0 or more: a negative one would drive the joint.
-        viscous = xp.maximum(v["damping"] + v["damping_bias"] * xp.sign(speed), 0.0)
-        damping = viscous + v["drag"] * fast + braked
-        friction = v["frictionloss"] + stuck + v["load"] * xp.abs(drive)
-        phase = v["cogging_per_turn"] * angle
-        cogging = v["cogging_cos"] * xp.cos(phase) + v["cogging_sin"] * xp.sin(phase)
-        # Friction that differs by direction is a mean friction and a constant torque: it sticks in the same band.
-        applied = -v["bias"] - cogging
-        # Add the joints without a drive, in the model's order.
-        still = 0.0 * applied[..., :1]
-        beside = (v["other_damping"] + still, v["other_frictionloss"] + still, 0.0 * v["other_damping"] + still)
-        rows = [
-            xp.concatenate(pair, axis=-1)[..., self._order]
-            for pair in zip((damping, friction, applied), beside, strict=True)
-        ]
-        controls = xp.concatenate([force, kp, kd], axis=-1)
-        return controls, rows[2], dict(zip(self.fields, rows, strict=False))
+        return force - kp * (beyond + dead) - push + xp.clip(push, -most, most)

@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty.noise import noises, widening
+from sim2real.identify.uncertainty.noise import are_white, noises, widening
 from sim2real.identify.uncertainty.uncertainty import Linearised
 
 QUANTUM, DEVIATION, BIAS = 0.0015, 0.004, 0.003
@@ -46,6 +46,19 @@ def test_an_exact_sensor_has_no_noise():
 def test_errors_of_the_model_are_no_noise():
     (found,) = noises(columns(slow=0.05, bias=0.0), {})
     assert found.deviation == pytest.approx(DEVIATION, rel=0.05)
+
+
+@pytest.mark.parametrize(("slow", "white"), [(0.0, True), (0.3, True), (1.0, False)])
+def test_residuals_are_white_unless_errors_of_the_model_are_as_large_as_the_noise(slow, white):
+    """Slow errors of 0.3 times the noise add 4 % to the deviation, those of 1.0 times 41 %; the ratio allows 10 %."""
+    rng, t = np.random.default_rng(0), np.arange(LENGTH) * 0.02
+    raw = rng.standard_normal((SEGMENTS, LENGTH, 2)) + slow * np.sqrt(2.0) * np.sin(2 * t)[:, None]
+    raw[::2, -20:] = 0.0  # what is no residual
+    assert are_white(raw, 1.1) is white
+
+
+def test_what_was_not_measured_is_not_white():
+    assert not are_white(np.zeros((3, 8, 1)), 1.1)
 
 
 def test_missing_samples_and_short_segments_are_left_out():

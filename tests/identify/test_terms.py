@@ -152,6 +152,44 @@ def test_a_model_that_is_clearly_worse_is_tried_with_all_needed_terms_at_a_time(
     assert ("real",) in fits.tried
 
 
+@pytest.mark.parametrize("optimism", [0.1, 1.0, 10.0])
+def test_the_selected_set_is_judged_however_far_off_its_first_errors_are(linear, optimism):
+    """First errors of ``real`` are too low or too high; those of refits decide, and no set is judged twice."""
+    fits, judged = Fits(linear), []
+
+    def attempt(present, starts, most):
+        trial = fits.attempt(present, starts, most)
+        return replace(trial, ahead=trial.ahead * (optimism if trial.names(TABLE) == ("real",) else 1.0), judged=False)
+
+    def judge(trial):
+        judged.append(trial.names(TABLE))
+        return replace(fits.attempt(trial.present, [np.zeros(6)], np.inf), judged=True)
+
+    trials = grown(attempt, lambda trial: trial.stats, TABLE, [np.zeros(6)], judge=judge)
+    assert select(trials).names(TABLE) == ("real",)
+    assert select(trials).near[0].judged
+    assert len(judged) == len(set(judged)) <= len(trials)
+
+
+def test_only_the_best_set_of_a_round_is_judged(linear):
+    fits, judged = Fits(linear), []
+
+    def judge(trial):
+        judged.append(trial.names(TABLE))
+        return replace(trial, judged=True)
+
+    unjudged = lambda *of: replace(fits.attempt(*of), judged=False)  # noqa: E731
+    trials = grown(unjudged, lambda trial: trial.stats, TABLE, [np.zeros(6)], judge=judge)
+    assert 0 < len(judged) < len(trials)
+
+
+def test_no_term_is_added_to_a_set_that_leaves_only_noise(linear):
+    fits = Fits(linear)
+    white = lambda *of: replace(fits.attempt(*of), white=True)  # noqa: E731
+    grown(white, lambda trial: trial.stats, TABLE, [np.zeros(6)])
+    assert fits.tried == [()]
+
+
 class WithLimit(ParameterTable):
     """The table, in which ``once`` is a limit."""
 

@@ -135,6 +135,18 @@ def test_without_terms_all_steps_are_one_call(model_file):
     np.testing.assert_allclose(at_once, stepped, atol=1e-12)
 
 
+@pytest.mark.parametrize("one", [*MECHANICAL, "all", "none"])
+def test_a_law_without_absent_terms_returns_what_the_whole_law_does(one):
+    law, rng = DriveLaw(np.array([1, 0]), np.array([1, 0]), np.array([2])), np.random.default_rng(0)
+    own = {"all": ON, "none": OFF}.get(one) or OFF | {what: ON[what] for what in OPTIONAL[one]}
+    values = {n: np.full((4, 2), v) for n, v in {**OWN, **own}.items()}
+    values |= {"other_damping": np.full((4, 1), 0.3), "other_frictionloss": np.full((4, 1), 0.2)}
+    control, qpos, qvel = (rng.uniform(-1.0, 1.0, (4, n)) for n in (10, 3, 3))
+    whole, short = (kind(np, values, control, qpos, qvel) for kind in (law, law.among(values)))
+    for some, other in zip((*whole[:2], *whole[2].values()), (*short[:2], *short[2].values()), strict=True):
+        np.testing.assert_allclose(other, some, atol=1e-15)
+
+
 @pytest.mark.parametrize("one", sorted(set(MECHANICAL) - {"tilt", "gravcomp", "torque_limit"}))
 def test_a_term_that_follows_the_state_is_called_before_every_step(one):
     law = DriveLaw(np.array([0]), np.array([0]), np.zeros(0, int))

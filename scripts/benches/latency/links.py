@@ -62,8 +62,8 @@ def motion(t: np.ndarray, goal: np.ndarray, length_s: float, step_s: float, **se
     """Return the servo's angles at the times ``0, step_s, ...``, for goals that hold from the times ``t`` on."""
     model = mujoco.MjModel.from_xml_string(SERVO.format(step=step_s, hold=2 * step_s, **servo))
     ticks = step_s * np.arange(round(length_s / step_s))
-    # A step in which the goal changes gets the mean of both. The integrator responds a quarter of a step early.
-    edges = np.concatenate([[-1.0], t + 0.25 * step_s, [length_s + 1.0]])
+    # A step in which the goal changes gets the mean of both, at its begin: half a step early (semi-implicit Euler).
+    edges = np.concatenate([[-1.0], t + 0.5 * step_s, [length_s + 1.0]])
     total = np.concatenate([[0.0], np.cumsum(np.concatenate([goal[:1], goal]) * np.diff(edges))])
     control = np.diff(np.interp(np.append(ticks, length_s), edges, total)) / step_s
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))

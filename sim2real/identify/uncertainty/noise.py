@@ -61,23 +61,39 @@ def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> floa
     the measurement does not count, nor the shares of the delays in their sum, which no log determines. Without slow
     residuals the factor is 1.
     """
-    # Measure the slow part of the residuals.
     raw = at.raw.transpose(0, 2, 1)  # (S, F, C): one row a field of a segment
-    inside = raw != 0.0
-    total = slow = 0.0
-    for field in range(raw.shape[1]):
-        rows = [r[i] for r, i in zip(raw[:, field], inside[:, field], strict=True) if i.sum() > _ORDER]
-        if not rows:
-            continue
-        white = np.mean(np.concatenate([np.diff(r, _ORDER) for r in rows]) ** 2) / _GAIN
-        squares = np.concatenate(rows) ** 2
-        total, slow = total + squares.size, slow + float(max(0.0, squares.mean() - white)) * squares.size
+    inside, (total, white, count) = raw != 0.0, _squares(raw)
+    slow = max(0.0, total - white) / count if count else 0.0
     # Compare it with the spread of the predictions, without the shift of time.
     J = at.jacobian.transpose(0, 2, 1, 3)[inside]
     shift = time_shift(table)
     J = J - np.outer(J @ shift, shift) / max(float(shift @ shift), 1.0)
     predicted = float(np.einsum("np,pq,nq->n", J, spread.scale_covariance, J).mean()) if J.size else 0.0
-    return float(np.sqrt(1.0 + slow / total / predicted)) if total and predicted > 0.0 else 1.0
+    return float(np.sqrt(1.0 + slow / predicted)) if predicted > 0.0 else 1.0
+
+
+def are_white(raw: np.ndarray, ratio: float) -> bool:
+    """Return whether residuals ``(S, C, F)`` are noise of the sensor, which no model predicts, but for a ratio."""
+    total, white, count = _squares(raw.transpose(0, 2, 1))
+    return bool(count) and total <= ratio**2 * white
+
+
+def _squares(raw: np.ndarray) -> tuple[float, float, int]:
+    """Return the sum of squares of residuals ``(S, F, C)``, the share of white noise in it, and their number.
+
+    In each field third differences separate white noise from slow errors; a 0 is no residual.
+    """
+    total, noise, count = 0.0, 0.0, 0
+    for field in range(raw.shape[1]):
+        rows = [r[r != 0.0] for r in raw[:, field]]
+        rows = [r for r in rows if r.size > _ORDER]
+        if not rows:
+            continue
+        white = float(np.mean(np.concatenate([np.diff(r, _ORDER) for r in rows]) ** 2)) / _GAIN
+        squares = np.concatenate(rows) ** 2
+        total, count = total + float(squares.sum()), count + squares.size
+        noise += min(white, float(squares.mean())) * squares.size
+    return total, noise, count
 
 
 def _quantum(readings: Sequence[float] | np.ndarray) -> float:

@@ -22,7 +22,7 @@ _RESAMPLED = 1000
 _FAR, _DIVERGED = 1.5, 1e100
 """Ratio of a set's error to that of a subset above which the set is not selected; mean square of a diverged
 prediction."""
-_ALIKE = 1.1
+ALIKE = 1.1
 """Largest ratio of two errors that count as equal."""
 _RARE = 0.02
 """Share of selections below which a model is no alternative."""
@@ -102,6 +102,8 @@ class Trial:
         rows: The estimates without each part, and their errors on it.
         ahead: Shape ``(K,)``: mean square of the errors up to the horizon on each part, with that part held out.
         free: Shape ``(K,)``: the same in free runs; zeros without free runs.
+        white: Whether the residuals are noise of the sensor: no larger set can predict better.
+        judged: Whether the fit ended, and the errors are those of refits where it matters; if not, of linear steps.
     """
 
     present: np.ndarray
@@ -111,6 +113,8 @@ class Trial:
     rows: Sequence[HeldOutPart]
     ahead: np.ndarray
     free: np.ndarray
+    white: bool = False
+    judged: bool = True
 
     def names(self, table: ParameterTable) -> tuple[str, ...]:
         """Return the names of the terms."""
@@ -237,7 +241,7 @@ def votes(scores: np.ndarray, size: np.ndarray) -> np.ndarray:
         off = scores - scores[np.argmin(mean)]
         excess = off @ share
         error = np.sqrt((off - excess[:, None]) ** 2 @ share / (parts - 1))
-        within = (excess <= error) | (np.sqrt(mean) <= _ALIKE * np.sqrt(mean.min()))
+        within = (excess <= error) | (np.sqrt(mean) <= ALIKE * np.sqrt(mean.min()))
         chosen[np.lexsort((mean, size, ~within))[0]] += 1.0
     return chosen / chosen.sum()
 
@@ -251,7 +255,7 @@ def _as_good(scores: np.ndarray, best: np.ndarray) -> np.ndarray:
 
 def better(squares: np.ndarray, than: np.ndarray) -> np.ndarray:
     """Return whether mean squares ``(..., K)`` are lower than others by more than the ratio of equal errors."""
-    return np.sqrt(squares.mean(axis=-1)) * _ALIKE < np.sqrt(than.mean(axis=-1))
+    return np.sqrt(squares.mean(axis=-1)) * ALIKE < np.sqrt(than.mean(axis=-1))
 
 
 def on_held_out_parts(stats: Statistics, table: ParameterTable, present: np.ndarray) -> np.ndarray:

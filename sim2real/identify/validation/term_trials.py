@@ -16,9 +16,11 @@ from sim2real.identify.fit import INSIDE, Fit, opened
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.search.refine import refine
+from sim2real.identify.uncertainty.noise import are_white
 from sim2real.identify.uncertainty.uncertainty import Linearised, linearise
 from sim2real.identify.validation import folds
 from sim2real.identify.validation.optional_terms import (
+    ALIKE,
     Statistics,
     Trial,
     better,
@@ -59,6 +61,7 @@ def grown(
     limited: Limited = lambda trial, present: (),
     needed: Sequence[int] = (),
     least: float = np.inf,
+    judge: Callable[[Trial], Trial] = lambda trial: trial,
 ) -> list[Trial]:
     """Return the fits of sets of terms: none, then larger ones as long as held-out parts are predicted better.
 
@@ -73,12 +76,13 @@ def grown(
         needed: Terms that the fit of all terms needs, the most needed one first: where a model without a term ends far
             away, as one that compensates no weight, an approximation around it proposes another term.
         least: Loss of the fit of all terms; a set that is clearly worse is tried with all needed terms at a time.
+        judge: Ends a fit, and returns its errors by refits: only the best of a round, and the selected set, need them.
     """
     none = np.zeros(len(table.terms), bool)
-    base = attempt(none, starts, np.inf)
+    base = judge(attempt(none, starts, np.inf))
     trials, limits = [base], table.of_limits()
-    # Add terms until the errors on held-out parts stay.
-    while not base.present.all():
+    # Add terms until the errors on held-out parts stay, or only noise is left.
+    while not base.present.all() and not base.white:
         stats, level = wider(base), list[Trial]()
         lacks = [i for i in needed if not base.present[i]]
         first = [base.present | np.isin(np.arange(len(none)), some) for some in (lacks, lacks[:1]) if some]
@@ -89,19 +93,23 @@ def grown(
                 break
             begins = [_begin(stats, table, present), opened(table, base.z, present), *starts]
             level.append(_with_gain(attempt(present, begins, base.loss), base))
+        _judge_best(level, judge)
         # Try the limits once no other term helps: the fit of one costs a descent from each of several levels.
         helped = bool(level) and better(_best(level).ahead, base.ahead)
         for i in () if helped else np.flatnonzero(limits & ~base.present):
             present = base.present | (np.arange(len(none)) == i)
             level.append(_with_gain(attempt(present, limited(base, present), base.loss), base))
             limits[i] = level[-1].loss < (1.0 - LITTLE) * base.loss
+        _judge_best(level, judge)
         trials += level
         if not level or not better(_best(level).ahead, base.ahead):
             break
         base = _best(level)
     # Fit the selected set without each of its terms, until no subset is left.
     while True:
-        chosen, there = selected(trials), {t.present.tobytes() for t in trials}
+        while not (chosen := selected(trials)).judged:
+            trials[_place(trials, chosen)] = judge(chosen)
+        there = {t.present.tobytes() for t in trials}
         fewer = [chosen.present & (np.arange(len(none)) != i) for i in np.flatnonzero(chosen.present)]
         lacking = [present for present in fewer if present.tobytes() not in there]
         if not lacking:
@@ -112,13 +120,23 @@ def grown(
             trials.append(_with_gain(attempt(present, begins, below.loss), below))
 
 
+def _judge_best(level: list[Trial], judge: Callable[[Trial], Trial]) -> None:
+    """Judge the best trial, until the best of them is judged."""
+    while level and not (best := _best(level)).judged:
+        level[_place(level, best)] = judge(best)
+
+
+def _place(trials: Sequence[Trial], trial: Trial) -> int:
+    return next(i for i, t in enumerate(trials) if t is trial)
+
+
 def _with_gain(trial: Trial, below: Trial) -> Trial:
     """Return a trial; with the errors of a smaller set if its loss is the same, as a limit that nothing reaches has.
 
     Such a set gets no refits, and the errors of linear steps are not comparable with those of refits.
     """
     if (1.0 - LITTLE) * below.loss <= trial.loss <= (1.0 + _WORSE) * below.loss:
-        return replace(trial, rows=below.rows, ahead=below.ahead, free=below.free)
+        return replace(trial, rows=below.rows, ahead=below.ahead, free=below.free, judged=True)
     return trial
 
 
@@ -209,7 +227,7 @@ class Trials:
         """Return the fits of ``grown``."""
         table = self._problem.table
         starts = [self._estimate.z, *table.starts()]
-        return grown(self.attempt, self.wider, table, starts, self.limited, self.needed(), self._least)
+        return grown(self.attempt, self.wider, table, starts, self.limited, self.needed(), self._least, self.judge)
 
     def needed(self) -> list[int]:
         """Return the terms without which the fit of all terms predicts held-out parts worse, the most needed first."""
@@ -246,19 +264,33 @@ class Trials:
             most: Loss of a smaller set; if the descent ends above it, it begins at the other starts, too.
         """
         problem, table = self._problem, self._problem.table
-        columns = table.of_terms(present)
-        data, names = problem.part(present=columns), self._names(present)
+        data, names = problem.part(present=table.of_terms(present)), self._names(present)
         self._on_set(", ".join(names) or "no term")
         stored = self._refits.whole(names, problem, data) if self._refits else None
         z, loss = stored or self._descended(present, starts, most, data)
-        # Refit without each part, unless the set is clearly worse, or hardly better than a smaller one: then the linear
-        # steps are near enough to the whole fit.
         self._least = min(self._least, loss)
-        refits = self._refits if loss <= min(_CLEAR * self._least, (1.0 - LITTLE) * most) else None
-        if refits and not stored:  # to the end, as each refit would have to descend that far, too
+        # Errors of linear steps suffice for a set that is clearly worse, or hardly better than a smaller one.
+        near = loss <= min(_CLEAR * self._least, (1.0 - LITTLE) * most)
+        return self._trial(present, z, loss, bool(self._refits) and near)
+
+    def judge(self, trial: Trial) -> Trial:
+        """Return a trial whose fit ended, with its errors by refits without each part."""
+        problem, data = self._problem, self._problem.part(present=self._problem.table.of_terms(trial.present))
+        refits, names, z, loss = self._refits, self._names(trial.present), trial.z, trial.loss
+        if trial.judged or refits is None:
+            return trial
+        if not refits.whole(names, problem, data):  # to the end, as each refit would have to descend that far, too
             further = refine(problem, z[None], data, settle=False, gain=_GAIN)
             z, loss = further.z, further.loss
             self._least = min(self._least, loss)
+        return self._trial(trial.present, z, loss, False, refits)
+
+    def _trial(
+        self, present: np.ndarray, z: np.ndarray, loss: float, unjudged: bool, refits: Refits | None = None
+    ) -> Trial:
+        """Return the trial of a fit, with errors by refits, or by linear steps."""
+        problem, columns = self._problem, self._problem.table.of_terms(present)
+        data, names = problem.part(present=columns), self._names(present)
         at = linearise(problem, z, data)
         stats = statistics(problem, at, self._masks)
         ends = self._without_each(z, at, stats, present)
@@ -272,7 +304,8 @@ class Trials:
         rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(ends), list(ends), *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
-        return Trial(present, z, loss, stats, tuple(rows), ahead, free)
+        white = are_white(at.raw, ALIKE)
+        return Trial(present, z, loss, stats, tuple(rows), ahead, free, white, not unjudged)
 
     def _names(self, present: np.ndarray) -> tuple[str, ...]:
         return tuple(n for n, there in zip(self._problem.table.terms, present, strict=True) if there)

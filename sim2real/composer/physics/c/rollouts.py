@@ -73,6 +73,10 @@ class StepLaw(Protocol):
         """
         return None
 
+    def among(self, values: Mapping[str, np.ndarray]) -> StepLaw:
+        """Return the law for these numbers of all copies: it may leave away what they switch off."""
+        return self
+
 
 class OpenLoop(Protocol):
     """A world on MuJoCo whose controls do not depend on its state: its physics can run outside of a graph's program.
@@ -251,6 +255,7 @@ class Rollouts:
     ) -> np.ndarray:
         """Step copies one physics step at a time, fill ``out``, and return which of them failed, ``(count,)``."""
         batch, (count, steps) = self._batch, control.shape[:2]
+        law = law.among(values)
         ids, failed = np.arange(count), np.zeros(count, bool)
         live = {n: batch.bind(n) for n in (*out, "ctrl", "qfrc_applied")}
         fields = {n: batch.expand(n) for n in law.fields}
