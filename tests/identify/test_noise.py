@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty.noise import are_white, noises, widening
+from sim2real.identify.uncertainty.noise import above_noise, noises, widening
 from sim2real.identify.uncertainty.uncertainty import Linearised
 
 QUANTUM, DEVIATION, BIAS = 0.0015, 0.004, 0.003
@@ -48,17 +48,16 @@ def test_errors_of_the_model_are_no_noise():
     assert found.deviation == pytest.approx(DEVIATION, rel=0.05)
 
 
-@pytest.mark.parametrize(("slow", "white"), [(0.0, True), (0.3, True), (1.0, False)])
-def test_residuals_are_white_unless_errors_of_the_model_are_as_large_as_the_noise(slow, white):
-    """Slow errors of 0.3 times the noise add 4 % to the deviation, those of 1.0 times 41 %; the ratio allows 10 %."""
-    rng, t = np.random.default_rng(0), np.arange(LENGTH) * 0.02
-    raw = rng.standard_normal((SEGMENTS, LENGTH, 2)) + slow * np.sqrt(2.0) * np.sin(2 * t)[:, None]
+@pytest.mark.parametrize(("slow", "ratio"), [(0.0, 1.0), (0.3, 1.04), (1.0, 1.41), (5.0, 5.1)])
+def test_residuals_are_above_the_noise_by_the_errors_of_the_model(slow, ratio):
+    rng, t = np.random.default_rng(0), np.arange(SEGMENTS * LENGTH).reshape(SEGMENTS, LENGTH) * 0.02
+    raw = rng.standard_normal((SEGMENTS, LENGTH, 2)) + slow * np.sqrt(2.0) * np.sin(2 * t)[..., None]
     raw[::2, -20:] = 0.0  # what is no residual
-    assert are_white(raw, 1.1) is white
+    assert above_noise(raw) == pytest.approx(ratio, rel=0.03)
 
 
-def test_what_was_not_measured_is_not_white():
-    assert not are_white(np.zeros((3, 8, 1)), 1.1)
+def test_what_was_not_measured_is_not_noise():
+    assert above_noise(np.zeros((3, 8, 1))) == np.inf
 
 
 def test_missing_samples_and_short_segments_are_left_out():

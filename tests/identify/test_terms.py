@@ -185,8 +185,8 @@ def test_only_the_best_set_of_a_round_is_judged(linear):
 
 def test_no_term_is_added_to_a_set_that_leaves_only_noise(linear):
     fits = Fits(linear)
-    white = lambda *of: replace(fits.attempt(*of), white=True)  # noqa: E731
-    grown(white, lambda trial: trial.stats, TABLE, [np.zeros(6)])
+    noise = lambda *of: replace(fits.attempt(*of), above=1.05)  # noqa: E731
+    grown(noise, lambda trial: trial.stats, TABLE, [np.zeros(6)])
     assert fits.tried == [()]
 
 
@@ -195,6 +195,13 @@ class WithLimit(ParameterTable):
 
     def of_limits(self):
         return terms("once")
+
+
+def test_limits_are_not_tried_where_residuals_are_near_the_noise(linear):
+    fits = Fits(linear)
+    near = lambda *of: replace(fits.attempt(*of), above=1.9)  # noqa: E731
+    grown(near, lambda trial: trial.stats, WithLimit(TABLE), [np.zeros(6)], lambda trial, present: [np.zeros(6)])
+    assert not any("once" in names for names in fits.tried)
 
 
 def test_limits_are_tried_once_no_other_term_helps(linear):

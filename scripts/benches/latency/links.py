@@ -59,10 +59,15 @@ class Truth:
 
 
 def motion(t: np.ndarray, goal: np.ndarray, length_s: float, step_s: float, **servo: float) -> np.ndarray:
-    """Return the servo's angles at the times ``0, step_s, ...``, for goals that hold from the times ``t`` on."""
+    """Return the servo's angles at the times ``0, step_s, ...``, for goals that hold from the times ``t`` on.
+
+    The integrator applies forces at the begin of a step, half a step early, and damping that is half a step late, which
+    acts like an inertia. Both are taken back: a fit would turn them into a delay.
+    """
+    servo["armature"] = max(servo["armature"] - 0.5 * step_s * servo["damping"], 0.0)
     model = mujoco.MjModel.from_xml_string(SERVO.format(step=step_s, hold=2 * step_s, **servo))
     ticks = step_s * np.arange(round(length_s / step_s))
-    # A step in which the goal changes gets the mean of both, at its begin: half a step early (semi-implicit Euler).
+    # A step in which the goal changes gets the mean of both.
     edges = np.concatenate([[-1.0], t + 0.5 * step_s, [length_s + 1.0]])
     total = np.concatenate([[0.0], np.cumsum(np.concatenate([goal[:1], goal]) * np.diff(edges))])
     control = np.diff(np.interp(np.append(ticks, length_s), edges, total)) / step_s

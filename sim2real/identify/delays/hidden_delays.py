@@ -64,12 +64,13 @@ class Hidden:
         """Return the delay that a share ``q`` of the messages does not exceed, and the ends of its interval [s].
 
         The ends are the quantiles at ``q`` minus and plus the error of the distribution there: a quantile within a gap
-        of the distribution has no standard error.
+        of the distribution has no standard error. Half a step of the grid, its resolution, widens the interval.
         """
         below = np.cumsum(self.share) - 0.5 * self.share
         error = self._error(np.array(_at(self._below(), below, q)))
         ends = np.interp([q, q - deviations * error, q + deviations * error], below, self.delays)
-        return float(ends[0]), float(ends[1]), float(ends[2])
+        half = 0.5 * float(self.delays[1] - self.delays[0])
+        return float(ends[0]), float(ends[1]) - half, float(ends[2]) + half
 
     def _below(self) -> np.ndarray:
         return np.cumsum(self.by_shape, axis=0) - 0.5 * self.by_shape

@@ -72,10 +72,10 @@ def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> floa
     return float(np.sqrt(1.0 + slow / predicted)) if predicted > 0.0 else 1.0
 
 
-def are_white(raw: np.ndarray, ratio: float) -> bool:
-    """Return whether residuals ``(S, C, F)`` are noise of the sensor, which no model predicts, but for a ratio."""
-    total, white, count = _squares(raw.transpose(0, 2, 1))
-    return bool(count) and total <= ratio**2 * white
+def above_noise(raw: np.ndarray) -> float:
+    """Return the ratio of residuals ``(S, C, F)`` to the noise of the sensor, which no model predicts."""
+    total, white, _ = _squares(raw.transpose(0, 2, 1))
+    return float(np.sqrt(total / white)) if white > 0.0 else np.inf
 
 
 def _squares(raw: np.ndarray) -> tuple[float, float, int]:

@@ -102,7 +102,7 @@ class Trial:
         rows: The estimates without each part, and their errors on it.
         ahead: Shape ``(K,)``: mean square of the errors up to the horizon on each part, with that part held out.
         free: Shape ``(K,)``: the same in free runs; zeros without free runs.
-        white: Whether the residuals are noise of the sensor: no larger set can predict better.
+        above: Ratio of the residuals to the noise of the sensor, which no set predicts.
         judged: Whether the fit ended, and the errors are those of refits where it matters; if not, of linear steps.
     """
 
@@ -113,7 +113,7 @@ class Trial:
     rows: Sequence[HeldOutPart]
     ahead: np.ndarray
     free: np.ndarray
-    white: bool = False
+    above: float = np.inf
     judged: bool = True
 
     def names(self, table: ParameterTable) -> tuple[str, ...]:

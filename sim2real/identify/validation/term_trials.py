@@ -16,7 +16,7 @@ from sim2real.identify.fit import INSIDE, Fit, opened
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.search.refine import refine
-from sim2real.identify.uncertainty.noise import are_white
+from sim2real.identify.uncertainty.noise import above_noise
 from sim2real.identify.uncertainty.uncertainty import Linearised, linearise
 from sim2real.identify.validation import folds
 from sim2real.identify.validation.optional_terms import (
@@ -43,6 +43,8 @@ LITTLE = 0.01
 _LEVELS, _ACTS, _LOWER = 16, 1e-4, 2
 """Levels of a limit that are simulated; relative change of the loss from which it acts; the second start's number of
 levels below the first."""
+_LIMITED = 2.0
+"""Ratio of residuals to noise from which limits are tried: one that acts leaves far more, and its fit takes long."""
 _TRIED = 3
 """Most larger sets that are fitted in a round."""
 _WORSE = 0.02
@@ -82,7 +84,7 @@ def grown(
     base = judge(attempt(none, starts, np.inf))
     trials, limits = [base], table.of_limits()
     # Add terms until the errors on held-out parts stay, or only noise is left.
-    while not base.present.all() and not base.white:
+    while not base.present.all() and base.above > ALIKE:
         stats, level = wider(base), list[Trial]()
         lacks = [i for i in needed if not base.present[i]]
         first = [base.present | np.isin(np.arange(len(none)), some) for some in (lacks, lacks[:1]) if some]
@@ -96,7 +98,7 @@ def grown(
         _judge_best(level, judge)
         # Try the limits once no other term helps: the fit of one costs a descent from each of several levels.
         helped = bool(level) and better(_best(level).ahead, base.ahead)
-        for i in () if helped else np.flatnonzero(limits & ~base.present):
+        for i in () if helped or base.above < _LIMITED else np.flatnonzero(limits & ~base.present):
             present = base.present | (np.arange(len(none)) == i)
             level.append(_with_gain(attempt(present, limited(base, present), base.loss), base))
             limits[i] = level[-1].loss < (1.0 - LITTLE) * base.loss
@@ -304,8 +306,7 @@ class Trials:
         rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(ends), list(ends), *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
-        white = are_white(at.raw, ALIKE)
-        return Trial(present, z, loss, stats, tuple(rows), ahead, free, white, not unjudged)
+        return Trial(present, z, loss, stats, tuple(rows), ahead, free, above_noise(at.raw), not unjudged)
 
     def _names(self, present: np.ndarray) -> tuple[str, ...]:
         return tuple(n for n, there in zip(self._problem.table.terms, present, strict=True) if there)
