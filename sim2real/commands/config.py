@@ -97,8 +97,8 @@ class PlayConfig:
     window: bool = False
     """Show it in a window; the arrow keys change forward velocity and yaw rate, comma and full stop the sideways one,
     the space bar stops."""
-    video: Annotated[Path | None, arg(metavar="FILE.gif")] = None
-    """Moving picture to write, from the side; needs no display."""
+    video: Annotated[Path | None, arg(metavar="FILE.gif|FILE.mp4")] = None
+    """Moving picture to write, from the side; needs no display, and FFmpeg for .mp4."""
     runs: Path = Path("runs")
     """Folder of all runs."""
 
@@ -106,3 +106,5 @@ class PlayConfig:
         """Check the numbers."""
         if not (0.0 < self.seconds <= 3600.0 and 0.0 <= self.push <= 10.0):
             raise UsageError(f"play takes up to 3600 s and pushes of 0 to 10 m/s, got {self.seconds} and {self.push}")
+        if self.video and self.video.suffix not in (".gif", ".mp4"):
+            raise UsageError(f"--video writes a .gif or a .mp4, got {self.video}", hint="--video walk.gif")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,8 @@ def run(config: PlayConfig) -> Walked:
     """
     if config.window and config.video:
         raise UsageError("play shows a window or writes a picture", hint="run it with one of both")
+    if config.video and config.video.suffix == ".mp4":
+        _ffmpeg()  # an error before the walk
     robot, folder = _chosen(config)
     hidden = None if config.seed is None else HiddenTwin.draw(np.random.default_rng(config.seed), len(robot.joints))
     twin, wanted = Twin(robot, hidden, config.seed or 0), np.array(config.command)
@@ -56,21 +60,35 @@ def steer(wanted: np.ndarray, key: int) -> None:
 
 def write_picture(twin: Twin, qpos: np.ndarray, out: Path) -> None:
     """Write the robot from the side, as a moving picture of its links."""
-    from matplotlib.animation import PillowWriter
+    from matplotlib import rc_context
+    from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.8, 2.7), dpi=80, layout="constrained")
     axes = figure.subplots()
     every = max(1, round(twin.robot.rate_hz / FRAMES_PER_S))
-    writer = PillowWriter(fps=round(twin.robot.rate_hz / every))
-    with writer.saving(figure, str(out), 80):
+    path = {} if out.suffix == ".gif" else {"animation.ffmpeg_path": _ffmpeg()}
+    writer = (FFMpegWriter if path else PillowWriter)(fps=round(twin.robot.rate_hz / every))
+    with rc_context(path), writer.saving(figure, str(out), 80):
         for row in qpos[::every]:
             axes.clear()
             for start, end in twin.links(row):
-                axes.plot([start[0], end[0]], [start[2], end[2]], color="#0b62b0", lw=3, solid_capstyle="round")
+                color = "#0b62b0" if start[1] + end[1] >= 2.0 * row[1] else "#8fb8dd"  # the far side is lighter
+                axes.plot([start[0], end[0]], [start[2], end[2]], color=color, lw=3, solid_capstyle="round")
             axes.axhline(0.0, color="#1c2530", lw=1)
             axes.set(xlim=(row[0] - 0.7, row[0] + 0.7), ylim=(-0.05, 0.6), aspect="equal", xlabel="forwards [m]")
             writer.grab_frame()
+
+
+def _ffmpeg() -> str:
+    """Return the path of FFmpeg: the system's, or that of the package imageio-ffmpeg."""
+    if found := shutil.which("ffmpeg"):
+        return found
+    try:
+        return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
+    except (ImportError, RuntimeError):
+        hint = "pip install imageio-ffmpeg, or write a .gif"
+        raise UsageError("a .mp4 needs FFmpeg, which is not installed", hint=hint) from None
 
 
 def _chosen(config: PlayConfig) -> tuple[ComposedRobot, Path]:

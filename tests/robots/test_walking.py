@@ -3,6 +3,7 @@
 import re
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import jax
@@ -76,6 +77,20 @@ def test_play_writes_a_picture(tmp_path, capsys):
     run(PlayConfig("go2", seconds=0.5, video=tmp_path / "a.gif", runs=tmp_path))
     assert (tmp_path / "a.gif").read_bytes()[:3] == b"GIF"
     assert "walked for 0.5 s" in capsys.readouterr().err
+
+
+def test_play_writes_a_film(tmp_path):
+    run(PlayConfig("go2", seconds=0.5, video=tmp_path / "a.mp4", runs=tmp_path))
+    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_film_without_ffmpeg_and_another_format_are_refused_before_the_walk(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(UsageError, match="needs FFmpeg"):
+        run(PlayConfig("no pipeline", video=tmp_path / "a.mp4"))
+    with pytest.raises(UsageError, match=r"a \.gif or a \.mp4"):
+        PlayConfig("go2", video=tmp_path / "a.avi")
 
 
 def test_play_refuses_a_robot_that_does_not_walk(tmp_path):
