@@ -82,8 +82,8 @@ def write_picture(twin: Twin, qpos: np.ndarray, out: Path) -> None:
 
 def _ffmpeg() -> str:
     """Return the path of FFmpeg: the system's, or that of the package imageio-ffmpeg."""
-    if found := shutil.which("ffmpeg"):
-        return found
+    if system := shutil.which("ffmpeg"):
+        return system
     try:
         return importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe()
     except (ImportError, RuntimeError):

@@ -74,7 +74,7 @@ class StepLaw(Protocol):
         return None
 
     def among(self, values: Mapping[str, np.ndarray]) -> StepLaw:
-        """Return the law for these numbers of all copies: it may leave away what they switch off."""
+        """Return the law for these numbers of all copies: a law may skip terms that are off in all of them."""
         return self
 
 
