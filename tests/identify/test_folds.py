@@ -162,8 +162,8 @@ def one():
     return SimpleNamespace(episode=episode, fit=whole, parts=parts, rows=rows)
 
 
-def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one):
-    for part, row in zip(one.parts, one.rows, strict=True):
+def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one, repetitions):
+    for part, row in list(zip(one.parts, one.rows, strict=True))[: repetitions(1, 3)]:
         rest = [s for s, gone in zip(spans(0), part.touches(spans(0), LENGTH_S), strict=True) if not gone]
         assert 4 <= len(rest) < len(spans(0))
         alone = fit(Model(), [one.episode], rest, LENGTH_S, CONFIG).values

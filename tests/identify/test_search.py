@@ -23,6 +23,8 @@ STANDARD = [
     "CMA_ES", "Sep_CMA_ES", "SNES", "xNES", "PGPE", "Open_ES", "SimpleES", "DifferentialEvolution", "PSO", "SimpleGA",
     "MA_ES", "CR_FM_NES", "SimulatedAnnealing",
 ]  # fmt: skip
+USUAL = ["CMA_ES", "SNES", "Open_ES", "DifferentialEvolution", "PSO", "SimulatedAnnealing"]
+"""One of each kind: `make test` takes these."""
 CONFIG = FitConfig(population=16, generations=2000, std=1.0, seed=1)
 
 
@@ -76,7 +78,7 @@ def test_when_nothing_can_be_simulated():
 
 @pytest.mark.parametrize(
     "strategy",
-    [s if s in (*STANDARD, *INCOMPLETE, "LM_MA_ES") else pytest.param(s, marks=pytest.mark.full) for s in strategies()],
+    [s if s in (*USUAL, *INCOMPLETE, "LM_MA_ES") else pytest.param(s, marks=pytest.mark.full) for s in strategies()],
 )
 def test_every_strategy_runs_or_says_why_not(strategy):
     config = FitConfig(strategy=strategy, population=8, generations=10, std=0.7)
@@ -165,7 +167,7 @@ def test_a_generation_sees_one_batch_and_the_end_sees_all():
     assert len({tuple(sorted(p.tolist())) for p in batches}) > 5
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.full) for s in (1, 2))])
 def test_a_search_goes_on_after_a_lucky_early_candidate(seed):
     """Its best loss is that of the first generation; the median falls, and that counts."""
     config, asked = replace(CONFIG, std=0.3, seed=seed), []
@@ -212,7 +214,7 @@ def on_host(candidates, around, pick, fresh):
     return np.asarray(bowl(jnp.asarray(candidates, jnp.float32)), np.float64)
 
 
-@pytest.mark.parametrize("strategy", ["CMA_ES", "SNES", "DifferentialEvolution"])
+@pytest.mark.parametrize("strategy", ["CMA_ES", pytest.param("SNES", marks=pytest.mark.full), "DifferentialEvolution"])
 def test_losses_outside_of_programs_are_searched_alike(strategy):
     config = replace(CONFIG, strategy=strategy, generations=30)
     alone = lambda z: float(bowl(z[None])[0])  # noqa: E731

@@ -73,6 +73,7 @@ def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, resti
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
 
 
+@pytest.mark.full  # `make test` refuses a delay in test_admission.py, and measures one in the test above
 def test_15_ms_more_of_delay_are_refused(make_pipeline, tmp_path, resting, capsys):
     latency = load_pipeline("pendulum").load().drive.embedded.emulator.actuation_latency_s + 0.015
     name = make_pipeline("late_pendulum", f"\n    embedded = faulty_emulator(actuation_latency_s={latency})\n")
@@ -160,6 +161,10 @@ def test_the_motors_of_a_voltage_drive_hold_nothing(tmp_path, resting, capsys):
     assert manifest_of(folder)["status"] == "failed"
 
 
+QUICK = ("wild", "unplugged")
+"""Faults that `make test` does not have in test_faults.py, test_kill.py and test_guardian.py."""
+
+
 @pytest.fixture(scope="module")
 def runs(repetitions):
     """How often each fault happens."""
@@ -167,15 +172,15 @@ def runs(repetitions):
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory, runs):
+def report(tmp_path_factory, runs, repetitions):
     """What the bench says of runs of each fault, two at a time; patient, for the machine may be busy."""
     path = tmp_path_factory.mktemp("faults") / "report.json"
     flags = ["--runs", str(runs), "--jobs", "2", "--servo-watchdog-s", "0.15", "--json", str(path)]
-    assert bench.main(["faults", *flags]) == 0
+    assert bench.main(["faults", *flags, "--faults", *repetitions(QUICK, faults.FAULTS)]) == 0
     return json.loads(path.read_text())
 
 
-@pytest.mark.parametrize("name", faults.FAULTS)
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.full) for n in faults.FAULTS])
 def test_a_fault_leaves_the_motor_safe_and_its_reason_said(report, runs, name):
     rows = {row["name"].removeprefix(f"faults/{name}/"): row["value"] for row in report["rows"]}
     assert (rows["code_and_reason"], rows["log_readable"]) == (runs, runs), report["wrong"]

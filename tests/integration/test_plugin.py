@@ -71,6 +71,7 @@ def test_what_it_brings_has_names(call):
     assert re.search(r"^oiled +entry point turntable.oiled:OiledTable$", said, re.MULTILINE)
 
 
+@pytest.mark.full  # `make test` records it below, and other devices pass the suite in tests/hardware
 def test_its_own_tests_pass(call):
     """They are the conformance suites of devices and robots, and have nothing else."""
     tests = [TESTS / "plugin" / name for name in ("test_odrive.py", "test_turntable.py")]

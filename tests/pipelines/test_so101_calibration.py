@@ -73,11 +73,13 @@ FAULTS = {
 }  # fmt: skip
 
 
-IN_FULL = {
-    "a servo mounted turned", "a direction turned in the file", "a horn that has slipped",
-    "a joint at its stop when calibrated",
+WHOLE_MOTION = {
+    "servos exchanged", "a servo mounted turned", "a direction turned in the file", "a zero that is off",
+    "a horn that has slipped", "a joint at its stop when calibrated",
 }  # fmt: skip
-"""Faults that need a whole motion of the hand; `make test` moves it for two others."""
+"""Faults that a motion of the hand shows. `make test` moves it in real time for one of them, and leaves the others to
+test_so101_hand_motion.py, where it takes no time."""
+IN_FULL = WHOLE_MOTION - {"servos exchanged"}
 
 
 @pytest.mark.parametrize("fault", [pytest.param(f, marks=pytest.mark.full) if f in IN_FULL else f for f in FAULTS])
@@ -91,6 +93,7 @@ def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
 
 
 @pytest.mark.slow
+@pytest.mark.full  # `make test` plays the motion to HandMotion in test_so101_hand_motion.py
 def test_a_right_calibration_is_accepted(arm, tmp_path):
     right = arm()
     calibrate(right.port, GUIDE, tmp_path / "calibration.json")
@@ -99,6 +102,7 @@ def test_a_right_calibration_is_accepted(arm, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.full  # as above
 def test_without_a_calibration_the_motion_makes_one(arm, tmp_path, monkeypatch):
     """Its zeros are those of the arm. Before, the encoders' seam was inside of the joints' travel."""
     new = arm(emulation={"homing_offset": 1900})

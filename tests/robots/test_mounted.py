@@ -103,6 +103,7 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
 
 
 @pytest.mark.realtime
+@pytest.mark.full  # test_mounting.py has each reading and command, the test below goals and limits
 def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path):
     """The log of a pendulum whose motor turns twice the other way gives the parameters of the pendulum's plant."""
     pipeline = load_pipeline("pendulum")

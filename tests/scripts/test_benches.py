@@ -124,6 +124,7 @@ def test_drift(run):
     assert {c["name"] for c in tested["changes"]} >= {"friction", "payload", "round_trip_delay"}
 
 
+@pytest.mark.full
 def test_view(run):
     pytest.importorskip("rerun")
     found = names(run("view"))

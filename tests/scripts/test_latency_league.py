@@ -51,6 +51,7 @@ def test_ours_finds_a_distribution_and_a_correlation_measures_the_lag_of_the_ser
     assert peak.mean > true.mean + 0.02
 
 
+@pytest.mark.full  # `make test` runs the other methods
 def test_sysid_finds_a_constant_delay_and_paces_is_a_multiple_of_its_step(monkeypatch):
     log, true = links.log("fixed", 3.0, 1), links.truth("fixed", 3.0)
     monkeypatch.setattr(methods, "PACE_S", 2.0)

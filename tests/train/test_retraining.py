@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 from retraining import environment
 
 
@@ -29,6 +30,7 @@ def test_all_numbers_of_a_recording_are_in_the_data():
     assert any((a != b).any() for a, b in zip(jax.tree.leaves(played(first)), jax.tree.leaves(own), strict=True))
 
 
+@pytest.mark.full  # `make test` checks the reason: the test above
 def test_a_second_recording_compiles_nothing(tmp_path):
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     command = [sys.executable, str(Path(__file__).with_name("retraining.py")), "0", "1"]

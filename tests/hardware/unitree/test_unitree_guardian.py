@@ -66,7 +66,14 @@ with Rig(device, gate) as rig:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
+@pytest.mark.parametrize(
+    "number",
+    [
+        pytest.param(signal.SIGKILL, id="killed"),
+        # `make test` stops the control process of a servo in test_guardian.py.
+        pytest.param(signal.SIGSTOP, id="stopped", marks=pytest.mark.full),
+    ],
+)
 def test_a_robot_that_stands_sinks_before_its_motors_switch_off(tmp_path, number):
     robot, log = emulated(tmp_path / "truth.bin"), tmp_path / "log.mcap"
     code = HOST.format(port=robot.port, log=str(log))

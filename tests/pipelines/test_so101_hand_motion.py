@@ -1,0 +1,58 @@
+"""The motion that checks or makes an SO-101's calibration, on the counts of its encoders, without waiting for them."""
+
+import json
+
+import numpy as np
+import pytest
+from test_so101_calibration import FAULTS, GOOD, GUIDE, PERSON, WHOLE_MOTION
+from wrong_arms import RAD_PER_COUNT, ZERO_COUNTS, WrongArm
+
+from sim2real.errors import HardwareLost
+from sim2real.hardware.feetech.calibration import CalibratedJoint
+from sim2real.hardware.feetech.hand_motion import HandMotion
+
+PERIOD_S, PATIENCE_S, OFFSET = 0.02, 8.0, 85
+
+
+def moved(folder, joints, calibrated, offset=OFFSET, **faults):
+    """Show the whole motion of a person to a motion by hand; return it, and whether it is complete."""
+    end_s = PERSON.write_motion(folder / "hand.npz")
+    arm, motion = WrongArm(folder / "hand.npz", **faults), HandMotion(joints, GUIDE.NUDGES, calibrated)
+    for t_s in np.arange(0.0, end_s + PATIENCE_S, PERIOD_S):
+        arm.advance(t_s)
+        angles = np.array([arm.measure(joint.servo_id)[0] for joint in joints])
+        if motion.feed(t_s, (np.round(angles / RAD_PER_COUNT) - offset) % 4096):
+            return motion, True
+    return motion, False
+
+
+def calibration(folder, changes):
+    """Return the joints of LeRobot's calibration with some changes."""
+    path = folder / "lerobot.json"
+    path.write_text(json.dumps({name: entry | changes.get(name, {}) for name, entry in GOOD.items()}))
+    return GUIDE.read(path)
+
+
+@pytest.mark.parametrize("fault", sorted(WHOLE_MOTION))
+def test_a_fault_contradicts_the_motion(tmp_path, fault):
+    plant, changes, _, message = FAULTS[fault]
+    with pytest.raises(HardwareLost, match=f"(?s){message}"):
+        moved(tmp_path, calibration(tmp_path, changes), True, **plant)
+
+
+def test_a_right_calibration_and_a_whole_motion_fit(tmp_path):
+    motion, complete = moved(tmp_path, calibration(tmp_path, {}), True)
+    assert complete
+    assert set(motion.directions.values()) == {1}
+
+
+def test_without_a_calibration_the_middle_between_the_stops_is_the_zero(tmp_path):
+    """The encoders' seam is inside of the joints' travel."""
+    joints = tuple(CalibratedJoint(name, entry["id"]) for name, entry in GOOD.items())
+    motion, complete = moved(tmp_path, joints, False, offset=1900)
+    assert complete
+    assert set(motion.directions.values()) == {1}
+    stops = np.array([nudge.travel_rad is not None for nudge in GUIDE.NUDGES])
+    zero = ((motion.low + motion.high) / 2 + 1900 - ZERO_COUNTS + 2048) % 4096 - 2048
+    order = [list(GOOD).index(nudge.joint) for nudge in GUIDE.NUDGES]
+    assert np.abs(zero[order][stops]).max() < 25
