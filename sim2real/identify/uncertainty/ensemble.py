@@ -23,6 +23,8 @@ from sim2real.identify.validation.optional_terms import Selection
 
 _WORSE = 0.1
 """Relative excess of the loss above which a model explains the recordings less well."""
+_GAIN = 1e-3
+"""Relative gain of the loss at which the descent of such a model ends: to the minimum, three of an arm take 200 s."""
 
 
 def posterior(
@@ -103,7 +105,7 @@ def _models(widest: Fit, estimate: Fit, spread: Uncertainty, selection: Selectio
         present, columns = trial.present, table.of_terms(trial.present)
         # Refine each other model from its rough fit, and keep those with a similar loss.
         data, rest = problem.part(present=columns), np.flatnonzero(columns)
-        z = refine(problem, trial.z[None], data, settle=False).z
+        z = refine(problem, trial.z[None], data, settle=False, gain=_GAIN).z
         if problem.loss(z, data) > (1.0 + _WORSE) * estimate.loss:
             continue
         # Compute its covariance, widened like the estimate's.
