@@ -67,7 +67,7 @@ def write_picture(twin: Twin, qpos: np.ndarray, out: Path) -> None:
     figure = Figure(figsize=(4.8, 2.7), dpi=80, layout="constrained")
     axes = figure.subplots()
     every = max(1, round(twin.robot.rate_hz / FRAMES_PER_S))
-    path = {} if out.suffix == ".gif" else {"animation.ffmpeg_path": _ffmpeg()}
+    path: Any = {} if out.suffix == ".gif" else {"animation.ffmpeg_path": _ffmpeg()}
     writer = (FFMpegWriter if path else PillowWriter)(fps=round(twin.robot.rate_hz / every))
     with rc_context(path), writer.saving(figure, str(out), 80):
         for row in qpos[::every]:

@@ -49,8 +49,8 @@ def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
     assert height.max() > 0.28
     assert height[-20:].max() < 0.2
     t_s, walking = recording.true_states()
-    aim = ROBOT.commands.of_trial(0)[:3]
-    settled = (t_s > 1.0) & (t_s < 2.4)
+    aim = np.array([0.4, 0.0, 0.3])
+    settled = (t_s > 1.0) & (t_s < 3.8)
     mean = np.array([walking[name][settled].mean() for name in ("linear[0]", "linear[1]", "gyro[2]")])
     assert np.abs(mean - aim).max() < 0.3
     # The log holds all columns of the commands, within the gate; on a busy machine a late command is replaced.
@@ -60,6 +60,21 @@ def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
     assert len(driven) > 0.95 * (len(sent["kp"]) - 50)
     np.testing.assert_allclose(sent["kp"][driven], 35.0)
     np.testing.assert_allclose(sent["kd"][driven], 0.6, rtol=1e-6)
+
+
+def test_all_trials_of_a_commanded_robot_have_one_command_within_the_policys():
+    robot = ROBOT.commanded((0.4, 0.0, 0.3))
+    for trial in (0, 7):
+        np.testing.assert_array_equal(robot.task.at_rest(trial).aim, np.tile(np.float32([0.4, 0.0, 0.3]), 4))
+        np.testing.assert_array_equal(ROBOT.task.at_rest(trial).aim, ROBOT.commands.of_trial(trial))
+    with pytest.raises(UsageError, match="velocities of at most"):
+        ROBOT.commanded((0.4, 0.7, 0.0))
+
+
+def test_a_robot_that_does_not_walk_refuses_a_velocity(tmp_path, capsys):
+    deploy = ["deploy", "pendulum", "--command", "0.4", "0", "0", "--runs", str(tmp_path)]
+    assert cli.main(deploy) == 2
+    assert "follows no velocity" in capsys.readouterr().err
 
 
 @pytest.mark.full  # `make test` records a deployment of it, above

@@ -22,17 +22,22 @@ class Commands:
         every_s: How long a command lasts [s].
         stand: Share of the commands that are 0: the robot stands still.
         count: Number of commands that are drawn.
+        fixed: The command of all trials; None: each trial has its own.
     """
 
     most: tuple[float, float, float] = (1.0, 0.6, 0.8)
     every_s: float = 2.5
     stand: float = 0.1
     count: int = 4
+    fixed: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         if min(self.most) < 0 or self.every_s <= 0 or not 0 <= self.stand <= 1 or self.count < 1:
             raise UsageError(f"commands need sizes of at least 0, a time above 0 and a share in [0, 1], got {self}")
+        if self.fixed is not None and not np.all(np.abs(self.fixed) <= self.most):
+            most = ", ".join(f"{value:g}" for value in self.most)
+            raise UsageError(f"the policy follows velocities of at most {most}, got {self.fixed}")
 
     @property
     def size(self) -> int:
@@ -50,6 +55,8 @@ class Commands:
 
         The same number gives the same commands, on hardware and in simulation.
         """
+        if self.fixed is not None:
+            return np.tile(np.array(self.fixed, np.float32), self.count)
         return np.asarray(replace(self, stand=0.0).draw(jax.random.key(trial)), np.float32)
 
     def at(self, drawn: Array, t_s: Scalar) -> Array:

@@ -97,6 +97,11 @@ class ComposedRobot(Robot):
         """Return the motors; default: targets of all joints, for the device of ``motors``."""
         return WalkingDrive(self.mjcf, self.joints, self.stance, self.policy_hz, self.gains, self.motors)
 
+    def commanded(self, command: tuple[float, float, float]) -> ComposedRobot:
+        """Return the robot with this command in all trials."""
+        kind = type(type(self).__name__, (type(self),), {"commands": replace(self.commands, fixed=command)})
+        return kind()
+
     def nominal(self) -> dict[str, float]:
         """Return the nominal values of the model's parameters, and the delays."""
         return super().nominal() | dict(zip(DELAYS, self.delays_s, strict=True))

@@ -46,6 +46,9 @@ class DeployConfig:
     """End with code 5 when more than 1 % of the steps miss their deadline."""
     view: ViewFlag = None
     """Show the robot live in the Rerun viewer; 'web': on a page for browsers."""
+    command: tuple[float, float, float] | None = None
+    """Commanded velocity of a robot that walks: forwards, to the left [m/s], yaw rate [rad/s]; default: each episode
+    has four of its own."""
     max_tilt_rad: float | None = None
     """Largest tilt [rad]; a robot that measures its tilt stops above it. Default: no limit."""
     gate: GateLimits = field(default_factory=GateLimits)

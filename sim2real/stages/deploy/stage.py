@@ -11,6 +11,7 @@ from sim2real.artifacts.deployment import PROBE, Deployment, Scores, log_of
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, finished, open_stage
+from sim2real.errors import UsageError
 from sim2real.robots.contract import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import check_timing, require_tilt, run_episodes
@@ -51,7 +52,7 @@ def deploy(
     config = python_arguments.config_of(config, pipeline.deploy)
     if identification is not None:
         identification = python_arguments.identification_of(identification)
-    robot = moving_robot(pipeline)
+    robot = _robot(pipeline, config)
     require_fit(robot, bundle)
     require_tilt(robot, config)
     robot.task.at_rest(0)  # a task that needs JAX is refused before the robot moves
@@ -73,7 +74,7 @@ def deploy(
     from sim2real.stages.deploy.verdict import judge
 
     world = None if identification is None else identification.world
-    deployment = compare(moving_robot(pipeline, world), recordings, bundle, identification, config.duration_s)
+    deployment = compare(_robot(pipeline, config, world), recordings, bundle, identification, config.duration_s)
     probe = folder / PROBE
     deployment = replace(deployment, probe=Recording.load(probe, folder / TRUTH) if probe.is_file() else None)
 
@@ -88,7 +89,7 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         run_dir: Run folder to add to; None takes that of the bundle.
     """
     # Check the bundle before a folder is made.
-    robot = moving_robot(pipeline)
+    robot = _robot(pipeline, config)
     path, run_dir = find_bundle(pipeline, config, root, run_dir)
     bundle = Bundle.load(path)
     require_fit(robot, bundle)
@@ -117,6 +118,21 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         stage.summary(summary_lines(deployment, summaries))
         check_timing(summaries, config)
     return stage.result
+
+
+def _robot(pipeline: Pipeline, config: DeployConfig, world: str | None = None) -> Robot:
+    """Return the robot, with the configured command.
+
+    Args:
+        world: World that it is simulated in; None: its own.
+    """
+    robot = moving_robot(pipeline, world)
+    if config.command is None:
+        return robot
+    commanded = getattr(robot, "commanded", None)
+    if commanded is None:
+        raise UsageError(f"pipeline {pipeline.name!r} follows no velocity", hint="run it without --command")
+    return commanded(config.command)
 
 
 def _identification(pipeline: Pipeline, run_dir: Path) -> Identification | None:
