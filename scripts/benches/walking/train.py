@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import shlex
+import sys
 import tempfile
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -47,14 +48,21 @@ def run(options: argparse.Namespace) -> Report:
         os.environ[VARIABLE] = OFF
         cold_s, warm_s = alone(first_step), alone(first_step)
         about = f"a first step of the graph takes {cold_s:.1f} s with them, {warm_s:.1f} s without"
-        rows.append(row("walk_train/kernels_s", round(cold_s - warm_s, 1), "s", about))
-        rows += alone(over_bare, options.copies, options.repeats, options.rollout)
+        rows += shown([row("walk_train/kernels_s", round(cold_s - warm_s, 1), "s", about)])
+        rows += shown(alone(over_bare, options.copies, options.repeats, options.rollout))
         for steps in options.steps:
             made, walks = trained(options, steps, Path(scratch))
-            rows += made
+            rows += shown(made)
             if walks:
                 break
     return {"rows": rows}
+
+
+def shown(rows: list[Row]) -> list[Row]:
+    """Print rows at once, because a bench of minutes on a lent GPU may be cut short; return them."""
+    for line in rows:
+        print(*(line[key] for key in ("name", "value", "unit", "yardstick")), file=sys.stderr, flush=True)
+    return rows
 
 
 def alone(work: Callable[..., Any], *arguments: object) -> Any:

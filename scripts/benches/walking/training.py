@@ -52,7 +52,7 @@ def require_gpu(bench: str) -> str:
 
 def add_training_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of a bench that trains and judges policies."""
-    usual = "--ppo.num-envs=8192 --ppo.minibatches=16 --ppo.evaluations=1"
+    usual = "--ppo.num-envs=8192 --ppo.rollout-steps=12 --ppo.minibatches=8 --ppo.evaluations=1"
     parser.add_argument("--flags", default=usual, help="flags of `sim2real train go2`, in one word")
     parser.add_argument("--twins", type=int, default=50, help="hidden twins that judge a policy")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of an episode of a twin [s]")
