@@ -261,6 +261,30 @@ def test_terms_are_chosen_without_what_is_left_out(three):
     assert float(rows[2].values["square"]) == 0.0
 
 
+def test_of_many_parts_several_share_a_refit_without_all_of_them(three, monkeypatch):
+    whole, _ = three
+    monkeypatch.setattr(folds, "MOST", 2)
+    parts, refits = folds_of(whole.problem, 3), Refits()
+    rows = leave_out(whole, parts, 0.2, 0.0, refits)
+    assert [r.name for r in rows] == ["recording 1", "recording 2", "recording 3"]
+    assert rows[0].values == rows[2].values != rows[1].values
+    # The last two rows are of fits without and with the log of the other robot.
+    assert float(rows[2].values["bias"]) == pytest.approx(BIAS, abs=0.003)
+    assert float(rows[1].values["bias"]) > BIAS + 0.002
+    assert rows[2].ahead["y"] > 10 * rows[0].ahead["y"]  # each part has its own error
+
+
+def test_groups_of_parts_cover_all_of_them_and_few_parts_stay_alone():
+    parts = [Fold(f"p{i}", ((i, 0.0, np.inf),)) for i in range(29)]
+    groups, of = folds.shared(parts)
+    assert len(groups) == folds.MOST
+    assert all(part.parts[0] in groups[g].parts for part, g in zip(parts, of, strict=True))
+    assert sum(len(g.parts) for g in groups) == len(parts)
+    groups, of = folds.shared(parts[: folds.MOST])
+    assert groups == parts[: folds.MOST]
+    assert of.tolist() == list(range(folds.MOST))
+
+
 def test_recordings_of_one_name_go_together(three):
     whole, _ = three
     found = folds_of(whole.problem, 5, ["slow", "fast", "slow"])

@@ -21,6 +21,8 @@ from sim2real.identify.validation import optional_terms
 from sim2real.identify.validation.prediction import labels
 from sim2real.identify.validation.refits import Refits
 
+MOST = 12
+"""Most fits without parts: each takes about as long as the fit to all of them."""
 MOVES = 10.0
 """Range of a joint's positions in motion, in deviations of a measurement."""
 
@@ -39,15 +41,24 @@ class Fold:
 
     def touches(self, spans: Sequence[Span], length_s: float) -> np.ndarray:
         """Return which segments of a length share time with this part, ``(S,)``, bool."""
-        return np.array(
-            [
-                any(
-                    r == s.recording and s.begin_s < end and begin < s.begin_s + length_s
-                    for r, begin, end in self.parts
-                )
-                for s in spans
-            ]
-        )
+        recording, begins = np.array([s.recording for s in spans]), np.array([s.begin_s for s in spans])
+        touched = np.zeros(len(spans), bool)
+        for r, begin, end in self.parts:
+            touched |= (recording == r) & (begins < end) & (begins + length_s > begin)
+        return touched
+
+
+def shared(parts: Sequence[Fold]) -> tuple[list[Fold], np.ndarray]:
+    """Return the parts that fits are made without, at most ``MOST``, and the number of that of each part, ``(K,)``.
+
+    Of more parts, every twelfth is in one group: the other parts of a kind, whose names are similar, stay in the fit.
+    """
+    of = np.arange(len(parts)) % MOST
+    if len(parts) <= MOST:
+        return list(parts), of
+    members = [[p for p, own in zip(parts, of, strict=True) if own == g] for g in range(MOST)]
+    groups = [Fold(f"group {g + 1}", tuple(s for p in some for s in p.parts)) for g, some in enumerate(members)]
+    return groups, of
 
 
 def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: int = 2) -> list[Fold]:
@@ -109,12 +120,13 @@ def leave_out(
     problem, table, touched = estimate.problem, estimate.problem.table, masks(estimate.problem, parts)
     every = np.ones(len(table.terms), bool)
     stats = optional_terms.statistics(problem, linearise(problem, estimate.z), touched)
+    groups, of = shared(parts)
     ends = []
-    for k in range(len(parts)):
-        start = table.at_scale(stats.x + stats.step(table, every, k, bounded=True))
-        rest = problem.part(problem.train[touched[k]])
-        ends.append(refitted(refits, table.terms, parts[k], problem, start, rest))
-    return predicted(estimate, parts, stats, [every] * len(parts), ends, settle_s, free_run_s)
+    for k, group in enumerate(groups):
+        start = table.at_scale(stats.x + stats.step(table, every, of == k, bounded=True))
+        rest = problem.part(problem.train[touched[of == k].any(axis=0)])
+        ends.append(refitted(refits, table.terms, group, problem, start, rest))
+    return predicted(estimate, parts, stats, [every] * len(parts), [ends[k] for k in of], settle_s, free_run_s)
 
 
 def refitted(

@@ -49,13 +49,13 @@ class Statistics:
     count: np.ndarray
 
     def step(
-        self, table: ParameterTable, present: np.ndarray, held_out: int | None = None, bounded: bool = False
+        self, table: ParameterTable, present: np.ndarray, held_out: np.ndarray | None = None, bounded: bool = False
     ) -> np.ndarray:
-        """Return the step to the estimate of a smaller model from all parts, or all but one, ``(P,)``.
+        """Return the step to the estimate of a smaller model from all parts, or all but some, ``(P,)``.
 
         Args:
             present: Shape ``(T,)``, bool: the terms of the model.
-            held_out: Number of the held-out part; None: all parts are used.
+            held_out: Shape ``(K,)``, bool: the held-out parts; None: all parts are used.
             bounded: Whether parameters stop at their bounds, and the others are optimised with these values.
         """
         # Move the parameters of absent terms to their values without effect.
@@ -69,7 +69,7 @@ class Statistics:
         # Sum the quadratic functions of the parts.
         g, H = self.gradient.sum(axis=0), self.information.sum(axis=0) + self.prior
         if held_out is not None:
-            g, H = g - self.gradient[held_out], H - self.information[held_out]
+            g, H = g - self.gradient[held_out].sum(axis=0), H - self.information[held_out].sum(axis=0)
         # Solve for the other parameters; stop those that leave their bounds, and solve again.
         for _ in range(len(self.x)):
             rest = np.flatnonzero(~gone)
@@ -261,8 +261,9 @@ def better(squares: np.ndarray, than: np.ndarray) -> np.ndarray:
 def on_held_out_parts(stats: Statistics, table: ParameterTable, present: np.ndarray) -> np.ndarray:
     """Return the mean square on each part with that part held out of the fit, ``(K,)``, for a model with some terms."""
     scores = []
-    for k in range(len(stats.value)):
-        step = stats.step(table, present, k, bounded=True)
+    parts = np.arange(len(stats.value))
+    for k in parts:
+        step = stats.step(table, present, parts == k, bounded=True)
         square = stats.value[k] + 2.0 * stats.gradient[k] @ step + step @ stats.information[k] @ step
         scores.append(square / stats.count[k])
     return np.array(scores)

@@ -12,7 +12,7 @@ from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.uncertainty.uncertainty import Uncertainty, between_parts
 from sim2real.identify.validation import optional_terms
-from sim2real.identify.validation.folds import Fold, folds_of, leave_out
+from sim2real.identify.validation.folds import MOST, Fold, folds_of, leave_out
 from sim2real.identify.validation.refits import Refits
 from sim2real.identify.validation.term_trials import Trials
 from sim2real.robots.contract import RecordedRobot
@@ -133,4 +133,7 @@ def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Seq
         [[c.parameter.to_scale(v) for c, v in zip(table.columns, estimates, strict=True)] for estimates in values]
     )
     share = np.array([[row.share.get(name, 0.0) for name in table.names] for row in rows])
+    if len(rows) > MOST:  # parts that were held out together have one estimate
+        moved, of = np.unique(moved, axis=0, return_inverse=True)
+        share = np.array([share[np.ravel(of) == g].sum(axis=0) for g in range(len(moved))])
     return between_parts(spread, table, x, moved, share)
