@@ -15,7 +15,7 @@ import tokenize
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -65,23 +65,23 @@ class Module:
     text: str
 
     @cached_property
-    def tree(self) -> ast.Module:
-        """Its syntax tree."""
-        return ast.parse(self.text)
+    def nodes(self) -> list[ast.AST]:
+        """All nodes of its syntax tree."""
+        return list(ast.walk(ast.parse(self.text)))
 
     @cached_property
     def lines(self) -> Counter[str]:
         """Number of lines of each kind: code, docstring, comment, blank; a comment stands on a line of its own."""
         lines = self.text.splitlines()
         kinds = ["code" if line.strip() else "blank" for line in lines]
-        for node in ast.walk(self.tree):
+        for node in self.nodes:
             if (
                 isinstance(node, ast.Expr)
                 and isinstance(node.value, ast.Constant)
                 and isinstance(node.value.value, str)
             ):
                 kinds[node.lineno - 1 : node.end_lineno] = ["docstring"] * len(kinds[node.lineno - 1 : node.end_lineno])
-        for token in tokenize.generate_tokens(io.StringIO(self.text).readline):
+        for token in tokens(self.text):
             if token.type == tokenize.COMMENT and lines[token.start[0] - 1].strip().startswith("#"):
                 kinds[token.start[0] - 1] = "comment"
         return Counter(kinds)
@@ -89,18 +89,25 @@ class Module:
     @cached_property
     def anys(self) -> int:
         """How often the name ``Any`` stands in it, imports apart."""
-        names = [node for node in ast.walk(self.tree) if isinstance(node, ast.Name) and node.id == "Any"]
+        names = [node for node in self.nodes if isinstance(node, ast.Name) and node.id == "Any"]
         return len(names)
 
     @cached_property
     def project_imports(self) -> int:
         """Number of modules of this project that it imports."""
-        return len({name for name in imported(self.tree) if name.startswith("sim2real")})
+        return len({name for name in imported(self.nodes) if name.startswith("sim2real")})
 
 
-def imported(tree: ast.AST) -> Iterator[str]:
-    """Yield the names of modules that a syntax tree imports, as they are written."""
-    for node in ast.walk(tree):
+@cache
+def tokens(text: str) -> list[tokenize.TokenInfo]:
+    """Return the names and the comments in a file of Python."""
+    wanted = (tokenize.NAME, tokenize.COMMENT)
+    return [token for token in tokenize.generate_tokens(io.StringIO(text).readline) if token.type in wanted]
+
+
+def imported(nodes: Iterable[ast.AST]) -> Iterator[str]:
+    """Yield the names of modules that the nodes of a syntax tree import, as they are written."""
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -139,7 +146,7 @@ def words(wanted: re.Pattern[str] = WORDS) -> list[tuple[str, int, str]]:
 
 def named_badly(text: str) -> Iterator[tuple[int, str]]:
     """Yield line and name of every name in code that is a participle, or has a word of speech as one of its parts."""
-    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+    for token in tokens(text):
         name = token.string.lower().strip("_")
         parts = set(name.replace("left_out", "left out").split("_"))
         if token.type == tokenize.NAME and (name in NAMES or (len(parts) > 1 and parts & PARTS_OF_NAMES)):

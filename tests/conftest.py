@@ -61,7 +61,7 @@ gc.set_threshold(200_000, 20, 100)
 
 KEEP_TIME = ("whole runs", "real time")
 # Rooms that take longest go to the workers first, so that none is left with a long one at the end.
-LONGEST = (*KEEP_TIME, "identify", "composer", "train", "robots", "runtime", "integration", "pipelines")
+LONGEST = (*KEEP_TIME, "robots", "identify", "composer", "stages", "train", "runtime", "view", "hardware", "foreign")
 
 
 @functools.cache

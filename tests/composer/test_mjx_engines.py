@@ -205,7 +205,7 @@ def test_mjx_is_traced_once_for_all_programs_that_a_model_is_in(monkeypatch):
     assert len(traced) == 1
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+@pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.full)])
 def test_a_step_is_that_of_mj_step_with_all_sensors(double, integrator):
     """``mjx.step`` leaves accelerometers at 0 where nothing is constrained, and RK4's sensors in its last stage."""
     model = mujoco.MjModel.from_xml_string(CHAIN)

@@ -95,17 +95,19 @@ def test_a_link_is_found_with_the_dynamics(kind):
     assert link.share.sum() == pytest.approx(1.0)
 
 
-def test_intervals_hold_the_truth():
+def test_intervals_hold_the_truth(repetitions):
     held = {"mean": 0, "p95": 0, "deviation": 0}
     truth = lag("gamma", 200_000, np.random.default_rng(0))[0]
     mean, p95 = truth.mean() + COMMAND_DELAY_S, np.quantile(truth, 0.95) + COMMAND_DELAY_S
     truth = {"mean": mean, "p95": p95, "deviation": truth.std()}
-    for seed in range(24):
+    count = repetitions(12, 24)
+    for seed in range(count):
         link, _ = identify(log("gamma", 3.0, seed))
         for name in held:
             own = getattr(link, name)
             held[name] += own.low95 <= truth[name] <= own.high95
-    assert min(held.values()) >= 20, held  # 24 intervals of 95 % hold fewer once in 200 times
+    # 24 intervals of 95 % hold fewer than 20 once in 200 times, and 12 fewer than 9 once in 400 times.
+    assert min(held.values()) >= repetitions(9, 20), held
 
 
 def test_a_constant_delay_has_no_jitter():

@@ -50,6 +50,7 @@ def test_the_twin_is_recorded_and_differs_from_the_model(head, tmp_path):
     assert {n: found[n] / nominal[n] for n in found} == pytest.approx(factors, rel=1e-6)
 
 
+@pytest.mark.full  # `make test` records and runs its twin, and other devices pass the suite in tests/hardware
 def test_it_passes_the_test_that_the_page_has(head, tmp_path):
     names: dict = {}
     exec(blocks()[2], names)

@@ -258,7 +258,7 @@ def observes(graph, gs):
 @pytest.mark.parametrize(
     ("way", "topology"),
     [(w, topologies.robot) for w in (rolls, rolls_in_parts, runs_a_row, steps, observes)]
-    + [(rolls, topologies.three_in_ten)],
+    + [pytest.param(rolls, topologies.three_in_ten, marks=pytest.mark.full)],
     ids=lambda x: x.__name__,
 )
 def test_an_episode_that_does_not_exist_has_no_steps(way, topology, compiled):

@@ -162,6 +162,7 @@ def test_compose_without_warp_leaves_its_rows_out(monkeypatch, capsys):
     assert "MuJoCo Warp is not installed, its rows are missing" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_runner(run):
     found = {row["name"]: row["value"] for row in run("runner")["rows"]}
     assert 0.0 < found["runner/numpy/32-64-64-8/p50_us"] < found["runner/numpy/32-64-64-8/p99_us"]
@@ -176,6 +177,7 @@ def test_log(run):
     assert {"log/loop_200hz/p99_ms", "log/range_read_ms"} <= set(rows)
 
 
+@pytest.mark.full  # `make test` reads the outcome of such a run, below
 def test_suite(run):
     report = run("suite")
     rows = {r["name"].removeprefix("suite/"): r["value"] for r in report["rows"]}

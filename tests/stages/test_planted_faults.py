@@ -176,9 +176,8 @@ def identified(t: np.ndarray, goal: np.ndarray, q: np.ndarray) -> tuple[Path, di
     return folder, json.loads((folder / "parameters.json").read_text())
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[] if n == "a frozen encoder" else [pytest.mark.full]) for n in FAULTS]
-)
+@pytest.mark.full  # `make test` finds the worst second in test_worst_second.py, and rejects models in test_verdict.py
+@pytest.mark.parametrize("name", FAULTS)
 def test_the_first_figure_shows_the_fault(name, tmp_path, monkeypatch, capsys):
     log, joints, end_s = FAULTS[name]
     t, goal, q = log()
