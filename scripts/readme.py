@@ -20,6 +20,8 @@ from benches.provenance import ROOT, why_stale
 from page_tables import recordings, sentences
 from page_tables.latency import latency
 from page_tables.league import evidence, league, league_promises
+from page_tables.walk_delays import figure as falls_over_delay
+from page_tables.walk_delays import walk_delays
 
 TABLES = {
     "evidence": ("randomise", "league"),
@@ -50,7 +52,8 @@ TABLES = {
     "excitation": ("excitation",),
     "twin": ("twin",),
     "walk": ("walk",),
-    "legs_identify": ("legs_identify",),
+    "legs_identify": ("legs_identify", "legs_identify_two_cores"),
+    "walk_delays": ("walk_delays",),
     "light": ("light",),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
@@ -74,6 +77,7 @@ PAGES = (
 )
 """Pages with tables, or with a sentence of figures."""
 FIGURE = "docs/images/what_training_knows.svg"
+DELAYS_FIGURE = "docs/images/falls_over_delay.svg"
 TRAINED_ON = {
     "data_sheet": "the data sheet, without delays",
     "uniform": "the data sheet, parameters 30 % up and down",
@@ -303,6 +307,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "twin": lambda chosen: sentences.twin(*chosen.values()),
         "walk": lambda chosen: sentences.walk(*chosen.values()),
         "legs_identify": lambda chosen: sentences.legs_identify(*chosen.values()),
+        "walk_delays": lambda chosen: walk_delays(*chosen.values()),
         "light": lambda chosen: sentences.light(*chosen.values()),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}
@@ -339,6 +344,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for page in (ROOT / name for name in PAGES):
         page.write_text(updated(page.read_text(), tables(reports)))
     (ROOT / FIGURE).write_text(what_training_knows(reports["randomise"], reports["randomise_worn"]))
+    (ROOT / DELAYS_FIGURE).write_text(falls_over_delay(reports["walk_delays"]))
     return 0
 
 

@@ -31,6 +31,7 @@ def test_the_tables_are_those_of_the_reports(script):
     assert all(any(f"<!-- {name}:begin -->" in text for text in pages.values()) for name in tables)
     figure = script.what_training_knows(reports["randomise"], reports["randomise_worn"])
     assert (ROOT / script.FIGURE).read_text() == figure
+    assert (ROOT / script.DELAYS_FIGURE).read_text() == script.falls_over_delay(reports["walk_delays"])
 
 
 def test_the_readme_is_read_in_a_minute():

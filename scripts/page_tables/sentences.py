@@ -40,10 +40,15 @@ def walk(report: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def legs_identify(report: Mapping[str, Any]) -> str:
-    """Return a table of the errors of identified Go2s, a row for each kind of parameter."""
+def legs_identify(report: Mapping[str, Any], two_cores: Mapping[str, Any]) -> str:
+    """Return a table of the errors of identified Go2s, a row for each kind of parameter.
+
+    Args:
+        two_cores: The report of fewer twins, one after another on two cores, which has the time of an identification.
+    """
     v = values(report)
     about = {row["name"]: row["yardstick"] for row in report["rows"]}
+    alone, twins_alone = values(two_cores), two_cores["flags"]["twins"]
     counted = lambda name: about[f"legs_identify/{name}"].split(" ")  # noqa: E731
     lines = ["| | within 10 % | worst |", "| --- | ---: | ---: |"]
     for kind in ("damping", "friction", "armature", "strength"):
@@ -58,7 +63,8 @@ def legs_identify(report: Mapping[str, Any]) -> str:
     text = (
         f"{yes} of {twins} identifications are accepted; in {whole.split(' ')[0]} all parameters are within 10 % (95 % "
         f"interval of that share: {interval}).\nThe 95 % intervals hold the truth in {held} of {of} cases. "
-        f"An identification takes {v['legs_identify/cpu_s']:.0f} s of a processor at most.\n"
+        f"On two cores an identification takes\n{alone['legs_identify/wall_s']:.0f} s at most, "
+        f"{alone['legs_identify/cpu_s']:.0f} s of a processor ({twins_alone} twins, one after another).\n"
     )
     return "\n".join([*lines, "", text])
 

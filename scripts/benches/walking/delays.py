@@ -56,11 +56,11 @@ def run(options: argparse.Namespace) -> Report:
         missing = [(ms, str(file)) for ms, file in estimates.items() if not file.is_file()]
         for _ in each(estimate, missing, options):
             pass
-        found = {ms: json.loads(file.read_text()) for ms, file in estimates.items()}
+        identified = {ms: json.loads(file.read_text()) for ms, file in estimates.items()}
         new = [name for name in names if name != SHIPPED and not (work / name / "training.json").is_file()]
         device = require_gpu("walk-delays") if new else ""
         with ThreadPoolExecutor(options.trainings) as pool:
-            list(pool.map(lambda name: trained(name, device, found, work, options), new))
+            list(pool.map(lambda name: trained(name, device, identified, work, options), new))
         # Judge all of them at all delays.
         rows, trainings = [], {}
         for name in names:
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> Report:
             rows += judged(trials, options.twins, f"walk_delays/{name}")
             if bundle is not None:
                 trainings[name] = json.loads((work / name / "training.json").read_text())
-    return {"rows": rows, "estimates": list(found.values()), "trainings": trainings}
+    return {"rows": rows, "estimates": list(identified.values()), "trainings": trainings}
 
 
 def estimate(ms: float, file: str, options: argparse.Namespace) -> dict[str, Any]:
@@ -87,10 +87,10 @@ def estimate(ms: float, file: str, options: argparse.Namespace) -> dict[str, Any
         legs.record(log, SEED, STAND_S, (ms / 3e3, ms / 1.5e3, 0.0))
         identification = identify(PIPELINE, log)
     delay = next(p for p in identification.parameters if p.name == ROUND_TRIP)
-    found = {"true_ms": ms, "estimate_ms": 1e3 * delay.estimate, "verdict": identification.verdict.status}
-    found["deviation_ms"] = 1e3 * (delay.standard_error or 0.0)
-    Path(file).write_text(json.dumps(found, indent=1))
-    return found
+    delay_row = {"true_ms": ms, "estimate_ms": 1e3 * delay.estimate, "verdict": identification.verdict.status}
+    delay_row["deviation_ms"] = 1e3 * (delay.standard_error or 0.0)
+    Path(file).write_text(json.dumps(delay_row, indent=1))
+    return delay_row
 
 
 def differences(name: str, estimates: Mapping[float, Mapping[str, float]]) -> list[str]:
@@ -99,9 +99,9 @@ def differences(name: str, estimates: Mapping[float, Mapping[str, float]]) -> li
 
     if name.startswith(IDENTIFIED):
         # A uniform draw within sqrt(3) deviations has the estimate's deviation.
-        found = estimates[float(name.removeprefix(IDENTIFIED))]
-        reach_ms = max(3**0.5 * found["deviation_ms"], 1e-3)
-        low, high = max(0.0, found["estimate_ms"] - reach_ms), max(0.0, found["estimate_ms"]) + reach_ms
+        delay_row = estimates[float(name.removeprefix(IDENTIFIED))]
+        reach_ms = max(3**0.5 * delay_row["deviation_ms"], 1e-3)
+        low, high = max(0.0, delay_row["estimate_ms"] - reach_ms), max(0.0, delay_row["estimate_ms"]) + reach_ms
         ranges = {"sensor_delay": (0.0, 1e-6), "actuator_delay": (low / 1e3, high / 1e3)}
     elif name == "wide":
         ranges = {n: (low / 1e3, high / 1e3) for n, (low, high) in WIDE_MS.items()}

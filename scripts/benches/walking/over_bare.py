@@ -14,7 +14,7 @@ ROOMS = (16, 96)
 
 
 def first_step() -> float:
-    """Return the time until a copy's graph has made one step, in a new process: import, trace, compile, kernels [s]."""
+    """Return the time until a copy's graph makes its first step in a new process: import, trace, compile, kernels [s]."""
     begin = time.perf_counter()
     import jax
 
@@ -93,8 +93,8 @@ def _programs(copies: int, steps: int) -> tuple[dict[str, tuple[Any, PyTree]], i
         def one(state: PyTree, key: Any) -> Any:
             def policy_step(now: PyTree, _: None) -> Any:
                 state, total = now
-                made = env.step(state, jnp.zeros(12), key)
-                return (made.state, total + made.reward + made.observation.sum()), None
+                step = env.step(state, jnp.zeros(12), key)
+                return (step.state, total + step.reward + step.observation.sum()), None
 
             (state, total), _ = jax.lax.scan(policy_step, (state, jnp.float32(0.0)), length=steps)
             return state.graph.state["world"].data.qpos, total

@@ -51,8 +51,8 @@ def run(options: argparse.Namespace) -> Report:
         rows += shown([row("walk_train/kernels_s", round(cold_s - warm_s, 1), "s", about)])
         rows += shown(alone(over_bare, options.copies, options.repeats, options.rollout))
         for steps in options.steps:
-            made, walks = trained(options, steps, Path(scratch))
-            rows += shown(made)
+            of_policy, walks = trained(options, steps, Path(scratch))
+            rows += shown(of_policy)
             if walks:
                 break
     return {"rows": rows}

@@ -52,6 +52,7 @@ def require_gpu(bench: str) -> str:
 
 def add_training_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of a bench that trains and judges policies."""
+    # Updates after 12 rows: with 24, 60 M steps ended at an error of 0.42 m/s; with 12 at 0.09 m/s, in the same time.
     usual = "--ppo.num-envs=8192 --ppo.rollout-steps=12 --ppo.minibatches=8 --ppo.evaluations=1"
     parser.add_argument("--flags", default=usual, help="flags of `sim2real train go2`, in one word")
     parser.add_argument("--twins", type=int, default=50, help="hidden twins that judge a policy")
