@@ -14,7 +14,7 @@ ROOMS = (16, 96)
 
 
 def first_step() -> float:
-    """Return the time until a copy's graph makes its first step in a new process: import, trace, compile, kernels [s]."""
+    """Return the time until a copy's graph makes its first step in a new process: import, trace, compile, build [s]."""
     begin = time.perf_counter()
     import jax
 
