@@ -1,7 +1,7 @@
 """Every bench runs with --quick, and its report says what it is of; figures are not looked at.
 
-Those that train, search, trace MJX or start processes for seconds are ``full``. In `make test` the others say that ``bench.main``
-makes a report of rows, ``train`` that a training can be measured, and
+Those that train, search, trace MJX or start processes for seconds are ``full``. In `make test` the others say that
+``bench.main`` makes a report of rows, ``train`` that a training can be measured, and
 ``test_help_shows_the_flags_of_a_bench`` that each module can be imported and has its flags and its quick ones.
 """
 
