@@ -233,7 +233,8 @@ def test_view_and_report_find_the_newest_run(monkeypatch, calls, capsys, tmp_pat
     recording, page = ModuleType("sim2real.view.rerun_recording"), ModuleType("sim2real.view.page.page")
     seen = []
     recording.view = lambda run_dir, save, scene, serve: seen.append((run_dir, save))
-    recording.Scene = recording.blueprint_of = recording.send_curve = None
+    for name in ("Scene", "blueprint_of", "send_style", "send_values", "time_column"):  # the live view imports them
+        setattr(recording, name, None)
     page.report = lambda run_dir: run_dir / "report.html"
     monkeypatch.setitem(sys.modules, recording.__name__, recording)
     monkeypatch.setitem(sys.modules, page.__name__, page)
