@@ -69,6 +69,18 @@ def legs_identify(report: Mapping[str, Any], two_cores: Mapping[str, Any]) -> st
     return "\n".join([*lines, "", text])
 
 
+def carried(report: Mapping[str, Any]) -> str:
+    """Return the result for an arm that carries its own weight."""
+    v = {name.removeprefix("carried/"): value for name, value in values(report).items()}
+    truth = {row["name"]: row["yardstick"] for row in report["rows"]}
+    model = truth["carried/stiffness_error"].rpartition(" ")[2]
+    return (
+        f"`auto` chooses the terms `{v['terms']}`. The controller carries {v['gravcomp']:.2f} of the weight (true: "
+        f"{truth['carried/gravcomp']}).\nStiffnesses are {v['stiffness_error']:.1f} % off, the maker's {model}. "
+        f"Verdict: {v['verdict']}, after {v['seconds'] / 60:.0f} min on two\ncores of a machine with other programs.\n"
+    )
+
+
 def twin(report: Mapping[str, Any]) -> str:
     """Return the time of `new --like so101`, from an empty environment to an accepted twin."""
     v = values(report)

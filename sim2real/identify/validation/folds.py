@@ -56,7 +56,7 @@ def shared(parts: Sequence[Fold]) -> tuple[list[Fold], np.ndarray]:
     of = np.arange(len(parts)) % MOST
     if len(parts) <= MOST:
         return list(parts), of
-    members = [[p for p, own in zip(parts, of, strict=True) if own == g] for g in range(MOST)]
+    members = [[p for p, group in zip(parts, of, strict=True) if group == g] for g in range(MOST)]
     groups = [Fold(f"group {g + 1}", tuple(s for p in some for s in p.parts)) for g, some in enumerate(members)]
     return groups, of
 
