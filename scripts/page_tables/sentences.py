@@ -77,7 +77,8 @@ def carried(report: Mapping[str, Any]) -> str:
     return (
         f"`auto` chooses the terms `{v['terms']}`. The controller carries {v['gravcomp']:.2f} of the weight (true: "
         f"{truth['carried/gravcomp']}).\nStiffnesses are {v['stiffness_error']:.1f} % off, the maker's {model}. "
-        f"Verdict: {v['verdict']}, after {v['seconds'] / 60:.0f} min on two\ncores of a machine with other programs.\n"
+        f"Verdict: {v['verdict']}, after {v['seconds'] / 60:.0f} min on "
+        f"{report['machine']['cores']} cores.\n"
     )
 
 
