@@ -107,12 +107,18 @@ def grown(
         if not level or not better(_best(level).ahead, base.ahead):
             break
         base = _best(level)
-    # Fit the selected set without each of its terms, until no subset is left.
+    return _with_subsets(trials, attempt, table, judge)
+
+
+def _with_subsets(
+    trials: list[Trial], attempt: Attempt, table: ParameterTable, judge: Callable[[Trial], Trial]
+) -> list[Trial]:
+    """Return trials with the fits of the selected set without each of its terms, until no subset is left."""
     while True:
         while not (chosen := selected(trials)).judged:
             trials[_place(trials, chosen)] = judge(chosen)
         there = {t.present.tobytes() for t in trials}
-        fewer = [chosen.present & (np.arange(len(none)) != i) for i in np.flatnonzero(chosen.present)]
+        fewer = [chosen.present & (np.arange(len(table.terms)) != i) for i in np.flatnonzero(chosen.present)]
         lacking = [present for present in fewer if present.tobytes() not in there]
         if not lacking:
             return trials
