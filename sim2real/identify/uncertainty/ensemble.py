@@ -24,7 +24,7 @@ from sim2real.identify.validation.optional_terms import Selection
 _WORSE = 0.1
 """Relative excess of the loss above which a model explains the recordings less well."""
 _GAIN = 1e-3
-"""Relative gain of the loss at which the descent of such a model ends: to the minimum, three of an arm take 200 s."""
+"""Relative gain of the loss at which the descent of such a model ends; to the minimum, those of an arm took 270 s."""
 
 
 def posterior(
