@@ -1,32 +1,33 @@
 """JAX, imported when it is first used: the modules that a robot needs are imported without it.
 
 ``from sim2real.later import jax, jnp`` stands for ``import jax`` and ``import jax.numpy as jnp``. A robot's computer
-may have no JAX: there, the first use is an error that names the package.
+may have no JAX: there, the first use of ``jax`` is an error that names the package, and ``jnp`` is numpy.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import traceback
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sim2real.errors import NotInstalled
-from sim2real.installation import ROBOT
+from sim2real.installation import ROBOT, has_jax
 
 ABSENT = ("distrax", "evosax", "flax", "jax", "jinja2", "matplotlib", "mujoco.mjx", "onnx", "optax", "scipy")
 """Packages that only the distribution ``sim2real`` brings."""
 
 
 class Later:
-    """A module that is imported when one of its attributes is first used.
+    """A module that is imported when one of its attributes is first used, or another one instead where it is absent.
 
     Raises:
         NotInstalled: At that use, if its package is not installed.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name, self._module = name, None
+    def __init__(self, name: str, instead: str = "") -> None:
+        self._name, self._instead, self._module = name, instead, None
 
     def __getattr__(self, attribute: str) -> Any:
         if self._module is None:
@@ -35,8 +36,15 @@ class Later:
             try:
                 self._module = importlib.import_module(self._name)
             except ModuleNotFoundError as error:
-                raise (not_installed(error.with_traceback(None)) or error) from None
+                if not self._instead:
+                    raise (not_installed(error.with_traceback(None)) or error) from None
+                self._module = importlib.import_module(self._instead)
         return getattr(self._module, attribute)
+
+
+def at_once() -> contextlib.AbstractContextManager[None]:
+    """Return a context in which JAX computes arrays, also inside of a function that it traces."""
+    return jax.ensure_compile_time_eval() if has_jax() else contextlib.nullcontext()
 
 
 def not_installed(error: ModuleNotFoundError) -> NotInstalled | None:
@@ -62,5 +70,7 @@ def _foreign(file: str) -> bool:
 if TYPE_CHECKING:
     import jax as jax
     import jax.numpy as jnp
+    from scipy import special as special
 else:
-    jax, jnp = Later("jax"), Later("jax.numpy")
+    special = Later("scipy.special")
+    jax, jnp = Later("jax"), Later("jax.numpy", instead="numpy")

@@ -133,7 +133,7 @@ def draw_target(key: Key) -> Array:
 def place_target(aim: Array) -> dict[str, Array]:
     """Return the target's position ``(3,)`` [m], and the opening [rad] as the first of ``(3,)``."""
     aim = jnp.asarray(aim, jnp.float32)
-    return {"target": aim[:3], "opening": jnp.zeros(3).at[0].set(aim[3])}
+    return {"target": aim[:3], "opening": aim[3] * np.eye(3, dtype=np.float32)[0]}
 
 
 TARGET = Aim(

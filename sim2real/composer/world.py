@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sim2real.composer.physics.c.rollouts import Start, StepLaw, check_steps
+from sim2real.composer.physics.c.rollouts import Start, StepLaw, WorldParams, check_steps
 from sim2real.composer.physics.mjx import constants, open_loop, stepping
 from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.physics.mjx.physics import MjxPhysics
@@ -22,27 +22,11 @@ from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseWorld
 
 if TYPE_CHECKING:
-    from jax.typing import ArrayLike
     from mujoco import mjx
 
     from sim2real.composer.models.element import Elements
     from sim2real.composer.types import MjModel
     from sim2real.types import PyTree
-
-
-@struct.dataclass
-class WorldParams(Base):
-    """Parameters to identify, or that differ from copy to copy.
-
-    Attributes:
-        values: Name -> array, in the unit of the attribute that it sets.
-        qpos: Positions ``(nq,)`` that the task's hooks find at the start [m or rad]; None: the model's.
-        qvel: Velocities ``(nv,)`` at the start [m/s or rad/s]; None: none.
-    """
-
-    values: dict[str, jax.Array]
-    qpos: ArrayLike | None = None
-    qvel: ArrayLike | None = None
 
 
 @struct.dataclass

@@ -18,7 +18,7 @@ import numpy as np
 from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, InputState
-from sim2real.graph.interpolation import between, mean_of
+from sim2real.graph.interpolation import between, mean_of, taken
 from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 
@@ -241,7 +241,8 @@ class TrainableDist(Base, DelayDistribution):
         that time (see ``sim2real.graph.interpolation``).
 
         Args:
-            inputs: The lengthened window, leaves ``(W, ...)``; its arrival times are those at the smallest delay.
+            inputs: The lengthened window, leaves ``(W, ...)``; its arrival times are those at the smallest delay. In
+                numpy the copies' axes come behind the first one, of ``age_s`` too.
             age_s: Shape ``(W,)``: step start minus sent time of each message [s]; large for empty slots.
             period_s: The reader's period [s]; for ``zoh_mean``.
             ts_s: The step's start [s from the episode's start]; for ``linear``.
@@ -258,16 +259,14 @@ class TrainableDist(Base, DelayDistribution):
         # exact ties are recognised.
         width = inputs.seq.shape[0]
         arrived = late > HALF_TICK_S if skip else late > -HALF_TICK_S
-        last = jnp.maximum(jnp.sum(arrived) - 1, window - 1)
+        last = jnp.maximum(jnp.sum(arrived, axis=0) - 1, window - 1)
         if self.interp == "zoh":
-            start = last - window + 1
-            return jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, start, window), inputs)
+            return _part(inputs, last - window + 1, window)
 
         # Interpolate at the times of the last messages, moved so that the newest lies at the step's start.
         late = jnp.where(inputs.seq < 0, ts_s if self.interp == "linear" else 1e9, late)
-        steps = jnp.arange(window - 1, -1, -1)
-        newest = jnp.take(late, last)
-        query = -(jnp.take(late, jnp.clip(last - steps, 0, width - 1)) - newest)
+        steps = jnp.arange(window - 1, -1, -1).reshape(-1, *[1] * last.ndim)
+        query = -(taken(late, jnp.clip(last - steps, 0, width - 1)) - taken(late, last[None]))
         slack = -HALF_TICK_S if skip else HALF_TICK_S
         return _interpolate(inputs, -late, query, slack, self.integers == "round")
 
@@ -279,13 +278,13 @@ def _interpolate(inputs: InputState, knots: jax.Array, query: jax.Array, slack: 
     ``slack`` [s] is added to the queries, so that exact ties are recognised.
     """
     above = jnp.clip(jnp.sum(knots[None] <= query[:, None], axis=1), 1, knots.shape[0] - 1)
-    low, high = jnp.take(knots, above - 1), jnp.take(knots, above)
+    low, high = taken(knots, above - 1), taken(knots, above)
     span = jnp.where(high > low, high - low, 1.0)
     weight = jnp.clip((query - low) / span, 0.0, 1.0)
     held = jnp.maximum(jnp.sum(knots[None] < query[:, None] + slack, axis=1) - 1, 0)
     one = partial(between, low=above - 1, weight=weight, held=held)
     seq, sent, received = (one(leaf, rounded=False) for leaf in (inputs.seq, inputs.ts_sent, inputs.ts_recv))
-    data = jax.tree_util.tree_map(partial(one, rounded=rounded), inputs.data)
+    data = pytree.map(partial(one, rounded=rounded), inputs.data)
     return InputState(seq, sent, received, data, inputs.delay_dist)
 
 
@@ -297,7 +296,14 @@ def _mean_over_period(inputs: InputState, late: Array, window: int, period_s: fl
     """
     # Fraction of the period in which each message, or a newer one, holds.
     share = jnp.clip(1.0 + late / period_s, 0.0, 1.0)
-    first = jnp.maximum(jnp.sum(late > -HALF_TICK_S) - window, 0)
-    held = jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, window), inputs)
-    mean = jax.tree_util.tree_map(lambda leaf, now: mean_of(leaf, share, now, rounded), inputs.data, held.data)
+    held = _part(inputs, jnp.maximum(jnp.sum(late > -HALF_TICK_S, axis=0) - window, 0), window)
+    mean = pytree.map(lambda leaf, now: mean_of(leaf, share, now, rounded), inputs.data, held.data)
     return held.replace(data=mean)
+
+
+def _part(inputs: InputState, first: Array, window: int) -> InputState:
+    """Return ``window`` messages of each leaf ``(W, ...)`` from the message ``first`` on, one number for each copy."""
+    if jnp.ndim(first) == 0:
+        return jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, window), inputs)
+    index = first + jnp.arange(window).reshape(-1, *[1] * first.ndim)
+    return pytree.map(lambda leaf: taken(leaf, index), inputs)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from sim2real.artifacts.estimation.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
 from sim2real.identify.parameter_paths import set_leaf
+from sim2real.installation import has_jax
 from sim2real.later import jax, jnp
 from sim2real.types import Array, PyTree
 
@@ -264,19 +265,19 @@ class ParameterTable:
         Args:
             present: Shape ``(P,)``, bool: others have their values in a model without them; default: all are kept.
         """
-        x = self._low + (self._high - self._low) * jax.nn.sigmoid(jnp.asarray(z))
+        x = self._low + (self._high - self._low) * (jax.nn.sigmoid(z) if has_jax() else 1.0 / (1.0 + np.exp(-z)))
         columns: dict[str, list[jax.Array]] = {}
         for i, c in enumerate(self.columns):
-            p, value = c.parameter, from_scale(c.parameter.transform, x[i], jnp)
+            p, value = c.parameter, from_scale(c.parameter.transform, x[..., i], jnp)
             if present is not None:
                 value = jnp.where(present[i], value, p.without)
             columns.setdefault(p.name, []).append(value)
         # Add the fixed parameters, and stack those that each recording has its own value of.
-        values: dict[str, jax.Array] = {}
+        values, copies = {}, x.shape[:-1]
         for p in self.parameters:
             column = columns.get(p.name)
             if column is None:
-                values[p.name] = jnp.full(self.recordings, p.nominal) if p.per_recording else jnp.float32(p.nominal)
+                values[p.name] = jnp.full(self.recordings if p.per_recording else copies, p.nominal, jnp.float32)
             else:
                 values[p.name] = jnp.stack(column) if p.per_recording else column[0]
         return values

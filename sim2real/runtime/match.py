@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.installation import has_jax
 from sim2real.later import jax, jnp
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ T = TypeVar("T")
 
 def matched(node: str, what: str, got: T, reference: str, like: object) -> T:
     """Return ``got`` with exactly the dtypes of ``like``, after ``check_match``, whose arguments it takes."""
+    if not has_jax():
+        return got
     check_match(node, what, got, reference, like)
 
     def cast(new: ArrayLike, old: ArrayLike) -> ArrayLike:

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from contractions import contracting_node
 
 from sim2real.graph import BaseNode
-from sim2real.graph.testing import HashInJax, HashInPython, NodeConformance, Value, contracting_node
+from sim2real.graph.testing import HashInJax, HashInPython, NodeConformance, Value
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 

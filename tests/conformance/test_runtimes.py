@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+from table_interpreter import interpret_hashes
 
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.testing import Played, RuntimeConformance, jax_hash_node
@@ -10,7 +11,6 @@ from sim2real.runtime.clock import Clock
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.runtime.compilation.wiring import wire
 from sim2real.runtime.init import OUTPUTS, init_graph_state
-from sim2real.runtime.testing import interpret_hashes
 
 KEY = jax.random.key(0)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dynamixel_sdk import GroupBulkRead, GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
+from plants import mean_latencies
 
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
 from sim2real.hardware.bus.packets import Instruction, Parser
@@ -210,7 +211,7 @@ def test_latencies_are_the_configured_ones_within_the_logged_lateness(start_robo
     effects = truth.of(Kind.EFFECT)[-60:]
     assert np.all(effects["t_ns"] - effects["late_ns"] == effects["t_host_ns"] + 140_000 + 6_000_000)
     assert np.all(np.abs(effects["late_ns"]) <= 250_000)
-    means = truth.mean_latencies()
+    means = mean_latencies(truth)
     assert means["actuation_s"] == pytest.approx(0.00614, abs=0.0003)
     assert means["sensing_s"] == pytest.approx(0.00415 + samples["late_ns"].mean() * 1e-9, abs=1e-5)
 

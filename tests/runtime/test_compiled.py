@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import topologies
+from contractions import contracting_node
 from jax.extend.core import jaxprs_in_params
 from test_wiring import simulate
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, Timeline, TrainableDist
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing import HashInPython, Value, contracting_node, hash_node, jax_hash_node
+from sim2real.graph.testing import HashInPython, Value, hash_node, jax_hash_node
 from sim2real.graph.times import Vertex
 from sim2real.graph.windows import bursty_episodes
 from sim2real.runtime.asynchronous import AsyncGraph

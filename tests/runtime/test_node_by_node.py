@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import topologies
+from contractions import Contraction
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +16,6 @@ from sim2real.graph import BaseWorld, Timeline, TrainableDist
 from sim2real.graph.node import TICKS_PER_S, Jitter, Scheduling
 from sim2real.graph.schedule import draw
 from sim2real.graph.testing import Value, jax_hash_node
-from sim2real.graph.testing.nodes import Contraction
 from sim2real.runtime.compilation.bursts import make_room
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph

@@ -5,6 +5,7 @@ import numpy as np
 import topologies
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from table_interpreter import interpret_hashes
 
 from sim2real.graph import Timeline
 from sim2real.graph.episode import MemoryRecorder
@@ -14,7 +15,6 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.compilation.wiring import wire, wire_pattern
 from sim2real.runtime.init import OUTPUTS
-from sim2real.runtime.testing import interpret_hashes
 
 
 def simulate(nodes, supervisor, timeline, eps=0, seed=0):

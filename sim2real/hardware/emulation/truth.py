@@ -158,31 +158,6 @@ class Truth:
         rows = self.of(Kind.STATE)
         return rows["t_ns"], {name: rows["values"][:, i] for i, name in enumerate(self.header["state_names"])}
 
-    def mean_latencies(self) -> dict[str, float]:
-        """Return the session's mean latencies [s]; NaN without samples, or without effects.
-
-        `sensing_s`: age of a sample when its answer reaches the host. `actuation_s`: time from the arrival of a goal's
-        bytes to its effect. `sample_before_request_s`: time from the sample to the arrival of the read's bytes;
-        negative if sampled later.
-        """
-        samples = self.of(Kind.SAMPLE)
-        effects = self.of(Kind.EFFECT)
-        effects = effects[effects["t_host_ns"] > 0]
-        return {
-            "sensing_s": _mean_s(samples["t_done_ns"] - samples["t_ns"]),
-            "actuation_s": _mean_s(effects["t_ns"] - effects["t_host_ns"]),
-            "sample_before_request_s": _mean_s(samples["t_host_ns"] - samples["t_ns"]),
-        }
-
-    def lateness_s(self) -> np.ndarray:
-        """Return the lateness of each answer against the plan, shape (N,) [s]: the emulator's real-time error."""
-        answers = np.isin(self.rows["kind"], (Kind.SAMPLE, Kind.REPLY))
-        return self.rows["late_ns"][answers] * 1e-9
-
-
-def _mean_s(durations_ns: np.ndarray) -> float:
-    return float(durations_ns.mean() * 1e-9) if durations_ns.size else float("nan")
-
 
 def read_truth(path: Path | str) -> Truth:
     """Read a truth file without an incomplete last row; raise Sim2RealError if it does not exist or has no header."""

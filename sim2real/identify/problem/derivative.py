@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
+from sim2real.later import jax, jnp
 from sim2real.types import PyTree
 
 

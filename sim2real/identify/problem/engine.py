@@ -6,16 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from sim2real import pytree
 from sim2real.composer.physics.c.rollouts import OpenLoop, Rollouts, Start, StepLaw
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, BaseWorld
+from sim2real.installation import has_jax
+from sim2real.later import jax
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph, Tables
-from sim2real.types import MjModel, PyTree
+from sim2real.types import Array, MjModel, PyTree
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
 
@@ -105,6 +106,11 @@ class Outside(NamedTuple):
     law: Mapping[str, PyTree]
 
 
+def _swapped(rows: Array) -> Array:
+    """Return rows of a graph with copies before time, or the other way; those of a program have no copies."""
+    return rows if has_jax() else np.swapaxes(rows, 0, 1)
+
+
 class CRollouts:
     """Rolls a graph's recorded commands out on C MuJoCo.
 
@@ -125,7 +131,7 @@ class CRollouts:
         world = self._world
         state, world_params = gs.state[world.name], params[world.name]
         law = world.law_values(world_params) if self._law else {}  # pyright: ignore[reportAttributeAccessIssue]
-        controls = self._graph.drive(gs, tables, messages, world.controls)
+        controls = _swapped(self._graph.drive(gs, tables, messages, world.controls))
         return Outside(dict(world.fields(world_params, state)), world.start(world_params, state), controls, law)
 
     def step(self, inputs: Outside) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,20 +147,9 @@ class CRollouts:
     ) -> PyTree:
         """Return a node's outputs in an episode, leaves ``(K, ...)``; traceable."""
         world = self._world
-        world_messages = jax.vmap(lambda *at: world.message(gs.state[world.name], *at))(*moved)
+        state = gs.state[world.name]
+        if not has_jax():
+            known = {world.name: world.message(state, *map(_swapped, moved))}
+            return pytree.map(_swapped, self._graph.run(gs, tables, messages, record, known))
+        world_messages = jax.vmap(lambda *at: world.message(state, *at))(*moved)
         return self._graph.run(gs, tables, messages, record, {world.name: world_messages})
-
-    def rollout(
-        self, gs: GraphState, params: Mapping[str, PyTree], tables: Tables, messages: Mapping[str, PyTree], record: str
-    ) -> PyTree:
-        """Return a node's outputs in an episode by a callback to C; no compilation cache holds such a program."""
-        inputs = self.inputs(gs, params, tables, messages)
-        dtype, count = jnp.result_type(float), inputs.controls.shape[0]
-        widths = (self._model.nq, self._model.nv, self._model.nv)
-        shapes = tuple(jax.ShapeDtypeStruct((1 + count, n), dtype) for n in widths)
-
-        def outside(messages: PyTree) -> tuple[np.ndarray, ...]:
-            return tuple(a.astype(dtype) for a in self.step(jax.tree_util.tree_map(np.asarray, messages)))
-
-        moved = jax.pure_callback(outside, shapes, inputs, vmap_method="expand_dims")
-        return self.outputs(gs, moved, tables, messages, record)

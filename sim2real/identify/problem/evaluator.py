@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2real.identify.problem.programs import OnCompile
@@ -14,6 +12,7 @@ from sim2real.identify.problem.residuals import LinearisedSegments, SegmentResid
 from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.problem.sizes import padded
+from sim2real.later import jax, jnp
 from sim2real.types import Array, PyTree
 
 _COMPARED = 16
@@ -120,7 +119,7 @@ class CompiledEvaluator:
         program = self._residuals.program("losses", self._residuals.losses)
         # Pad the candidates: each number of them compiles once.
         points = padded(candidates, -(-len(candidates) // _COMPARED) * _COMPARED)
-        return np.asarray(program(_single(points), _single(around), data), np.float64)[: len(candidates)]
+        return np.asarray(program(single(points), single(around), data), np.float64)[: len(candidates)]
 
     def searched(self, data: Data) -> PyTree:
         """See ``Evaluator``: traceable ``Losses``, whose data is an argument."""
@@ -135,14 +134,14 @@ class CompiledEvaluator:
         """See ``Evaluator``."""
         many = jax.vmap(self._residuals.predict, in_axes=(0, 0, 0, None))
         program = self._residuals.program("predict", many)
-        arrays = {n: _single(v) for n, v in values.items()}
-        residuals, starts = program(arrays, jnp.asarray(eps, jnp.int32), _single(fit_s), data)
+        arrays = {n: single(v) for n, v in values.items()}
+        residuals, starts = program(arrays, jnp.asarray(eps, jnp.int32), single(fit_s), data)
         return np.asarray(residuals, np.float64), np.asarray(starts, np.float64)
 
     def with_values(self, z: np.ndarray, rows: np.ndarray, data: Data) -> np.ndarray:
         """See ``Evaluator``."""
         program = self._residuals.program("with_values", self._with_values)
-        return np.asarray(program(_single(z), _single(rows), data), np.float64)
+        return np.asarray(program(single(z), single(rows), data), np.float64)
 
     def _with_values(self, z: Array, rows: Array, data: Data) -> PyTree:
         residuals = self._residuals
@@ -176,5 +175,6 @@ def stacked(at: LinearisedSegments) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([r.reshape(-1), prior]), np.concatenate([J.reshape(-1, J.shape[-1]), slope])
 
 
-def _single(a: Any) -> jax.Array:
+def single(a: Any) -> jax.Array:
+    """Return an array of single precision."""
     return jnp.asarray(np.asarray(a), jnp.float32)

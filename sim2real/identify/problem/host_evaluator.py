@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from sim2real import pytree
 from sim2real.identify.problem.broyden import Slope, corrected
 from sim2real.identify.problem.engine import CRollouts, Outside
-from sim2real.identify.problem.evaluator import Stacked, replaced
+from sim2real.identify.problem.evaluator import Stacked, replaced, single
 from sim2real.identify.problem.initial_states import InitialStates, next_shift, trees_are_apart
 from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.residuals import InitialState, LinearisedSegments, SegmentResiduals
@@ -23,12 +22,12 @@ from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.problem.sizes import padded
 from sim2real.identify.problem.together import Together
+from sim2real.installation import has_jax
+from sim2real.later import jax
 from sim2real.types import PyTree
 
 _FEW, _COPIES = 24, 128
 """Copies in one call of the two programs: each size compiles once. A descent evaluates one point in a call."""
-
-
 _CACHED = 2
 """Points whose Jacobians are cached: that of a set of terms, and that of all terms around it."""
 _SEARCHED = 8
@@ -187,7 +186,7 @@ class OutsideEvaluator:
         program = self._residuals.program(
             "replaced", jax.vmap(lambda z, row: replaced(self._residuals, z, row), (None, 0))
         )
-        values = jax.tree_util.tree_map(np.asarray, program(_single(z), _single(rows)))
+        values = jax.tree_util.tree_map(np.asarray, program(single(z), single(rows)))
         return self._tamed(self._projected(values, self._states(z, data, again=True), data))
 
     def _states(self, z: np.ndarray, data: Data, again: bool = False) -> InitialState | None:
@@ -238,36 +237,40 @@ class OutsideEvaluator:
     def _errors(self, values: Mapping[str, np.ndarray], eps: np.ndarray, shift: np.ndarray, data: Data) -> np.ndarray:
         """Return the residuals of segments ``eps (N,)`` with shifted initial states ``(N, n)``, ``(N, K, F)``."""
         residuals = self._residuals
-        before = residuals.program("inputs", jax.vmap(residuals.inputs, (0, 0, 0, None)))
-        after = residuals.program("errors", jax.vmap(residuals.errors, (0, 0, 0, 0, None)))
+        before = residuals.of_copies("inputs", residuals.inputs, (0, 0, 0, None))
+        after = residuals.of_copies("errors", residuals.errors, (0, 0, 0, 0, None))
         errors = []
         for first in range(0, len(eps), _COPIES):
             rows = slice(first, first + _COPIES)
             count = len(eps[rows])
-            size = _FEW if count <= _FEW else _COPIES
             # Pad the copies to one of two sizes, as each size compiles once.
+            size = count if not has_jax() else _FEW if count <= _FEW else _COPIES
             part = {n: np.asarray(v[rows], np.float32) for n, v in values.items()}
             shifts = np.asarray(shift[rows] * self._prior, np.float32)
             arguments = padded((part, np.asarray(eps[rows], np.int32), shifts), size)
-            inputs: Outside = jax.tree_util.tree_map(lambda a, n=count: np.asarray(a)[:n], before(*arguments, data))
+            inputs: Outside = before(*arguments, data)
+            if has_jax():
+                inputs = pytree.map(lambda a, n=count: np.asarray(a)[:n], inputs)
             moved = padded(tuple(a.astype(np.float32) for a in self._rollouts.step(inputs)), size)
             errors.append(np.asarray(after(*arguments, moved, data), np.float64)[:count])
         return np.concatenate(errors)
 
     def _decoded(self, z: np.ndarray, data: Data) -> dict[str, np.ndarray]:
-        decode = self._residuals.program("decode", jax.vmap(self._residuals.table.decode, (0, None)))
-        points = _single(padded(z, -(-len(z) // _COPIES) * _COPIES))
+        decode = self._residuals.of_copies("decode", self._residuals.table.decode, (0, None))
+        points = single(padded(z, -(-len(z) // _COPIES) * _COPIES))
         return {n: np.asarray(v)[: len(z)] for n, v in decode(points, data.present).items()}
 
     def _priors(self, z: np.ndarray) -> np.ndarray:
         """Return the residuals of the priors at points ``(N, P)``, ``(N, Q)``."""
         program = self._residuals.program("priors", jax.vmap(self._residuals.table.prior_residuals))
-        return np.asarray(program(_single(padded(z, -(-len(z) // _COPIES) * _COPIES))), np.float64)[: len(z)]
+        return np.asarray(program(single(padded(z, -(-len(z) // _COPIES) * _COPIES))), np.float64)[: len(z)]
 
     def _of_prior(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         of_prior = self._residuals.table.prior_residuals
+        if all(c.parameter.prior is None for c in self._residuals.table.columns):
+            return np.zeros(0), np.zeros((0, z.size))
         program = self._residuals.program("prior", lambda z: (of_prior(z), jax.jacfwd(of_prior)(z)))
-        value, slope = (np.asarray(a, np.float64) for a in program(_single(z)))
+        value, slope = (np.asarray(a, np.float64) for a in program(single(z)))
         return value, slope
 
     def _loss(self, r: np.ndarray, prior: np.ndarray, data: Data) -> float:
@@ -281,7 +284,3 @@ class OutsideEvaluator:
     def _tamed_slope(self, raw: np.ndarray) -> np.ndarray:
         step = 1e-6 * np.maximum(np.abs(raw), 1.0)
         return (self._tamed(raw + step) - self._tamed(raw - step)) / (2.0 * step)
-
-
-def _single(a: Any) -> jax.Array:
-    return jnp.asarray(np.asarray(a), jnp.float32)

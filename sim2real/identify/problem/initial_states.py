@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping
 from itertools import zip_longest
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.problem.residuals import STATE_DIFFERENCE, InitialState, SegmentResiduals
@@ -139,9 +137,11 @@ def separated(slope: np.ndarray) -> tuple[list[tuple[int, ...]], np.ndarray]:
     responds = slope > _RESPONDS * slope.max(initial=0.0)
     alone = [i for i in range(len(slope)) if not responds[i].any()]
     # Columns and residuals that depend on each other, directly or by way of others, are of one tree.
-    edges = np.block([[np.zeros((len(slope),) * 2), responds], [responds.T, np.zeros((slope.shape[1],) * 2)]])
-    label = connected_components(csr_array(edges), directed=False)[1]
-    columns, rows = label[: len(slope)], label[len(slope) :]
+    label, rows = np.arange(len(slope)), np.full(slope.shape[1], len(slope))
+    for _ in label:  # each takes the lowest number among its neighbours
+        rows = np.minimum(rows, np.where(responds, label[:, None], len(slope)).min(axis=0, initial=len(slope)))
+        label = np.minimum(label, np.where(responds, rows, len(slope)).min(axis=1, initial=len(slope)))
+    columns = label
     belongs = columns[:, None] == rows[None]
     belongs[alone] = True
     trees = [[i for i in np.flatnonzero(columns == k) if i not in alone] for k in np.unique(columns)]

@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
-from sim2real.errors import UsageError
+from sim2real.errors import NotInstalled, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.schedule import draw
 from sim2real.identify.config import FitConfig
@@ -26,6 +25,8 @@ from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.residuals import SegmentResiduals
 from sim2real.identify.problem.segments import Data, Retimed, Span, cut, data_of
 from sim2real.identify.problem.sizes import padded, rounded
+from sim2real.installation import has_jax
+from sim2real.later import jnp
 from sim2real.runtime.compilation.bursts import make_room
 from sim2real.types import Array, PyTree
 
@@ -117,6 +118,8 @@ class Problem:
     def _residuals(self) -> SegmentResiduals:
         nodes = self.model.nodes(self.config.max_delay_s)
         engine = choose(self.config.engine, nodes, self.model.given, self.config.jacobian)
+        if engine.name != "c" and not has_jax():
+            raise NotInstalled(f"this needs JAX, as {engine.why}")
         check_devices(self.config.devices, engine)
         return SegmentResiduals(self.model, nodes, self.table, self.config, engine)
 

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import jax
-
+from sim2real.later import jax
 from sim2real.types import PyTree
 
 OnCompile = Callable[[bool], None]

@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
@@ -22,6 +23,8 @@ from sim2real.identify.problem.engine import Choice, CRollouts, Outside
 from sim2real.identify.problem.programs import Program
 from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
+from sim2real.installation import has_jax
+from sim2real.later import jax, jnp
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph
 from sim2real.types import Array, PyTree, Scalar
 
@@ -45,7 +48,8 @@ class InitialState(NamedTuple):
     residuals: Array
 
 
-_StateSearch = tuple[jax.Array, InitialState, jax.Array]
+_Function = Callable[..., PyTree]
+_StateSearch = tuple[Array, InitialState, Array]
 """The next candidate, the best point so far, and its cost."""
 
 
@@ -84,13 +88,16 @@ class SegmentResiduals:
         self._outside = CRollouts(self.graph, engine.model) if engine.name == "c" else None
         self.channels = model.channels
         sigmas = [c.position_sigma for c in self.channels] + [c.velocity_sigma for c in self.channels]
-        self.prior = 30.0 * jnp.array(sigmas)
+        self.prior = 30.0 * np.array(sigmas, np.float32)
         self.forward = config.jacobian == "forward"
         self.programs: dict[str, Program] = {}
         self.searches: dict[tuple[object, ...], Program] = {}
         self._late = [p.name for p in table if p.side == "measurement"]
-        # Trace the rollout once for all programs that contain it: tracing MuJoCo takes 6 s.
-        self._rollout = jax.jit(self._simulate)
+
+    @functools.cached_property
+    def _rollout(self) -> Callable[..., PyTree]:
+        """``_simulate``, traced once for all programs that contain it: tracing MuJoCo takes 6 s."""
+        return jax.jit(self._simulate)
 
     @property
     def outside(self) -> CRollouts:
@@ -110,6 +117,10 @@ class SegmentResiduals:
             self.programs[name] = Program(function)
         return self.programs[name]
 
+    def of_copies(self, name: str, function: _Function, axes: tuple[int | None, ...]) -> _Function:
+        """Return a function of many copies: compiled, or, without JAX, the function itself on arrays of copies."""
+        return self.program(name, jax.vmap(function, axes)) if has_jax() else function
+
     def simulate(self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data) -> PyTree:
         """Return the sensor's predictions of a segment, leaves ``(K, ...)``.
 
@@ -126,8 +137,6 @@ class SegmentResiduals:
         """Simulate a segment for one recording's parameters, from an initial state."""
         params = self.model.params(values, start)
         gs = self._first(params, messages, eps)
-        if self.engine.name == "c":
-            return self.outside.rollout(gs, params, tables, messages, self.model.sensor)
         return self.graph.run(gs, tables, messages, self.model.sensor)
 
     def _started(
@@ -139,7 +148,7 @@ class SegmentResiduals:
 
     def _first(self, params: Mapping[str, PyTree], messages: PyTree, eps: Array | int) -> GraphState:
         # Assume that the first recorded command held before, too.
-        first = jax.tree_util.tree_map(lambda rows: rows[0], messages)
+        first = pytree.map(lambda rows: rows[0], messages)
         return self.graph.begin(params, first, jnp.asarray(eps, jnp.int32))
 
     def _begun(
@@ -147,7 +156,10 @@ class SegmentResiduals:
     ) -> tuple[dict[str, PyTree], GraphState, PyTree, PyTree]:
         """Return parameters of the nodes, first state, timing and commands of a segment."""
         params = self.model.params(*self._started(values, eps, shift, data))
-        tables, messages = jax.tree_util.tree_map(lambda rows: rows[eps], (data.tables, data.messages))
+        tables, messages = pytree.map(lambda rows: rows[eps], (data.tables, data.messages))
+        if np.ndim(eps):  # in numpy, copies come behind time and window
+            tables = pytree.map(lambda rows: np.moveaxis(rows, 0, -1), tables)
+            messages = pytree.map(lambda rows: np.swapaxes(rows, 0, 1), messages)
         return params, self._first(params, messages, eps), tables, messages
 
     def inputs(self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data) -> Outside:
@@ -174,7 +186,7 @@ class SegmentResiduals:
         for field, sigma, entry in self.fields:
             error = entry(getattr(predicted, field)) - entry(data.measured[field][eps])
             columns.append(jnp.where(counts, error / sigma, 0.0))
-        return jnp.stack(columns, axis=1)
+        return jnp.stack(columns, axis=-1)
 
     def initial_state(
         self,
@@ -299,13 +311,13 @@ class SegmentResiduals:
         Args:
             delay_s: Delay of the samples [s].
         """
-        c = data.starts[eps]  # (channels, 4): a cubic in time
+        cubic = jnp.moveaxis(data.starts[eps], -1, 0)
         if self.config.initial_state == "rest":
-            return jnp.concatenate([c[:, 0], jnp.zeros(len(self.channels))])
-        t = jnp.asarray(delay_s, jnp.float32)
-        position = c[:, 0] + t * (c[:, 1] + t * (c[:, 2] + t * c[:, 3]))
-        velocity = c[:, 1] + t * (2 * c[:, 2] + t * 3 * c[:, 3])
-        return jnp.concatenate([position, velocity])
+            return jnp.concatenate([cubic[0], jnp.zeros_like(cubic[0])], axis=-1)
+        t = jnp.asarray(delay_s, jnp.float32)[..., None]
+        position = cubic[0] + t * (cubic[1] + t * (cubic[2] + t * cubic[3]))
+        velocity = cubic[1] + t * (2 * cubic[2] + t * 3 * cubic[3])
+        return jnp.concatenate([position, velocity], axis=-1)
 
     def differentiable(self, f: Callable[[PyTree], PyTree], step: float | None = None) -> Callable[[PyTree], PyTree]:
         """Return a function of one array with a derivative: its own, or finite differences; default: as configured."""

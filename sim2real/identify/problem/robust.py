@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
-
 from sim2real.identify.config import Loss
+from sim2real.later import jnp
 from sim2real.types import Array, PyTree
 
 

@@ -16,7 +16,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
 from sim2real.identify.model import ChecksLogs, IdentifiableModel
 from sim2real.identify.problem.sizes import padded, rounded
-from sim2real.later import jax, jnp
+from sim2real.later import jnp
 from sim2real.types import Array, PyTree
 
 _LEAST_SAMPLES = 4
@@ -103,14 +103,13 @@ def data_of(cuts: Segments, tables: PyTree, from_s: float, fields: int, paramete
     # Pad measurements and messages.
     measured = {f: np.asarray(padded(rows, steps, 1), np.float32) for f, rows in cuts.measured.items()}
     messages = {
-        n: jax.tree_util.tree_map(lambda leaf: padded(leaf, rounded(leaf.shape[1]), 1), tree)
-        for n, tree in cuts.messages.items()
+        n: pytree.map(lambda leaf: padded(leaf, rounded(leaf.shape[1]), 1), tree) for n, tree in cuts.messages.items()
     }
     rows = (tables, messages, measured, ts.astype(np.float32), np.asarray(cuts.starts, np.float32),
             np.array([s.recording for s in cuts.spans], np.int32))  # fmt: skip
     # Weights of the fitted segments.
     counts = rounded(max(len(fitted), 1))
-    return jax.tree_util.tree_map(
+    return pytree.map(
         jnp.asarray,
         Data(
             *padded(rows, size),
@@ -172,7 +171,7 @@ def cut(
         spans=tuple(ordered),
         length_s=length_s,
         timeline=_later(timeline, model.sensor, to_ticks(model.ahead_s)),
-        messages={n: jax.tree_util.tree_map(lambda f, n=n: rows(n, f), tree) for n, tree in model.given.items()},
+        messages={n: pytree.map(lambda f, n=n: rows(n, f), tree) for n, tree in model.given.items()},
         measured={f: rows(model.sensor, f) for f in sorted(fields)},
         ts=np.where(start < length_s, start, 0.0),
         starts=np.stack([_local_fit(recordings[s.recording], model, s.begin_s) for s in ordered]),
@@ -298,7 +297,7 @@ def ranges(
     Args:
         length_s: Length of a segment [s].
     """
-    fields = [(n, f) for n, tree in model.given.items() for f in jax.tree_util.tree_leaves(tree)]
+    fields = [(n, f) for n, tree in model.given.items() for f in pytree.leaves(tree)]
     positions = list(dict.fromkeys(c.position for c in model.channels))
     ends: dict[str, list[np.ndarray]] = {}
     for node, name in [*fields, *((model.sensor, f) for f in positions)]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim2real.later import jax
+from sim2real import pytree
 from sim2real.types import PyTree
 
 _EXACT = 4
@@ -36,4 +36,4 @@ def padded(tree: PyTree, size: int, axis: int = 0) -> PyTree:
         width = [(0, size - leaf.shape[i]) if i == axis else (0, 0) for i in range(leaf.ndim)]
         return np.pad(leaf, width, mode="edge")
 
-    return jax.tree_util.tree_map(lambda leaf: one(np.asarray(leaf)), tree)
+    return pytree.map(lambda leaf: one(np.asarray(leaf)), tree)

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import chdtrc, stdtrit
 
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Data
+from sim2real.later import special
 
 VAGUE = 0.15
 """Standard errors above this share of the bounds' width are not identifiable (a uniform distribution has 0.29)."""
@@ -150,7 +150,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     root = root_of_inverse(precision)
     cov[np.ix_(rest, rest)] = root @ root.T
     # Widen the errors to those between blocks of the log.
-    quantile = float(stdtrit(max(count / inflation - free, 1.0), 0.975))
+    quantile = float(special.stdtrit(max(count / inflation - free, 1.0), 0.975))
     linear, wider = np.sqrt(np.diag(cov)), np.ones(size)
     error, freedom = _by_blocks(*_blocks(problem, at, rest), (at.prior * variance)[np.ix_(rest, rest)])
     wider[rest] = _widening(error / linear[rest], freedom, quantile)
@@ -219,7 +219,9 @@ def between_parts(
     error = np.sqrt((parts - 1) / parts * np.sum((moved - moved.mean(axis=0)) ** 2, axis=0))
     errors = np.sqrt(np.diag(spread.scale_covariance))
     shifts = time_shift(table) != 0.0
-    factor = _widening(error / np.maximum(errors, 1e-30), np.full(len(x), parts - 1.0), float(stdtrit(1e3, 0.975)))
+    factor = _widening(
+        error / np.maximum(errors, 1e-30), np.full(len(x), parts - 1.0), float(special.stdtrit(1e3, 0.975))
+    )
     factor = np.where((share.max(axis=0) > _ALONE) | shifts, 1.0, factor)
     factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(errors, 1e-30)))
     return scaled(spread, table, x, factor)
@@ -363,8 +365,8 @@ def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float) -> np.nda
     """
     freedom = np.maximum(freedom, 1.0)
     begin, full = _BY_CHANCE
-    share = np.clip((begin - chdtrc(freedom, freedom * ratio**2)) / (begin - full), 0.0, 1.0)
-    wider = np.maximum(ratio * stdtrit(freedom, 0.975) / quantile, 1.0)
+    share = np.clip((begin - special.chdtrc(freedom, freedom * ratio**2)) / (begin - full), 0.0, 1.0)
+    wider = np.maximum(ratio * special.stdtrit(freedom, 0.975) / quantile, 1.0)
     return np.where(freedom >= _LEAST_FREEDOM, 1.0 + share * (wider - 1.0), 1.0)
 
 

@@ -48,7 +48,7 @@ class IdentifiableLoop:
         Args:
             start: Shape ``(2 * channels,)``: initial positions, then velocities.
         """
-        position, velocity = jnp.split(jnp.asarray(start), 2)
+        position, velocity = jnp.split(jnp.asarray(start), 2, axis=-1)
         begin = EpisodeStart(position, velocity, jnp.zeros(self._robot.task.aim_size))
         params = self._robot.node_parameters(values, begin)
         del params[self._robot.roles.supervisor]

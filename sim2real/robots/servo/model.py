@@ -14,7 +14,7 @@ from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.identify.export.card.plain import PlainSimulation, converged
 from sim2real.identify.parameters import Parameter
-from sim2real.later import jax, jnp
+from sim2real.later import at_once, jnp
 from sim2real.robots.contract import RobotModel
 from sim2real.robots.control_loop.hardware import Embedded
 from sim2real.robots.control_loop.messages import EpisodeStart
@@ -22,14 +22,14 @@ from sim2real.robots.roles import ROLES, Roles
 from sim2real.robots.servo import parameters
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.robots.servo.payload import PAYLOAD, Hand
+from sim2real.robots.servo.plain_world import servo_world
 from sim2real.robots.servo.servos import Servos, gear_of
 from sim2real.robots.servo.task import NO_AIM, Aim
 from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
-    from sim2real.composer.world import WorldParams
+    from sim2real.composer.physics.c.rollouts import WorldParams
     from sim2real.hardware.emulation.emulated_bus import BusEmulation
-    from sim2real.robots.servo.simulated_world import ServoWorld
 
 _AT_ONCE = 1e9
 """Speed that stands for an infinite one in a document [rad/s]."""
@@ -95,12 +95,10 @@ class ComposedModel(RobotModel):
         of_servos = parameters.parameters(self.servos.sheet, self.servos.joints)
         return [*of_servos, self.hand.parameter()] if self.hand else of_servos
 
-    def make_world(self, resumed: bool = False) -> ServoWorld:
+    def make_world(self, resumed: bool = False) -> PyTree:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
-        from sim2real.robots.servo.simulated_world import ServoWorld  # MJX
-
         fields, worn, roles = self.fields(self.task), self.servos.sheet.worn, self._roles
-        return ServoWorld(roles.world, self.task, fields, resumed, roles.actuator, worn)
+        return servo_world(roles.world, self.task, fields, resumed, roles.actuator, worn)
 
     def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
         """Return the world's parameters for an episode."""
@@ -186,5 +184,5 @@ class ComposedModel(RobotModel):
 
     @cached_property
     def _world_params(self) -> WorldParams:
-        with jax.ensure_compile_time_eval():  # a cached array must not belong to the function that JAX traces now
+        with at_once():  # a cached array must not belong to the function that JAX traces now
             return self.make_world().init_params()

@@ -107,23 +107,29 @@ def place(
     Args:
         step_s: The physics' time step [s].
     """
-    n, gear = len(joints), np.array([gear_of(joint) for joint in joints], np.float32)
+    gear = np.array([gear_of(joint) for joint in joints], np.float32)
     gain, damping, inertia, friction, full, off = (
-        jnp.stack([jnp.asarray(v, jnp.float32) for v in of_joints(values, name, joints, otherwise)])
+        _stacked(of_joints(values, name, joints, otherwise))
         for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", sheet.full_rad), (MISSES, 0.0))
     )
-    worn = {STRIBECK: jnp.stack(of_joints(values, "stribeck", joints, _NEVER_RAD_S)) / gear} if sheet.worn else {}
+    worn = {STRIBECK: _stacked(of_joints(values, "stribeck", joints, _NEVER_RAD_S)) / gear} if sheet.worn else {}
+    stiffness, zero = gain * gear**2, 0.0 * gain
     armature = jnp.maximum(_beside_damping(inertia, damping, step_s), 0.0)
     return {
-        "gain": jnp.zeros((n, 10)).at[:, 0].set(gain * gear**2),
-        "bias": jnp.zeros((n, 10)).at[:, 0].set(gain * off * gear).at[:, 1].set(-gain * gear**2),
+        "gain": jnp.stack([stiffness, *[zero] * 9], axis=-1),
+        "bias": jnp.stack([gain * off * gear, -stiffness, *[zero] * 8], axis=-1),
         # The torque limit is that at full duty, so it is proportional to the gain.
-        "most": (gain * full * gear)[:, None] * jnp.array([-1.0, 1.0]),
+        "most": (gain * full * gear)[..., None] * jnp.array([-1.0, 1.0]),
         "damping": damping * gear**2,
         "armature": armature * gear**2,
         "friction": friction * gear,
         **worn,
     }
+
+
+def _stacked(each: Sequence[Scalar]) -> jax.Array:
+    """Return numbers of the joints ``(..., joints)``."""
+    return jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(v, jnp.float32) for v in each)), axis=-1)
 
 
 def identified_mjcf(

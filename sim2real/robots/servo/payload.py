@@ -75,5 +75,6 @@ class Hand:
         numbers = values.get(PAYLOAD, 0.0), empty[_MASS], empty[_CENTRE], self.at_m
         xp = namespace(*numbers[:3])
         payload, mass, centre, at_m = (xp.asarray(number, np.float32) for number in numbers)
+        payload = payload[..., None]  # of the one link
         total = mass + payload
-        return {_MASS: total, _CENTRE: (mass * centre + payload * at_m) / total}
+        return {_MASS: total, _CENTRE: (mass[..., None] * centre + payload[..., None] * at_m) / total[..., None]}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import jax
 import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.node import BaseNode
@@ -84,11 +84,11 @@ def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, replayed: Mappi
 def _check_replayed(name: str, recorded: PyTree, timeline: Timeline) -> None:
     """Check that there is a recorded output for every step of every episode."""
     steps = int(timeline.vertices[name].count.max(initial=0))
-    for path, leaf in jax.tree_util.tree_flatten_with_path(recorded)[0]:
+    for path, leaf in pytree.flatten_with_path(recorded)[0]:
         shape = np.shape(leaf)
         if len(shape) < 2 or shape[0] != timeline.episodes or shape[1] < steps:
             raise UsageError(
-                f"the given outputs of node {name!r}{jax.tree_util.keystr(path)} have shape {shape}: its timeline has "
+                f"the given outputs of node {name!r}{''.join(map(str, path))} have shape {shape}: its timeline has "
                 f"{timeline.episodes} episodes of up to {steps} steps",
                 hint=f"give leaves of shape ({timeline.episodes}, {steps}, ...), an output for each step",
             )

@@ -56,9 +56,7 @@ def judge(
         messages.append(f"not even the sum of {' and '.join(delays)} is determined: let the commands change more")
     return {
         "source": PLANNED if source.planned else "log",
-        "recordings": [
-            {"name": n, **coverage(e, model, units)} for n, e in zip(source.names, source.episodes, strict=True)
-        ],
+        "recordings": covered(model, source, units),
         "segments": problem.segments,
         "segment_s": length_s,
         "condition": determined.condition,
@@ -68,6 +66,12 @@ def judge(
         "messages": messages,
         "parameters": [*rows, *([round_trip] if round_trip else [])],
     }
+
+
+def covered(model: IdentifiableModel, source: JudgedLogs, units: Mapping[str, str]) -> list[dict[str, Json]]:
+    """Return the coverage of each recording."""
+    pairs = zip(source.names, source.episodes, strict=True)
+    return [{"name": name, **coverage(episode, model, units)} for name, episode in pairs]
 
 
 def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:

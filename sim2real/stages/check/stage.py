@@ -11,7 +11,6 @@ from sim2real.installation import has_jax
 from sim2real.robots.contract import RecordedRobot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.check.config import CheckConfig
-from sim2real.stages.check.coverage import coverage
 from sim2real.stages.check.result import Checked
 from sim2real.stages.check.show import show, show_json, show_recordings
 from sim2real.stages.check.sources import JudgedLogs, find_source
@@ -72,23 +71,20 @@ def check(
     # Refuse logs that no parameter can be determined from, also without JAX.
     for episode in source.episodes:
         check_log(episode, model)
-    if not has_jax():
-        show_recordings(
-            [
-                {"name": name, **coverage(episode, model, dict(robot.units))}
-                for name, episode in zip(source.names, source.episodes, strict=True)
-            ],
-            config.json,
-        )
+    # Judge them, and recommend the next command.
+    from sim2real.stages.check.determination import covered, judge  # 0.3 s
+
+    try:
+        with progress(None, "check: simulate"):
+            judgement = judge(model, source, fitting, parameters, robot.units)
+    except (NotInstalled, ModuleNotFoundError, AttributeError):  # of JAX, or of its arrays
+        if has_jax():
+            raise
+        show_recordings(covered(model, source, robot.units), config.json)
         raise NotInstalled(
             "which parameters this recording determines is computed with JAX, which is not installed here",
             hint=f"copy it to a computer with sim2real: `sim2real check {pipeline.name} --log LOG`",
-        )
-    # Judge them, and recommend the next command.
-    from sim2real.stages.check.determination import judge  # JAX programs
-
-    with progress(None, "check: simulate"):
-        judgement = judge(model, source, fitting, parameters, dict(robot.units))
+        ) from None
     flags = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}
     identify = recording_advice.command(pipeline, replace(pipeline.identify, **flags), config.runs)
     record = f"sim2real record {pipeline.name}"

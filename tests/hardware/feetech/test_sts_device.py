@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+from plants import lateness_s, mean_latencies
 from sts_bench import IDS, PLANTS
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
@@ -211,9 +212,9 @@ def test_the_emulator_as_a_process_keeps_its_latencies(tmp_path, connect):
         time.sleep(0.02)
         robot.stop()
         truth = robot.truth()
-    means = truth.mean_latencies()
+    means = mean_latencies(truth)
     assert means["actuation_s"] == pytest.approx(0.0062, abs=0.0005)
-    assert means["sensing_s"] == pytest.approx(0.0043 + truth.lateness_s().mean(), abs=0.0005)
+    assert means["sensing_s"] == pytest.approx(0.0043 + lateness_s(truth).mean(), abs=0.0005)
     sent_s = 1e-9 * np.array([r.transaction.t_sent_ns - truth.header["start_ns"] for r in readings])
     sampled_s = np.array([r.position_rad for r in readings]) / 4.0
     assert np.median(sent_s[:, None] - sampled_s) == pytest.approx(0.004 - 0.0001, abs=0.001)

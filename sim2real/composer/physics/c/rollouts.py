@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
+from sim2real import pytree
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
-from sim2real.graph.base import StepState
+from sim2real.graph.base import Base, StepState
 
 if TYPE_CHECKING:
     from sim2real.composer.types import Array, ArrayLike, MjModel
@@ -42,6 +43,21 @@ class Start(NamedTuple):
     qpos: Array
     qvel: Array
     warmstart: Array
+
+
+@pytree.dataclass
+class WorldParams(Base):
+    """Parameters to identify, or that differ from copy to copy.
+
+    Attributes:
+        values: Name -> array, in the unit of the attribute that it sets.
+        qpos: Positions ``(nq,)`` that the task's hooks find at the start [m or rad]; None: the model's.
+        qvel: Velocities ``(nv,)`` at the start [m/s or rad/s]; None: none.
+    """
+
+    values: dict[str, PyTree]
+    qpos: PyTree = None
+    qvel: PyTree = None
 
 
 class StepLaw(Protocol):
