@@ -22,7 +22,6 @@ from sim2real.robots.roles import ROLES, Roles
 from sim2real.robots.servo import parameters
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.robots.servo.payload import PAYLOAD, Hand
-from sim2real.robots.servo.plain_world import servo_world
 from sim2real.robots.servo.servos import Servos, gear_of
 from sim2real.robots.servo.task import NO_AIM, Aim
 from sim2real.types import Array, PyTree, Scalar
@@ -97,6 +96,8 @@ class ComposedModel(RobotModel):
 
     def make_world(self, resumed: bool = False) -> PyTree:
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
+        from sim2real.robots.servo.plain_world import servo_world  # record imports no physics
+
         fields, worn, roles = self.fields(self.task), self.servos.sheet.worn, self._roles
         return servo_world(roles.world, self.task, fields, resumed, roles.actuator, worn)
 
