@@ -38,9 +38,6 @@ def with_extra(extra: str) -> str:
 def require_one(folder: Path = Path(__file__).parents[1]) -> None:
     """Refuse two distributions in one folder: their files are the same, and the second has replaced those of the first.
 
-    Args:
-        folder: The folder of the packages.
-
     Raises:
         UsageError: Both are there.
     """

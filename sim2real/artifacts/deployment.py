@@ -116,7 +116,6 @@ class Deployment(Summed):
     """Episodes on the robot, and the same policy in simulation.
 
     Attributes:
-        gap: Quantities on the robot and in simulation.
         simulated: Columns of each episode's simulation: ``t`` [s] and a field's values ``(N,)``; a field with its own
             times has them as ``t_FIELD``. Empty without a simulation.
         probe: Log of the small steps that measure the delay; None if the delay was not measured.

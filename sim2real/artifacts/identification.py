@@ -195,13 +195,11 @@ class Identification(Shown):
         logs: The fitted recordings, then the recordings that are held out whole.
         residual_inflation: Factor on the variance of the estimates, as residuals are correlated in time.
         misfit: Root mean square of the residuals, in deviations of the measurement.
-        prediction: Errors over horizons.
         held_out: Errors of each position on held-out data, the largest first.
         worst: The second in which the model explains a joint worst; None without samples, and in older files.
         aggregate: Quantities estimated from each recording alone; empty unless configured.
         left_out: A fit for each held-out part; empty without folds.
         promises: The ledger: each error on a held-out part or on held-out data, beside the bound that was given before.
-        bounds: Bounds on the errors of later logs.
         ranges: Signal -> its range in the fitted segments; see ``segments.ranges``.
         tried: What optional terms gain on held-out parts; empty if none was tried.
         terms: Optional terms of the model in the fit; None if the model has no optional terms.

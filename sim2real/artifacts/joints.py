@@ -17,7 +17,6 @@ class JointRow:
     """One joint.
 
     Attributes:
-        errors: Its errors on held-out data.
         delay: Its own delay, or the sum of the delays that all joints share; None if the model has no delay.
         friction: Its own friction, or the one that it shares with other joints; None if the model has none.
     """

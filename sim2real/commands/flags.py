@@ -135,7 +135,6 @@ def parse(
 
     Args:
         default: A dataclass; its values are the defaults.
-        prog: The command, for the help.
         kind: Type to parse into where it is more than the default's class (a generic class with its argument).
 
     Raises:

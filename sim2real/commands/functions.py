@@ -30,11 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Run(Shown):
-    """A run folder: the newest finished result of each stage, read when it is first asked for.
-
-    Attributes:
-        folder: The folder.
-    """
+    """A run folder: the newest finished result of each stage, read when it is first asked for."""
 
     folder: Path
 

@@ -24,7 +24,6 @@ class StepRecord(NamedTuple):
     """One finished step of a node; times in ticks [us] from the episode's start.
 
     Attributes:
-        node: The node's name.
         seq: Number of the step, from 0.
         scheduled: The step's slot (timing rule 2).
         start: Start by the timing rules.
@@ -49,7 +48,6 @@ class MessageRecord(NamedTuple):
 
     Attributes:
         node: The reader's name.
-        input: Name of the reader's input.
         seq_out: Number of the sender's step.
         seq_in: Number of the reader's step that consumed it; -1 if none did.
     """

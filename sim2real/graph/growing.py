@@ -22,7 +22,6 @@ class Growing:
         check: Called with each timeline before it is used.
 
     Attributes:
-        timeline: The timeline so far.
         ticks: Its length [ticks]; it has all steps that start earlier.
     """
 

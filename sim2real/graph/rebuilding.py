@@ -29,9 +29,6 @@ def rebuild(
             removes the node and its connections. All other nodes are copied.
         delays: (reader, input) -> communication delay, such as a ``TrainableDist``, instead of the graph's.
 
-    Returns:
-        The nodes by name.
-
     Raises:
         UsageError: A name is unknown, or a replacement does not fit.
     """

@@ -82,9 +82,6 @@ def save_bundle(
         references: Source of the observations, such as ``log`` -> JAX's actions; the runner is compared with them, and
             ``policy.json`` has the differences.
 
-    Returns:
-        The folder.
-
     Raises:
         Sim2RealError: Weights and contract do not fit each other, or the runner, ONNX and JAX give different actions.
     """
@@ -143,9 +140,6 @@ def load_bundle(folder: str | Path, backend: str | None = None) -> PolicyRunner:
     Args:
         backend: ``"numpy"``, or, if onnxruntime is installed, ``"onnx"``, which runs networks of any kind; default:
             numpy if it runs this network.
-
-    Returns:
-        The policy, ready to run.
 
     Raises:
         UsageError: The backend is unknown, not installed or does not run this network.

@@ -154,11 +154,7 @@ class OnnxBackend:
 
 
 class PolicyRunner:
-    """A policy as a function of the observation.
-
-    Args:
-        contract: Observations, actions and rate of the policy.
-    """
+    """A policy as a function of the observation."""
 
     def __init__(self, contract: PolicyContract, backend: Backend) -> None:
         self.contract = contract

@@ -25,7 +25,6 @@ class FigureBlock:
     """A figure.
 
     Attributes:
-        svg: The figure as SVG.
         narrow: Whether two such figures fit side by side.
         phone: The same panels in one column, as SVG, which a telephone shows instead; "" for none.
         kind: Kind of block, for the template.
@@ -254,12 +253,7 @@ def fixed(value: float | None, decimals: int) -> str:
 
 
 def interval(low: float | None, high: float | None, digits: int = 4) -> str:
-    """Return an interval as text.
-
-    Args:
-        low: Lower end; None if unknown.
-        high: Upper end; None if unknown.
-    """
+    """Return an interval as text."""
     return MISSING if low is None or high is None else f"{number(low, digits)} to {number(high, digits)}"
 
 

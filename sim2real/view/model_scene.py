@@ -17,7 +17,6 @@ class ModelScene:
     """Draws a model over time; a ``Scene``.
 
     Args:
-        mjcf: The model.
         columns: Joint -> field of its measured position (``"position[0]"``). A composed model names a joint by the path
             of its parts, ``arm/elbow/joint``; then the name before ``joint`` counts.
     """

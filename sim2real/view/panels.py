@@ -38,7 +38,6 @@ class Panel:
 
     Attributes:
         label: Label of the vertical axis.
-        lines: The lines.
         title: Title; empty for none.
         spans: Shaded intervals [s].
         zoom: Enlarged interval in a second column [s]; None for no second column.

@@ -35,7 +35,6 @@ class Signals:
     """The time series of a recorded session.
 
     Attributes:
-        episode: The log.
         measured: Outputs of nodes without inputs, at the time of the sample.
         commanded: Outputs of the other nodes, at the time of sending.
         truth: True states of an embedded robot, by name.

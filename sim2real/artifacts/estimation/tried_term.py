@@ -16,7 +16,6 @@ class TriedTerm:
     """Errors on held-out parts without and with a term.
 
     Attributes:
-        term: Its name.
         without: Root mean square without the term [deviations of a measurement].
         error: The same with the term; None if the set was not fitted, because less than 5 % of gain was predicted.
         outcome: ``chosen``; ``mends`` if the error falls by more than 5 %; ``not reached`` of a limit without effect.

@@ -22,10 +22,7 @@ class WorstSecond:
     """The worst second of the joint that the identified model explains worst.
 
     Attributes:
-        name: The joint's name in tables.
         column: Its position's name among the columns of the samples.
-        recording: Number of the recording.
-        segment: Number of the simulated segment.
         begin_s: Start of the second in the recording [s].
         end_s: Its end [s]; a shorter segment has a shorter one.
         rmse: Root mean square of the residual in it; None if the model diverges.
@@ -56,11 +53,7 @@ class WorstSecond:
         return "the model diverges" if self.rmse is None else with_small_unit(self.rmse, self.unit)
 
     def text(self, logs: Sequence[Source]) -> str:
-        """Return joint, time and error on one line; of several recordings with the name of its file.
-
-        Args:
-            logs: The recordings.
-        """
+        """Return joint, time and error on one line; of several recordings with the name of its file."""
         log = logs[self.recording].path.replace("\\", "/").rsplit("/", 1)[-1] if len(logs) > 1 else ""
         at = f"{self.begin_s:.1f} s" + (f" of {log}" if log else "")
         return f"joint {self.name}, {at}, {self.error}"

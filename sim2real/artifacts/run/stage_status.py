@@ -21,7 +21,6 @@ class StageStatus:
     """The status of a stage of a run.
 
     Attributes:
-        newest: The newest finished attempt.
         stale: The reason if it is out of date; "" if it is current.
     """
 

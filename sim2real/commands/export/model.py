@@ -49,9 +49,6 @@ def export(
         identification: The identification, or its folder.
         to: ``mjcf``, ``mjlab``, ``isaaclab``, ``json``, or ``card``, which is a folder.
 
-    Returns:
-        The file.
-
     Raises:
         UsageError: The identification was interrupted or is of another robot, or the target cannot hold the model.
     """

@@ -103,8 +103,6 @@ class Played(NamedTuple):
     """One episode of hash nodes, as a runtime played it.
 
     Attributes:
-        states: Initial state of each node.
-        defaults: Default output of each node.
         outputs: Node -> its outputs by seq, shape ``(N,)``; the last few steps may be missing.
     """
 

@@ -41,8 +41,6 @@ class ServoLink(ABC):
     Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
 
     Attributes:
-        form: How packets are written.
-        table: The servos' memory.
         ping_bytes: Bytes of data of the answer to a ping.
 
     Raises:

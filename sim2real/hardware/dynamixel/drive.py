@@ -18,12 +18,7 @@ from sim2real.hardware.plant import OperatingMode
 
 
 class Drive(ABC):
-    """A way to drive servos. Commands are float64 arrays of shape (n,), in the order of the bus's ids.
-
-    Attributes:
-        mode: The servos' operating mode.
-        kind: The quantity of a command.
-    """
+    """A way to drive servos. Commands are float64 arrays of shape (n,), in the order of the bus's ids."""
 
     mode: ClassVar[OperatingMode]
     kind: ClassVar[CommandKind]

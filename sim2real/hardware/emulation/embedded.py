@@ -26,8 +26,6 @@ class Emulated(Protocol):
     """Settings of an emulated robot: a dataclass whose fields become flags of its process.
 
     Attributes:
-        program: Module of the process.
-        seed: Seed of jitter, noise and faults.
         actuation_latency_s: Time from a command to its effect [s].
         actuation_jitter_s: Half-width of the variation of that time [s].
     """

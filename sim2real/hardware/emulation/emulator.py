@@ -213,9 +213,6 @@ def emulate(
     """Run the command line of an emulator; return its exit code.
 
     Args:
-        program: Its module.
-        about: Its help.
-        kind: Class of its settings.
         run: Emulates with options and settings until the flag is set.
     """
     try:

@@ -35,7 +35,6 @@ class CalibratedJoint:
     Args:
         zero_count: The servo's count at the joint's zero [counts].
         direction: 1, or -1 if the joint's angle falls as the count rises.
-        low_count: Lowest count of the joint's range.
         gear: Turns of the joint per turn of the servo [1].
         homing_offset: Offset in the servo for which the other counts hold, checked at `open`; None: not checked.
     """

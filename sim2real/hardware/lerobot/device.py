@@ -28,7 +28,6 @@ class LerobotSettings:
     """A robot of LeRobot: the values that its commands take as ``--robot.type`` and ``--robot.id``.
 
     Args:
-        kind: Type of the robot.
         name: Id of the robot, the name of its calibration file.
         calibration_dir: Folder of that file; None: LeRobot's own.
         module: The module that registers the type.

@@ -51,8 +51,6 @@ class LerobotLink:
     LeRobot gives up at the first lost answer. Here its instructions are repeated until the bus counts as lost.
 
     Attributes:
-        robot: LeRobot's robot.
-        bus: Its bus.
         retries: Repetitions of the last call [1].
 
     Raises:

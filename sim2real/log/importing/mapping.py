@@ -274,11 +274,7 @@ def _printable(text: str) -> list[str]:
 
 
 def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
-    """Return a mapping as the text of a mapping file.
-
-    Args:
-        comments: Lines above it.
-    """
+    """Return a mapping as the text of a mapping file."""
     lines = [
         *(f"# {part}" for line in comments for part in _printable(line)),
         f"pipeline = {toml_value(mapping.pipeline)}",

@@ -29,12 +29,7 @@ _HOLD_S = 1.0
 
 
 class JointSensor(RobotSensor):
-    """Positions and velocities of all joints, of one reading.
-
-    Args:
-        position_sigma_rad: Standard deviation of a measured position.
-        velocity_sigma_rad_s: Standard deviation of a measured velocity.
-    """
+    """Positions and velocities of all joints, of one reading."""
 
     units = MappingProxyType({"position": "rad", "velocity": "rad/s"})
 

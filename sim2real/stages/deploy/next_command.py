@@ -33,7 +33,6 @@ def with_command(
     """Return advice with the command that carries it out.
 
     Args:
-        folder: Folder of the deployment.
         deployment: With its logs and the drift of the robot.
     """
     if advice.status == "fine" or advice.joint:

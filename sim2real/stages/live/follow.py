@@ -17,7 +17,6 @@ def follow(run_dir: Path, name: str, target: str, scene: Scene | None) -> None:
     """Show the stages of a run while they write, from their beginning, until Ctrl-C.
 
     Args:
-        name: The pipeline's name.
         target: See ``open_viewer``.
 
     Raises:

@@ -42,7 +42,6 @@ class Translation:
     """Nodes and constants of a traced function, with the given names of its inputs and outputs.
 
     Attributes:
-        nodes: The nodes, in order.
         constants: Name -> array.
 
     Raises:

@@ -23,7 +23,6 @@ class WorstLines:
     """The lines of the figure.
 
     Attributes:
-        worst: The second.
         lines: Command if it is a position, measurement and prediction, with gaps between segments.
         residual: Measured minus identified.
     """

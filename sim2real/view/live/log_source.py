@@ -23,7 +23,6 @@ class LogSource:
     """The new steps of a log, as a tab.
 
     Args:
-        path: The log.
         entity: Prefix of its entities.
         offset_s: Returns the begin of a log on the live view's timeline [s], from its wall clock at time 0 [ns].
     """
