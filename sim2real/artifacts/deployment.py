@@ -10,11 +10,18 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.estimation.drift import Drift
-from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import (
+    check,
+    make_folder,
+    malformed,
+    read_arrays,
+    read_versioned,
+    write_arrays,
+    write_json,
+)
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.summary import ArtifactTable, Summed, words_and_unit
-from sim2real.errors import Sim2RealError
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
 
@@ -200,11 +207,7 @@ class Deployment(Summed):
         Raises:
             Sim2RealError: When the file is missing, malformed, or of another format.
         """
-        file = folder / RESULT
-        with malformed(file, _AGAIN):
-            deployment = read_json(file, Deployment)
-            if deployment.format != FORMAT:
-                raise Sim2RealError(f"{file} has format {deployment.format}, this version reads {FORMAT}", hint=_AGAIN)
+        deployment = read_versioned(folder / RESULT, Deployment, _AGAIN, FORMAT)
         if deployment.advice is None:
             return deployment
         return replace(

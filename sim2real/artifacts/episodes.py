@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.estimation.noise import Noise
-from sim2real.artifacts.files import check, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import check, malformed, read_arrays, read_versioned, write_arrays, write_json
 from sim2real.artifacts.summary import ArtifactTable, Interval
-from sim2real.errors import Sim2RealError
 
 FORMAT = 1
 EPISODES, DRAWS = "episodes.json", "episodes.npz"
@@ -103,10 +102,7 @@ class Episodes:
         Raises:
             Sim2RealError: When a file is missing, malformed, or of another format.
         """
-        with malformed(path / EPISODES, _AGAIN):
-            episodes = read_json(path / EPISODES, Episodes)
-            if episodes.format != FORMAT:
-                raise Sim2RealError(f"{path} has format {episodes.format}, this version reads {FORMAT}", hint=_AGAIN)
+        episodes = read_versioned(path / EPISODES, Episodes, _AGAIN, FORMAT)
         with malformed(path / DRAWS, _AGAIN):
             kinds: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in _ARRAYS}
             for name, values in read_arrays(path / DRAWS).items():

@@ -71,6 +71,19 @@ def read_json(path: Path, kind: type[T]) -> T:
         raise ValueError(str(error)) from error
 
 
+def read_versioned(path: Path, kind: type[T], again: str, *formats: int) -> T:
+    """Return the document in a JSON file as ``read_json`` does.
+
+    Raises:
+        Sim2RealError: When the file is missing, malformed, or of none of the formats; ``again`` is the hint.
+    """
+    with malformed(path, again):
+        document = read_json(path, kind)
+    if (version := vars(document)["format"]) not in formats:
+        raise Sim2RealError(f"{path} has format {version}, this version reads {formats[-1]}", hint=again)
+    return document
+
+
 def write_json(path: Path, document: object) -> None:
     """Write a document as JSON; a reader finds the old file or the new one, never a part.
 

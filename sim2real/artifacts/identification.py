@@ -17,11 +17,18 @@ from sim2real.artifacts.estimation.quantity import Quantity
 from sim2real.artifacts.estimation.search import Search
 from sim2real.artifacts.estimation.tried_term import TriedTerm
 from sim2real.artifacts.estimation.worst_second import WorstSecond
-from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import (
+    check,
+    make_folder,
+    malformed,
+    read_arrays,
+    read_versioned,
+    write_arrays,
+    write_json,
+)
 from sim2real.artifacts.run.run_folder import Source
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown
 from sim2real.artifacts.timing import TIMING, Timing
-from sim2real.errors import Sim2RealError
 from sim2real.types import Json
 
 FORMAT = 3
@@ -362,12 +369,8 @@ class Identification(Shown):
         path = Path(path)
         file = path / PARAMETERS if path.is_dir() else path
         # Read the estimates, then the samples and the timing if their files exist.
+        identification = read_versioned(file, Identification, _AGAIN, FORMAT)
         with malformed(file, _AGAIN):
-            identification = read_json(file, Identification)
-            if identification.format != FORMAT:
-                raise Sim2RealError(
-                    f"{file} has format {identification.format}, this version reads {FORMAT}", hint=_AGAIN
-                )
             check(all(np.isfinite(p.estimate) for p in identification.parameters), "an estimate is no number")
         # Files beside it may be missing: a copy of the estimates alone can be read.
         others: dict[str, Json] = {}

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.artifacts.files import check, malformed, read_json, write_json
+from sim2real.artifacts.files import check, read_versioned, write_json
 from sim2real.artifacts.summary import ArtifactTable
-from sim2real.errors import Sim2RealError
 
 FORMAT = 1
 SENSITIVITY = "sensitivity.json"
@@ -120,9 +119,4 @@ class Sensitivity:
         Raises:
             Sim2RealError: When the file is missing, malformed, or of another format.
         """
-        file = path / SENSITIVITY if path.is_dir() else path
-        with malformed(file, _AGAIN):
-            sensitivity = read_json(file, Sensitivity)
-            if sensitivity.format != FORMAT:
-                raise Sim2RealError(f"{file} has format {sensitivity.format}, this version reads {FORMAT}", hint=_AGAIN)
-            return sensitivity
+        return read_versioned(path / SENSITIVITY if path.is_dir() else path, Sensitivity, _AGAIN, FORMAT)

@@ -13,7 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.artifacts.files import check, make_folder, malformed, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import (
+    check,
+    make_folder,
+    malformed,
+    read_arrays,
+    read_versioned,
+    write_arrays,
+    write_json,
+)
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError
 from sim2real.graph.delays import DelayDistribution
@@ -212,10 +220,7 @@ class Timing(Shown):
         """
         path = Path(path)
         file = path / TIMING if path.is_dir() else path
-        with malformed(file, _AGAIN):
-            timing = read_json(file, Timing)
-            if timing.format not in _READ:
-                raise Sim2RealError(f"{file} has format {timing.format}, this version reads {FORMAT}", hint=_AGAIN)
+        timing = read_versioned(file, Timing, _AGAIN, *_READ)
         # Read the samples, and check that they belong to the nodes of the document.
         samples = file.with_suffix(".npz")
         with malformed(samples, _AGAIN):

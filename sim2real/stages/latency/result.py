@@ -10,11 +10,10 @@ from typing import Literal
 
 import numpy as np
 
-from sim2real.artifacts.files import malformed, read_json, write_json
+from sim2real.artifacts.files import read_versioned, write_json
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Spread
-from sim2real.errors import Sim2RealError
 from sim2real.graph.node import TICKS_PER_S
 
 FORMAT = 1
@@ -101,12 +100,7 @@ class Latency:
     @staticmethod
     def load(path: Path) -> Latency:
         """Read a latency from its file or folder."""
-        file = path / LATENCY if path.is_dir() else path
-        with malformed(file, _AGAIN):
-            latency = read_json(file, Latency)
-            if latency.format != FORMAT:
-                raise Sim2RealError(f"{file} has format {latency.format}, this version reads {FORMAT}", hint=_AGAIN)
-        return latency
+        return read_versioned(path / LATENCY if path.is_dir() else path, Latency, _AGAIN, FORMAT)
 
 
 def measured(recording: Recording, chain: Sequence[str]) -> Iterator[tuple[str, Where, np.ndarray, bool]]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,31 +38,19 @@ SUFFIXES = {".npz": "npz", ".json": "json", ".csv": "csv", ".parquet": "lerobot"
 _COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
 
 
-@dataclass(frozen=True)
-class ForeignFile:
-    """An open file of another recorder.
+@dataclass(frozen=True, kw_only=True)
+class ForeignFile(RawSignals):
+    """An open file of another recorder, with its signals.
 
     Attributes:
         path: The file.
         format: One of the values of ``SUFFIXES``.
-        keys: Names of the signals that a proposal uses.
-        load: Returns a signal by name; raises KeyError for an unknown name.
-        columns: Signal -> names of its columns.
         beside: Further files of the same recording.
-        notes: Sentences about skipped signals.
-        nominal: Names of stamps that were generated from a rate, not recorded.
-        facts: Metadata of the file: ``meta/info.json`` of a LeRobot data set.
     """
 
     path: Path
     format: str
-    keys: Sequence[str]
-    load: Callable[[str], Json]
-    columns: Mapping[str, Sequence[str]] = field(default_factory=dict)
     beside: tuple[Path, ...] = ()
-    notes: tuple[str, ...] = ()
-    nominal: frozenset[str] = frozenset()
-    facts: Mapping[str, Json] = field(default_factory=dict)
 
     def signal(self, source: str, column: int | None = None) -> np.ndarray:
         """Return a signal.
@@ -157,17 +145,7 @@ def open_foreign(path: Path, format: str | None = None, episode: int | None = No
             raw = read_bag(files) if format == "mcap" else _READERS[format](path)
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror or error}", hint="check its name") from None
-    return ForeignFile(
-        files[0],
-        format,
-        raw.keys,
-        raw.load,
-        raw.columns,
-        tuple(files[1:]),
-        raw.notes,
-        raw.nominal,
-        raw.facts,
-    )
+    return ForeignFile(**vars(raw), path=files[0], format=format, beside=tuple(files[1:]))
 
 
 def _read_json(path: Path) -> RawSignals:
@@ -224,7 +202,9 @@ def joined(files: Sequence[ForeignFile]) -> ForeignFile:
     beside = tuple(path for f in files for path in (f.path, *f.beside))[1:]
     notes = tuple(note for f in files for note in f.notes)
     nominal = frozenset(f"{stem}/{name}" for stem, file in by_stem.items() for name in file.nominal)
-    return ForeignFile(files[0].path, files[0].format, keys, load, columns, beside, notes, nominal, files[0].facts)
+    first = files[0]
+    signals = RawSignals(keys, load, columns, notes, nominal, first.facts)
+    return ForeignFile(**vars(signals), path=first.path, format=first.format, beside=beside)
 
 
 _READERS: dict[str, Callable[[Path], RawSignals]] = {"npz": read_npz, "json": _read_json, "csv": read_csv}
