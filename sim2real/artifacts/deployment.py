@@ -151,7 +151,6 @@ class Deployment(Summed):
     summary: tuple[Mapping[str, Json], ...] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def __post_init__(self) -> None:
-        """Check that a file holds at least one episode."""
         check(bool(self.episodes), "no episode")
 
     def about(self) -> Mapping[str, Json]:

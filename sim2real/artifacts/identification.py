@@ -97,7 +97,6 @@ class Matrix:
     matrix: np.ndarray
 
     def __post_init__(self) -> None:
-        """Check the size, as the matrix can come from a file."""
         size = len(self.names)
         check(self.matrix.shape == (size, size), f"a matrix of {self.matrix.shape} for {size} names")
 
@@ -148,7 +147,6 @@ class HeldOut:
     beaten_by: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that a file holds the error of the identified model."""
         check("identified" in self.rmse, f"no error of the identified model in {self.name!r}")
 
 

@@ -103,7 +103,6 @@ class PlayConfig:
     """Folder of all runs."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if not (0.0 < self.seconds <= 3600.0 and 0.0 <= self.push <= 10.0):
             raise UsageError(f"play takes up to 3600 s and pushes of 0 to 10 m/s, got {self.seconds} and {self.push}")
         if self.video and self.video.suffix not in (".gif", ".mp4"):

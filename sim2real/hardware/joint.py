@@ -42,7 +42,6 @@ class Joint:
         return joint if isinstance(joint, Joint) else cls(joint)
 
     def __post_init__(self) -> None:
-        """Check that angles can be converted both ways."""
         if self.direction not in (1, -1):
             raise UsageError(f"joint {self.name!r}: direction = {self.direction!r} is neither 1 nor -1")
         if not (math.isfinite(self.gear) and self.gear > 0):

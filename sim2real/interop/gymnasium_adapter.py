@@ -17,7 +17,8 @@ from sim2real.composer.task import UNLIMITED
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.interop.composed_task import PureTask
 from sim2real.interop.environment import Copy, RobotEnvironment
-from sim2real.interop.pure_environment import PureEnvironment, Transition, select_copies
+from sim2real.interop.pure_environment import PureEnvironment, Transition
+from sim2real.train.environment.protocol import select
 
 try:
     import gymnasium
@@ -89,7 +90,7 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
     def _reset_some(self, last: Transition[S], keys: jax.Array, mask: jax.Array) -> tuple[Transition[S], jax.Array]:
         """Return the copies, those of the mask at the start of an episode, and the keys for the next ones."""
         fresh, next_keys = self._reset_all(keys)
-        return select_copies(mask, fresh, last), select_copies(mask, next_keys, keys)
+        return select(mask, fresh, last), select(mask, next_keys, keys)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Array] | None = None
@@ -105,7 +106,7 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
         if seed is not None or self._keys is None:
             keys = self._keys_of(self._seeds(seed))
             is_partial = self._keys is not None and mask is not None
-            self._keys = select_copies(jax.numpy.asarray(mask), keys, self._keys) if is_partial else keys
+            self._keys = select(jax.numpy.asarray(mask), keys, self._keys) if is_partial else keys
         # Reset all copies, or those of the mask.
         if mask is None or self._last is None:
             last, self._keys = self._start(self._keys)

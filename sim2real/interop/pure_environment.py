@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Generic, NamedTuple, Protocol, TypeVar
 
 import jax
-import jax.numpy as jnp
 from dm_env import specs
 
 if TYPE_CHECKING:
     from sim2real.types import Key, PyTree
 
 S = TypeVar("S")
-T = TypeVar("T")
 
 
 class Transition(NamedTuple, Generic[S]):
@@ -76,17 +74,3 @@ class PureEnvironment(Protocol[S]):
     def reseed(self, state: S, key: Key) -> S:
         """Return the start of an episode with random numbers from ``key``; any other state may stay as it is."""
         ...
-
-
-def select_copies(mask: jax.Array, new: T, old: T) -> T:
-    """Return ``new`` where the mask is true, else ``old``, for each of N copies.
-
-    Args:
-        mask: Shape ``(N,)``, bool.
-        new: Leaves of shape ``(N, ...)``.
-    """
-
-    def select(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
-
-    return jax.tree.map(select, new, old)

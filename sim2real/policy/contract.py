@@ -36,7 +36,6 @@ class ObservationTerm:
     high: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that the term has at least one entry."""
         if isinstance(self.units, str) or not self.units or not 1 <= self.history <= MAX_HISTORY:
             raise UsageError(
                 f"observation term {self.name!r} needs at least one unit and one step of history, "
@@ -84,7 +83,6 @@ class ActionTerm:
     high: float
 
     def __post_init__(self) -> None:
-        """Check the bounds."""
         if not -MAX_BOUND <= self.low < self.high <= MAX_BOUND:
             raise UsageError(
                 f"action {self.name!r} needs finite bounds with low < high, got {self.low} and {self.high}",
@@ -117,7 +115,6 @@ class PolicyContract:
     hashes: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that there are observations and actions with unique names, and that rate and delays are valid."""
         if not self.observation or not self.action:
             raise UsageError("a policy needs at least one observation term and one action")
         for kind, terms in (("observation term", self.observation), ("action", self.action)):

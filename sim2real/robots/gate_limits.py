@@ -40,7 +40,6 @@ class GateLimits:
     """Longest silence on the bus; after it the guardian takes the torque off, and the servos' watchdogs trip [s]."""
 
     def __post_init__(self) -> None:
-        """Check that all limits are in their ranges."""
         positive = (
             "command_timeout_s",
             "max_speed_rad_s",

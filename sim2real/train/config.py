@@ -88,7 +88,6 @@ class PPOConfig:
     """Rows of an evaluation; no episode may be longer. The first training episodes are staggered over as many rows."""
 
     def __post_init__(self) -> None:
-        """Check that all values are in their ranges."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if type(field.default) is int and (not isinstance(value, int) or value < 1):

@@ -91,7 +91,7 @@ def test_a_link_is_found_with_the_dynamics(kind):
     assert link.lost.value == pytest.approx(record.lost.mean(), rel=0.2, abs=2e-3)
     assert link.drift.low95 <= record.drift <= link.drift.high95
     assert np.exp(found.hidden.x[:2]) == pytest.approx([GAIN, RATE], rel=0.03)
-    assert not link.separate
+    assert len(link.parts) > 1
     assert link.share.sum() == pytest.approx(1.0)
 
 

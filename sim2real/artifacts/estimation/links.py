@@ -52,11 +52,6 @@ class Link:
     share: np.ndarray
     jitter: Ranged = Ranged(None, None, None)
 
-    @property
-    def separate(self) -> bool:
-        """Whether the mean is this link's alone."""
-        return len(self.parts) == 1
-
     def rows(self) -> ArtifactTable:
         """Return a row for each number that the log determines."""
         total, name = " + ".join(self.parts), self.name

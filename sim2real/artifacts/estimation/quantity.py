@@ -34,5 +34,4 @@ class Quantity:
     agree: bool
 
     def __post_init__(self) -> None:
-        """Check that every estimate has an error."""
         check(self.estimates.shape == self.standard_errors.shape, f"{self.name}: estimates without errors")

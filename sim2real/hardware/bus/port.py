@@ -44,7 +44,6 @@ class LinkConfig:
     """The longest time that the servos' own watchdogs can be set to [s]."""
 
     def __post_init__(self) -> None:
-        """Check that servos support the baud rate, and that times are none before their beginning."""
         if self.baud_rate not in self.baud_rates:
             raise UsageError(
                 f"baud rate {self.baud_rate} is none of a {self.family} servo's. Available: {list(self.baud_rates)}"

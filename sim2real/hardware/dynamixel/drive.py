@@ -65,7 +65,6 @@ class VoltageDrive(Drive):
     kind = VOLTAGE
 
     def __post_init__(self) -> None:
-        """Check the supply voltage."""
         if not 0.0 < self.supply_v < math.inf:
             raise UsageError(f"supply_v = {self.supply_v} must be larger than 0")
 
@@ -106,7 +105,6 @@ class PositionDrive(Drive):
     kind = POSITION
 
     def __post_init__(self) -> None:
-        """Check that the values fit the registers."""
         for register, value in self._settings().items():
             if not register.minimum <= value <= register.maximum:
                 limits = f"[{register.minimum}, {register.maximum}]"

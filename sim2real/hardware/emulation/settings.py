@@ -57,7 +57,6 @@ class Emulation:
     on_signal: bool = False
 
     def __post_init__(self) -> None:
-        """Check that all values are in their ranges."""
         ranges = {
             "baud_rate": (1, 10_000_000),
             "sensing_jitter_s": (0.0, self.sensing_latency_s),

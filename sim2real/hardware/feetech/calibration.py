@@ -49,7 +49,6 @@ class CalibratedJoint:
     homing_offset: int | None = None
 
     def __post_init__(self) -> None:
-        """Check that the values make a joint."""
         if self.direction not in (1, -1):
             raise UsageError(f"joint {self.name!r}: direction = {self.direction} is neither 1 nor -1")
         if not 0.0 < self.gear < math.inf:

@@ -32,7 +32,6 @@ class StsDrive:
     joints: tuple[CalibratedJoint, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that the values fit the registers."""
         for name, register in (("p_gain", reg.P_GAIN), ("d_gain", reg.D_GAIN), ("i_gain", reg.I_GAIN)):
             if not register.minimum <= getattr(self, name) <= register.maximum:
                 raise UsageError(f"{name} = {getattr(self, name)} is outside [{register.minimum}, {register.maximum}]")

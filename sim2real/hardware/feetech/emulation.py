@@ -76,7 +76,6 @@ class StsEmulation(BusEmulation):
     homing_offset: int = 0
 
     def __post_init__(self) -> None:
-        """Check that all values are in their ranges."""
         super().__post_init__()
         for name, (low, high) in {
             "wrong_id": (0, 1),

@@ -57,7 +57,6 @@ class GateConfig:
     stop_s: float = 0.5
 
     def __post_init__(self) -> None:
-        """Check that all limits are in their ranges and fit each other."""
         # A gate that refuses every command, or the one at rest, would stop the robot at once.
         low, high = self.range
         if low.ndim > 1 + self.has_columns or (low.ndim and high.ndim and low.shape != high.shape):

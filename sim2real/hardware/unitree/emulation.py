@@ -70,7 +70,6 @@ class UnitreeEmulation:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check that all values are in their ranges."""
         negative = [name for name, value in asdict(self).items() if value is not None and value < 0]
         unlikely = [name for name in ("reply_loss", "corrupt", "late") if getattr(self, name) > 1]
         if unlikely:

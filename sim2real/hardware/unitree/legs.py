@@ -39,7 +39,6 @@ class LegDrive:
     lie_s: float = 4.0
 
     def __post_init__(self) -> None:
-        """Check that the gain of legs that damp is one that may be sent."""
         if not (0.0 < self.damping <= self.kd_max and self.lie_s >= 0.0):
             raise UsageError(
                 f"legs: damping = {self.damping:g} N m s/rad must be above 0 and at most kd_max = {self.kd_max:g}, "

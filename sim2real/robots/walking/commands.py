@@ -32,7 +32,6 @@ class Commands:
     fixed: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if min(self.most) < 0 or self.every_s <= 0 or not 0 <= self.stand <= 1 or self.count < 1:
             raise UsageError(f"commands need sizes of at least 0, a time above 0 and a share in [0, 1], got {self}")
         if self.fixed is not None and not np.all(np.abs(self.fixed) <= self.most):

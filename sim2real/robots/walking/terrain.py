@@ -69,7 +69,6 @@ class Terrain:
     length_m: float = 40.0
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         if not (self.most_m > 0 and 0 < self.cell_m <= 1 and self.length_m > 0):
             raise UsageError(f"terrain needs a height and lengths above 0 and cells of at most 1 m, got {self}")
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.train.environment.protocol import Step
+from sim2real.train.environment.protocol import Step, choose
 
 if TYPE_CHECKING:
     from sim2real.train.environment.graph_environment import EnvState, GraphEnvironment
-
-T = TypeVar("T")
 
 
 class PolicySteps:
@@ -84,8 +82,3 @@ class PolicySteps:
             return row
         graph = row.state.graph
         return row._replace(truncated=row.truncated | (graph.step >= jnp.asarray(self._last)[graph.eps]))
-
-
-def choose(condition: jax.Array, new: T, old: T) -> T:
-    """Return ``new`` if ``condition``, shape ``()``, is true, else ``old``; for one copy."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)

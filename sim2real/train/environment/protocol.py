@@ -16,7 +16,7 @@ the observation returned in that row). If both are set, the row counts as termin
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,8 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
 from sim2real.types import PyTree
+
+T = TypeVar("T")
 
 
 class Step(NamedTuple):
@@ -216,6 +218,20 @@ def metric_names(env: TrainingEnvironment) -> set[str]:
     key = jax.eval_shape(lambda: jax.random.key(0))
     action = jax.ShapeDtypeStruct(np.shape(env.action_low), np.float32)
     return set(jax.eval_shape(env.step, jax.eval_shape(env.reset, key)[0], action, key).metrics)
+
+
+def choose(condition: jax.Array, new: T, old: T) -> T:
+    """Return ``new`` if ``condition``, shape ``()``, is true, else ``old``."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def select(mask: jax.Array, new: T, old: T) -> T:
+    """Return ``new`` where ``mask (N,)`` is true, else ``old``, for each of N copies; leaves ``(N, ...)``."""
+
+    def one(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
+
+    return jax.tree.map(one, new, old)
 
 
 def _check_state(start: object, after: object) -> None:

@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import jax
 
+from sim2real.train.environment.protocol import select
 from sim2real.train.networks.architectures import Network, is_recurrent
 from sim2real.train.networks.policy import Policy
-from sim2real.train.ppo.rollout import repeat, select
+from sim2real.train.ppo.rollout import repeat
 from sim2real.types import PyTree
 
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, get_privileged, get_reset, metric_names
+from sim2real.train.environment.protocol import TrainingEnvironment, get_privileged, get_reset, metric_names, select
 from sim2real.train.networks.policy import Policy
 from sim2real.train.ppo.teacher import advice
 from sim2real.types import PyTree
@@ -76,20 +76,6 @@ class PolicyEvaluation(NamedTuple):
     running: jax.Array
     terminated: jax.Array
     figures: dict[str, jax.Array]
-
-
-def choose(condition: jax.Array, new: T, old: T) -> T:
-    """Return ``new`` if ``condition``, shape ``()``, is true, else ``old``."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
-
-
-def select(mask: jax.Array, new: T, old: T) -> T:
-    """Return ``new`` where ``mask (N,)`` is true, else ``old``, for each of N copies; leaves ``(N, ...)``."""
-
-    def one(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
-
-    return jax.tree.map(one, new, old)
 
 
 def repeat(carry: T, count: int) -> T:

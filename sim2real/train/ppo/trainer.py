@@ -18,7 +18,7 @@ import numpy as np
 
 from sim2real.runtime.program_arguments import data_of, with_data
 from sim2real.train.config import PPOConfig as PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, check_environment, get_width
+from sim2real.train.environment.protocol import TrainingEnvironment, check_environment, choose, get_width
 from sim2real.train.networks.architectures import Factory
 from sim2real.train.networks.policy import Policy
 from sim2real.train.networks.sequences import ActorCritic
@@ -32,7 +32,6 @@ from sim2real.train.ppo.rollout import (
     PolicyEvaluation,
     add_rows,
     averages,
-    choose,
     collect,
     evaluate,
     new_evaluation,
