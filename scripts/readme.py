@@ -55,27 +55,12 @@ TABLES = {
     "walk": ("walk",),
     "legs_identify": ("legs_identify", "legs_identify_two_cores"),
     "walk_delays": ("walk_delays",),
+    "walk_train": ("walk_train",),
     "light": ("light",),
 }
 """Tables, and the reports that each is made of; a table whose reports are not all there stays as it is."""
-PAGES = (
-    *("README.md", "docs/results.md", "docs/getting_started.md"),
-    *(
-        f"docs/guides/{name}.md"
-        for name in (
-            "so101",
-            "train",
-            "safety",
-            "compose",
-            "deploy",
-            "scale",
-            "view",
-            "record",
-            "walk",
-            "robot_computer",
-        )
-    ),
-)
+GUIDES = ("so101", "train", "safety", "compose", "deploy", "scale", "view", "record", "walk", "robot_computer")
+PAGES = ("README.md", "docs/results.md", "docs/getting_started.md", *(f"docs/guides/{name}.md" for name in GUIDES))
 """Pages with tables, or with a sentence of figures."""
 FIGURE = "docs/images/what_training_knows.svg"
 DELAYS_FIGURE = "docs/images/falls_over_delay.svg"
@@ -310,6 +295,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "walk": lambda chosen: sentences.walk(*chosen.values()),
         "legs_identify": lambda chosen: sentences.legs_identify(*chosen.values()),
         "walk_delays": lambda chosen: walk_delays(*chosen.values()),
+        "walk_train": lambda chosen: sentences.walk_train(*chosen.values()),
         "light": lambda chosen: sentences.light(*chosen.values()),
     }
     there = {table: names for table, names in TABLES.items() if set(names) <= set(reports)}

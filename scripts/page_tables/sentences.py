@@ -40,6 +40,28 @@ def walk(report: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+_OF_TRAINING = {
+    "graph_over_bare": "the graph over as many bare `mjx.step`",
+    "learnt_steps_per_s": "learnt steps a second",
+    "command_s": "from the command to the policy's bundle",
+    "compile_s": "of it: trace and compile",
+    "calm/falls": "falls of its twins",
+    "calm/error_m_s": "error of the velocity",
+    "calm/error_rad_s": "error of the yaw rate",
+    "pushed/falls": "falls with pushes",
+    "kernels_s": "once on a machine: Warp's kernels",
+}
+
+
+def walk_train(report: Mapping[str, Any]) -> str:
+    """Return a table of a walking policy's training on one GPU beside its goals."""
+    rows = {row["name"].removeprefix("walk_train/").split("/", 1)[-1]: row for row in report["rows"]}
+    lines = ["| | measured | goal |", "| --- | ---: | ---: |"]
+    for name, label in _OF_TRAINING.items():
+        lines.append(f"| {label} | {rows[name]['value']:,} {rows[name]['unit']} | {rows[name]['goal']} |")
+    return "\n".join(lines).replace(" 1 |", " |") + "\n"
+
+
 def legs_identify(report: Mapping[str, Any], two_cores: Mapping[str, Any]) -> str:
     """Return a table of the errors of identified Go2s, a row for each kind of parameter.
 

@@ -11,27 +11,33 @@ COLOURS = ("#b8540c", "#0b62b0", "#2c8a4b")
 LEFT, WIDTH, TOP, HEIGHT, APART = 62, 310, 62, 210, 410
 """Place and size of a panel, and the distance of the two [px]."""
 _FALLS, _ERROR = "falls", "error_m_s"
-_PREFIX = "identified_"
+LABELS = {
+    "nominal": "nominal: no delay, one robot",
+    "wide": "wide: delays of 0 to 46 ms",
+    "identified": "identified: the true delay",
+}
 
 
 def walk_delays(report: Mapping[str, Any]) -> str:
-    """Return the table: a row for each delay, falls and errors of each policy."""
-    policies, delays, v = _of(report)
-    twins = report["flags"]["twins"]
-    lines = [f"| true delay | {' | '.join(map(label, policies))} |", "|---:" * (1 + len(policies)) + "|"]
+    """Return the table: a row for each delay, falls and errors of each policy; falls alone of the other identified."""
+    delays, v = _of(report)
+    twins, every = report["flags"]["twins"], ", ".join(f"{ms:g}" for ms in delays)
+    head = f"| true delay | {' | '.join(LABELS.values())} | falls of those identified at {every} ms |"
+    lines = [head, "|---:" * (2 + len(LABELS)) + "|"]
     for ms in delays:
         cells = [
             f"{v[name, ms, _FALLS]} of {twins}; {v[name, ms, _ERROR]:.3f} m/s, {v[name, ms, 'error_rad_s']:.3f} rad/s"
-            for name in policies
+            for name in LABELS
         ]
+        cells.append(", ".join(str(v[f"identified_{trained:g}", ms, _FALLS]) for trained in delays))
         lines.append(f"| {ms:g} ms | {' | '.join(cells)} |")
     return "\n".join([*lines, ""])
 
 
 def figure(report: Mapping[str, Any]) -> str:
     """Return the figure as SVG: falls with exact 95 % intervals, and the error of the velocity, over the true delay."""
-    policies, delays, v = _of(report)
-    twins, most = report["flags"]["twins"], max(x for (_, _, what), x in v.items() if what == _ERROR)
+    delays, v = _of(report)
+    twins, most = report["flags"]["twins"], max(v[name, ms, _ERROR] for name in LABELS for ms in delays)
     top_error = 0.1 * (int(10 * most) + 1)
     body = [
         '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 820 330" font-family="sans-serif" font-size="13">',
@@ -40,29 +46,22 @@ def figure(report: Mapping[str, Any]) -> str:
         *_axes(0, f"falls of {twins} twins, 95 % interval", twins, delays, "{:.0f}"),
         *_axes(1, "error of the velocity [m/s]", top_error, delays, "{:.2g}"),
     ]
-    for i, name in enumerate(policies):
-        colour, left = COLOURS[i % len(COLOURS)], LEFT + 250 * i
+    for i, (name, label) in enumerate(LABELS.items()):
+        colour, left = COLOURS[i], LEFT + 250 * i
         body.append(f'<rect x="{left}" y="10" width="14" height="12" fill="{colour}"/>')
-        body.append(f'<text x="{left + 20}" y="21">{label(name)}</text>')
+        body.append(f'<text x="{left + 20}" y="21">{label}</text>')
         for panel, what, most in ((0, _FALLS, twins), (1, _ERROR, top_error)):
             # The curves stand beside one another, so that their intervals can stay apart.
             places = [(x(panel, ms, delays) + 5 * (i - 1), y(v[name, ms, what], most)) for ms in delays]
             path = " ".join(f"{a:.1f},{b:.1f}" for a, b in places)
             body.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2"/>')
             for ms, (a, b) in zip(delays, places, strict=True):
-                at_home = name == f"{_PREFIX}{ms:g}"
-                body.append(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="{7 if at_home else 3.5}" fill="{colour}"/>')
+                body.append(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.5" fill="{colour}"/>')
                 if what == _FALLS:
                     _, low, high = share(int(v[name, ms, what]), twins)
                     ends = f'y1="{y(twins * low, twins):.1f}" y2="{y(twins * high, twins):.1f}"'
                     body.append(f'<line x1="{a:.1f}" x2="{a:.1f}" {ends} stroke="{colour}"/>')
     return "\n".join([*body, "</svg>", ""])
-
-
-def label(name: str) -> str:
-    """Return a policy's name for readers."""
-    labels = {"nominal": "nominal: no delay, one robot", "wide": "wide: delays of 0 to 46 ms"}
-    return labels.get(name, f"identified: a delay of {name.removeprefix(_PREFIX)} ms")
 
 
 def x(panel: int, ms: float, delays: list[float]) -> float:
@@ -88,10 +87,11 @@ def _axes(panel: int, title: str, most: float, delays: list[float], form: str) -
     return [*lines, f'<text x="{left + WIDTH / 2}" y="{bottom + 42}" text-anchor="middle">true delay [ms]</text>']
 
 
-def _of(report: Mapping[str, Any]) -> tuple[list[str], list[float], dict[tuple[str, float, str], float]]:
-    """Return the policies, the delays [ms], and the figures by policy, delay and kind."""
+def _of(report: Mapping[str, Any]) -> tuple[list[float], dict[tuple[str, float, str], float]]:
+    """Return the delays [ms], and the figures by policy, delay and kind; ``identified`` is that of each true delay."""
     figures = {}
     for line in report["rows"]:
         _, name, delay, what = line["name"].split("/")
         figures[name, float(delay.removesuffix("_ms")), what] = line["value"]
-    return list(dict.fromkeys(n for n, _, _ in figures)), sorted({ms for _, ms, _ in figures}), figures
+    matched = {("identified", ms, what): x for (name, ms, what), x in figures.items() if name == f"identified_{ms:g}"}
+    return sorted({ms for _, ms, _ in figures}), figures | matched
