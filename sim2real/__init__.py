@@ -4,8 +4,6 @@ Each public name is imported on its first use: ``import sim2real`` itself loads 
 read the names from ``__init__.pyi``.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 from types import ModuleType

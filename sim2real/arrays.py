@@ -1,7 +1,5 @@
 """Arithmetic on a caller's numbers: numpy arrays, or JAX arrays and tracers. Imports no JAX."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The command line: arguments in, a command called, an exit code out."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

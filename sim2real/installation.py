@@ -1,7 +1,5 @@
 """Which distribution is installed: ``sim2real`` with everything, or ``sim2real-robot`` for a robot's computer."""
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """How far a joint can have moved between two readings: the rule that a robot is stopped by, and a file is read with."""
 
-from __future__ import annotations
-
 import numpy as np
 
 STAMP_S = 0.01

@@ -1,7 +1,5 @@
 """The random numbers that a robot's computer draws, such as targets: JAX's, or the same ones in numpy without JAX."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """JSON and array files of artifacts, read into typed dataclasses, with errors that name the file."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

@@ -1,7 +1,5 @@
 """The joints of an identification, a row for each: error, delay, friction and verdict."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Paths in messages; imports no large library, so that the command line starts fast."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Files that a stage writes while it computes, for a viewer that joins it: curves, and the best fit so far."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

@@ -1,7 +1,5 @@
 """The commands ``new``, ``log recover``, ``export``, ``play``; each field is a flag. No JAX, for ``--help``."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal

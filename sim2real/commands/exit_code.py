@@ -1,7 +1,5 @@
 """The end of a command that failed: its message, its exit code, and the end of its process."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Command-line flags from typed configurations: a field is a flag, its docstring the help, its value the default."""
 
-from __future__ import annotations
-
 import contextlib
 import difflib
 import io

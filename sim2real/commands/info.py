@@ -1,7 +1,5 @@
 """What ``sim2real info`` prints about the installation, a pipeline, a log or a run."""
 
-from __future__ import annotations
-
 import json
 import os
 from functools import reduce

@@ -1,7 +1,5 @@
 """Flags of the commands for a robot that no pipeline describes. Imports no JAX, so that ``--help`` stays instant."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

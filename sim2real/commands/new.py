@@ -1,7 +1,5 @@
 """Write the files of a pipeline for a robot that was recorded."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``sim2real new NAME --like so101 --port PORT``: from the plug of an arm to its identified model."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """``identify`` and ``check``: for a pipeline, or with ``--mjcf`` for a robot that its model describes."""
 
-from __future__ import annotations
-
 import sys
 
 from sim2real.commands import command_kinds

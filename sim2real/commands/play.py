@@ -1,7 +1,5 @@
 """``sim2real play``: a policy walks on a twin in C MuJoCo."""
 
-from __future__ import annotations
-
 import importlib
 import shutil
 import time

@@ -1,7 +1,5 @@
 """``sim2real log recover``: copies the readable part of a damaged log."""
 
-from __future__ import annotations
-
 from sim2real.commands.config import RecoverConfig
 from sim2real.log.recovery import recover
 from sim2real.stages.terminal.console import note, table, wrote

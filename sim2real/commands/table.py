@@ -1,7 +1,5 @@
 """The commands by name, in the order of ``sim2real --help``. A new stage is one more row."""
 
-from __future__ import annotations
-
 from sim2real.commands.command_kinds import Command, CommandGroup, ConfigCommand, FunctionCommand, PipelineStage
 
 _BASELINES = "Ends with code 1 if a baseline predicts as well."

@@ -1,7 +1,5 @@
 """The nodes of a graph, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from sim2real.errors import UsageError

@@ -1,7 +1,5 @@
 """Delay distributions from recorded delays."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError

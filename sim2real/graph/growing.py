@@ -1,7 +1,5 @@
 """Timelines without an end: more delays are drawn when a run reaches the end of the timeline."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -6,8 +6,6 @@ with measured times; ``schedule`` calls them for all episodes at once. ``docs/ti
 draws them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.errors import UsageError

@@ -1,7 +1,5 @@
 """The times of steps and messages of E episodes, in ticks [us]: the parts of a timeline."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The messages in a reader's window, computed from a timeline."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Devices and worlds of sim2real and of installed packages, by name; listing them imports no module."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from importlib import metadata
 from typing import Any, Final

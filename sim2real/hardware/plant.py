@@ -1,7 +1,5 @@
 """The physics of emulated servos: the protocol of a plant, and the clock that steps it."""
 
-from __future__ import annotations
-
 import heapq
 import importlib
 import importlib.util

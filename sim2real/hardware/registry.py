@@ -1,7 +1,5 @@
 """Devices by name: those of sim2real, and those of installed packages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, cast
 

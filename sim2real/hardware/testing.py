@@ -15,8 +15,6 @@ A device that is not on a serial port defines `make_robot` instead of `emulation
 any kind, a process with an address.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

@@ -4,8 +4,6 @@
 ``docs/guides/interop.md``.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,5 @@
 """A gymnasium vector environment as a ``VecEnv`` of Stable-Baselines3."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Iterable
 from typing import Any

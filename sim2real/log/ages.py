@@ -1,7 +1,5 @@
 """The age of the messages that a node's steps use, computed from a log."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.graph.episode import Episode

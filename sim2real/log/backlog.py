@@ -1,7 +1,5 @@
 """The backlog of a log's writer: it distinguishes a slow writer from a stuck disk, and limits the queue's memory."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Reads a log file once from beginning to end, sorts its messages by channel, and decodes them on request."""
 
-from __future__ import annotations
-
 import mmap
 from collections.abc import Iterator
 from contextlib import contextmanager

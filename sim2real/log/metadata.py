@@ -1,7 +1,5 @@
 """Encoding of the session's metadata records: a JSON document with a checksum, and its plain values for viewers."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import zlib

@@ -1,7 +1,5 @@
 """Reads logs, whole or damaged, as episodes with the original names and shapes."""
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Copies the readable records of a damaged MCAP file into a new one."""
 
-from __future__ import annotations
-
 import mmap
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The topics of a log: their names, ROS message types and byte layouts."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Reads a log while it is being written: each call returns the steps that the writer has added since the last one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mcap.writer import MCAP0_MAGIC

@@ -1,7 +1,5 @@
 """Values and keys in TOML, which the standard library reads and does not write."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """The recorder that writes a log: control threads put records into a queue, and a writer thread writes them."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import queue

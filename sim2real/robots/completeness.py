@@ -1,7 +1,5 @@
 """Tests of the data of robots and of their parts, and of the methods of their classes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """Checks of robots when they are loaded: an incomplete robot is refused, and the message lists all of its gaps."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Roles of the nodes in a robot's graph: the stages find nodes by role, not by name."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """The columns that a deployment and its simulation are scored on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -7,8 +7,6 @@ Each function raises an ``AssertionError`` that names the defect. Torque comes o
 embedded robot.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Imports no JAX: the folder is set in the environment, which child processes inhe
 JAX was imported before.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import hashlib

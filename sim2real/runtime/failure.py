@@ -1,7 +1,5 @@
 """Failures of a running graph; each names the node."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Objects whose numbers are arguments of a compiled program: other numbers do not need another program."""
 
-from __future__ import annotations
-
 from typing import Protocol, TypeVar, runtime_checkable
 
 from sim2real.types import PyTree

@@ -1,7 +1,5 @@
 """Timing statistics of a running graph."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The range of seeds, for every stage. Imports no JAX."""
 
-from __future__ import annotations
-
 from sim2real.errors import UsageError
 
 

@@ -1,7 +1,5 @@
 """The settings of PPO; every field is also a flag of the command line."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Literal

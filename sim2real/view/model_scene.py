@@ -1,7 +1,5 @@
 """A robot's MuJoCo model in the 3-D view: its geometries on bodies that move as the measured joints do."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Mapping
 from typing import Any

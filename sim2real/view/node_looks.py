@@ -1,7 +1,5 @@
 """The order of nodes in a picture, their colours, and the longest of their periods."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Figures with panels over a common time axis."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

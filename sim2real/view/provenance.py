@@ -1,7 +1,5 @@
 """Configuration, files and versions of a stage, at the end of its section."""
 
-from __future__ import annotations
-
 from sim2real.artifacts.run.run_folder import StageFolder
 from sim2real.view.blocks import Block, FoldBlock, pairs_table
 

@@ -1,7 +1,5 @@
 """The content of a Rerun recording, independent of Rerun: one tab for each episode, with curves and a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

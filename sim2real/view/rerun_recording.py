@@ -3,8 +3,6 @@
 The data is sent after the run, so that no control loop waits for a viewer, and by columns, which is 17 times faster.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

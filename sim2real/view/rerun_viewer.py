@@ -1,7 +1,5 @@
 """The Rerun viewer: a window, a page for browsers, a viewer at an address, or a file."""
 
-from __future__ import annotations
-
 import os
 import socket
 import sys

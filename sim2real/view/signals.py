@@ -1,7 +1,5 @@
 """Time series of an episode: measurements, commands, and true states."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

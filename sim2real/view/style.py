@@ -1,7 +1,5 @@
 """The common style of all figures, and their conversion to SVG that uses the page's colours."""
 
-from __future__ import annotations
-
 import html
 import io
 import re

@@ -1,7 +1,5 @@
 """Figures and numbers on timing: periods, lateness, and the schedule."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The drift test: parameters of a robot that differ from their estimates in a later log."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sim2real.artifacts.summary import ArtifactTable, Interval

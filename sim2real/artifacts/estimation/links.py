@@ -1,7 +1,5 @@
 """The delay of a link: its distribution, and the share of lost messages."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The noise of a sensor: how its readings scatter around the motion."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Bounds on errors of predictions, and the errors beside the bounds that were given before."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

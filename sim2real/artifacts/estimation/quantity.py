@@ -1,7 +1,5 @@
 """One quantity, estimated separately from each of several recordings."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The search for an estimate."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

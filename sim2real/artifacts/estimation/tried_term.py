@@ -1,7 +1,5 @@
 """An optional term that an identification tried, with its gain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -1,7 +1,5 @@
 """The second of the recordings in which the identified model explains a joint worst."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The kernel releases the lock when the process ends for any reason. On a platform
 counts as locked, because the end of its writer cannot be detected.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """A stage's ``manifest.json``: inputs, configuration, outputs and status; plain JSON, replaced atomically."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import hashlib

@@ -4,8 +4,6 @@
 manifests and reads no other file, so large logs cost no time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``sim2real export identified --to card``: a folder with which a stranger reproduces each figure of a robot."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

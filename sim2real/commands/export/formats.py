@@ -1,7 +1,5 @@
 """The formats of an export: one file each, or a folder."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

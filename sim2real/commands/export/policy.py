@@ -1,7 +1,5 @@
 """``sim2real export policy``: a bundle for another machine, with an example that runs it on numpy alone."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

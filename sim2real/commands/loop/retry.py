@@ -1,7 +1,5 @@
 """Retries of an unattended run: identify with wider bounds, train with more steps."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Callable
 from dataclasses import replace

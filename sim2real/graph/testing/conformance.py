@@ -1,7 +1,5 @@
 """Test suites to inherit: the requirements on every node and every runtime."""
 
-from __future__ import annotations
-
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """A second, slow implementation of the timing rules, message by message in Python integers, to test schedule.py."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from fractions import Fraction

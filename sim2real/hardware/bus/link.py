@@ -4,8 +4,6 @@ The makers' packages are not used because they do not time their reads. They pol
 after a fixed 34 ms, drop the error bytes of a synchronised read, and confuse a late answer with the next one.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import termios

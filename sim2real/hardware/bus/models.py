@@ -1,7 +1,5 @@
 """Servo models of all families, and the reaction of each to the death of the computer that controls it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

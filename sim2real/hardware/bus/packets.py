@@ -1,7 +1,5 @@
 """Packets on a half-duplex bus of servos: the shared part, and the abstract part that each family defines."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The serial port of a bus of servos, and the time limits that hold on it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """The registers of a servo's memory, for all families: their addresses, and the encoding of their numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import partial

@@ -1,7 +1,5 @@
 """Servos of any family on one bus: the guardian that watches them, and every way in which their torque goes off."""
 
-from __future__ import annotations
-
 import atexit
 import logging
 import os

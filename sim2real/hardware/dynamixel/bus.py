@@ -1,7 +1,5 @@
 """The bus of DYNAMIXEL X servos: reads and commands them in SI units, and takes their torque off at the end."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

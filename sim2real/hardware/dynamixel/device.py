@@ -1,7 +1,5 @@
 """DYNAMIXEL X servos on a bus, as a device."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

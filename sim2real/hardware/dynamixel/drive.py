@@ -1,7 +1,5 @@
 """Drives of servos, by voltage or by joint angle: conversion of commands to goals on the bus, and of readings back."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace

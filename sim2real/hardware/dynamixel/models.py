@@ -1,7 +1,5 @@
 """The table of DYNAMIXEL X models, with the reaction of each to the death of the computer that controls it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

@@ -5,8 +5,6 @@
 Source: ROBOTIS e-Manual, "DYNAMIXEL Protocol 2.0"; the tests compare it with ROBOTIS' own SDK.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import Final
 

@@ -4,8 +4,6 @@ Addresses, sizes, ranges and defaults are those of ROBOTIS' e-Manual for the XL4
 addresses, and differ in limits, gains and in the meaning of address 126 (load or current).
 """
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -1,7 +1,5 @@
 """One emulated servo: its registers, and the rules of its firmware."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

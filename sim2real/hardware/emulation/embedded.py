@@ -1,7 +1,5 @@
 """An emulated robot: starts and stops the emulator as a separate process."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

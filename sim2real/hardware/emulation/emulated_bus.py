@@ -6,8 +6,6 @@ the values that it reads are those of one sensing latency earlier, and its comma
 later.
 """
 
-from __future__ import annotations
-
 import heapq
 import random
 from abc import ABC, abstractmethod

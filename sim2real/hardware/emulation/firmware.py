@@ -1,7 +1,5 @@
 """The firmware of one emulated servo, as far as all families share it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Servos on an emulated bus: the effect of each instruction, for all families."""
 
-from __future__ import annotations
-
 import time
 from abc import abstractmethod
 from collections.abc import Callable

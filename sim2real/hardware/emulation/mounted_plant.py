@@ -1,7 +1,5 @@
 """A plant behind mountings: emulated servos on joints with a zero, a direction and a gear."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

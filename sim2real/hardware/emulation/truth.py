@@ -4,8 +4,6 @@ The file is one line of JSON (the header), followed by rows of fixed size, flush
 cut off can be read. All times are CLOCK_MONOTONIC nanoseconds, which all processes of a machine share.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import queue

@@ -4,8 +4,6 @@ Its parameters differ from the model's by factors, so that an identification has
 structure: an error of the MJCF is also in its twin.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Follows a motion by hand on the bus, and makes a calibration of it, in LeRobot's format."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

@@ -7,8 +7,6 @@ LeRobot's angles in degrees are zero in the middle of the range (`motors_bus.py`
 Its `drive_mode` 1 mirrors the joint. A turn has 4095 counts for LeRobot, 4096 here: 0.02 % of an angle.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

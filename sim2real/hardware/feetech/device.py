@@ -1,7 +1,5 @@
 """Feetech STS servos as a device: joints in position mode, behind the contract of `sim2real.hardware.device`."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Gains and limits with which Feetech servos follow a position, and their registers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The search for the servos of a robot on a port, before anything else is read from them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

@@ -3,8 +3,6 @@
 Everything here is computed from counts of the encoders; no servo is written.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

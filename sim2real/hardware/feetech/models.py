@@ -1,7 +1,5 @@
 """The table of Feetech STS models with this memory table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

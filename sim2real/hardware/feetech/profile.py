@@ -1,7 +1,5 @@
 """The setpoint of emulated position servos: it moves to the goal with limited speed and acceleration."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -9,8 +9,6 @@ Sources: Feetech, "Servo SCS Communication Protocol" (its examples are in the te
 feetech-servo-sdk 1.0.0, for the meaning of the error byte's bits.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import Final
 

@@ -5,8 +5,6 @@ number and sign bits those of LeRobot's `motors/feetech/tables.py`. Comments nam
 Numbers are little endian. A signed one is a magnitude and a sign bit, not a two's complement.
 """
 
-from __future__ import annotations
-
 import math
 from enum import IntEnum
 from typing import Final

@@ -1,7 +1,5 @@
 """A robot of LeRobot as a device: its follower class reads and commands, in joint angles [rad]."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

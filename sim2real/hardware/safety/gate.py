@@ -1,7 +1,5 @@
 """The safety gate: checks and limits every command before it is sent to an actuator."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

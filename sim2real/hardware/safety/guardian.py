@@ -1,7 +1,5 @@
 """The control process's side of the guardian: starts it, sends it signs of life, and reads its messages."""
 
-from __future__ import annotations
-
 import os
 import select
 import socket

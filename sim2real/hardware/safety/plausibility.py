@@ -1,7 +1,5 @@
 """Checks whether measured positions are physically possible: no jumps, and no standstill under changing torque."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

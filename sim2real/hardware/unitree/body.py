@@ -1,7 +1,5 @@
 """The physics of an emulated robot of Unitree: what a body has to do. Imports no cyclonedds."""
 
-from __future__ import annotations
-
 from typing import Final, Protocol
 
 import numpy as np

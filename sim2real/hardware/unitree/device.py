@@ -1,7 +1,5 @@
 """A Go2's legs as a device, over its low-level interface."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping, Sequence

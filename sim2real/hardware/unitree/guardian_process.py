@@ -5,8 +5,6 @@
 Its writer of commands exists before torque goes on, and publishes only when the control process no longer does.
 """
 
-from __future__ import annotations
-
 import sys
 
 from sim2real.errors import HardwareLost

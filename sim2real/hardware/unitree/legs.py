@@ -1,7 +1,5 @@
 """The motors of a Go2: names, limits, and the commands that keep it safe."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """The safe way out of a robot on legs: its motors damp until it lies, then the torque goes off."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Final

@@ -1,7 +1,5 @@
 """The stream of states of a robot that sends them without a request: the first after a call, and counts of losses."""
 
-from __future__ import annotations
-
 import threading
 import time
 from array import array

@@ -1,7 +1,5 @@
 """Evidence in the numbers of a recording: order of the commands, units, encoder steps, contradictions, copies."""
 
-from __future__ import annotations
-
 from itertools import combinations, product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Goals: order, signs and unit of the commands, and ambiguities of commands that repeat."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

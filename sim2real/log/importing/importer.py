@@ -1,7 +1,5 @@
 """Imports files of other recorders: converts their signals to steps and outputs of nodes, and writes a log."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

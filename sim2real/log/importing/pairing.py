@@ -1,7 +1,5 @@
 """Finds measurements and commands among the signals of a file, by their names or by their lag."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

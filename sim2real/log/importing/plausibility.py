@@ -1,7 +1,5 @@
 """Positions that are impossible for a joint: jumps at the end of a turn, and readings that leap away and back."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.later import Later

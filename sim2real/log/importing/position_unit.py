@@ -1,7 +1,5 @@
 """The unit of positions from velocities and goals, whose units are related to it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks measured positions: unit, turns, and readings that are impossible for a joint."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Proposes the mapping of a file of another recorder, from names and data, with the evidence."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The quantities of a recording in standard units: positions, velocities, gains, torque on or off."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Selects the samples of a node to import: complete ones, with positions that are possible for a joint."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

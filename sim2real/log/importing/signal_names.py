@@ -1,7 +1,5 @@
 """The meaning of a signal's name in a file of another recorder: side, quantity, unit and joint."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

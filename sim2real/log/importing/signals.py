@@ -1,7 +1,5 @@
 """The signals in a file of another recorder, grouped by the meaning of their names, with their time stamps."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

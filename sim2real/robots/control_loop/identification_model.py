@@ -1,7 +1,5 @@
 """A robot of a control loop as a model for the identify stage."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from sim2real import pytree

@@ -1,7 +1,5 @@
 """The messages between the nodes of a servo robot."""
 
-from __future__ import annotations
-
 from sim2real import pytree
 from sim2real.graph.base import Base
 from sim2real.types import Array

@@ -1,7 +1,5 @@
 """The policy's node on the robot: the agent's observation and message around a bundle's runner, without JAX."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -4,8 +4,6 @@
 clock, where a call of JAX for each small array would take longer than the policy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Unpack
 

@@ -1,7 +1,5 @@
 """The slow motion of a robot of servos to its rest pose; torque is off before and afterwards."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

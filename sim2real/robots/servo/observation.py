@@ -1,7 +1,5 @@
 """The policy of a robot of servos: its observation, entry by entry, and its actions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Unpack

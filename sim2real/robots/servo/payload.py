@@ -1,7 +1,5 @@
 """The payload of a robot of servos: an optional term of its model, and part of each drift test."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The world of a servo robot in simulation; sensor and actuator are in ``simulated_devices.py``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

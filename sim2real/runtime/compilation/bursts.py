@@ -1,7 +1,5 @@
 """Windows for messages that come in bursts, e.g. when a node catches up with its grid after a hiccup."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks that nodes and timeline fit each other and can be compiled."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

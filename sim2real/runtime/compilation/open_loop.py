@@ -5,8 +5,6 @@ and no rings of outputs (``sim2real.runtime.compilation.compiled``): each node m
 make their steps and look messages up by ``seq``. The program depends only on the number of steps: it serves every log.
 """
 
-from __future__ import annotations
-
 import graphlib
 from collections.abc import Callable, Collection, Mapping
 

@@ -5,8 +5,6 @@ and then, so each result in a row is masked. A row of 10 ticks with three steps 
 hand, needs no mask. It exists if the steps of all episodes have slack at the same ticks.
 """
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

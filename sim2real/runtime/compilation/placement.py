@@ -6,8 +6,6 @@ time after the last tick that it depends on and before the first tick that depen
 boundary in between, also if boundaries are several ticks apart. Pure numpy, before anything is compiled.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The figures of a compiled graph."""
 
-from __future__ import annotations
-
 import jax
 
 from sim2real.runtime.compilation.walk import Walk

@@ -5,8 +5,6 @@ steps whose messages it consumes, and after its node's previous step. The sequen
 computes every slot, with or without a step in it: this is a shortest common supersequence problem. Pure numpy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

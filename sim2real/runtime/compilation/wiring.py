@@ -5,8 +5,6 @@ pattern (``pattern.py``) the slots stand between the ticks. ``placement.py`` dec
 numpy, before anything is compiled; ``tests/table_interpreter.py`` interprets the tables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

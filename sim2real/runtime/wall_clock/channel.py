@@ -1,7 +1,5 @@
 """A connection on the wall clock: stamps messages when they arrive, hands them over by the timing rules."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator

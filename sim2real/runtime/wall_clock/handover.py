@@ -1,7 +1,5 @@
 """Synchronises the supervisor's thread with the caller of ``reset`` and ``step``, step by step."""
 
-from __future__ import annotations
-
 import threading
 from typing import NamedTuple
 

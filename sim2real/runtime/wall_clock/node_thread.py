@@ -1,7 +1,5 @@
 """The thread of one node on the wall clock: its startup, its steps by the timing rules, its stop."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence

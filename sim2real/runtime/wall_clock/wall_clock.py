@@ -1,7 +1,5 @@
 """A graph on the wall clock: one thread per node, and the timing rules with measured times."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Watches the nodes' threads for a step that hangs, and for a startup that continues after the graph has stopped."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterable, Mapping

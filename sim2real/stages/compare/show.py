@@ -1,7 +1,5 @@
 """The printed form of a comparison."""
 
-from __future__ import annotations
-
 import json
 
 from sim2real.artifacts.comparison import LEVEL, Comparison

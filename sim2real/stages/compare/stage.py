@@ -1,7 +1,5 @@
 """Compare runs: read their artifacts, test which parameters differ, print tables and write a page."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Flags of deploy. Imports no JAX, so that ``--help`` stays instant."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Literal

@@ -1,7 +1,5 @@
 """The episodes of a deployment on the robot: open it, measure its delay, run the policy."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The command to type after a deployment."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Checks before a deployment: the bundle fits the robot; the robot's delay is one of those in training."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The log of the small steps that measure the delay; the model is tested on it as on an episode."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Output of deploy: timing and warnings of the sessions, the gap to simulation, the tests of the model, the verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

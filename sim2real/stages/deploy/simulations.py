@@ -1,7 +1,5 @@
 """Simulations of a deployed policy, on timelines like those of the robot."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

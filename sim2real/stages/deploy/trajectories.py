@@ -1,7 +1,5 @@
 """Trajectories of whole episodes on the robot beside simulations of the same policy: distance and range of motion."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The verdict on a deployment: the model tested on the deployment's logs, drift of the robot, timing and success."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

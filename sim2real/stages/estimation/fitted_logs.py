@@ -1,7 +1,5 @@
 """Refuse logs that were fitted, as a test of a fit: by the hashes of their files and by their measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 

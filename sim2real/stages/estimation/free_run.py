@@ -1,7 +1,5 @@
 """Free runs on held-out data: their error as a share of the range of the motion, and a term that reduces it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Optional terms of a model, and the errors of an identification on held-out parts of the recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

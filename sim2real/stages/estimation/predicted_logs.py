@@ -1,7 +1,5 @@
 """Logs with data that was not fitted, and how much further their motion goes than the fitted one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

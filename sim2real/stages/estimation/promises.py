@@ -5,8 +5,6 @@ are blocks of it, which are alike; what comes after it differs, in time and in t
 counts as a part, and the bound on later data begins at its error if that is larger.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Advice on a recording, in sentences, from the results of a check; and commands to identify again."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import fields

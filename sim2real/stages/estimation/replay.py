@@ -1,7 +1,5 @@
 """Replay of a deployment: its commands drive the models of its robot, and its log tests the parameters."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

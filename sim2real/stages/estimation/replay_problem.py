@@ -1,7 +1,5 @@
 """The residuals of later logs, such as of a deployment, with the parameters of an identification."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How logs are cut into fitted and held-out segments."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A motion from a file as an excitation: a recorded, teleoperated or hand-guided one."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The commands that a recording plays: a generated excitation, or a motion from a file within the robot's limits."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.errors import UsageError

@@ -1,7 +1,5 @@
 """Excitation signals: commands that make a robot's dynamics identifiable."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.errors import UsageError

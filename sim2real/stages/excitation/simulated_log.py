@@ -1,7 +1,5 @@
 """The log of simulated commands, for a robot that equals its model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Configuration of an identification; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The fit of an identification: all optional terms, then the selected ones."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """From a fit to an identification: intervals, predictions, free runs and the verdict."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The ledger of an identification: its errors beside the bounds that were given before, and bounds on later errors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

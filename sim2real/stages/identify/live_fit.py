@@ -1,7 +1,5 @@
 """Progress of a search for a viewer that joins it: the loss, and the best fit so far over the recording."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

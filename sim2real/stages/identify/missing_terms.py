@@ -1,7 +1,5 @@
 """The optional term that a model may lack, if its residuals are far above the noise of the sensor."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What identify prints: tables of estimates, errors and links, and the summary of the stage."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.artifacts.estimation.links import links_table

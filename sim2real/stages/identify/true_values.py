@@ -1,7 +1,5 @@
 """True parameters and delays of the embedded robot, read after the fit for comparison."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

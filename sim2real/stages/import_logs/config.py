@@ -1,7 +1,5 @@
 """How files of other recorders become logs; every field is a flag. Imports no JAX, so that ``--help`` stays instant."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

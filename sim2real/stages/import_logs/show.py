@@ -1,7 +1,5 @@
 """The printed form of an import: notes on a file, the proposed mapping with its evidence, and the written files."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Turn files of other recorders into logs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

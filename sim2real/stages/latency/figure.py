@@ -1,7 +1,5 @@
 """The picture of a test of latency: where the milliseconds go, and how they scatter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The printed form of a latency test."""
 
-from __future__ import annotations
-
 from sim2real.artifacts.estimation.links import links_table
 from sim2real.artifacts.identification import Identification
 from sim2real.stages.latency.result import Latency

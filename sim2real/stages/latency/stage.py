@@ -1,7 +1,5 @@
 """The stage latency: steps on the robot, and the parts of the delay between a motion and the motion that answers it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from sim2real.artifacts.recording import LOG, TRUTH

@@ -1,7 +1,5 @@
 """The flag ``--view`` of several stages."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import tyro

@@ -1,7 +1,5 @@
 """Starts the process of a live view beside a stage, and ends it after the stage."""
 
-from __future__ import annotations
-
 import json
 import os
 import select

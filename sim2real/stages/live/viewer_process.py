@@ -4,8 +4,6 @@ It runs at low priority. It shares no lock, no queue and no memory with the stag
 except by the processor time that it takes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The soft end of an episode: the robot comes to rest, and is held where it would fall."""
 
-from __future__ import annotations
-
 import select
 import sys
 

@@ -1,7 +1,5 @@
 """One episode on the robot: the graph on the wall clock, its log, and how well it kept its times."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping

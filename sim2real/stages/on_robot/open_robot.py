@@ -1,7 +1,5 @@
 """Opening the robot for a stage that moves it, and the printed state of its rig."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict

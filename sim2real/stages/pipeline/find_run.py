@@ -1,7 +1,5 @@
 """The run of a user's text: its path, its name, a stage folder in it, or a pipeline's newest run."""
 
-from __future__ import annotations
-
 import difflib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The robot of a pipeline, for the stages that need hardware or training."""
 
-from __future__ import annotations
-
 from sim2real.errors import UsageError
 from sim2real.robots.contract import Robot
 from sim2real.robots.worlds import in_world

@@ -1,7 +1,5 @@
 """Logs that belong to a pipeline, opened for the stages that read them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from sim2real.artifacts.recording import Recording

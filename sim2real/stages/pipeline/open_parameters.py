@@ -1,7 +1,5 @@
 """Identified parameters that belong to a pipeline, opened for the stages that simulate with them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from sim2real.artifacts.identification import UNFINISHED, Identification

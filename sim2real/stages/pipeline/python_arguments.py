@@ -1,7 +1,5 @@
 """Arguments of the functions for Python: objects, or their names and files; any other value is an error."""
 
-from __future__ import annotations
-
 import reprlib
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace

@@ -1,7 +1,5 @@
 """A robot that flags describe instead of a pipeline; every field is a flag. Imports no JAX: ``--help`` is instant."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The printed form of a recording session."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A stage on one line: dots while it runs; its output is held back, and printed if it fails."""
 
-from __future__ import annotations
-
 import io
 import sys
 import time

@@ -1,7 +1,5 @@
 """Settings of the stage train; every field is a flag. Imports no JAX, so that ``--help`` is instant."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 

@@ -1,7 +1,5 @@
 """Differences between the episodes of a training: parameters, noise, starts, pushes; as distributions to show."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The distributions that the episodes of a training are drawn from, shown without training."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Inputs of a training: the identification, the teacher, the interrupted training; found and checked."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

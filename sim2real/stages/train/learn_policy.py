@@ -1,7 +1,5 @@
 """PPO on the environment of a training, with a progress bar."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

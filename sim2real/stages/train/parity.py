@@ -1,7 +1,5 @@
 """Observations for the comparison of a bundle's runner with JAX, before the bundle is written."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 import jax

@@ -1,7 +1,5 @@
 """Continuing a training that was interrupted."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

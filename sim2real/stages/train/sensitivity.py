@@ -1,7 +1,5 @@
 """Sensitivity of a policy: its success in simulation with each parameter moved by multiples of its uncertainty."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The tables and texts that the stage train prints."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Protocol
 

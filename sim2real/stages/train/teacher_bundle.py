@@ -1,7 +1,5 @@
 """Teachers: the search among runs, the comparison with the student's robot, and the contract in their bundle."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

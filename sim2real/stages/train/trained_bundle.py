@@ -1,7 +1,5 @@
 """The bundle of a trained policy: contract, weights, graph, history, and JAX's actions to compare a runner with."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

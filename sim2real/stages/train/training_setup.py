@@ -1,7 +1,5 @@
 """The environment of a training, from an identification and the robot's timing."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Flags of validate. Imports no JAX, so that ``--help`` stays instant."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The result of validate."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

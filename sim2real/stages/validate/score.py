@@ -1,7 +1,5 @@
 """Errors of an identification on later logs, beside those of the baselines and the promised ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Output of validate: the errors on the later logs and the verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO, promises_table

@@ -1,7 +1,5 @@
 """What validate simulates: the models of an identification, and later logs in segments."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

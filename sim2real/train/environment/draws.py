@@ -1,7 +1,5 @@
 """Draws of parameters and delays for the episodes of a training, within the uncertainty of the identification."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -13,8 +13,6 @@ An episode ends in a row with ``terminated`` (the value after it is 0) or ``trun
 the observation returned in that row). If both are set, the row counts as terminated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 

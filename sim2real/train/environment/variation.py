@@ -1,7 +1,5 @@
 """The differences between the episodes of a training; every field is a flag. Imports no JAX: ``--help`` is instant."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Networks of actors and critics: a perceptron, a GRU or a user's own network, as pure functions of one input."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Callable

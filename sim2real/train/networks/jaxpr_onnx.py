@@ -3,8 +3,6 @@
 # jax2onnx 0.17.1 exports the same networks, but a vmapped flax module only by way of a jaxpr. It adds 23 distributions
 # of 175 MB, needs an older orbax-checkpoint, and its first export takes 8 s (docs/reference/choices.md).
 
-from __future__ import annotations
-
 import string
 from collections.abc import Callable, Sequence
 

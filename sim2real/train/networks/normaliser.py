@@ -1,7 +1,5 @@
 """Running statistics of the networks' inputs."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

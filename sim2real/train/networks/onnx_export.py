@@ -1,7 +1,5 @@
 """Export of a policy with a user's network to ONNX: a robot runs it without JAX and without the network's code."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import jax

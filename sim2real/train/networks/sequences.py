@@ -1,7 +1,5 @@
 """Networks over the rows of a rollout: all rows at once, or in the order of time if the network has memory."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Errors for figures of a training that are missing or not finite."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError

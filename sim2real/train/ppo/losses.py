@@ -1,7 +1,5 @@
 """The loss that an update minimises, and the advantages in it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import jax

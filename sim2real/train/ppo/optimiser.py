@@ -1,7 +1,5 @@
 """Adam, and the schedule of its step size."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """Progress and result of a training."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plays environments: training rollouts and evaluation episodes."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple, TypeVar
 

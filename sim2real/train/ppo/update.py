@@ -1,7 +1,5 @@
 """One PPO update: the batch of a rollout with its advantages, then minibatch steps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple

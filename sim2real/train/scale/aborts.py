@@ -5,8 +5,6 @@ and aborts too. So a handler of the C library catches the signal and runs Python
 while the main thread ends the command with an error message.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

@@ -1,7 +1,5 @@
 """Compiler options for a training on a GPU, where compiling can take longer than the training of a pendulum."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """The processes of one training, on one host or several. Imports no JAX, so ``--help`` is instant."""
 
-from __future__ import annotations
-
 import re
 import socket
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The policies of a sweep count as seeds.
 """
 
-from __future__ import annotations
-
 import math
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Several processes of one training: they join, compare their settings, and end with an error if one is lost."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

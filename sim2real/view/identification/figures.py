@@ -1,7 +1,5 @@
 """Figures of an identification: predictions, the search, and correlations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

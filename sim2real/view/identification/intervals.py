@@ -1,7 +1,5 @@
 """Figures of the estimates: intervals within the bounds, and the agreement of recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

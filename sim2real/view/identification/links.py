@@ -1,7 +1,5 @@
 """The delays of links on a page: distribution, mean and share of lost messages."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

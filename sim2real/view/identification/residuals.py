@@ -1,7 +1,5 @@
 """Residuals of the identified model on held-out data: over time, as a histogram, and their autocorrelation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

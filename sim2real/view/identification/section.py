@@ -1,7 +1,5 @@
 """The section of an identification: verdict, parameters, predictions, residuals, correlations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The figure beside the verdict on an identification: the worst joint in its worst second."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A growing log as a live view shows it: at most 50 rows a second, and of each group of steps the latest one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The files of a training and of a search as a live view shows them: curves, and the best fit so far."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

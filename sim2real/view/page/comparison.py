@@ -1,7 +1,5 @@
 """The page of a comparison: parameters of all runs in one figure, then the tables."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from matplotlib.axes import Axes

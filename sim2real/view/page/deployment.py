@@ -1,7 +1,5 @@
 """The section of a deployment: verdict, robot and simulation with their difference, picture of the robot, tables."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

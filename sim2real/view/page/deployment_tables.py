@@ -1,7 +1,5 @@
 """The tables of a deployment on a page: gap, drift, commands played again, times."""
 
-from __future__ import annotations
-
 from sim2real.artifacts.deployment import Deployment
 from sim2real.view.blocks import Block, TableBlock
 

@@ -1,7 +1,5 @@
 """The figure of the distributions of the training's episodes, with the recorded values."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

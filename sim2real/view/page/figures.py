@@ -1,7 +1,5 @@
 """Figures of record, train and deploy. Each is one ``<svg>`` element with the colours of the page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The iterations of a run on its page."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from sim2real.artifacts.run.iterations import Iterations

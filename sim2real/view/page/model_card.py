@@ -1,7 +1,5 @@
 """The page of a model card: its numbers, the limits of its data, and the recipe of each figure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pages for a browser: one self-contained HTML file, without scripts and without a network."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

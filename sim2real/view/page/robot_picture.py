@@ -3,8 +3,6 @@
 OpenGL ends the process if a driver fails, and a page must not be lost with it.
 """
 
-from __future__ import annotations
-
 import base64
 import importlib
 import json

@@ -1,7 +1,5 @@
 """The four stages' sections of a page, each from the stage's folder."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.artifacts.bundle import History

@@ -1,7 +1,5 @@
 """The sensitivity of a policy to wrong parameters, as a figure and a table."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from matplotlib.lines import Line2D

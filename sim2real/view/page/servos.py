@@ -1,7 +1,5 @@
 """The servos on a page: late and lost answers, suspicious measurements, and commands."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from sim2real.graph.episode import Episode

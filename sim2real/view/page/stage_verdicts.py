@@ -1,7 +1,5 @@
 """The verdicts on record, train and deploy, as boxes of a page."""
 
-from __future__ import annotations
-
 from sim2real.artifacts.bundle import GOOD_SUCCESS
 from sim2real.artifacts.deployment import Deployment
 from sim2real.view.blocks import Banner, Tone, number, sentence

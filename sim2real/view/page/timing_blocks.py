@@ -1,7 +1,5 @@
 """Tiles, figures and the table of a page about the timing of episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple
 

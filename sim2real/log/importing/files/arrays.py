@@ -1,7 +1,5 @@
 """Reads arrays in npz files; their headers are read first, so that an archive unpacks no more than the limit."""
 
-from __future__ import annotations
-
 import math
 import zipfile
 import zlib

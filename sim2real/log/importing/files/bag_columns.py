@@ -1,7 +1,5 @@
 """The messages of one topic as columns of numbers, and the choice of their clock."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Mapping, Sequence
 from typing import Any

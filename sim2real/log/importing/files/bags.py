@@ -1,7 +1,5 @@
 """Reads MCAP files of other recorders, ROS 2 bags among them: messages in CDR or JSON become columns by topic."""
 
-from __future__ import annotations
-
 import json
 import mmap
 import re

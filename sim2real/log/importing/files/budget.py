@@ -1,7 +1,5 @@
 """Limits on the memory and time that a file of another recorder takes; all readers of such files apply them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

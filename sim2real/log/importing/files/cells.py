@@ -1,7 +1,5 @@
 """Numbers in the form of words: in the cells of a table, or in an array of words."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.errors import UsageError

@@ -1,7 +1,5 @@
 """Dates and times of day in texts, as numbers."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """The signals that a reader of another recorder's file returns: names, a loader, and notes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 

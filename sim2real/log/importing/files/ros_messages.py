@@ -1,7 +1,5 @@
 """Decodes ROS 2 messages in CDR by their definition in the bag; docs/reference/choices.md compares other readers."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Reads tables in text: CSV with commas, semicolons, tabs, bars or blanks between the cells."""
 
-from __future__ import annotations
-
 import codecs
 import csv
 import json
