@@ -4,15 +4,15 @@ import os
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
+
+from virtual_bus import PLANTS as PLANTS
+from virtual_bus import VirtualBus
 
 from sim2real.hardware.emulation import emulator
 from sim2real.hardware.emulation.emulated_bus import truth_header
 from sim2real.hardware.emulation.truth import TruthLog, read_truth
 from sim2real.hardware.feetech.emulation import StsBus
-from sim2real.hardware.plant import load_plant
 
-PLANTS = Path(__file__).parents[1] / "plants.py"
 IDS = (1, 2, 3)
 
 
@@ -59,33 +59,11 @@ class Served:
         return read_truth(self._path)
 
 
-class Bench:
-    """An emulated bus in virtual time: no process, no waiting, every instant exact."""
+class Bench(VirtualBus):
+    """STS servos on it."""
 
-    def __init__(self, path, plant, config, **plant_args):
-        self.plant = load_plant(f"{PLANTS}:{plant}", plant_args)
-        self.now_ns = 0
-        self.sent = []
-        self._path = path
-        self._log = TruthLog(path, truth_header(self.plant, config, 0))
-        self.bus = StsBus(self.plant, config, self._log, self._take, 0, lambda: self.now_ns)
-        self.servos = self.bus.servos
-
-    def _take(self, answer):
-        self.sent.append((self.now_ns, answer))
-        return True
-
-    def run_until(self, t_ns):
-        while (due_ns := self.bus.next_due_ns()) is not None and due_ns <= t_ns:
-            self.now_ns = max(self.now_ns, due_ns)
-            self.bus.run_until(self.now_ns)
-        self.now_ns = t_ns
-        self.bus.run_until(t_ns)
-
-    def send(self, t_ns, *packets):
-        self.run_until(t_ns)
-        self.bus.feed(b"".join(packets), t_ns)
-        self.bus.run_until(t_ns)
+    def __init__(self, *arguments, **plant_args):
+        super().__init__(StsBus, *arguments, **plant_args)
 
     def ask(self, packet, wait_ns=20_000_000):
         """Send a packet and return what is answered until a while later, in one piece."""
@@ -93,10 +71,3 @@ class Bench:
         self.run_until(self.now_ns + wait_ns)
         answers, self.sent = b"".join(answer for _, answer in self.sent), []
         return answers
-
-    def close(self):
-        self._log.close()
-
-    def truth(self):
-        self.close()
-        return read_truth(self._path)

@@ -1,0 +1,44 @@
+from pathlib import Path
+
+from sim2real.hardware.emulation.emulated_bus import truth_header
+from sim2real.hardware.emulation.truth import TruthLog, read_truth
+from sim2real.hardware.plant import load_plant
+
+PLANTS = Path(__file__).parent / "plants.py"
+
+
+class VirtualBus:
+    """An emulated bus in virtual time: no process, no waiting, every instant exact."""
+
+    def __init__(self, bus_type, path, plant, config, **plant_args):
+        self.plant = load_plant(f"{PLANTS}:{plant}", plant_args)
+        self.now_ns = 0
+        self.sent = []
+        self._path = path
+        self._log = TruthLog(path, truth_header(self.plant, config, 0))
+        self.bus = bus_type(self.plant, config, self._log, self._take, 0, lambda: self.now_ns)
+        self.servos = self.bus.servos
+
+    def _take(self, answer):
+        self.sent.append((self.now_ns, answer))
+        return True
+
+    def run_until(self, t_ns):
+        """Go on to a time, stopping at everything that is due on the way."""
+        while (due_ns := self.bus.next_due_ns()) is not None and due_ns <= t_ns:
+            self.now_ns = max(self.now_ns, due_ns)
+            self.bus.run_until(self.now_ns)
+        self.now_ns = t_ns
+        self.bus.run_until(t_ns)
+
+    def send(self, t_ns, *packets):
+        self.run_until(t_ns)
+        self.bus.feed(b"".join(packets), t_ns)
+        self.bus.run_until(t_ns)
+
+    def close(self):
+        self._log.close()
+
+    def truth(self):
+        self.close()
+        return read_truth(self._path)
