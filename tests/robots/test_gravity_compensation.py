@@ -65,7 +65,8 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch
     table = model.parameters.with_terms(["gravcomp"])
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     widest = fit(model, [episode], spans, 0.6, config, table)
-    monkeypatch.setattr(thinned, "MOST_STEPS", kept * 0.6 / STEP_S * len(widest.problem.table) + 1)
+    of_segment = 0.6 / STEP_S * (thinned.BESIDE + 1) * len(widest.problem.table)
+    monkeypatch.setattr(thinned, "MOST_STEPS", kept * of_segment + 1)
     parts, sets = folds_of(widest.problem, 3), []
     trials = Trials(widest, parts, config.settle_s, config.free_run_s, Refits(), sets.append)
     simulated, ahead = [], folds._ahead

@@ -26,8 +26,10 @@ from sim2real.installation import has_jax
 from sim2real.later import jax
 from sim2real.types import PyTree
 
-_FEW, _COPIES = 24, 128
-"""Copies in one call of the two programs: each size compiles once. A descent evaluates one point in a call."""
+_FEW, _COPIES, _MANY = 24, 128, 512
+"""Copies in one call of the two programs: each size compiles once. A descent evaluates one point in a call. Many logs
+make thousands of copies: a Jacobian of 20 logs took 24 s of processor time with 128 at a time, 18 s with 512."""
+
 _CACHED = 2
 """Points whose Jacobians are cached: that of a set of terms, and that of all terms around it."""
 _SEARCHED = 8
@@ -137,9 +139,10 @@ class OutsideEvaluator:
         return losses
 
     def lively(self, data: Data, most: int | None = None) -> Data:
-        """See ``Evaluator``: segments of each channel in turn, and one of each recording.
+        """See ``Evaluator``: segments of each channel in turn, and one of each recording, if these are few.
 
-        These suffice for a search: all 23 segments of an arm took 2.6 times as long.
+        These suffice for a search: all 23 segments of an arm took 2.6 times as long. Of many recordings each has one
+        only if each has parameters of its own.
         """
         # Measure the range of each channel in each segment.
         live = np.flatnonzero(np.asarray(data.weight) > 0.0)
@@ -152,8 +155,9 @@ class OutsideEvaluator:
         # Take the first segment of each recording, then the others in that order.
         recordings = np.asarray(data.recording)[segments]
         firsts = np.unique(recordings, return_index=True)[1]
-        turns = dict.fromkeys([*firsts.tolist(), *order.tolist()])
-        count = max(most or max(_SEARCHED, 2 * len(reaches)), len(firsts))
+        count, alone = most or max(_SEARCHED, 2 * len(reaches)), any(p.per_recording for p in self._residuals.table)
+        count = max(count, len(firsts)) if alone else count
+        turns = dict.fromkeys([*(firsts if len(firsts) <= count else ()), *order.tolist()])
         weight = np.zeros(len(data.fitted), np.float32)
         weight[live[list(turns)[:count]]] = 1.0
         return data._replace(weight=weight)
@@ -239,12 +243,12 @@ class OutsideEvaluator:
         residuals = self._residuals
         before = residuals.of_copies("inputs", residuals.inputs, (0, 0, 0, None))
         after = residuals.of_copies("errors", residuals.errors, (0, 0, 0, 0, None))
-        errors = []
-        for first in range(0, len(eps), _COPIES):
-            rows = slice(first, first + _COPIES)
+        errors, most = [], _MANY if len(eps) > 2 * _MANY else _COPIES
+        for first in range(0, len(eps), most):
+            rows = slice(first, first + most)
             count = len(eps[rows])
-            # Pad the copies to one of two sizes, as each size compiles once.
-            size = count if not has_jax() else _FEW if count <= _FEW else _COPIES
+            # Pad the copies to one of few sizes, as each size compiles once.
+            size = next(size for size in (_FEW, _COPIES, _MANY) if count <= size) if has_jax() else count
             part = {n: np.asarray(v[rows], np.float32) for n, v in values.items()}
             shifts = np.asarray(shift[rows] * self._prior, np.float32)
             arguments = padded((part, np.asarray(eps[rows], np.int32), shifts), size)

@@ -244,6 +244,9 @@ class _Descent:
         first = value(z)
         if not (np.isfinite(first).all() and np.isfinite(slope(z)).all()):
             return z
+        # End where no step can gain that share: steps that fail took 12 evaluations of each refit without a part.
+        if self._gainable(slope(z), first) < gain:
+            return z
         # Pin directions that the data does not determine, so that steps stay finite.
         pin *= float(np.linalg.norm(first))
 
@@ -260,6 +263,11 @@ class _Descent:
         options: Any = {"jac": pinned_slope, "gtol": None}  # scipy's stubs have neither functions nor None
         solution = least_squares(pinned, z, ftol=gain, xtol=near, max_nfev=most, **options)
         return np.asarray(solution.x, np.float64)
+
+    def _gainable(self, J: np.ndarray, residuals: np.ndarray) -> float:
+        """Return the share of the sum of squares that the next Gauss-Newton step gains, if the slope is right."""
+        reach = np.linalg.qr(J[:, np.asarray(self._data.present)])[0].T @ residuals
+        return float(reach @ reach) / max(float(residuals @ residuals), 1e-300)
 
     def _report(self, loss: float, z: np.ndarray) -> None:
         self.steps += 1

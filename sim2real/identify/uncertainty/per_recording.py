@@ -47,7 +47,7 @@ def identify_each(estimate: Fit) -> list[tuple[Mapping[str, Value], Uncertainty]
         start = min(starts, key=lambda z, data=data: np.nan_to_num(problem.loss(z, data), nan=np.inf))
         z = refine(problem, start[None], data, settle=False).z
         # Compute the uncertainty from the residuals of this recording.
-        end = linearise(problem, z)
+        end = linearise(problem, z, data)  # all segments at the end of each recording took K^2 simulations
         part = replace(end, residuals=end.residuals[mask], jacobian=end.jacobian[mask], raw=end.raw[mask])
         alone.append((as_numbers(table, z), from_linearised(problem, part)))
     return alone

@@ -117,16 +117,15 @@ def leave_out(
     """
     refits = refits or Refits()
     refits.begin(estimate.problem.table.terms, estimate.z, estimate.loss)
-    problem, table, touched = estimate.problem, estimate.problem.table, masks(estimate.problem, parts)
-    every = np.ones(len(table.terms), bool)
+    problem, table, (groups, _) = estimate.problem, estimate.problem.table, shared(parts)
+    touched, every = masks(problem, groups), np.ones(len(table.terms), bool)
     stats = optional_terms.statistics(problem, linearise(problem, estimate.z), touched)
-    groups, of = shared(parts)
     ends = []
     for k, group in enumerate(groups):
-        start = table.at_scale(stats.x + stats.step(table, every, of == k, bounded=True))
-        rest = problem.part(problem.train[touched[of == k].any(axis=0)])
+        start = table.at_scale(stats.x + stats.step(table, every, np.arange(len(groups)) == k, bounded=True))
+        rest = problem.part(problem.train[touched[k]])
         ends.append(refitted(refits, table.terms, group, problem, start, rest))
-    return predicted(estimate, parts, stats, [every] * len(parts), [ends[k] for k in of], settle_s, free_run_s)
+    return predicted(estimate, parts, stats, every, ends, settle_s, free_run_s)
 
 
 def refitted(
@@ -153,24 +152,31 @@ def predicted(
     estimate: Fit,
     parts: Sequence[Fold],
     stats: optional_terms.Statistics,
-    present: Sequence[np.ndarray],
+    present: np.ndarray,
     ends: Sequence[np.ndarray],
     settle_s: float,
     free_run_s: float,
 ) -> list[HeldOutPart]:
-    """Return the errors of estimates without each part, ``(P,)`` each, on that part."""
-    problem, table = estimate.problem, estimate.problem.table
-    values = [
-        {
-            n: np.asarray(v, np.float64)
-            for n, v in table.decode(jnp.asarray(z, jnp.float32), table.of_terms(own)).items()
-        }
-        for z, own in zip(ends, present, strict=True)
+    """Return the errors on each part of the estimate without its group.
+
+    Args:
+        stats: Of the groups of ``shared``.
+        present: Shape ``(T,)``, bool: the terms of the model.
+        ends: Shape ``(G, P)``: the estimates without each group.
+    """
+    problem, table, of = estimate.problem, estimate.problem.table, shared(parts)[1]
+    columns = table.of_terms(present)
+    by_group = [
+        {n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32), columns).items()}
+        for z in ends
     ]
-    names = [tuple(n for n, there in zip(table.terms, own, strict=True) if there) for own in present]
+    values = [by_group[g] for g in of]
+    names = [tuple(n for n, there in zip(table.terms, present, strict=True) if there)] * len(parts)
     stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
-    own = np.einsum("kpp->kp", stats.information)
-    shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own / np.maximum(own.sum(axis=0), 1e-300)]
+    # The information of a group is that of its parts, in like shares.
+    own = np.einsum("kpp->kp", stats.information) / np.bincount(of)[:, None]
+    total = np.maximum(own[of].sum(axis=0), 1e-300)
+    shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own[of] / total]
     ahead = _ahead(estimate.windows, parts, stacked, settle_s)
     free, run_s = [{} for _ in parts], 0.0
     if free_run_s:

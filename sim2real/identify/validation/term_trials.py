@@ -201,10 +201,9 @@ class Trials:
         self._on_set = on_set
         self._estimate, self._parts, self._times = estimate, parts, (settle_s, free_run_s)
         self._refits = refits
-        self._problem = thinned(estimate.problem, parts)
-        self._masks = folds.masks(self._problem, parts)
-        self._groups, self._of = folds.shared(parts)
-        self._without = np.array([self._masks[self._of == g].any(axis=0) for g in range(len(self._groups))])
+        self._groups = folds.shared(parts)[0]
+        self._problem = thinned(estimate.problem, self._groups)
+        self._masks = folds.masks(self._problem, self._groups)
         self._least = estimate.loss if self._problem is estimate.problem else self._problem.loss(estimate.z)
         self._sigma = dict(zip(labels(self._problem), (s for _, s, _ in self._problem.fields), strict=True))
 
@@ -264,7 +263,7 @@ class Trials:
         return [self._estimate.z, *(table.at_scale(x[i]) for i in (best, min(best + _LOWER, _LEVELS)))]
 
     def wider(self, trial: Trial) -> Statistics:
-        """Return the loss of each part around a trial, by the parameters of all terms."""
+        """Return the loss of each group of parts around a trial, by the parameters of all terms."""
         return statistics(self._problem, linearise(self._problem, trial.z), self._masks)
 
     def attempt(self, present: np.ndarray, starts: Sequence[np.ndarray], most: float) -> Trial:
@@ -306,13 +305,12 @@ class Trials:
         ends = self._without_each(z, at, stats, present)
         if refits:
             refits.begin(names, z, loss)
-            rest = [problem.part(problem.train[touched], columns) for touched in self._without]
+            rest = [problem.part(problem.train[touched], columns) for touched in self._masks]
             ends = [
                 folds.refitted(refits, names, group, problem, end, one, gain=_GAIN)
                 for group, end, one in zip(self._groups, ends, rest, strict=True)
             ]
-        of_parts = [ends[g] for g in self._of]
-        rows = folds.predicted(self._estimate, self._parts, stats, [present] * len(of_parts), of_parts, *self._times)
+        rows = folds.predicted(self._estimate, self._parts, stats, present, ends, *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
         return Trial(present, z, loss, stats, tuple(rows), ahead, free, above_noise(at.raw), not unjudged)
@@ -337,14 +335,14 @@ class Trials:
     def _without_each(self, z: np.ndarray, at: Linearised, stats: Statistics, present: np.ndarray) -> np.ndarray:
         """Return the estimates without each group, ``(G, P)``: linear steps, shorter where a full one does not help."""
         problem, table, count = self._problem, self._problem.table, len(self._groups)
-        steps = np.array([stats.step(table, present, self._of == g, bounded=True) for g in range(count)])
+        steps = np.array([stats.step(table, present, np.arange(count) == g, bounded=True) for g in range(count)])
         points = at.x + np.concatenate([share * steps for share in _SHARES])
         # Simulate all candidates at a time, and compare each on the segments of the other groups.
         without = [c.parameter.without for c in table.columns]
         residuals = problem.with_values(z, np.where(table.of_terms(present), table.unscale(points), without))
         squares = np.nan_to_num(np.sum(residuals**2, axis=(2, 3)), nan=np.inf)
         ends = []
-        for k, touched in enumerate(self._without):
+        for k, touched in enumerate(self._masks):
             candidates = range(k, len(points), count)
             ends.append(points[min(candidates, key=lambda g: float(squares[g][~touched].sum()))])
         return table.at_scale(np.array(ends))

@@ -10,8 +10,10 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.folds import Fold, masks
 
-MOST_STEPS = 5e6
+MOST_STEPS = 8e6
 """Steps of single joints in a Jacobian from which fewer segments are taken: about 4 s on two cores."""
+BESIDE = 4
+"""Joints whose steps take as long as what a step of a model takes beside its joints."""
 _FEWEST = 2
 """Fewest segments of a channel that are live."""
 
@@ -25,7 +27,7 @@ def thinned(problem: Problem, parts: Sequence[Fold]) -> Problem:
     model, channels = problem.engine.model, len(problem.channels)
     if model is None:  # a program simulates segments without weight, too
         return problem
-    steps = problem.segment_s / float(model.opt.timestep) * int(model.nv) * len(problem.table)
+    steps = problem.segment_s / float(model.opt.timestep) * (BESIDE + int(model.nv)) * len(problem.table)
     keep = max(int(MOST_STEPS / steps), _FEWEST * channels, len(parts))
     if keep >= len(problem.train):
         return problem
