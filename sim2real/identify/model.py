@@ -94,6 +94,15 @@ class IdentifiableModel(Protocol):
 
 
 @runtime_checkable
+class CarriesPayload(Protocol):
+    """A model with a payload that differs between logs."""
+
+    def loaded(self, params: dict[str, PyTree], first: Mapping[str, PyTree]) -> dict[str, PyTree]:
+        """Return node parameters with the payload that the first command of each given node names."""
+        ...
+
+
+@runtime_checkable
 class ChecksLogs(Protocol):
     """A model that does not describe the motion of all logs."""
 

@@ -34,6 +34,8 @@ class DriveCommand(Base):
         kd: Damping, in the log's unit.
         enabled: 1 with torque on, 0 with torque off.
         volts: Measured supply voltage [V]; 0: unknown.
+        payload: Mass of what the robot holds, the same in all of a log [kg].
+        payload_reach: Distance of that mass from the origin of its body, towards the body's centre of mass [m].
     """
 
     goal: Value | None = None
@@ -44,6 +46,8 @@ class DriveCommand(Base):
     kd: Value | None = None
     enabled: Value | None = None
     volts: Value | None = None
+    payload: Value | None = None
+    payload_reach: Value | None = None
 
 
 @struct.dataclass

@@ -16,7 +16,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
 from sim2real.identify.config import FitConfig
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.model import CarriesPayload, IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.derivative import finite_differences
 from sim2real.identify.problem.engine import Choice, CRollouts, Outside
@@ -135,7 +135,7 @@ class SegmentResiduals:
         self, values: Mapping[str, PyTree], start: PyTree, tables: PyTree, messages: PyTree, eps: Array | int
     ) -> PyTree:
         """Simulate a segment for one recording's parameters, from an initial state."""
-        params = self.model.params(values, start)
+        params = self._params(values, start, messages)
         gs = self._first(params, messages, eps)
         return self.graph.run(gs, tables, messages, self.model.sensor)
 
@@ -146,6 +146,13 @@ class SegmentResiduals:
         values_ = self.table.of_recording(values, data.recording[eps])
         return values_, self.start(eps, sum(values_[n] for n in self._late), data) + shift
 
+    def _params(self, values: Mapping[str, PyTree], start: PyTree, messages: PyTree) -> dict[str, PyTree]:
+        """Return the parameters of the nodes for a segment, with the payload of its log."""
+        params = self.model.params(values, start)
+        if not isinstance(self.model, CarriesPayload):
+            return params
+        return self.model.loaded(params, pytree.map(lambda rows: rows[0], messages))
+
     def _first(self, params: Mapping[str, PyTree], messages: PyTree, eps: Array | int) -> GraphState:
         # Assume that the first recorded command held before, too.
         first = pytree.map(lambda rows: rows[0], messages)
@@ -155,11 +162,12 @@ class SegmentResiduals:
         self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data
     ) -> tuple[dict[str, PyTree], GraphState, PyTree, PyTree]:
         """Return parameters of the nodes, first state, timing and commands of a segment."""
-        params = self.model.params(*self._started(values, eps, shift, data))
+        started = self._started(values, eps, shift, data)
         tables, messages = pytree.map(lambda rows: rows[eps], (data.tables, data.messages))
         if np.ndim(eps):  # in numpy, copies come behind time and window
             tables = pytree.map(lambda rows: np.moveaxis(rows, 0, -1), tables)
             messages = pytree.map(lambda rows: np.swapaxes(rows, 0, 1), messages)
+        params = self._params(*started, messages)
         return params, self._first(params, messages, eps), tables, messages
 
     def inputs(self, values: Mapping[str, Array], eps: Array | int, shift: Array, data: Data) -> Outside:

@@ -310,7 +310,7 @@ class Trials:
                 folds.refitted(refits, names, group, problem, end, one, gain=_GAIN)
                 for group, end, one in zip(self._groups, ends, rest, strict=True)
             ]
-        rows = folds.predicted(self._estimate, self._parts, stats, present, ends, *self._times)
+        rows = folds.predicted(self._estimate, self._parts, stats, present, list(ends), *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
         return Trial(present, z, loss, stats, tuple(rows), ahead, free, above_noise(at.raw), not unjudged)

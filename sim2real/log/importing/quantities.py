@@ -18,6 +18,8 @@ _EXTRA = {
     "enabled": ("enabled", None, ""),
     "goal_velocity": ("velocity", "command", "rad/s"),
     "torque": ("torque", "command", "N m"),
+    "payload": ("payload", None, "kg"),
+    "payload_reach": ("reach", None, "m"),
 }
 """Commands beside a goal: field -> quantity, side or None for any, and unit."""
 _MOTION, _OTHER_COMMANDS = ("position", "velocity"), ("torque", "duty", "voltage", "kp", "kd")

@@ -23,6 +23,8 @@ _QUANTITIES = {
     "kp": "kp stiffness",
     "kd": "kd",
     "enabled": "enable enabled",
+    "payload": "payload",
+    "reach": "reach",
     "rate": "fps rate hz freq frequency",
     "period": "dt period",
     "error": "error errors err",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -13,7 +14,8 @@ import numpy as np
 
 from sim2real.artifacts.files import check
 from sim2real.composer.models.mjcf.translate import mj
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
@@ -23,6 +25,7 @@ from sim2real.robots.from_model.encoders import EncoderParams, Encoders
 from sim2real.robots.from_model.holding import Holding
 from sim2real.robots.from_model.mjcf import (
     NO_LIMIT,
+    PAYLOAD,
     JointDrive,
     copy_back,
     driven,
@@ -52,12 +55,13 @@ from sim2real.robots.from_model.mjcf_parameters import (
 from sim2real.robots.from_model.plain import driven_simulation
 from sim2real.robots.from_model.reached import Recordings, reached
 from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
-from sim2real.types import PyTree, Scalar
+from sim2real.types import MjModel, PyTree, Scalar
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
 
 ROBOT_FILE = "robot.toml"
 COMMANDS = tuple(f.name for f in fields(DriveCommand))
+_OF_PAYLOAD = {"payload": "kg", "payload_reach": "m"}
 DRIVING = ("goal", "goal_velocity", "torque", "duty")
 """Fields of commands; a robot has at least one of them."""
 
@@ -81,6 +85,7 @@ class RobotConfig:
         volts_unit: Supply voltage at which the drive has the identified strength [V].
         fix_base: Whether a floating base is held.
         hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
+        payload_body: Body that holds the payload that a log names; "": that of the last joint.
     """
 
     model: Path
@@ -98,6 +103,7 @@ class RobotConfig:
     fix_base: bool = False
     contacts: bool = False
     hold: tuple[str, ...] = ()
+    payload_body: str = ""
     terms: tuple[ParameterPattern, ...] = ()
 
     def driven(self, rubbing: bool = True, carried: bool = False) -> PyTree:
@@ -106,7 +112,8 @@ class RobotConfig:
 
     def how(self, rubbing: bool, carried: bool) -> tuple[PyTree, ...]:
         """Return the arguments of ``mjcf.driven_spec``."""
-        return self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold, carried
+        holder = self.payload_body if "payload" in self.commands else None
+        return self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold, carried, holder
 
     def held(self) -> Holding:
         """Return the held and the free joints among those that were not recorded."""
@@ -186,8 +193,10 @@ class MjcfRobot(LoggedRobot):
         units = {field: unit for field, unit in units.items() if field in there}
         slides = [joint in slides_of(self.model, self.config.joints) for joint in self.config.joints]
         if len(set(slides)) == 1:
-            return {field: unit_for(unit, slides[0]) for field, unit in units.items()}
-        return {f"{field}[{i}]": unit_for(unit, s) for field, unit in units.items() for i, s in enumerate(slides)}
+            units = {field: unit_for(unit, slides[0]) for field, unit in units.items()}
+        else:
+            units = {f"{field}[{i}]": unit_for(unit, s) for field, unit in units.items() for i, s in enumerate(slides)}
+        return units | {field: unit for field, unit in _OF_PAYLOAD.items() if field in self.config.commands}
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified."""
@@ -199,6 +208,7 @@ class MjcfRobot(LoggedRobot):
         still = {n: jnp.zeros(1 if n in config.shared else len(config.joints)) for n in config.commands}
         units = config.kp_unit, config.kd_unit, config.volts_unit
         world = DrivenWorld("world", 1 / config.step_s, self.model, units, terms=self.lawful)
+        world.derives = "payload" in config.commands  # without mass a joint has another inertia for its friction
         sensor = Encoders("sensor", config.rate_hz, world, config.velocity)
         return sensor, RecordedActuator("actuator", config.rate_hz, DriveCommand(**still)), world
 
@@ -283,6 +293,11 @@ class MjcfRobot(LoggedRobot):
 
     def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
         """Return the driven model with identified values."""
+        if "payload" in self.config.commands:
+            raise UsageError(
+                "a model card reproduces logs without a payload, and these name one",
+                hint="export to mjcf or to json: the payload is not part of the model there",
+            )
         loop, world, how = self.identifiable(1.0), self.make_nodes()[2], self.config.how(*self._how)
         return driven_simulation(lambda start: loop.params(values, start)[world.name], world, how)
 
@@ -320,15 +335,53 @@ class IdentifiableMjcf(IdentifiableRecording):
         self._placed: Sequence[Placed] = robot.placed
         self._joints, self._dofs = world.joints, world.qvel_at
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
-        self._model = robot.model
+        self._model, self._commands = robot.model, robot.config.commands
 
     def reached(self, recordings: Recordings) -> Mapping[str, float]:
         """Return limit -> the largest torque or speed that recordings reach, of limits that no pattern names."""
         limits = [p for p in self._placed if p.among_limits]
         if not limits:
             return {}
-        most = dict(zip(LIMITS, reached(self._model, self._joints, recordings), strict=True))
+        pairs = [reached(self._holding(r), self._joints, [r]) for r in recordings]
+        most = dict(zip(LIMITS, np.max(pairs, axis=0), strict=True))
         return {p.parameter.name: float(most[p.what][list(p.at)].max()) for p in limits}
+
+    def check(self, episode: Episode) -> None:
+        """Raise an error if the payload changes within a log, or is no mass."""
+        sent = episode.outputs[self._robot.roles.actuator]
+        for field in (f for f in _OF_PAYLOAD if f in sent and f in self._commands):
+            values = np.unique(sent[field])
+            if len(values) > 1 or not np.all(values >= 0.0):
+                listed = ", ".join(f"{v:g}" for v in values[:4])
+                raise Sim2RealError(
+                    f"{field} is {listed} {_OF_PAYLOAD[field]}: a log has one payload, of 0 or more",
+                    hint="cut the log where the payload changes, or remove the field from the mapping",
+                )
+
+    def loaded(self, params: dict[str, PyTree], first: Mapping[str, PyTree]) -> dict[str, PyTree]:
+        """Return node parameters with the payload of a log's first command; see ``identify.model.CarriesPayload``."""
+        command, world = first[self._robot.roles.actuator], params["world"]
+        if command.payload is None:
+            return params
+        model, at = world.model, self._model.body(PAYLOAD).id
+        changed = {"body_mass": jnp.asarray(model.body_mass).at[at].add(command.payload[0])}
+        if command.payload_reach is not None:
+            changed["body_pos"] = jnp.asarray(model.body_pos).at[at].set(self._place(command.payload_reach[0]))
+        return {**params, "world": world.replace(model=model.tree_replace(changed))}
+
+    def _holding(self, episode: Episode) -> MjModel:
+        """Return the model with the payload of a log."""
+        sent, model = episode.outputs[self._robot.roles.actuator], copy.copy(self._model)
+        if "payload" in self._commands:
+            model.body(PAYLOAD).mass[:] += sent["payload"][0, 0]
+            if "payload_reach" in self._commands:
+                model.body(PAYLOAD).pos[:] = self._place(sent["payload_reach"][0, 0])
+        return model
+
+    def _place(self, reach: Scalar) -> PyTree:
+        """Return where a payload is in the frame of its body, ``(3,)`` [m]."""
+        middle = self._model.body(PAYLOAD).pos
+        return reach * middle / np.linalg.norm(middle)
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.

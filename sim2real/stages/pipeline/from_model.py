@@ -232,6 +232,7 @@ def describe(
         fix_base=flags.fix_base,
         contacts=flags.contacts,
         hold=flags.hold,
+        payload_body=flags.payload_body,
         terms=named_terms(flags.parameter)
         or usual_terms(commands, physical, read_model(Path(str(flags.mjcf))), joints),
     )

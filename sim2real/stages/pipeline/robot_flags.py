@@ -34,6 +34,9 @@ class RobotFlags:
     """Simulate contacts."""
     hold: Annotated[tuple[str, ...], UseAppendAction] = ()
     """Positions of joints that were not recorded: JOINT=VALUE [rad or m], or a keyframe; default: keyframe home."""
+    payload_body: str = ""
+    """Body that holds the payload of each log, if the logs have a field payload [kg]; default: that of the last
+    joint."""
     as_told: bool = False
     """Keep names, order and signs of the file or the mapping, even if the data contradicts them or is ambiguous."""
 
