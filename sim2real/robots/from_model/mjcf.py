@@ -11,14 +11,12 @@ import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
-from sim2real.robots.from_model import model_file
+from sim2real.robots.from_model import model_file, payload
 from sim2real.robots.from_model.holding import Holding, apply, plan
 from sim2real.types import MjModel, MjSpec, PyTree
 from sim2real.worlds.drive_terms import NO_LIMIT
 
-_LEAST_FRICTION, _LEAST_GRAVCOMP, _NO_MASS = 1e-9, 1e-9, 1e-9
-PAYLOAD = "sim2real_payload"
-"""Body of the payload that a log names."""
+_LEAST_FRICTION, _LEAST_GRAVCOMP = 1e-9, 1e-9
 _SOFT, _HOLDS = (0.02, 1.0, 0.9, 0.95, 0.001, 0.5, 2.0), 0.9999
 """MuJoCo's default solref and solimp of friction, and the impedance of friction that holds a joint."""
 _OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
@@ -76,7 +74,7 @@ def driven_spec(
         rubbing: Whether joints have at least a little dry friction: MJX compiles no friction for a model without any.
         hold: Positions of joints that were not recorded: ``JOINT=VALUE`` [rad or m], or the name of a keyframe.
         carried: Whether bodies have at least a little gravity compensation: MuJoCo computes none without any.
-        holder: Body that gets a body ``PAYLOAD`` without mass, at its centre of mass; "": that of the last joint.
+        holder: Body that gets a payload without mass, at its centre of mass; "": that of the last joint.
     """
     # Hold the joints that were not recorded.
     spec = read_spec(path, contacts)
@@ -85,7 +83,7 @@ def driven_spec(
     limits = {j: limit_of(model, j) for j in joints}
     apply(spec, model, holding)
     if holder is not None:
-        _hold_payload(spec, model, joints, holder)
+        payload.hold(spec, model, joints, holder)
 
     # Add the actuators, and give each joint its torque limit.
     for what, gain in (("force", (1.0, 0.0, 0.0)), ("kp", (0.0, -1.0, 0.0)), ("kd", (0.0, 0.0, -1.0))):
@@ -111,23 +109,6 @@ def driven_spec(
     if not contacts:
         option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
     return spec
-
-
-def _hold_payload(spec: MjSpec, model: MjModel, joints: Sequence[str], holder: str) -> None:
-    """Add a body for the payload that a log names; its mass and its place are set for each log."""
-    names = [model.body(i).name for i in range(1, model.nbody)]
-    if holder and holder not in names:
-        raise UsageError(f"no body {holder!r} for the payload. Available: {', '.join(filter(None, names))}")
-    body: Any = spec.body(holder) if holder else spec.joint(joints[-1]).parent
-    middle = model.body_ipos[model.body(holder).id if holder else model.jnt_bodyid[model.joint(joints[-1]).id]]
-    if not np.any(middle):
-        raise UsageError(
-            f"the centre of mass of body {body.name!r} is at its origin, so a payload has no direction from there",
-            hint="give the body an inertial, or name another one with --payload-body",
-        )
-    payload = body.add_body(name=PAYLOAD, pos=middle)
-    payload.explicitinertial, payload.mass, payload.inertia = True, _NO_MASS, [_NO_MASS] * 3
-    payload.ipos, payload.iquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]  # not the holder's, as a new body has
 
 
 def _clear(part: Any) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -14,18 +13,18 @@ import numpy as np
 
 from sim2real.artifacts.files import check
 from sim2real.composer.models.mjcf.translate import mj
-from sim2real.errors import Sim2RealError, UsageError
+from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.log.toml_text import toml_value
+from sim2real.robots.from_model import payload
 from sim2real.robots.from_model.doubts import beyond_ranges, open_loops
 from sim2real.robots.from_model.encoders import EncoderParams, Encoders
 from sim2real.robots.from_model.holding import Holding
 from sim2real.robots.from_model.mjcf import (
     NO_LIMIT,
-    PAYLOAD,
     JointDrive,
     copy_back,
     driven,
@@ -53,15 +52,14 @@ from sim2real.robots.from_model.mjcf_parameters import (
     tilted,
 )
 from sim2real.robots.from_model.plain import driven_simulation
-from sim2real.robots.from_model.reached import Recordings, reached
+from sim2real.robots.from_model.reached import reached
 from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
-from sim2real.types import MjModel, PyTree, Scalar
+from sim2real.types import PyTree, Scalar
 from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
 
 ROBOT_FILE = "robot.toml"
 COMMANDS = tuple(f.name for f in fields(DriveCommand))
-_OF_PAYLOAD = {"payload": "kg", "payload_reach": "m"}
 DRIVING = ("goal", "goal_velocity", "torque", "duty")
 """Fields of commands; a robot has at least one of them."""
 
@@ -196,7 +194,7 @@ class MjcfRobot(LoggedRobot):
             units = {field: unit_for(unit, slides[0]) for field, unit in units.items()}
         else:
             units = {f"{field}[{i}]": unit_for(unit, s) for field, unit in units.items() for i, s in enumerate(slides)}
-        return units | {field: unit for field, unit in _OF_PAYLOAD.items() if field in self.config.commands}
+        return units | {field: unit for field, unit in payload.UNITS.items() if field in self.config.commands}
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified."""
@@ -337,51 +335,26 @@ class IdentifiableMjcf(IdentifiableRecording):
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
         self._model, self._commands = robot.model, robot.config.commands
 
-    def reached(self, recordings: Recordings) -> Mapping[str, float]:
+    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
         """Return limit -> the largest torque or speed that recordings reach, of limits that no pattern names."""
         limits = [p for p in self._placed if p.among_limits]
         if not limits:
             return {}
-        pairs = [reached(self._holding(r), self._joints, [r]) for r in recordings]
+        actuator, pairs = self._robot.roles.actuator, []
+        for episode in recordings:
+            model = payload.holding(self._model, episode.outputs[actuator], self._commands)
+            pairs.append(reached(model, self._joints, episode))
         most = dict(zip(LIMITS, np.max(pairs, axis=0), strict=True))
         return {p.parameter.name: float(most[p.what][list(p.at)].max()) for p in limits}
 
     def check(self, episode: Episode) -> None:
         """Raise an error if the payload changes within a log, or is no mass."""
-        sent = episode.outputs[self._robot.roles.actuator]
-        for field in (f for f in _OF_PAYLOAD if f in sent and f in self._commands):
-            values = np.unique(sent[field])
-            if len(values) > 1 or not np.all(values >= 0.0):
-                listed = ", ".join(f"{v:g}" for v in values[:4])
-                raise Sim2RealError(
-                    f"{field} is {listed} {_OF_PAYLOAD[field]}: a log has one payload, of 0 or more",
-                    hint="cut the log where the payload changes, or remove the field from the mapping",
-                )
+        payload.check(episode.outputs[self._robot.roles.actuator], self._commands)
 
     def loaded(self, params: dict[str, PyTree], first: Mapping[str, PyTree]) -> dict[str, PyTree]:
         """Return node parameters with the payload of a log's first command; see ``identify.model.CarriesPayload``."""
-        command, world = first[self._robot.roles.actuator], params["world"]
-        if command.payload is None:
-            return params
-        model, at = world.model, self._model.body(PAYLOAD).id
-        changed = {"body_mass": jnp.asarray(model.body_mass).at[at].add(command.payload[0])}
-        if command.payload_reach is not None:
-            changed["body_pos"] = jnp.asarray(model.body_pos).at[at].set(self._place(command.payload_reach[0]))
-        return {**params, "world": world.replace(model=model.tree_replace(changed))}
-
-    def _holding(self, episode: Episode) -> MjModel:
-        """Return the model with the payload of a log."""
-        sent, model = episode.outputs[self._robot.roles.actuator], copy.copy(self._model)
-        if "payload" in self._commands:
-            model.body(PAYLOAD).mass[:] += sent["payload"][0, 0]
-            if "payload_reach" in self._commands:
-                model.body(PAYLOAD).pos[:] = self._place(sent["payload_reach"][0, 0])
-        return model
-
-    def _place(self, reach: Scalar) -> PyTree:
-        """Return where a payload is in the frame of its body, ``(3,)`` [m]."""
-        middle = self._model.body(PAYLOAD).pos
-        return reach * middle / np.linalg.norm(middle)
+        command = first[self._robot.roles.actuator]
+        return {**params, "world": payload.loaded(self._model, params["world"], command)}
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.

@@ -1,8 +1,8 @@
-"""The torques and speeds that recordings of a robot reach, which bound the search for its limits."""
+"""The torques and speeds that a recording of a robot reaches, which bound the search for its limits."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -10,7 +10,6 @@ from sim2real.composer.models.mjcf.translate import mj
 from sim2real.graph.episode import Episode
 from sim2real.types import MjModel
 
-Recordings = Iterable[Episode]
 _WINDOW_S = 0.06
 """Length of the parabolas that give speeds and accelerations [s]."""
 _MOST = 0.99
@@ -19,7 +18,7 @@ _STATES = 2000
 """Most states of a log whose torques are computed."""
 
 
-def reached(model: MjModel, joints: np.ndarray, episodes: Recordings) -> tuple[np.ndarray, np.ndarray]:
+def reached(model: MjModel, joints: np.ndarray, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest torques and speeds of the recorded joints, ``(joints,)`` each [N m, rad/s].
 
     The torques are those that the model's masses need for the measured motion. Friction adds to them.
@@ -27,16 +26,12 @@ def reached(model: MjModel, joints: np.ndarray, episodes: Recordings) -> tuple[n
     Args:
         joints: Shape ``(joints,)``: their numbers in the model.
     """
-    torque = speed = np.zeros(len(joints))
-    for episode in episodes:
-        t_s, position = episode.steps["sensor"].begun_s, np.asarray(episode.outputs["sensor"]["position"], np.float64)
-        t_s, rows = np.unique(np.asarray(t_s, np.float64), return_index=True)
-        velocity, acceleration = _derivatives(t_s, position[rows])
-        some = np.unique(np.linspace(0, len(t_s) - 1, _STATES).astype(int))
-        needed = _torques(model, joints, position[rows][some], velocity[some], acceleration[some])
-        torque = np.maximum(torque, np.quantile(np.abs(needed), _MOST, axis=0))
-        speed = np.maximum(speed, np.quantile(np.abs(velocity), _MOST, axis=0))
-    return torque, speed
+    t_s, position = episode.steps["sensor"].begun_s, np.asarray(episode.outputs["sensor"]["position"], np.float64)
+    t_s, rows = np.unique(np.asarray(t_s, np.float64), return_index=True)
+    velocity, acceleration = _derivatives(t_s, position[rows])
+    some = np.unique(np.linspace(0, len(t_s) - 1, _STATES).astype(int))
+    needed = _torques(model, joints, position[rows][some], velocity[some], acceleration[some])
+    return np.quantile(np.abs(needed), _MOST, axis=0), np.quantile(np.abs(velocity), _MOST, axis=0)
 
 
 def _derivatives(t_s: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
