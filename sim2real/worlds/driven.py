@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 
 from sim2real.graph.base import Base, GraphState, StepState
-from sim2real.types import MjModel
+from sim2real.types import MjModel, PyTree, Scalar
 from sim2real.worlds.closing import Closing
 from sim2real.worlds.drive_terms import DriveLaw, DriveTerms
 from sim2real.worlds.mjx import MjxParams, MjxWorld
@@ -19,6 +19,12 @@ from sim2real.worlds.recorded import command_delay
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Value
+
+
+PAYLOAD = "sim2real_payload"
+"""Body of the payload that a log names."""
+OF_PAYLOAD = {"payload": "kg", "payload_reach": "m"}
+"""Fields of commands that name it, with their units."""
 
 
 @struct.dataclass
@@ -116,6 +122,18 @@ class DrivenWorld(MjxWorld):
         terms = off.replace(**{f.name: zero + getattr(off, f.name) for f in fields(off)}) if self.law else None
         return DriveParams(params.model, params.qpos, params.qvel, terms=terms)
 
+    def holding(self, params: DriveParams, command: DriveCommand) -> DriveParams:
+        """Return parameters with the payload of a command."""
+        if command.payload is None:
+            return params
+        fields, at = params.model, self.model.body(PAYLOAD).id
+        mass = jnp.asarray(fields.body_mass).at[at].add(jnp.ravel(command.payload)[0])
+        changed: dict[str, PyTree] = {"body_mass": mass}
+        if command.payload_reach is not None:
+            place = payload_place(self.model, jnp.ravel(command.payload_reach)[0])
+            changed["body_pos"] = jnp.asarray(fields.body_pos).at[at].set(place)
+        return params.replace(model=fields.tree_replace(changed))
+
     def law_values(self, params: DriveParams) -> dict[str, jax.Array]:
         """Return the values of the law: friction and limits of the model, and the coefficients of the terms."""
         model, still = params.model, jnp.zeros(len(self.joints))
@@ -185,3 +203,9 @@ class DrivenWorld(MjxWorld):
 def _of_log(gain: Value | None, unit: float) -> Value:
     """Return the log's gain in its unit; 1 without a gain."""
     return 1.0 if gain is None else gain / unit
+
+
+def payload_place(model: MjModel, reach: Scalar) -> PyTree:
+    """Return where a payload is in the frame of the body that holds it, ``(3,)`` [m]."""
+    middle = model.body(PAYLOAD).pos
+    return reach * middle / np.linalg.norm(middle)

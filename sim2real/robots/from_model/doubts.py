@@ -1,13 +1,14 @@
-"""Recorded positions that a model cannot have: beyond the ranges of joints, or where a loop is open."""
+"""Recordings that a model cannot have: positions beyond the ranges of joints, open loops, payloads that change."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.types import MjModel
+from sim2real.worlds.driven import OF_PAYLOAD
 
 _CHECKED, _OPEN = 100, 5e-3
 """Number of recorded positions at which loops must close, and the largest error of a closed one [m or rad]."""
@@ -56,3 +57,20 @@ def open_loops(
         f"the loops of {file} cannot close at {stays.mean():.0%} of the recorded positions; the largest gap is "
         f"{gaps.max():.3g} (m or rad), at {worst}: check order, signs, units and zeros of the joints"
     ]
+
+
+def check_payload(sent: Mapping[str, np.ndarray], commands: Collection[str]) -> None:
+    """Raise an error if the payload changes within a log, or is no mass.
+
+    Args:
+        sent: The log's commands by field.
+        commands: Fields that the robot reads.
+    """
+    for field in (f for f in OF_PAYLOAD if f in sent and f in commands):
+        values = np.unique(sent[field])
+        if len(values) > 1 or not np.all(values >= 0.0):
+            listed = ", ".join(f"{v:g}" for v in values[:4])
+            raise Sim2RealError(
+                f"{field} is {listed} {OF_PAYLOAD[field]}: a log has one payload, of 0 or more",
+                hint="cut the log where the payload changes, or remove the field from the mapping",
+            )

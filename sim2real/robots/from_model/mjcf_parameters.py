@@ -12,7 +12,6 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, Transform
-from sim2real.robots.from_model import payload
 from sim2real.robots.from_model.joints.joint_patterns import require_quick
 from sim2real.robots.from_model.joints.quantities import (
     ABOUT,
@@ -40,6 +39,7 @@ from sim2real.robots.from_model.joints.sharing import sharing
 from sim2real.robots.from_model.mjcf import gains_of, limit_of, slides_of, unit_for
 from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds.drive_terms import NO_LIMIT
+from sim2real.worlds.driven import PAYLOAD
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def expand(
         names = [model.body(i).name for i in range(1, model.nbody)] if term.what == "payload" else list(joints)
         offset = 1 if term.what == "payload" else 0
         require_quick(term.joints, names)
-        at = [i for i, name in enumerate(names) if name != payload.BODY and re.fullmatch(term.joints, name, re.DOTALL)]
+        at = [i for i, name in enumerate(names) if name != PAYLOAD and re.fullmatch(term.joints, name, re.DOTALL)]
         if not at:
             raise UsageError(
                 f"{term.what!r}: {term.joints!r} matches none of {', '.join(names)}",

@@ -14,13 +14,11 @@ import numpy as np
 from sim2real.artifacts.files import check
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
-from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.log.toml_text import toml_value
-from sim2real.robots.from_model import payload
-from sim2real.robots.from_model.doubts import beyond_ranges, open_loops
+from sim2real.robots.from_model.doubts import beyond_ranges, check_payload, open_loops
 from sim2real.robots.from_model.encoders import EncoderParams, Encoders
 from sim2real.robots.from_model.holding import Holding
 from sim2real.robots.from_model.mjcf import (
@@ -52,10 +50,10 @@ from sim2real.robots.from_model.mjcf_parameters import (
     tilted,
 )
 from sim2real.robots.from_model.plain import driven_simulation
-from sim2real.robots.from_model.reached import reached
+from sim2real.robots.from_model.reached import Recordings, reached
 from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
 from sim2real.types import PyTree, Scalar
-from sim2real.worlds.driven import DriveCommand, DrivenWorld, DriveParams
+from sim2real.worlds.driven import OF_PAYLOAD, DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
 
 ROBOT_FILE = "robot.toml"
@@ -194,7 +192,7 @@ class MjcfRobot(LoggedRobot):
             units = {field: unit_for(unit, slides[0]) for field, unit in units.items()}
         else:
             units = {f"{field}[{i}]": unit_for(unit, s) for field, unit in units.items() for i, s in enumerate(slides)}
-        return units | {field: unit for field, unit in payload.UNITS.items() if field in self.config.commands}
+        return units | {field: unit for field, unit in OF_PAYLOAD.items() if field in self.config.commands}
 
     def dynamics(self) -> list[Parameter]:
         """Return what may be identified."""
@@ -217,6 +215,7 @@ class MjcfRobot(LoggedRobot):
             UsageError: When a joint moves further than its range is wide.
         """
         position, file = np.asarray(outputs[self.roles.sensor]["position"], np.float64), self.config.model.name
+        check_payload(outputs.get(self.roles.actuator, {}), self.config.commands)
         beyond = beyond_ranges(self.model, self.config.joints, position, file)
         return [*beyond, *open_loops(self.make_nodes()[2].gaps, position, self.config.joints, file)]
 
@@ -333,28 +332,21 @@ class IdentifiableMjcf(IdentifiableRecording):
         self._placed: Sequence[Placed] = robot.placed
         self._joints, self._dofs = world.joints, world.qvel_at
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
-        self._model, self._commands = robot.model, robot.config.commands
+        self._model = robot.model
 
-    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
+    def reached(self, recordings: Recordings) -> Mapping[str, float]:
         """Return limit -> the largest torque or speed that recordings reach, of limits that no pattern names."""
         limits = [p for p in self._placed if p.among_limits]
         if not limits:
             return {}
-        actuator, pairs = self._robot.roles.actuator, []
-        for episode in recordings:
-            model = payload.holding(self._model, episode.outputs[actuator], self._commands)
-            pairs.append(reached(model, self._joints, episode))
+        pairs = [reached(self._model, self._joints, episode) for episode in recordings]
         most = dict(zip(LIMITS, np.max(pairs, axis=0), strict=True))
         return {p.parameter.name: float(most[p.what][list(p.at)].max()) for p in limits}
-
-    def check(self, episode: Episode) -> None:
-        """Raise an error if the payload changes within a log, or is no mass."""
-        payload.check(episode.outputs[self._robot.roles.actuator], self._commands)
 
     def loaded(self, params: dict[str, PyTree], first: Mapping[str, PyTree]) -> dict[str, PyTree]:
         """Return node parameters with the payload of a log's first command; see ``identify.model.CarriesPayload``."""
         command = first[self._robot.roles.actuator]
-        return {**params, "world": payload.loaded(self._model, params["world"], command)}
+        return {**params, "world": self._world.holding(params["world"], command)}
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters.

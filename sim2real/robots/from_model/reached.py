@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.graph.episode import Episode
+from sim2real.robots.from_model.payload import holding
 from sim2real.types import MjModel
 
+Recordings = Iterable[Episode]
 _WINDOW_S = 0.06
 """Length of the parabolas that give speeds and accelerations [s]."""
 _MOST = 0.99
@@ -26,6 +28,7 @@ def reached(model: MjModel, joints: np.ndarray, episode: Episode) -> tuple[np.nd
     Args:
         joints: Shape ``(joints,)``: their numbers in the model.
     """
+    model = holding(model, episode.outputs["actuator"])
     t_s, position = episode.steps["sensor"].begun_s, np.asarray(episode.outputs["sensor"]["position"], np.float64)
     t_s, rows = np.unique(np.asarray(t_s, np.float64), return_index=True)
     velocity, acceleration = _derivatives(t_s, position[rows])
