@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from on_c import residuals_on_c
 
 from sim2real.composer.physics.c.rollouts import Rollouts, Start
 from sim2real.errors import UsageError
@@ -172,14 +173,14 @@ def engines(tmp_path_factory):
     episode = Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
     jax.config.update("jax_enable_x64", True)  # everywhere: the thread that calls C has no context of ours
     try:
-        programs = {}
+        programs, shift = {}, jnp.array([0.3, -1.0])
         for engine in ("c", "compiled"):
             config = FitConfig(max_delay_s=0.02, initial_state="measured", engine=engine)
             problem = Problem(robot.identifiable(0.02), [episode], [Span(0, 0.1)], 0.4, config)
             assert problem.engine.name == engine
-            programs[engine] = jax.jit(
-                lambda v, p=problem: 0.002 * p.residuals.residuals(v, 0, jnp.array([0.3, -1.0]), p.data)
-            )
+            on_mjx = jax.jit(lambda v, p=problem: p.residuals.residuals(v, 0, shift, p.data))
+            on_c = lambda v, p=problem: residuals_on_c(p, v, shift)  # noqa: E731
+            programs[engine] = on_c if engine == "c" else on_mjx
         yield SimpleNamespace(**programs)
     finally:
         jax.config.update("jax_enable_x64", False)
@@ -187,7 +188,7 @@ def engines(tmp_path_factory):
 
 def played(program, terms):
     values = {"kp": 9.0, "kd": 0.1, "frictionloss": 0.03, "delay": 0.0071, **terms}
-    return np.asarray(program({n: jnp.asarray(v) for n, v in values.items()}))
+    return 0.002 * np.asarray(program({n: jnp.asarray(v) for n, v in values.items()}))
 
 
 @pytest.mark.parametrize("one", [*MECHANICAL, "all"])
