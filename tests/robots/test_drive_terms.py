@@ -1,5 +1,6 @@
 """Optional terms of friction and drive: on both engines, and beside a simulation that is written by hand."""
 
+import functools
 import math
 from dataclasses import fields
 from types import SimpleNamespace
@@ -179,8 +180,8 @@ def engines(tmp_path_factory):
             problem = Problem(robot.identifiable(0.02), [episode], [Span(0, 0.1)], 0.4, config)
             assert problem.engine.name == engine
             on_mjx = jax.jit(lambda v, p=problem: p.residuals.residuals(v, 0, shift, p.data))
-            on_c = lambda v, p=problem: residuals_on_c(p, v, shift)  # noqa: E731
-            programs[engine] = on_c if engine == "c" else on_mjx
+            on_c = functools.partial(residuals_on_c(problem), shift=shift) if engine == "c" else None
+            programs[engine] = on_c or on_mjx
         yield SimpleNamespace(**programs)
     finally:
         jax.config.update("jax_enable_x64", False)

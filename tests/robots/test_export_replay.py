@@ -148,7 +148,7 @@ def predicted(robot, values, field, commands, shape=(1,)):
     config = FitConfig(max_delay_s=0.03, initial_state="rest", jacobian="finite")
     problem = Problem(robot.identifiable(0.03), [episode], [Span(0, 0.0)], SEGMENT_S, config)
     tree = {n: jnp.float32(v) for n, v in values.items()}
-    error = np.asarray(residuals_on_c(problem, tree, jnp.zeros(2)))
+    error = np.asarray(residuals_on_c(problem)(tree, jnp.zeros(2)))
     ts = problem.ts[0]
     counted, error = ts >= 0, error[: len(ts)]
     assert counted.sum() > 80
