@@ -1,6 +1,5 @@
 """Optional terms of friction and drive: on both engines, and beside a simulation that is written by hand."""
 
-import functools
 import math
 from dataclasses import fields
 from types import SimpleNamespace
@@ -9,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from on_c import residuals_on_c
 
 from sim2real.composer.physics.c.rollouts import Rollouts, Start
 from sim2real.errors import UsageError
@@ -174,14 +172,14 @@ def engines(tmp_path_factory):
     episode = Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
     jax.config.update("jax_enable_x64", True)  # everywhere: the thread that calls C has no context of ours
     try:
-        programs, shift = {}, jnp.array([0.3, -1.0])
+        programs = {}
         for engine in ("c", "compiled"):
             config = FitConfig(max_delay_s=0.02, initial_state="measured", engine=engine)
             problem = Problem(robot.identifiable(0.02), [episode], [Span(0, 0.1)], 0.4, config)
             assert problem.engine.name == engine
-            on_mjx = jax.jit(lambda v, p=problem: p.residuals.residuals(v, 0, shift, p.data))
-            on_c = functools.partial(residuals_on_c(problem), shift=shift) if engine == "c" else None
-            programs[engine] = on_c or on_mjx
+            programs[engine] = jax.jit(
+                lambda v, p=problem: 0.002 * p.residuals.residuals(v, 0, jnp.array([0.3, -1.0]), p.data)
+            )
         yield SimpleNamespace(**programs)
     finally:
         jax.config.update("jax_enable_x64", False)
@@ -189,7 +187,7 @@ def engines(tmp_path_factory):
 
 def played(program, terms):
     values = {"kp": 9.0, "kd": 0.1, "frictionloss": 0.03, "delay": 0.0071, **terms}
-    return 0.002 * np.asarray(program({n: jnp.asarray(v) for n, v in values.items()}))
+    return np.asarray(program({n: jnp.asarray(v) for n, v in values.items()}))
 
 
 @pytest.mark.parametrize("one", [*MECHANICAL, "all"])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from on_c import residuals_on_c
 from small_robot import SERVOS, SHEET, VALUES, PairRobot, PairTask
 
 from sim2real.graph.episode import Episode, Steps
@@ -83,16 +82,11 @@ def engines(request, episode):
             own = problem.residuals
             sigmas = jnp.array([s for _, s, _ in problem.fields])
 
-            def on_mjx(values, shift, own=own, data=problem.data, steps=problem.ts.shape[1], sigmas=sigmas):
+            def run(values, shift, own=own, data=problem.data, steps=problem.ts.shape[1], sigmas=sigmas):
                 errors = jax.vmap(lambda e: own.residuals(values, e, shift, data))(jnp.arange(2))
                 return sigmas * errors[:, :steps]
 
-            on_host = residuals_on_c(problem) if engine == "c" else None
-
-            def on_c(values, shift, run=on_host, steps=problem.ts.shape[1], sigmas=sigmas):
-                return sigmas * np.stack([run(values, shift, e)[:steps] for e in (0, 1)])
-
-            programs[engine] = on_c if engine == "c" else jax.jit(on_mjx)
+            programs[engine] = jax.jit(run)
         yield SimpleNamespace(**programs, worn=request.param is worn_robot)
     finally:
         jax.config.update("jax_enable_x64", False)

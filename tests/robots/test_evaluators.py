@@ -39,7 +39,7 @@ def problems(request):
         config = FitConfig(max_delay_s=MAX_DELAY_S, initial_state=request.param, engine=engine)
         model, spans = converged_robot().identifiable(MAX_DELAY_S), [Span(0, b, b != 0.4) for b in BEGINS_S]
         made[engine] = Problem(model, [pair_log()], spans, SEGMENT_S, config)
-    measured = shown_by(made["compiled"])
+    measured = shown_by(made["c"])
     for problem in made.values():
         problem.data = problem.data._replace(measured=measured)
     return SimpleNamespace(**made)

@@ -3,12 +3,12 @@
 from dataclasses import replace
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from flax import struct
-from on_c import residuals_on_c
 
 from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
@@ -148,7 +148,7 @@ def predicted(robot, values, field, commands, shape=(1,)):
     config = FitConfig(max_delay_s=0.03, initial_state="rest", jacobian="finite")
     problem = Problem(robot.identifiable(0.03), [episode], [Span(0, 0.0)], SEGMENT_S, config)
     tree = {n: jnp.float32(v) for n, v in values.items()}
-    error = np.asarray(residuals_on_c(problem)(tree, jnp.zeros(2)))
+    error = np.asarray(jax.jit(lambda v: problem.residuals.residuals(v, 0, jnp.zeros(2), problem.data))(tree))
     ts = problem.ts[0]
     counted, error = ts >= 0, error[: len(ts)]
     assert counted.sum() > 80

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -56,13 +57,14 @@ def residuals(pair, episode):
     config = FitConfig(max_delay_s=MAX_DELAY_S, initial_state="measured", jacobian="finite", skip_s=0.2)
     spans = [Span(0, b) for b in BEGINS_S]
     problem = Problem(pair.identifiable(MAX_DELAY_S), [episode], spans, SEGMENT_S, config)
-    ts, count = problem.ts, len(spans)
+    every = jnp.arange(len(spans))
 
-    def run(values):
-        every = {n: np.full(count, v) for n, v in values.items()}
-        return problem.predict(every, np.arange(count), np.full(count, SEGMENT_S))
+    def of(values):
+        return jax.vmap(lambda e: problem.residuals.residuals(values, e, jnp.zeros(4), problem.data))(every)
 
-    found = {"true": run(TRUTH), "wrong": run({**TRUTH, "gain": 1.3 * TRUTH["gain"]})}
+    run, ts = jax.jit(of), problem.ts
+    values = {n: jnp.float32(v) for n, v in TRUTH.items()}
+    found = {"true": run(values), "wrong": run({**values, "gain": 1.3 * values["gain"]})}
     errors = {k: np.asarray(v)[:, : ts.shape[1]] for k, v in found.items()}
     return SimpleNamespace(problem=problem, config=config, ts=ts, **errors)
 

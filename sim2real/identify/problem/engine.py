@@ -14,7 +14,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.installation import has_jax
-from sim2real.later import jax
+from sim2real.later import jax, jnp
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph, Tables
 from sim2real.types import Array, MjModel, PyTree
 
@@ -153,3 +153,18 @@ class CRollouts:
             return pytree.map(_swapped, self._graph.run(gs, tables, messages, record, known))
         world_messages = jax.vmap(lambda *at: world.message(state, *at))(*moved)
         return self._graph.run(gs, tables, messages, record, {world.name: world_messages})
+
+    def rollout(
+        self, gs: GraphState, params: Mapping[str, PyTree], tables: Tables, messages: Mapping[str, PyTree], record: str
+    ) -> PyTree:
+        """Return a node's outputs in an episode by a callback to C; no compilation cache holds such a program."""
+        inputs = self.inputs(gs, params, tables, messages)
+        dtype, count = jnp.result_type(float), inputs.controls.shape[0]
+        widths = (self._model.nq, self._model.nv, self._model.nv)
+        shapes = tuple(jax.ShapeDtypeStruct((1 + count, n), dtype) for n in widths)
+
+        def outside(messages: PyTree) -> tuple[np.ndarray, ...]:
+            return tuple(a.astype(dtype) for a in self.step(jax.tree_util.tree_map(np.asarray, messages)))
+
+        moved = jax.pure_callback(outside, shapes, inputs, vmap_method="expand_dims")
+        return self.outputs(gs, moved, tables, messages, record)

@@ -137,6 +137,8 @@ class SegmentResiduals:
         """Simulate a segment for one recording's parameters, from an initial state."""
         params = self._params(values, start, messages)
         gs = self._first(params, messages, eps)
+        if self.engine.name == "c":
+            return self.outside.rollout(gs, params, tables, messages, self.model.sensor)
         return self.graph.run(gs, tables, messages, self.model.sensor)
 
     def _started(

@@ -66,8 +66,7 @@ def simulate(
     # Simulate by the configured engine.
     if engine.name == "c":
         outside = CRollouts(graph, engine.model)
-        moved = outside.step(jax.jit(outside.inputs)(gs, params, tables, messages))
-        records = jax.jit(lambda *moved: outside.outputs(gs, moved, tables, messages, model.sensor))(*moved)
+        records = jax.jit(lambda state: outside.rollout(state, params, tables, messages, model.sensor))(gs)
     else:
         records = jax.jit(lambda state: graph.run(state, tables, messages, model.sensor))(gs)
     # Return the simulation as an episode.
