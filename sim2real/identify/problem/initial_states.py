@@ -138,7 +138,8 @@ def separated(slope: np.ndarray) -> tuple[list[tuple[int, ...]], np.ndarray]:
     alone = [i for i in range(len(slope)) if not responds[i].any()]
     # Columns and residuals that depend on each other, directly or by way of others, are of one tree.
     label, rows = np.arange(len(slope)), np.full(slope.shape[1], len(slope))
-    for _ in label:  # each takes the lowest number among its neighbours
+    # Each takes the lowest number among its neighbours; SciPy is no part of the light installation.
+    for _ in label:
         rows = np.minimum(rows, np.where(responds, label[:, None], len(slope)).min(axis=0, initial=len(slope)))
         label = np.minimum(label, np.where(responds, rows, len(slope)).min(axis=1, initial=len(slope)))
     columns = label
