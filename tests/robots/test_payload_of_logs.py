@@ -73,8 +73,8 @@ def test_without_the_field_one_mass_fits_neither_log(tmp_path):
 
 
 def test_columns_of_a_payload_are_found_by_their_names():
-    names = ("payload_kg", "payload_reach_m", "arm/payload")
-    assert [meaning(name).quantity for name in names] == ["payload", "reach", "payload"]
+    names = ("payload_kg", "payload_reach_m", "arm/payload", "reach")
+    assert [meaning(name).quantity for name in names] == ["payload", "reach", "payload", ""]
 
 
 def test_the_torque_that_a_limit_is_sought_from_includes_the_payload(tmp_path):
@@ -89,6 +89,11 @@ def test_a_payload_that_changes_within_a_log_is_refused(tmp_path):
     episode.outputs["actuator"]["payload"][100:] = 0.7
     with pytest.raises(Sim2RealError, match=r"payload is 0.5, 0.7 kg: a log has one payload"):
         robot(tmp_path).doubts(episode.outputs)
+
+
+def test_a_reach_without_a_payload_is_refused(tmp_path):
+    with pytest.raises(Sim2RealError, match="has a payload_reach and no payload"):
+        robot(tmp_path, ("goal", "payload_reach")).doubts(recorded(*LOADS[0]).outputs)
 
 
 def test_a_body_that_cannot_hold_a_payload_is_refused(tmp_path):

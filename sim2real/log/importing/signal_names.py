@@ -24,7 +24,6 @@ _QUANTITIES = {
     "kd": "kd",
     "enabled": "enable enabled",
     "payload": "payload",
-    "reach": "reach",
     "rate": "fps rate hz freq frequency",
     "period": "dt period",
     "error": "error errors err",
@@ -99,6 +98,8 @@ def meaning(name: str) -> Meaning:
         if word in _QUANTITY and not (quantity == "stamp" and known_unit):
             # The last quantity counts, unless it is an error: `torque_enable` enables, `goal_time` is a time.
             quantity = quantity if quantity == "error" else _QUANTITY[word]
+        elif word == "reach" and quantity == "payload":  # alone it may be of a task
+            quantity = "reach"
         elif known_unit:
             unit = known_unit
         elif word not in _FILLERS:

@@ -66,6 +66,8 @@ def check_payload(sent: Mapping[str, np.ndarray], commands: Collection[str]) -> 
         sent: The log's commands by field.
         commands: Fields that the robot reads.
     """
+    if "payload_reach" in commands and "payload" not in commands:
+        raise Sim2RealError("the log has a payload_reach and no payload", hint="map the mass, too, as payload [kg]")
     for field in (f for f in OF_PAYLOAD if f in sent and f in commands):
         values = np.unique(sent[field])
         if len(values) > 1 or not np.all(values >= 0.0):
