@@ -241,11 +241,11 @@ class _Descent:
 
         # Linearise the initial states at the start of the round.
         value, slope = self._problem.evaluator.around(z, self._data)
-        first = value(z)
-        if not (np.isfinite(first).all() and np.isfinite(slope(z)).all()):
+        first, J = value(z), slope(z)
+        if not (np.isfinite(first).all() and np.isfinite(J).all()):
             return z
         # End where no step can gain that share: steps that fail took 12 evaluations of each refit without a part.
-        if self._gainable(slope(z), first) < gain:
+        if self._gainable(J, first) < gain:
             return z
         # Pin directions that the data does not determine, so that steps stay finite.
         pin *= float(np.linalg.norm(first))
