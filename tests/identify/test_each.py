@@ -5,6 +5,7 @@ import pytest
 from test_folds import BIAS, CONFIG, LENGTH_S, Model, lag_log, spans
 
 from sim2real.identify.fit import fit
+from sim2real.identify.uncertainty import per_recording
 from sim2real.identify.uncertainty.per_recording import identify_each
 
 
@@ -18,3 +19,18 @@ def test_each_recording_says_what_it_says_alone(repetitions):
         for name, error in zip(whole.problem.table.names, errors, strict=True):
             assert values[name] == pytest.approx(alone.values[name], abs=0.05 * error)
         np.testing.assert_allclose(spread.standard_error, errors, rtol=0.02)
+
+
+def test_the_errors_of_a_recording_are_computed_from_its_own_segments(monkeypatch):
+    """With all segments for each recording, K recordings cost K^2 simulations."""
+    episodes = [lag_log(1), lag_log(2, 2 * BIAS)]
+    whole = fit(Model(), episodes, [*spans(0), *spans(1)], LENGTH_S, CONFIG)
+    live, linearise = [], per_recording.linearise
+
+    def counted(problem, z, data=None):
+        live.append(int(np.sum(np.asarray((data or problem.data).weight))))
+        return linearise(problem, z, data)
+
+    monkeypatch.setattr(per_recording, "linearise", counted)
+    identify_each(whole)
+    assert live == [len(spans(0)) + len(spans(1)), len(spans(0)), len(spans(1))]

@@ -157,6 +157,16 @@ def test_a_start_at_the_optimum_stays(minimum):
     np.testing.assert_allclose(problem.values(found.z), minimum.x, atol=1e-3)
 
 
+@pytest.mark.parametrize(("share", "moves"), [(0.5, True), (2.0, False)])
+def test_a_round_ends_where_its_step_gains_less_than_is_asked(minimum, share, moves):
+    problem = Stub(valley)
+    near = problem.table.at_scale(minimum.x + np.array([0.02, 0.0]))
+    gained = 1.0 - minimum.cost / 3 / problem.loss(near)
+    found = refine(problem, near[None], settle=False, gain=share * gained)
+    assert np.array_equal(found.z, near) != moves
+    assert moves or found.steps <= 3
+
+
 def test_a_coarse_descent_ends_early_and_within_percents(minimum):
     """As for a model to compare with."""
     problem = Stub(valley)
