@@ -46,7 +46,7 @@ class UprightRunner:
         tilt_rad = self._tilt_rad(observation)
         if not abs(tilt_rad) <= self._limit_rad:
             raise SafetyStop(
-                f"the robot leans by {tilt_rad:.3g} rad, {self._limit_rad:.3g} rad are allowed",
+                f"the robot leans by {tilt_rad:.3g} rad, more than the {self._limit_rad:.3g} rad that are allowed",
                 hint="set it upright; max_tilt_rad sets the limit",
             )
         return self._runner(observation)

@@ -18,7 +18,7 @@ from sim2real.view.live.follower import Follower
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
 
 PERIOD_S = 0.2
-"""Time between two reads: that of the flushes of a log's writer."""
+"""Time between two reads: two flushes of a log's writer."""
 NICENESS = 10
 
 
