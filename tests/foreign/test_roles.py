@@ -154,7 +154,7 @@ def test_a_mapping_with_a_gain_of_zero_describes_a_robot_without_it(tmp_path, mo
     np.savez("run.npz", t_s=t, goal=goal, q=q, kd=0.0)
     Path("map.toml").write_text(
         'pipeline = "robot"\n[nodes.actuator]\nstamps = "t_s"\nfields.goal = { source = "goal", unit = "rad" }\n'
-        'fields.kd = { source = "kd", shape = [1] }\n'
+        'fields.kd = { source = "kd" }\n'
         '[nodes.sensor]\nstamps = "t_s"\nfields.position = { source = "q", unit = "rad" }\n'
     )
     told = RobotFlags(mjcf=Path("robot.xml"), mapping=Path("map.toml"))

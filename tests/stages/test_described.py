@@ -15,6 +15,7 @@ from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import RobotConfig
 from sim2real.stages.estimation import recording_advice
 from sim2real.stages.pipeline import from_model
+from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
@@ -119,6 +120,27 @@ def test_new_writes_a_pipeline_that_loads(workplace, flags):
     assert [c.label for c in robot.channels] == (list(flags[1:]) or ["pan_joint", "lift_joint"])
     assert pipeline.identify.initial_state == "measured"
     assert pipeline.mapping_of(Path("run.npz")) is not None
+
+
+def test_the_number_of_a_lone_joint_is_a_vector(workplace, recorded):
+    t, goal, q = recorded
+    np.savez("lone.npz", t=t, goal=goal[:, 0], q=q[:, 0], volts=12.0)
+    Path("map.toml").write_text(
+        'pipeline = "robot"\n[nodes.actuator]\nstamps = "t"\nfields.goal = { source = "goal", unit = "rad" }\n'
+        'fields.volts = { source = "volts", unit = "V" }\n'
+        '[nodes.sensor]\nstamps = "t"\nfields.position = { source = "q", unit = "rad" }\n'
+    )
+    flags = ["--joints", "pan_joint", "--hold", "lift_joint=0.1", "--mapping", "map.toml"]
+    assert cli.main(["new", "rig", "robot.xml", "--log", "lone.npz", *flags]) == 0
+    pipeline = load_pipeline("rig")
+    outputs = open_recording(Path("lone.npz"), pipeline, pipeline.load()).episode.outputs
+    shapes = {name: values.shape for fields in outputs.values() for name, values in fields.items()}
+    assert shapes == {"goal": (1000, 1), "volts": (1000, 1), "position": (1000, 1)}
+    # A log of ours keeps its shapes, and the error tells the remedy.
+    assert cli.main(["import", "lone.npz", "--mapping", "map.toml", "--out", "lone.mcap"]) == 0
+    with pytest.raises(UsageError, match="goal \\(\\)") as caught:
+        from_model.from_flags(RobotFlags(mjcf=Path("robot.xml"), joints=("pan_joint",)), ["lone.mcap"])
+    assert "shape = [-1]" in str(caught.value.hint)
 
 
 def test_new_without_a_log_goes_by_its_flags(workplace, capsys):

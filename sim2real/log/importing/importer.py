@@ -286,7 +286,7 @@ def _samples(file: ForeignFile, where: str, values: np.ndarray, how: FieldMappin
         )
     scaled = (scale * values.astype(np.float64) + how.offset).astype(dtype)
     shape = scaled.shape[1:] if how.shape is None else how.shape
-    if np.prod(shape, dtype=int) != np.prod(scaled.shape[1:], dtype=int):
+    if shape != (-1,) and np.prod(shape, dtype=int) != np.prod(scaled.shape[1:], dtype=int):
         raise UsageError(
             f"a sample of field {where} has the shape {scaled.shape[1:]} in {file.path}, and {shape} in the mapping",
             hint="correct the shape, or choose columns of the source",

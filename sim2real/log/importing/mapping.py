@@ -7,7 +7,7 @@ import math
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sim2real.errors import UsageError
@@ -33,7 +33,7 @@ class FieldMapping:
         unit: Unit of the field, after scaling.
         scale: The field is ``scale * signal + offset``; one number, or one for each column.
         offset: See ``scale`` [the field's unit].
-        shape: Shape of one sample; None: as in the file.
+        shape: Shape of one sample; None: as in the file; ``(-1,)``: a vector, of a number one of length 1.
         column: Column of a two-dimensional signal; None: all columns.
         turn: A turn in the signal's unit, to count turns of angles that jump at its end; 0: no counting.
     """
@@ -92,6 +92,14 @@ class ImportMapping:
     def units(self) -> dict[str, dict[str, str]]:
         """Node -> field -> unit, for the fields that have one."""
         return {n: {f: m.unit for f, m in node.fields.items() if m.unit} for n, node in self.nodes.items()}
+
+    def of_joints(self) -> ImportMapping:
+        """Return the mapping with a vector for each field, as joints have it."""
+        nodes = {
+            name: replace(n, fields={k: replace(f, shape=f.shape or (-1,)) for k, f in n.fields.items()})
+            for name, n in self.nodes.items()
+        }
+        return replace(self, nodes=nodes)
 
     def inputs(self, file: Path) -> dict[str, Path]:
         """Return the files that an import reads, by name, for the manifest."""
@@ -227,8 +235,10 @@ def _field(table: Mapping[str, Json], where: str) -> FieldMapping:
     if not 0.0 <= turn < math.inf:
         raise UsageError(f"{where}: turn must be above 0, such as 360 for degrees, got {turn}", hint=_HINT)
     shape = _value(table, "shape", list, where)
-    if shape is not None and not all(type(n) is int and n > 0 for n in shape):
-        raise UsageError(f"{where}: shape must be a list of whole numbers above 0, got {shape}", hint=_HINT)
+    if shape not in (None, [-1]) and not all(type(n) is int and n > 0 for n in shape):
+        raise UsageError(
+            f"{where}: shape must be a list of whole numbers above 0, or [-1] for a vector, got {shape}", hint=_HINT
+        )
     unit = _value(table, "unit", str, where) or ""
     if not unit.isprintable():
         raise UsageError(f"{where}: a unit stands on one line, got {unit!r}", hint=_HINT)

@@ -161,8 +161,8 @@ def _named(
             continue
         if name not in names:
             raise UsageError(
-                f"{path} has no joint {name or entry!r} to hold. Joints: {', '.join(filter(None, names))}; "
-                f"keyframes: {', '.join(filter(None, keys)) or 'none'}",
+                f"{path} has no {'joint' if name else 'keyframe'} {name or entry!r} to hold. "
+                f"Joints: {', '.join(filter(None, names))}; keyframes: {', '.join(filter(None, keys)) or 'none'}",
                 hint="write JOINT=VALUE, or the name of a keyframe",
             )
         number = names[name]

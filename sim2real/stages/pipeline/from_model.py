@@ -104,7 +104,7 @@ def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
         mapping, episode = None, read_log(first)
         name = str(episode.metadata.get("pipeline") or name)
     else:
-        mapping = load_mapping(flags.mapping, name) if flags.mapping else None
+        mapping = load_mapping(flags.mapping, name).of_joints() if flags.mapping else None
         if mapping is None:
             description = import_logs_stage.description_of_model(flags.mjcf, name, flags.joints, flags.rate_hz)
             mapping, _ = import_logs_stage.proposed(open_foreign(first), replace(description, as_told=flags.as_told))
@@ -194,8 +194,8 @@ def _description(flags: RobotFlags, model: MjModel, episode: Episode) -> RobotCo
     if wrong := [f"{name} {shapes[name]}" for name in ("position", *driving) if shapes[name] not in (n, one.get(name))]:
         raise UsageError(
             f"a sample of each field has the shape {n}, for {', '.join(joints)}, but in the log: {', '.join(wrong)}",
-            hint="name the joints that were recorded with --joints, in the order of the columns; in a mapping, "
-            "shape = [1] makes a vector of a number",
+            hint="name the joints that were recorded with --joints, in the order of the columns; in the mapping of an "
+            "import, shape = [-1] makes a vector of a number",
         )
     # Rate and step follow from the log and the model.
     fastest = min(float(np.quantile(np.diff(episode.steps[n].begun_s), _FASTEST)) for n in ("actuator", "sensor"))

@@ -76,4 +76,5 @@ def pipeline_of(path: Path, identification: Identification, config: ValidateConf
     pipeline = from_model.pipeline_beside(path, identification)
     if not isinstance(pipeline, from_model.DescribedPipeline):
         return pipeline
-    return pipeline.reading(config.log, load_mapping(config.mapping, pipeline.name) if config.mapping else None)
+    mapping = load_mapping(config.mapping, pipeline.name).of_joints() if config.mapping else None
+    return pipeline.reading(config.log, mapping)
