@@ -97,6 +97,6 @@ def rubbed(velocity: Value, push: Value, most: Value) -> jax.Array:
     """
     moving = velocity != 0.0
     slowed = velocity + push - jnp.sign(velocity) * most
-    reverses = moving & (velocity * slowed < 0.0)
+    reverses = moving & (jnp.sign(velocity) * slowed < 0.0)  # a product of small speeds is 0
     rest = jnp.where(reverses, slowed / jnp.where(reverses, slowed - velocity, 1.0), 1.0)  # of the step
     return jnp.where(moving & ~reverses, slowed, rest * stopped(push, most))

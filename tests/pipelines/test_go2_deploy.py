@@ -119,6 +119,31 @@ def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsy
     assert "does not test the model" in advice.reasons[-1]
 
 
+@pytest.mark.full  # test_weighing.py has the load from a log of the emulator's clock
+@pytest.mark.realtime
+def test_the_load_of_a_robot_on_its_feet_over_dds(tmp_path, capsys):
+    logs = []
+    for number, excitation in enumerate(("multisine", "standing")):
+        line = ["record", "go2", "--excitation", excitation, "--runs", str(tmp_path / str(number))]
+        assert cli.main(line) == 0
+        logs += (tmp_path / str(number)).glob("go2/*/record/session.mcap")
+    line = ["identify", "go2", "--log", str(logs[0]), "--standing", str(logs[1]), "--runs", str(tmp_path)]
+    assert cli.main(line) == 0
+    (folder,) = (tmp_path / "go2").glob("*/identify")
+    found = Identification.load(folder)
+    assert "not determined by this log: foot_friction, roughness" in found.verdict.reasons
+    load = found.parameters[-1]
+    assert load.name == "payload"
+    assert load.estimate == pytest.approx(load.truth, abs=0.3)
+    assert load.high95 - load.low95 < 0.8
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert "standing" in manifest["inputs"]
+    # Without a log in a stand nothing else is known of the joints.
+    capsys.readouterr()
+    assert cli.main(["identify", "go2", "--log", str(logs[1]), "--runs", str(tmp_path)]) == 1
+    assert "a log of its load is for --standing" in capsys.readouterr().err
+
+
 def test_the_gate_has_the_range_of_each_joint():
     from sim2real.hardware.unitree.device import UnitreeLegs
 

@@ -33,8 +33,7 @@ def log(tmp_path_factory):
     legs.record(path, SEED, SECONDS)
     header = read_truth(path.with_suffix(".truth.bin")).header
     config = header["config"]
-    # The emulator's physics is half of its step of 1 ms ahead of its clock.
-    delays = {"sensor_delay": config["sensing_latency_s"], "actuator_delay": config["actuation_latency_s"] - 5e-4}
+    delays = {"sensor_delay": config["sensing_latency_s"], "actuator_delay": config["actuation_latency_s"]}
     return Recording.load(path).episode, header["truth"] | delays
 
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sim2real.worlds import friction
@@ -95,6 +95,7 @@ def test_stopped_takes_away_up_to_the_most_and_never_reverses(speed, most):
 
 
 @given(speed=speeds, push=st.floats(-20.0, 20.0, width=32), most=st.floats(0.0, 20.0, width=32))
+@example(speed=1.1754943508222875e-38, push=0.0, most=0.5)
 def test_rubbed_is_the_end_of_a_thousand_small_steps(speed, push, most):
     after = speed
     for _ in range(1000):

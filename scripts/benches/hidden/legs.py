@@ -15,13 +15,20 @@ _TOOK_S = {"sensor": 5e-4, "agent": 2e-4, "actuator": 3e-4}
 """Mean durations of the steps of a loop on a computer [s]."""
 
 
-def record(path: Path, seed: int, seconds: float, latencies_s: tuple[float, float, float] | None = None) -> None:
-    """Write the log of the excitation of ``record go2``, played to a hidden robot.
+def record(
+    path: Path,
+    seed: int,
+    seconds: float,
+    latencies_s: tuple[float, float, float] | None = None,
+    standing: bool = False,
+) -> None:
+    """Write the log of the excitation of ``record go2``, played to a hidden robot in a stand.
 
     Args:
         seed: Of the robot, of its latencies and of its noise.
         seconds: Length of the excitation, before the legs' way to it [s].
         latencies_s: Latency of sensing, latency and jitter of actuation [s]; None: those of the seed.
+        standing: Whether the robot is on its feet instead, as for ``record go2 --excitation standing``.
     """
     from dataclasses import replace
 
@@ -39,16 +46,22 @@ def record(path: Path, seed: int, seconds: float, latencies_s: tuple[float, floa
     plant = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:Go2Body", "plant")
     drawn = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:latencies", "plant")
     sensing_s, acting_s, jitter_s = latencies_s or drawn(seed)
-    body, config = plant("stand", seed), UnitreeEmulation(sensing_s, acting_s, jitter_s, seed=seed)
+    body, config = (
+        plant("floor" if standing else "stand", seed),
+        UnitreeEmulation(sensing_s, acting_s, jitter_s, seed=seed),
+    )
     truth = TruthLog(path.with_suffix(".truth.bin"), truth_header(body, config, 0))
     legs = EmulatedLegs(body, config, truth, 0)
-    # Let the legs hang, then plan the way to the excitation from there.
-    begin_ns = round(1e9 * HANG_S)
-    legs.advance(begin_ns)
-    config_of = replace(pipeline.record, duration_s=seconds, seed=seed)
-    hanging = legs.state(begin_ns).record["motor_state"]["q"][:12]
-    signal = excitation(config_of, robot.rate_hz, len(robot.joints))
-    goals = approached(robot.drive.around(signal), hanging, robot.rate_hz)
+    # Let the legs hang, then plan the way to the excitation from there; or let the robot stand up.
+    if standing:
+        begin_ns, goals = _stand_up(legs, robot), robot.drive.around(robot.drive.standing(seconds))
+    else:
+        begin_ns = round(1e9 * HANG_S)
+        legs.advance(begin_ns)
+        config_of = replace(pipeline.record, duration_s=seconds, seed=seed)
+        hanging = legs.state(begin_ns).record["motor_state"]["q"][:12]
+        signal = excitation(config_of, robot.rate_hz, len(robot.joints))
+        goals = approached(robot.drive.around(signal), hanging, robot.rate_hz)
     # The times of the loop's steps; a measurement is the first state after its step's start.
     rng, count = np.random.default_rng([20261126, seed]), len(goals)
     took = {name: mean * rng.gamma(4.0, 0.25, count) for name, mean in _TOOK_S.items()}
@@ -65,9 +78,28 @@ def record(path: Path, seed: int, seconds: float, latencies_s: tuple[float, floa
         parts = (motors["q"], motors["dq"], imu["quaternion"], imu["gyroscope"])
         readings.append(BodyReading(*(np.array(part, np.float32) for part in parts)))
         commands.append(robot.drive.message(np.asarray(goal, np.float32)))
-        table = np.stack([getattr(commands[-1], n) for n in ("q", "dq", "kp", "kd", "tau")], axis=-1)
-        legs.receive(command(table), begin_ns + round(1e9 * sent[k]))
+        legs.receive(command(_table(commands[-1])), begin_ns + round(1e9 * sent[k]))
     truth.close()
     ends = {name: starts[name] + took[name] for name in starts}
     starts["sensor"] = starts["sensor"] + arrives
     write_log(path, "go2", (starts, ends), readings, commands, robot.units)
+
+
+def _stand_up(legs: Any, robot: Any) -> int:
+    """Let a robot on the floor stand up as before a deployment; return when it stands [ns]."""
+    from sim2real.hardware.unitree.legs import command
+    from sim2real.robots.walking.drive import StandUp
+    from sim2real.robots.walking.messages import leg_command
+
+    motion, start = StandUp(), np.asarray(robot.motors.folded)
+    for k in range(round(motion.duration_s * robot.rate_hz)):
+        t_s = k / robot.rate_hz
+        legs.advance(round(1e9 * t_s))
+        target = motion.targets(t_s, start, start, np.asarray(robot.stance))
+        legs.receive(command(_table(leg_command(target, motion.kp, motion.kd))), round(1e9 * t_s))
+    return round(1e9 * motion.duration_s)
+
+
+def _table(sent: Any) -> np.ndarray:
+    """Return the columns of a command, as the robot's message has them."""
+    return np.stack([getattr(sent, name) for name in ("q", "dq", "kp", "kd", "tau")], axis=-1)

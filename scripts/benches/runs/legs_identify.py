@@ -19,8 +19,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "own": {},
     "quick": {"settle_s": 0.1, "horizon_s": 0.5, "refine_steps": 1},
 }
-CLOSE, CLOSE_S = 0.1, 0.001
-"""Largest error of a parameter, as a share of the truth, and of the sum of the delays [s]."""
+CLOSE, CLOSE_S, CLOSE_KG = 0.1, 0.001, 0.3
+"""Largest error of a parameter, as a share of the truth, of the sum of the delays [s], and of the load [kg]."""
 KINDS = {"damping": "damping", "friction": "friction", "armature": "armature", "strength": "strength of motors"}
 
 
@@ -48,6 +48,10 @@ def run(options: argparse.Namespace) -> Report:
     late = np.array([d["delay_off_s"] for d in done])
     rows.append(_share("legs_identify/delay/close", int((late <= CLOSE_S).sum()), len(done), "delays within 1 ms"))
     rows.append(row("legs_identify/delay/worst", four_digits(1e3 * float(late.max())), "ms", "", "1"))
+    loads = np.array([d["load_off_kg"] for d in done])
+    rows.append(_share("legs_identify/load/close", int((loads <= CLOSE_KG).sum()), len(done), "loads within 0.3 kg"))
+    worst = f"median {four_digits(float(np.median(loads)))} kg"
+    rows.append(row("legs_identify/load/worst", four_digits(float(loads.max())), "kg", worst, str(CLOSE_KG)))
     held, count = (sum(d[key] for d in done) for key in ("held", "intervals"))
     rows.append(_share("legs_identify/intervals", held, count, "95 % intervals that hold the truth"))
     for key, unit in (("wall_s", "s"), ("cpu_s", "s of a processor")):
@@ -66,9 +70,11 @@ def one(seed: int, options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "session.mcap"
         legs.record(log, seed, options.seconds)
+        standing = Path(folder) / "standing.mcap"
+        legs.record(standing, seed, options.seconds, standing=True)
         header = read_truth(log.with_suffix(".truth.bin")).header
         begin_s, begin_cpu_s = time.perf_counter(), time.process_time()
-        identification = identify("go2", log, SETTINGS[options.settings])
+        identification = identify("go2", log, SETTINGS[options.settings], standing=standing)
         took_s, took_cpu_s = time.perf_counter() - begin_s, time.process_time() - begin_cpu_s
     truth, rows = header["truth"], {p.name: p for p in identification.parameters}
     errors = {
@@ -82,6 +88,7 @@ def one(seed: int, options: argparse.Namespace) -> dict[str, Any]:
         "verdict": identification.verdict.status,
         "reasons": list(identification.verdict.reasons),
         "errors": errors,
+        "load_off_kg": abs(rows["payload"].estimate - truth["payload"]),
         "delay_off_s": abs(rows[ROUND_TRIP].estimate - late_s),
         "held": int(np.sum(inside)),
         "intervals": len(inside),

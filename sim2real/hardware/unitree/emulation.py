@@ -123,8 +123,9 @@ class EmulatedLegs:
     def advance(self, t_ns: int) -> None:
         """Integrate the body to the last grid point at or before a time [ns]."""
         while (now_ns := self._now_ns()) + self._step_ns <= t_ns:
-            # A command acts from the grid point nearest to its time.
-            while self._coming and self._coming[0][0] <= now_ns + self._step_ns // 2:
+            # A command acts from the next grid point on, in the mean half a step late: the integrator moves a joint as
+            # if its force had acted half a step earlier.
+            while self._coming and self._coming[0][0] <= now_ns:
                 self._apply(*self._coming.popleft())
             alone_s = self._config.alone_after_s
             if self._heard_ns is not None and alone_s is not None and now_ns - self._heard_ns > 1e9 * alone_s:
@@ -170,10 +171,10 @@ class EmulatedLegs:
         self._modes, self._law, self._heard_ns, self._damps = modes, law, t_ns, False
         self._body.drive(law)
         # Mode, goal and position gain: of the first motor for each command, of the others if their mode changes.
-        now_ns, changed[0] = self._now_ns(), True
+        acts_ns, changed[0] = self._now_ns() - self._step_ns // 2, True
         for i in np.flatnonzero(changed).tolist():
             values = float(modes[i]), float(q[i]), float(kp[i])
-            self._truth.write(Kind.EFFECT, i, t_ns, now_ns, now_ns, now_ns - effect_ns, values)
+            self._truth.write(Kind.EFFECT, i, t_ns, acts_ns, acts_ns, acts_ns - effect_ns, values)
 
     def _damp(self, now_ns: int) -> None:
         """Let the motors that are on damp their joints, as the host is silent."""

@@ -29,6 +29,8 @@ _STILL_RAD_S = 0.3
 """Speed below which a joint is at rest, above the noise of the motors' speeds [rad/s]."""
 _HANG_S = 20.0
 """Longest time for legs in a stand to come to rest, without torque [s]."""
+_BENT, _BEND_HZ = 0.25, 0.3
+"""How far a standing robot bends its legs, as a share of the way to folded ones, and how often: slowly [Hz]."""
 _LARGEST = {"dq": 1.0, "kp": 120.0, "kd": 8.0, "tau": 1.0}
 """Largest magnitude of each column but the target [rad/s, N m/rad, N m s/rad, N m]; kp and kd are at least 0."""
 
@@ -163,6 +165,13 @@ class WalkingDrive(RobotDrive):
     def around(self, signal: np.ndarray) -> np.ndarray:
         """Return targets ``(N, joints)`` [rad] of an excitation around the stance."""
         return signal + self._stance
+
+    def standing(self, duration_s: float) -> np.ndarray:
+        """Return targets ``(N, joints)`` around the stance [rad]: the legs bend towards folded ones, and back."""
+        t_s = np.arange(0.0, duration_s, 1.0 / self.rate_hz)
+        bent = 0.5 * _BENT * (1.0 - np.cos(2.0 * np.pi * _BEND_HZ * t_s))
+        folded = self._stance if self._motors is None else np.asarray(self._motors.folded)
+        return bent[:, None] * (folded - self._stance)
 
     def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
         """Return targets ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s, from legs that hang at rest."""

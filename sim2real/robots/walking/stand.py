@@ -21,6 +21,7 @@ from sim2real.robots.from_model.encoders import EncoderParams, Encoders
 from sim2real.robots.from_model.mjcf import driven_spec, read_spec
 from sim2real.robots.roles import ROLES
 from sim2real.robots.walking.joints import STRENGTH, JointParameters
+from sim2real.robots.walking.messages import gravity_of
 from sim2real.types import Array, Key, MjModel, PyTree, Scalar
 from sim2real.worlds.driven import DriveCommand, DrivenWorld
 from sim2real.worlds.mjx import MjxState
@@ -29,8 +30,8 @@ from sim2real.worlds.recorded import RecordedActuator
 STEP_S, FINE_S = 0.002, 0.001
 """Time step of the simulation, and the shorter one for which parameters hold [s]: a step acts as armature, of half the
 step times the damping, so the longer step gets less armature. It halves the time of a fit."""
-_STILL_RAD_S = 0.04
-"""Largest deviation of the gyro in a stand [rad/s]."""
+_STILL_RAD_S, _LEVEL_RAD = 0.04, 0.01
+"""Largest deviations in a stand: of the gyro [rad/s], and of the tilt, which legs on the floor change slowly [rad]."""
 
 
 class LegsInAStand:
@@ -78,14 +79,17 @@ class LegsInAStand:
         """Refuse a log in which the base turns: it was not in a stand.
 
         Raises:
-            OtherMotion: The gyro measured rotation.
+            OtherMotion: The gyro measured rotation, or the tilt changed.
         """
-        gyro = np.asarray(episode.outputs[self.sensor].get("gyro", np.zeros((1, 3))), np.float64)
-        if (turning := float(gyro.std(axis=0).max())) > _STILL_RAD_S:
+        sensed, level = episode.outputs[self.sensor], np.array([[1.0, 0.0, 0.0, 0.0]])
+        gyro = np.asarray(sensed.get("gyro", np.zeros((1, 3))), np.float64)
+        tilt = [gravity_of(q)[:2] for q in np.asarray(sensed.get("quaternion", level), np.float64)]
+        turning, tilting = float(gyro.std(axis=0).max()), float(np.std(tilt, axis=0).max())
+        if turning > _STILL_RAD_S or tilting > _LEVEL_RAD:
             raise OtherMotion(
-                f"the base of the robot moved (its gyro varies by {turning:.2g} rad/s), and this model is of legs in a "
-                "stand",
-                hint="record the robot in a stand, with its legs in the air",
+                f"the base of the robot moved (its gyro varies by {turning:.2g} rad/s, its tilt by {tilting:.2g} rad), "
+                "and this model is of legs in a stand",
+                hint="record the robot in a stand, with its legs in the air; a log of its load is for --standing",
             )
 
     def params(self, values: Mapping[str, Scalar], start: Array) -> dict[str, PyTree]:

@@ -1,6 +1,6 @@
 """Refuse logs that were fitted, as a test of a fit: by the hashes of their files and by their measurements."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -10,6 +10,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.manifest import sha256
 from sim2real.errors import UsageError
 from sim2real.identify.model import IdentifiableModel, position_of
+from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.terminal.console import note
 
 _PIECE = 50
@@ -45,6 +46,22 @@ def require_new(
         elif any(_contains(positions, piece) for piece in pieces):
             messages.append(f"{log.path} holds measurements that these parameters were identified from")
     return _refuse(messages, "take a log of later motion, or --force: errors there are no test of a fit", force)
+
+
+def require_standing(robot: RecordedRobot, log: Recording, model: IdentifiableModel) -> None:
+    """Refuse a log that is not of a robot on its feet."""
+    from sim2real.robots.walking.plain import weighing  # the modules of walking robots alone
+
+    weighing.check(robot, log.episode, {p.name: p.nominal for p in model.parameters})
+
+
+def with_load(
+    identification: Identification, robot: RecordedRobot, log: Recording, truth: Mapping[str, float]
+) -> Identification:
+    """Return an identification with the load, from a log of the robot on its feet; see ``weighing.weighed``."""
+    from sim2real.robots.walking.plain import weighing
+
+    return weighing.weighed(robot, identification, log.episode, truth)
 
 
 def require_apart(

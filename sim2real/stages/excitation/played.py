@@ -24,6 +24,8 @@ def played(config: RecordConfig, pipeline: Pipeline, robot: Robot, announce: boo
         UsageError: The robot cannot play it: the frequencies are too high, or a motion leaves its limits.
     """
     commands = len(robot.agent.action)
+    if config.standing:
+        return robot.drive.standing(config.duration_s)
     if config.motion is None:
         return excitation(config, robot.rate_hz, commands).reshape(-1, commands)
     motion = read_motion(config.motion, pipeline, robot, names_of(config, robot))

@@ -21,6 +21,8 @@ class IdentifyConfig(FitConfig):
     sheet."""
     hold_out: Annotated[tuple[str, ...], UseAppendAction] = ()
     """MCAP log that is held out: predicted, not fitted; one flag a log."""
+    standing: str | None = None
+    """Log of a robot on its feet (`record --excitation standing`), from which its load is estimated."""
     force: bool = False
     """Allow a log that is given twice: held out and fitted, or fitted two times."""
     settle_s: float = 0.3

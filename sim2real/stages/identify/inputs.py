@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import sim2real
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.manifest import sha256
 from sim2real.graph.episode import Episode
@@ -19,13 +20,13 @@ from sim2real.identify.validation.refits import REFITS, Refits
 from sim2real.robots.contract import RecordedRobot, Robot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.fitted_logs import require_apart
+from sim2real.stages.estimation.fitted_logs import require_apart, require_standing, with_load
 from sim2real.stages.estimation.segment_split import spans, with_length
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.open_log import require_units
 from sim2real.stages.pipeline.pipeline import Pipeline
 
-_WITHOUT_EFFECT = ("log", "hold_out", "begin", "force", "each", "links", "reveal", "devices")
+_WITHOUT_EFFECT = ("log", "hold_out", "begin", "standing", "force", "each", "links", "reveal", "devices")
 """Settings on which no refit depends; logs count by their content."""
 
 
@@ -39,6 +40,7 @@ class Inputs:
         logs: The fitted recordings, then those that are held out whole.
         windows: Segments to fit, and segments to predict.
         refits: Finished refits without parts of the recordings.
+        standing: The recording of a robot on its feet; None: there is none.
     """
 
     pipeline: Pipeline
@@ -50,11 +52,16 @@ class Inputs:
     fitted: int
     windows: list[Span]
     refits: Refits = field(default_factory=Refits)
+    standing: Recording | None = None
 
     @property
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of training that no log of the robot determines."""
         return tuple(self.robot.model.unidentified()) if isinstance(self.robot, Robot) else ()
+
+    def weighed(self, document: Identification, truth: Mapping[str, float]) -> Identification:
+        """Return an identification with the load from the recording of a robot on its feet, if there is one."""
+        return document if self.standing is None else with_load(document, self.robot, self.standing, truth)
 
     @property
     def digest(self) -> str:
@@ -100,11 +107,13 @@ def prepare(
     fitted: Sequence[Recording],
     held_out: Sequence[Recording],
     begin: Mapping[str, float] | None = None,
+    standing: Recording | None = None,
 ) -> Inputs:
     """Return the data of an identification.
 
     Args:
         begin: Values at which the search begins; default: the pipeline's.
+        standing: The recording of a robot on its feet.
 
     Raises:
         UsageError: When the recordings are too short, one is given twice, or the configuration does not fit the model.
@@ -112,15 +121,17 @@ def prepare(
     """
     robot = robot_of(pipeline, config)
     logs = (*fitted, *held_out)
-    for log in logs:
+    for log in (*logs, *([standing] if standing else [])):
         require_units(log, robot)
     model = robot.identifiable(config.max_delay_s)
     require_apart(fitted, held_out, model, config.force)
     episodes = [log.episode for log in fitted]
     table = table_of(model, config, episodes).with_begin(begin or {})
     config = with_length(config, model)
+    if standing:
+        require_standing(robot, standing, model)
     windows = spans([log.episode for log in logs], len(fitted), config, config.settle_s + config.horizon_s)
-    return Inputs(pipeline, config, robot, model, table, logs, len(fitted), windows)
+    return Inputs(pipeline, config, robot, model, table, logs, len(fitted), windows, standing=standing)
 
 
 def robot_of(pipeline: Pipeline, config: IdentifyConfig) -> RecordedRobot:

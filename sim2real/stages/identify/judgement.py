@@ -76,8 +76,10 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         if fits.selection is not None:
             document = replace(document, tried=of_selection(fits.selection, fits.widest.problem.table))
         document, lacks = patiently(lambda: lack(document, inputs, fit))
+    document = inputs.weighed(document, truth)
     document, outside = with_promises(document, inputs, fit, parts)
-    open_ = [f"not determined by this log: {', '.join(names)}"] if (names := inputs.undetermined) else []
+    names = [n for n in inputs.undetermined if n not in document.values]
+    open_ = [f"not determined by this log: {', '.join(names)}"] if names else []
     return estimate.judged(document, findings, inputs.units, config.max_delay_s, [*outside, *held, *open_], lacks)
 
 

@@ -34,6 +34,7 @@ def identify(
     hold_out: AnyRecording | Sequence[AnyRecording] = (),
     best: Best | None = None,
     begin: Mapping[str, float] | None = None,
+    standing: AnyRecording | None = None,
 ) -> Identification:
     """Identify a robot's parameters.
 
@@ -45,6 +46,7 @@ def identify(
         hold_out: Recordings that are only predicted.
         best: Updated with the best values so far while the search runs.
         begin: Values at which the search begins; default: the pipeline's.
+        standing: The recording of a robot on its feet, from which its load is estimated.
 
     Returns:
         Estimates, their uncertainty, their predictions, and a verdict.
@@ -57,7 +59,8 @@ def identify(
     config = config_of(config, pipeline.identify)
     fitted = recordings_of(recording, pipeline)
     held_out = recordings_of(hold_out, pipeline, "hold_out") if hold_out else ()
-    return _identify(prepare(pipeline, config, fitted, held_out, begin), best or Best())
+    stands = recordings_of(standing, pipeline, "standing")[0] if standing is not None else None
+    return _identify(prepare(pipeline, config, fitted, held_out, begin, stands), best or Best())
 
 
 def _identify(inputs: Inputs, best: Best) -> Identification:
@@ -88,8 +91,11 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     fitted = len(logs) - len(config.hold_out)
     # Refuse wrong flags, logs that are given twice and logs that are too short before a folder is made.
     begin = _begin(config.begin, pipeline) if config.begin else None
-    inputs = prepare(pipeline, config, logs[:fitted], logs[fitted:], begin)
+    standing = Path(config.standing) if config.standing else None
+    stands = open_recording(standing, pipeline, robot) if standing else None
+    inputs = prepare(pipeline, config, logs[:fitted], logs[fitted:], begin, stands)
     files = {"log" if i == 0 else f"log_{i}": path for i, path in enumerate(paths)}
+    files |= {"standing": standing} if standing else {}
     with (
         open_stage(root, pipeline.name, "identify", config, files, run_dir) as stage,
         searching(

@@ -33,7 +33,8 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
-    connect = robot.drive.connect_to_record if isinstance(config, RecordConfig) else robot.drive.connect
+    hangs = isinstance(config, RecordConfig) and not config.standing
+    connect = robot.drive.connect_to_record if hangs else robot.drive.connect
     with connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
         _require_rig(session.rig)
         if config.dry_run:

@@ -11,7 +11,7 @@ from sim2real.robots.gate_limits import GateLimits
 from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed
 
-GENERATED, HAND = ("multisine", "chirp", "steps"), "hand"
+GENERATED, HAND, STANDING = ("multisine", "chirp", "steps"), "hand", "standing"
 _FILES = (".mcap", ".csv", ".npz", ".json", ".parquet")
 
 
@@ -23,9 +23,9 @@ class RecordConfig:
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
     duration_s: float = 40.0
     """Length of the recording [s]."""
-    excitation: Annotated[str, tyro.conf.arg(metavar="multisine|chirp|steps|hand|FILE")] = "multisine"
+    excitation: Annotated[str, tyro.conf.arg(metavar="multisine|chirp|steps|hand|standing|FILE")] = "multisine"
     """Command signal; a file has a motion to play: a log, or csv, npz or parquet columns named by joint; 'hand': torque
-    stays off, a person moves the robot."""
+    stays off, a person moves the robot; 'standing': a robot on legs stands up and bends them."""
     amplitude: float = 1.8
     """Largest command of the excitation [the actuator's unit; V for the pendulum]."""
     low_hz: float = 0.2
@@ -49,6 +49,11 @@ class RecordConfig:
         return self.excitation == HAND
 
     @property
+    def standing(self) -> bool:
+        """Whether a robot on legs is recorded on its feet."""
+        return self.excitation == STANDING
+
+    @property
     def motion(self) -> Path | None:
         """The file whose motion is played; None for a generated excitation."""
         return Path(self.excitation) if Path(self.excitation).suffix in _FILES else None
@@ -57,9 +62,9 @@ class RecordConfig:
         """Check what can be checked before anything moves."""
         check_seed(self.seed)
         check_view(self.view)
-        if self.excitation not in (*GENERATED, HAND) and self.motion is None:
+        if self.excitation not in (*GENERATED, HAND, STANDING) and self.motion is None:
             raise UsageError(
-                f"--excitation {self.excitation} is neither {', '.join(GENERATED)} nor {HAND}, nor a file",
+                f"--excitation {self.excitation} is neither {', '.join((*GENERATED, HAND))} nor {STANDING}, nor a file",
                 hint="a motion is a log (.mcap), or a .csv, .npz, .json or .parquet file",
             )
         if not 1.0 <= self.duration_s <= 3600.0:

@@ -55,7 +55,7 @@ def record(
         if signal is None:
             session.rig.withhold_torque()
             note("torque is off: move the robot by hand", urgent=True)
-        nodes = robot.recording_nodes(session, signal)
+        nodes = robot.recording_nodes(session, signal, config.standing)
         run_episode(pipeline, robot, session, nodes, {}, log, duration_s, config, "record")
     return Recording.load(log, truth)
 

@@ -28,6 +28,12 @@ from unitree_sdk2py.utils.crc import CRC  # noqa: E402
 FOLDED, STANDING = np.array([0.0, 1.36, -2.65] * 4), np.array([0.0, 0.8, -1.5] * 4)
 PERIOD_S = 0.005
 
+
+def off():
+    """Return how far a joint is from standing at most [rad]."""
+    return np.abs([motor.q for motor in states[-1].motor_state[:12]] - STANDING).max()
+
+
 ChannelFactoryInitialize(int(sys.argv[1]), "lo")
 crc, states = CRC(), []
 platform.system = system
@@ -41,7 +47,8 @@ command = unitree_go_msg_dds__LowCmd_()
 command.head, command.level_flag = [0xFE, 0xEF], 0xFF
 start = np.array([motor.q for motor in states[-1].motor_state[:12]])
 begin = time.monotonic()
-while (t_s := time.monotonic() - begin) < 2.0:
+# On a busy machine it stands later.
+while (t_s := time.monotonic() - begin) < 2.0 or (t_s < 10.0 and off() > 0.15):
     to_fold, to_stand = min(1.0, t_s / 0.4), np.clip((t_s - 0.4) / 0.8, 0.0, 1.0)
     goal = start + to_fold * (FOLDED - start) + to_stand * (STANDING - FOLDED)
     for motor, q in zip(command.motor_cmd, goal, strict=False):

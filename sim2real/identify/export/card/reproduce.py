@@ -115,7 +115,7 @@ def verlet(model: Untyped, data: Untyped) -> None:
     moving = before * (1.0 - 0.5 * h * damping)
     # Friction opposes the motion until it stops; for the rest of the step the joint sticks, or moves the other way.
     slowed = moving + push - np.sign(moving) * dry
-    turns = moving * slowed < 0.0
+    turns = np.sign(moving) * slowed < 0.0
     rest = np.where(turns, slowed / np.where(turns, slowed - moving, 1.0), 1.0)
     after = np.where((moving != 0.0) & ~turns, slowed, rest * np.sign(push) * np.maximum(np.abs(push) - dry, 0.0))
     data.qvel[:] = after / (1.0 + 0.5 * h * damping)

@@ -1,0 +1,126 @@
+"""The load of a robot on its feet, from the torques of its joints."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+from benches.hidden import legs
+
+from pipelines.go2.robot import ROBOT
+from sim2real.artifacts.estimation.posterior import Alternative, Posterior
+from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.recording import Recording
+from sim2real.errors import OtherMotion, UsageError
+from sim2real.hardware.emulation.truth import read_truth
+from sim2real.robots.walking.plain import weighing
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.train.environment.draws import draw_robots
+from sim2real.train.environment.variation import VariationConfig
+
+
+def logged(folder, seed, **options):
+    """Return a log of a hidden robot, and the values that an identification would find: the true ones."""
+    path = folder / f"{seed}.mcap"
+    legs.record(path, seed, 8.0, **options)
+    header = read_truth(path.with_suffix(".truth.bin")).header
+    truth, config = header["truth"], header["config"]
+    values = {p.name: truth.get(p.name, p.nominal) for p in ROBOT.identifiable(0.06).parameters}
+    values |= {"sensor_delay": config["sensing_latency_s"], "actuator_delay": config["actuation_latency_s"]}
+    return Recording.load(path).episode, values, truth["payload"]
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory):
+    return logged(tmp_path_factory.mktemp("standing"), 1, standing=True)
+
+
+def identified(values, deviation=0.005):
+    """Return an identification with these values, whose parameters are known with a relative deviation."""
+    names = [n for n in values if n.endswith(("strength", "damping", "friction")) and n != "motor_strength"]
+    at = np.log([values[n] for n in names])
+    posterior = Posterior(
+        tuple(names), ("log",) * len(names), at, np.eye(len(names)) * deviation**2, at - 1.0, at + 1.0
+    )
+    rows = tuple(Estimate(n, "1", "dynamics", "", None, float(v), "accepted") for n, v in values.items())
+    return Identification("go2", (), Judgement("accepted", ()), rows, posterior=posterior)
+
+
+def test_true_parameters_give_the_true_load(standing):
+    episode, values, load = standing
+    found = weighing.balances_of(ROBOT, episode, values).load(ROBOT, values)
+    assert found == pytest.approx(load, abs=0.06)
+    # Motors that are stronger by 3 % carry 3 % more than the robot's 15 kg and its load.
+    stronger = {n: 1.03 * v if n.endswith("_strength") else v for n, v in values.items()}
+    assert weighing.balances_of(ROBOT, episode, values).load(ROBOT, stronger) - found == pytest.approx(0.48, abs=0.06)
+
+
+@pytest.mark.full  # the quick test has one of these robots
+@pytest.mark.parametrize("seed", [0, 2, 6])
+def test_loads_of_other_robots(tmp_path, seed):
+    episode, values, load = logged(tmp_path, seed, standing=True)
+    assert weighing.balances_of(ROBOT, episode, values).load(ROBOT, values) == pytest.approx(load, abs=0.06)
+
+
+def test_the_load_has_an_interval_and_training_draws_it_beside_the_strengths(standing):
+    episode, values, load = standing
+    before = identified(values)
+    found = weighing.weighed(ROBOT, before, episode, {"payload": load})
+    row = found.parameters[-1]
+    assert (row.name, row.unit, row.verdict, row.truth) == ("payload", "kg", "accepted", load)
+    assert row.low95 < load < row.high95
+    assert 0.03 < row.high95 - row.low95 < 0.6
+    assert found.posterior.names == (*before.posterior.names, "payload")
+    rng, vary = np.random.default_rng(0), VariationConfig(range={})
+    draws = draw_robots(found.values, found, vary, 1.0, rng)
+    assert draws["payload"].mean() == pytest.approx(row.estimate, abs=0.05)
+    assert draws["payload"].std() == pytest.approx(row.standard_error, rel=0.3)
+    # Robots with stronger motors carry more.
+    strengths = np.mean([v for n, v in draws.items() if n.endswith("_strength")], axis=0)
+    assert np.corrcoef(strengths, draws["payload"])[0, 1] > 0.25
+    np.testing.assert_array_equal(found.posterior.covariance[:-1, :-1], before.posterior.covariance)
+
+
+def test_alternatives_have_the_load_too(standing):
+    episode, values, load = standing
+    one = identified(values).posterior
+    document = replace(identified(values), posterior=replace(one, others=(Alternative("another", 0.5, one),)))
+    found = weighing.weighed(ROBOT, document, episode, {}).posterior
+    assert found.others[0].posterior.names[-1] == "payload"
+    assert found.sample(np.random.default_rng(0), 50)["payload"].mean() == pytest.approx(load, abs=0.2)
+
+
+def changed(episode, node, **fields):
+    return replace(episode, outputs={**episode.outputs, node: {**episode.outputs[node], **fields}})
+
+
+def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing):
+    episode, values, _ = standing
+    weighing.check(ROBOT, episode, values)
+    hanging, _, _ = logged(tmp_path, 1)
+    with pytest.raises(OtherMotion, match="beside the robot's own weight") as refused:
+        weighing.check(ROBOT, hanging, values)
+    assert "not in a stand" in refused.value.hint
+    with pytest.raises(OtherMotion, match="base of the robot moved") as refused:
+        ROBOT.identifiable(0.06).check(episode)
+    assert "--standing" in refused.value.hint
+    still = changed(episode, "sensor", velocity=0.0 * episode.outputs["sensor"]["velocity"])
+    with pytest.raises(OtherMotion, match="stands still"):
+        weighing.check(ROBOT, still, values)
+    turned = np.tile([0.9, 0.43589, 0.0, 0.0], (len(episode.outputs["sensor"]["quaternion"]), 1))
+    with pytest.raises(OtherMotion, match="not stand upright"):
+        weighing.check(ROBOT, changed(episode, "sensor", quaternion=turned), values)
+    with pytest.raises(UsageError, match="does not stand on legs"):
+        weighing.check(load_pipeline("pendulum").load(), episode, values)
+
+
+def test_the_legs_bend_slowly_towards_the_folded_ones():
+    goals = ROBOT.drive.around(ROBOT.drive.standing(10.0))
+    assert len(goals) == 500
+    np.testing.assert_allclose(goals[0], ROBOT.stance, atol=1e-6)
+    share = (goals - ROBOT.stance) / (np.asarray(ROBOT.motors.folded) - ROBOT.stance)
+    assert share.max() == pytest.approx(0.25, abs=0.01)
+    assert np.abs(np.diff(goals, axis=0)).max() * ROBOT.rate_hz < 0.4
