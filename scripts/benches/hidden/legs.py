@@ -35,9 +35,7 @@ def record(
     from sim2real.hardware.emulation.truth import TruthLog
     from sim2real.hardware.plant import load_named
     from sim2real.hardware.unitree.emulation import EmulatedLegs, UnitreeEmulation, truth_header
-    from sim2real.hardware.unitree.legs import command
     from sim2real.robots.servo.drive import approached
-    from sim2real.robots.walking.messages import BodyReading
     from sim2real.stages.excitation.signals import excitation
     from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -62,6 +60,15 @@ def record(
         hanging = legs.state(begin_ns).record["motor_state"]["q"][:12]
         signal = excitation(config_of, robot.rate_hz, len(robot.joints))
         goals = approached(robot.drive.around(signal), hanging, robot.rate_hz)
+    _play(path, legs, robot, goals, begin_ns, seed)
+    truth.close()
+
+
+def _play(path: Path, legs: Any, robot: Any, goals: np.ndarray, begin_ns: int, seed: int) -> None:
+    """Write the log of a loop that sends targets ``(N, joints)`` [rad] from a time on [ns]."""
+    from sim2real.hardware.unitree.legs import command
+    from sim2real.robots.walking.messages import BodyReading
+
     # The times of the loop's steps; a measurement is the first state after its step's start.
     rng, count = np.random.default_rng([20261126, seed]), len(goals)
     took = {name: mean * rng.gamma(4.0, 0.25, count) for name, mean in _TOOK_S.items()}
@@ -79,7 +86,6 @@ def record(
         readings.append(BodyReading(*(np.array(part, np.float32) for part in parts)))
         commands.append(robot.drive.message(np.asarray(goal, np.float32)))
         legs.receive(command(_table(commands[-1])), begin_ns + round(1e9 * sent[k]))
-    truth.close()
     ends = {name: starts[name] + took[name] for name in starts}
     starts["sensor"] = starts["sensor"] + arrives
     write_log(path, "go2", (starts, ends), readings, commands, robot.units)
