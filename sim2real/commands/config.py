@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from sim2real.errors import UsageError
+from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 
@@ -95,6 +96,10 @@ class PlayConfig:
     window: bool = False
     """Show it in a window; the arrow keys change forward velocity and yaw rate, comma and full stop the sideways one,
     the space bar stops."""
+    view: ViewFlag = None
+    """Show it in the Rerun viewer; 'web': on a page for browsers. The same keys steer in the terminal."""
+    gamepad: Annotated[Path | None, arg(metavar="/dev/input/js0")] = None
+    """Gamepad that steers: the left stick sets the velocity, the right one the yaw rate."""
     video: Annotated[Path | None, arg(metavar="FILE.gif|FILE.mp4")] = None
     """Moving picture to write, from the side; needs no display, and FFmpeg for .mp4."""
     runs: Path = Path("runs")
@@ -103,5 +108,8 @@ class PlayConfig:
     def __post_init__(self) -> None:
         if not (0.0 < self.seconds <= 3600.0 and 0.0 <= self.push <= 10.0):
             raise UsageError(f"play takes up to 3600 s and pushes of 0 to 10 m/s, got {self.seconds} and {self.push}")
+        check_view(self.view)
+        if sum(map(bool, (self.window, self.view, self.video))) > 1:
+            raise UsageError("play shows a window or a view, or writes a picture", hint="run it with one of them")
         if self.video and self.video.suffix not in (".gif", ".mp4"):
             raise UsageError(f"--video writes a .gif or a .mp4, got {self.video}", hint="--video walk.gif")

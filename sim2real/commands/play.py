@@ -3,6 +3,7 @@
 import importlib
 import shutil
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,45 +16,47 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.policy.bundle import load_bundle
 from sim2real.robots.walking.robot import ComposedRobot
 from sim2real.robots.walking.twin import HiddenTwin, Twin, Walked, walk
+from sim2real.stages.live.steering import gamepad, steer, terminal_keys
 from sim2real.stages.pipeline.pipeline import available, load_pipeline
 from sim2real.stages.terminal.console import note, wrote
+from sim2real.view.model_scene import ModelScene
+from sim2real.view.rerun_viewer import open_viewer, rerun_module
 
 FRAMES_PER_S = 12.5
-_KEYS = {265: (0, 0.1), 264: (0, -0.1), 44: (1, 0.1), 46: (1, -0.1), 263: (2, 0.1), 262: (2, -0.1)}
-"""Key of GLFW -> entry of the command, and its change: arrows, comma, full stop."""
-_SPACE = 32
+_VIEWED_EVERY = 5
+"""Policy steps in an update of the Rerun viewer."""
 
 
 def run(config: PlayConfig) -> Walked:
     """Walk, print how it went, and return it.
 
     Raises:
-        UsageError: There is no policy, the robot does not walk, or the window and the picture exclude each other.
+        UsageError: There is no policy or no gamepad, or the robot does not walk.
     """
-    if config.window and config.video:
-        raise UsageError("play shows a window or writes a picture", hint="run it with one of both")
     if config.video and config.video.suffix == ".mp4":
         _ffmpeg()  # an error before the walk
     robot, folder = _chosen(config)
     hidden = None if config.seed is None else HiddenTwin.draw(np.random.default_rng(config.seed), len(robot.joints))
     twin, wanted = Twin(robot, hidden, config.seed or 0), np.array(config.command)
-    shown = _window(twin, wanted) if config.window else None
-    walked = walk(twin, load_bundle(folder), lambda _: wanted, config.seconds, config.push, shown=shown)
+    sources = [gamepad(config.gamepad, robot.commands.most)] if config.gamepad else []
+    shown = _window(twin, wanted) if config.window else _View(twin, config.view) if config.view else None
+
+    def command(_: float) -> np.ndarray:
+        for follow in sources:
+            follow(wanted)
+        return wanted.copy()
+
+    with terminal_keys() if config.view else nullcontext() as keys:
+        sources += [keys] if keys else []
+        walked = walk(twin, load_bundle(folder), command, config.seconds, config.push, shown=shown)
+    if isinstance(shown, _View):
+        shown.close()
     if config.video:
         write_picture(twin, walked.qpos, config.video)
         wrote(config.video)
     end = f"fell after {walked.fell_s:.1f} s" if walked.fell_s is not None else f"walked for {config.seconds:g} s"
     note(f"{end}; off the command by {walked.error_m_s:.3f} m/s and {walked.error_rad_s:.3f} rad/s")
     return walked
-
-
-def steer(wanted: np.ndarray, key: int) -> None:
-    """Change the commanded velocity ``(3,)`` by a key."""
-    if key == _SPACE:
-        wanted[:] = 0.0
-    elif key in _KEYS:
-        entry, change = _KEYS[key]
-        wanted[entry] = np.clip(wanted[entry] + change, -1.0, 1.0)
 
 
 def write_picture(twin: Twin, qpos: np.ndarray, out: Path) -> None:
@@ -127,3 +130,40 @@ def _window(twin: Twin, wanted: np.ndarray) -> Any:
         time.sleep(max(0.0, begin + t_s - time.monotonic()))
 
     return shown
+
+
+class _View:
+    """Shows policy steps in the Rerun viewer, each at its time; a file gets them at once.
+
+    Args:
+        target: Value of the flag ``--view``.
+    """
+
+    def __init__(self, twin: Twin, target: str) -> None:
+        rr, joints = rerun_module(), {name: f"position[{i}]" for i, name in enumerate(twin.robot.joints)}
+        self._recording, self._paced = rr.RecordingStream("sim2real play"), not target.endswith(".rrd")
+        note(open_viewer(self._recording, target), urgent=True)
+        self._recording.send_blueprint(rr.blueprint.Blueprint(rr.blueprint.Spatial3DView(origin="/robot")))
+        self._scene, self._rows, self._begin = ModelScene(str(twin.robot.mjcf), joints), list[np.ndarray](), 0.0
+        self._names = [f"base[{i}]" for i in range(3)] + [f"quaternion[{i}]" for i in range(4)] + list(joints.values())
+
+    def __call__(self, twin: Twin, t_s: float) -> None:
+        """Show a step."""
+        self._begin = self._begin or time.monotonic() - t_s
+        self._rows.append(np.append(twin.data.qpos, t_s))
+        if len(self._rows) == _VIEWED_EVERY:
+            self._send()
+        if self._paced:
+            time.sleep(max(0.0, self._begin + t_s - time.monotonic()))
+
+    def close(self) -> None:
+        """Send what remains."""
+        if self._rows:
+            self._send()
+        self._recording.flush()
+        self._recording.disconnect()
+
+    def _send(self) -> None:
+        *columns, times = np.array(self._rows).T
+        self._scene(self._recording, times, dict(zip(self._names, columns, strict=True)), "robot")
+        self._rows.clear()

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, Unpack
 
 import numpy as np
 
-from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.identify.model import Channel, PlainSimulation
@@ -133,9 +132,10 @@ class RobotDrive(_Part, Protocol):
         """Return the commands ``(N, actions)`` of an excitation; default: the signal itself, around 0."""
         return signal
 
-    def standing(self, duration_s: float) -> np.ndarray:
-        """Return the excitation ``(N, actions)`` of a robot on its feet; default: there is none."""
-        raise UsageError("this robot does not stand on legs", hint="choose another --excitation")
+    def standing(self, duration_s: float) -> np.ndarray | None:
+        """Return the excitation ``(N, actions)`` of a robot on its feet; None: it has no feet."""
+        del duration_s
+        return None
 
     def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
         """Return the commands ``(N, actions)`` with which a recording plays an excitation; default: ``around``."""

@@ -8,28 +8,43 @@ import numpy as np
 
 _GROUPS = (0, 1, 2)
 """Groups of geometries that MuJoCo's viewer shows; by convention the others are for collisions."""
+_ABOVE_M = 10.0
+"""Height from which a robot is lowered to the floor [m]."""
 _GHOST, _PLAIN = (66, 150, 230), (150, 162, 176)
 
 
 class ModelScene:
     """Draws a model over time; a ``Scene``.
 
+    A floating base turns as the fields ``quaternion[i]`` do, and is at ``base[i]`` [m]. Without these it is above the
+    origin, and the lowest part of the robot on the floor.
+
     Args:
-        columns: Joint -> field of its measured position (``"position[0]"``). A composed model names a joint by the path
-            of its parts, ``arm/elbow/joint``; then the name before ``joint`` counts.
+        mjcf: The model, or the path of its file.
+        columns: Joint, or its actuator -> field of its measured position (``"position[0]"``). A composed model names a
+            joint by the path of its parts, ``arm/elbow/joint``; then the name before ``joint`` counts.
     """
 
     def __init__(self, mjcf: str, columns: Mapping[str, str]) -> None:
         self._mj: Any = importlib.import_module("mujoco")  # pyright does not see the names of its C extension
-        self._model = self._mj.MjModel.from_xml_string(mjcf)
+        text = mjcf.lstrip().startswith("<")
+        self._model = (self._mj.MjModel.from_xml_string if text else self._mj.MjModel.from_xml_path)(mjcf)
         self._data = self._mj.MjData(self._model)
         if self._model.nkey:
             self._mj.mj_resetDataKeyframe(self._model, self._data, 0)
         self._places: dict[int, str] = {}
         self._shapes: dict[bool, dict[int, tuple[Any, Any]]] = {}
+        free = np.flatnonzero(self._model.jnt_type == self._mj.mjtJoint.mjJNT_FREE)
+        self._base = int(self._model.jnt_qposadr[free[0]]) if free.size else None
+        planes = np.flatnonzero(self._model.geom_type == self._mj.mjtGeom.mjGEOM_PLANE)
+        self._floor = int(planes[0]) if planes.size else None
+        driven = {
+            int(self._model.actuator_trnid[a, 0]): str(self._model.actuator(a).name) for a in range(self._model.nu)
+        }
         for i in range(self._model.njnt):
             full = self._model.joint(i).name
-            name = full if full in columns else full.removesuffix("/joint").rsplit("/", 1)[-1]
+            short = full.removesuffix("/joint").rsplit("/", 1)[-1]
+            name = next((n for n in (full, driven.get(i, "")) if n in columns), short)
             if name in columns:
                 self._places[int(self._model.jnt_qposadr[i])] = columns[name]
 
@@ -55,6 +70,7 @@ class ModelScene:
         for row in range(len(t_s)):
             for address, name in self._places.items():
                 self._data.qpos[address] = columns[name][row]
+            self._move_base(columns, row)
             self._mj.mj_kinematics(self._model, self._data)
             at_m[row], turned[row] = self._data.xpos[bodies], self._data.xquat[bodies][:, [1, 2, 3, 0]]
         time = rr.TimeColumn("time", duration=t_s)
@@ -62,12 +78,29 @@ class ModelScene:
             moved = rr.Transform3D.columns(translation=at_m[:, i], quaternion=turned[:, i])
             rec.send_columns(f"{entity}/body_{body}", [time], moved)
 
+    def _move_base(self, columns: Mapping[str, np.ndarray], row: int) -> None:
+        """Place a floating base by a row of the columns, otherwise on the floor."""
+        if self._base is None or "quaternion[0]" not in columns:
+            return
+        place, turn = self._data.qpos[self._base : self._base + 3], slice(self._base + 3, self._base + 7)
+        self._data.qpos[turn] = [columns[f"quaternion[{i}]"][row] for i in range(4)]
+        place[:] = [columns[f"base[{i}]"][row] if f"base[{i}]" in columns else 0.0 for i in range(3)]
+        if "base[2]" in columns or self._floor is None:
+            return
+        place[2] = _ABOVE_M
+        self._mj.mj_kinematics(self._model, self._data)
+        moving = np.flatnonzero(self._model.geom_bodyid > 0).tolist()
+        gaps = [self._mj.mj_geomDistance(self._model, self._data, self._floor, g, 2 * _ABOVE_M, None) for g in moving]
+        place[2] -= min(gaps)
+
     def _drawn(self, ghost: bool) -> dict[int, tuple[Any, Any]]:
         """Return geometry -> its pose and its shape, which a live view sends once but would make for each call."""
         import rerun as rr
 
         model = self._model
-        drawn = [g for g in range(model.ngeom) if model.geom_rgba[g, 3] > 0.0 and model.geom_group[g] in _GROUPS]
+        visible = [g for g in range(model.ngeom) if model.geom_rgba[g, 3] > 0.0 and g != self._floor]
+        # Some models have no other geometries than those for collisions.
+        drawn = [g for g in visible if model.geom_group[g] in _GROUPS] or visible
         return {
             g: (rr.Transform3D(**_pose(model.geom_pos[g], model.geom_quat[g])), shape)
             for g in drawn
@@ -79,7 +112,7 @@ class ModelScene:
         import rerun as rr
 
         kinds, model = self._mj.mjtGeom, self._model
-        kind, size = model.geom_type[geom], model.geom_size[geom]
+        kind, size = kinds(model.geom_type[geom]), model.geom_size[geom]  # an enum is in no tuple by its number
         rgb = (255 * model.geom_rgba[geom, :3]).astype(int).tolist() if model.geom_rgba[geom, :3].any() else _PLAIN
         look: dict[str, Any] = {"colors": [_GHOST if ghost else rgb]}
         fill: dict[str, Any] = {"fill_mode": "majorwireframe" if ghost else "solid"}

@@ -1,5 +1,6 @@
 """The content of a Rerun recording, independent of Rerun: one tab for each episode, with curves and a scene."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -14,6 +15,8 @@ from sim2real.log.schema import unit_of
 from sim2real.view.signals import Series, Signals, signals_of, simulated_beside
 
 IDLE = "idle"
+_MOST_PLOTS = 28
+"""More plots beside each other cannot be read: a quadruped's log has 91."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,24 @@ def episode_tab(title: str, entity: str, log: Signals, simulated: list[Series]) 
         states = [s for s in simulated if s.name not in commands]
         motions.append(_motion(f"{entity}/scene/simulation", states, [], ghost=True))
     return Tab(title, entity, plots, motions, log.episode)
+
+
+def with_goals(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
+    """Return the plots with each joint's goal, in legs ``q``, beside its position."""
+    merged = dict(plots)
+    for title in plots:
+        position = re.sub(r"^(goal|q)(?=\[| |$)", "position", title)
+        if position != title and position in plots:
+            merged[position] = [*plots[position], *merged.pop(title)]
+    return merged
+
+
+def readable(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
+    """Return the plots that fit beside each other: of very many, goals beside positions, and none that is constant."""
+    if len(plots) <= _MOST_PLOTS:
+        return dict(plots)
+    moving = {t: c for t, c in with_goals(plots).items() if any(len(x.values) and np.ptp(x.values) for x in c)}
+    return moving or dict(plots)
 
 
 def _identify_tab(identification: Identification, recording: int, which: str) -> Tab:

@@ -14,7 +14,7 @@ from sim2real.artifacts.run.run_folder import finished_stages, pipeline_of
 from sim2real.graph.episode import TICKS_PER_S, Episode
 from sim2real.log.ages import input_ages
 from sim2real.view.node_looks import color_of, in_order, slowest_period_s
-from sim2real.view.rerun_content import IDLE, Curve, Tab, states_of, tabs_of
+from sim2real.view.rerun_content import IDLE, Curve, Tab, readable, states_of, tabs_of
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
 
 TIMELINE = "time"
@@ -181,7 +181,7 @@ def _page(tab: Tab, with_scene: bool) -> Any:
     whole = rrb.TimeAxis(view_range=rrb.TimeRange(start=begin, end=end))
     plots = [
         rrb.TimeSeriesView(name=title, contents=[c.entity for c in curves], plot_legend=legend, axis_x=whole)
-        for title, curves in tab.plots.items()
+        for title, curves in readable(tab.plots).items()
     ]
     side: list[Any] = []
     if with_scene and tab.motions:

@@ -12,6 +12,7 @@ from sim2real.view.live.follower import Follower
 from sim2real.view.live.log_source import LogSource, _thinned
 from sim2real.view.live.stage_sources import FitSource, ProgressSource
 from sim2real.view.model_scene import ModelScene
+from sim2real.view.rerun_content import Curve, readable
 
 rr = pytest.importorskip("rerun")
 from rerun.chunk import RrdReader  # noqa: E402
@@ -119,6 +120,53 @@ MODEL = """
       <geom type="mesh" mesh="tetra"/><geom type="cylinder" size=".1 .2"/>
     </body></body></worldbody></mujoco>
 """
+
+
+FLOATING = """<mujoco><worldbody>
+  <geom type="plane" size="1 1 1" group="3"/>
+  <body><freejoint/><geom type="box" size=".2 .1 .05" group="3"/>
+    <body pos="0 0 -.1"><joint name="knee_joint" axis="0 1 0"/>
+      <geom type="sphere" size=".02" pos="0 0 -.3" group="3"/></body>
+  </body></worldbody><actuator><motor name="knee" joint="knee_joint"/></actuator></mujoco>
+"""
+
+
+def test_a_floating_base_turns_as_measured_and_its_foot_is_on_the_floor(tmp_path):
+    path = tmp_path / "floating.xml"
+    path.write_text(FLOATING)
+    scene = ModelScene(str(path), {"knee": "position[0]"})  # the name of the actuator
+    columns = {"position[0]": np.array([0.0, np.pi / 3]), **{f"quaternion[{i}]": np.zeros(2) for i in range(4)}}
+    columns["quaternion[0]"] = np.ones(2)
+    heights = []
+    for row in range(2):
+        scene._data.qpos[7] = columns["position[0]"][row]
+        scene._move_base(columns, row)
+        heights.append(float(scene._data.qpos[2]))
+    np.testing.assert_allclose(heights, [0.42, 0.1 + 0.3 * np.cos(np.pi / 3) + 0.02], atol=1e-4)
+    # A known place counts.
+    scene._move_base({**columns, **{f"base[{i}]": np.full(2, 0.5 + i) for i in range(3)}}, 0)
+    np.testing.assert_allclose(scene._data.qpos[:3], [0.5, 1.5, 2.5])
+    # A model with nothing but geometries for collisions is drawn all the same, without its floor.
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "floating.rrd")
+    scene(recording, np.array([0.0, 1.0]), columns, "robot")
+    recording.flush()
+    recording.disconnect()
+    moving, static = rows_of(tmp_path / "floating.rrd")
+    assert moving == {"/robot/body_1": 2, "/robot/body_2": 2}
+    assert {e for e in static if "geom" in e} == {"/robot/body_1/geom_1", "/robot/body_2/geom_2"}
+
+
+def test_of_very_many_plots_the_constant_ones_are_left_out_and_goals_stand_beside_positions():
+    def plots(count):
+        names = [f"{name}[{i}] [rad]" for name in ("position", "q", "kp") for i in range(count)]
+        curve = lambda name: Curve(name, name, "", np.arange(3.0), np.arange(3.0) * (name[0] != "k"))  # noqa: E731
+        return {name: [curve(name)] for name in names}
+
+    assert list(readable(plots(9))) == list(plots(9))
+    merged = readable(plots(12))
+    assert list(merged) == [f"position[{i}] [rad]" for i in range(12)]
+    assert [c.label for c in merged["position[3] [rad]"]] == ["position[3] [rad]", "q[3] [rad]"]
 
 
 def test_a_model_moves_as_its_joints_do(tmp_path):

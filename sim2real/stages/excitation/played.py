@@ -25,7 +25,9 @@ def played(config: RecordConfig, pipeline: Pipeline, robot: Robot, announce: boo
     """
     commands = len(robot.agent.action)
     if config.standing:
-        return robot.drive.standing(config.duration_s)
+        if (bent := robot.drive.standing(config.duration_s)) is None:
+            raise UsageError("this robot does not stand on legs", hint="choose another --excitation")
+        return bent
     if config.motion is None:
         return excitation(config, robot.rate_hz, commands).reshape(-1, commands)
     motion = read_motion(config.motion, pipeline, robot, names_of(config, robot))

@@ -18,7 +18,8 @@ def scene_of(pipeline: Pipeline, robot: RecordedRobot | Robot | None) -> dict[st
     if not isinstance(robot, Robot):
         return {}
     columns = {name: fields["position"] for name, fields in robot.sensor.joints.items() if "position" in fields}
-    return {"mjcf": robot.identified_mjcf(robot.nominal()), "columns": columns}
+    file = getattr(robot, "mjcf", None)  # of a walking robot, which has no model for others
+    return {"mjcf": robot.identified_mjcf(robot.nominal()) or (str(file) if file else None), "columns": columns}
 
 
 def drawn(scene: Mapping[str, Json]) -> Scene | None:

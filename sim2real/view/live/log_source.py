@@ -1,6 +1,6 @@
 """A growing log as a live view shows it: at most 50 rows a second, and of each group of steps the latest one."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
 from sim2real.log.tail import LogTail
-from sim2real.view.rerun_content import Curve, Tab, episode_tab
+from sim2real.view.rerun_content import Curve, Tab, episode_tab, with_goals
 from sim2real.view.signals import outputs_of
 
 ROWS_PER_S = 50.0
@@ -41,19 +41,9 @@ class LogSource:
             for node, steps in thinned.steps.items()
         ]
         return _moved(
-            replace(tab, plots={**_with_goals(tab.plots), "Lateness [ms]": curves}, episode=None, recent_s=RECENT_S),
+            replace(tab, plots={**with_goals(tab.plots), "Lateness [ms]": curves}, episode=None, recent_s=RECENT_S),
             self._offset_s(self._tail.epoch_ns),
         )
-
-
-def _with_goals(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
-    """Return the plots with each joint's goal beside its position."""
-    merged = dict(plots)
-    for title in plots:
-        position = title.replace("goal", "position", 1)
-        if title.startswith("goal") and position in plots:
-            merged[position] = [*plots[position], *merged.pop(title)]
-    return merged
 
 
 def _thinned(episode: Episode) -> tuple[Episode, dict[str, np.ndarray]]:
