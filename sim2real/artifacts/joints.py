@@ -45,9 +45,13 @@ def joint_rows(identification: Identification) -> list[JointRow]:
     parameters = identification.parameters
     round_trip = next((p for p in parameters if p.name == ROUND_TRIP), None)
     delays = [p for p in parameters if p.kind == "delay"]
-    friction = [p for p in parameters if p.name.startswith("friction")]
+    friction = [p for p in parameters if any(w.startswith("friction") for w in _words(p.name))]
     return [
-        JointRow(row, _of_joint(delays, row.name, shared=False) or round_trip, _of_joint(friction, row.name))
+        JointRow(
+            row,
+            _of_joint(delays, "delay", row.name, shared=False) or round_trip,
+            _of_joint(friction, "friction", row.name),
+        )
         for row in identification.held_out
     ]
 
@@ -73,8 +77,8 @@ def _is_absent(estimate: Estimate) -> bool:
     return estimate.lower == 0.0 and estimate.upper is not None and estimate.estimate < 1e-3 * estimate.upper
 
 
-def _of_joint(parameters: Sequence[Estimate], joint: str, shared: bool = True) -> Estimate | None:
-    """Return the parameter whose name ends with the most words of a joint's name.
+def _of_joint(parameters: Sequence[Estimate], quantity: str, joint: str, shared: bool = True) -> Estimate | None:
+    """Return the parameter whose name has the most words of a joint's name, and no others but the quantity.
 
     Args:
         shared: Whether a parameter without words of a joint counts, too.
@@ -82,7 +86,7 @@ def _of_joint(parameters: Sequence[Estimate], joint: str, shared: bool = True) -
     words = set(_words(joint))
     best, most = None, -1 if shared else 0
     for p in parameters:
-        _, *rest = _words(p.name.partition("@")[0])
+        rest = [word for word in _words(p.name.partition("@")[0]) if not word.startswith(quantity)]
         if set(rest) <= words and len(rest) > most:
             best, most = p, len(rest)
     return best

@@ -70,7 +70,7 @@ class ModelScene:
         for row in range(len(t_s)):
             for address, name in self._places.items():
                 self._data.qpos[address] = columns[name][row]
-            self._move_base(columns, row)
+            self._move_base(columns, row, ghost)
             self._mj.mj_kinematics(self._model, self._data)
             at_m[row], turned[row] = self._data.xpos[bodies], self._data.xquat[bodies][:, [1, 2, 3, 0]]
         time = rr.TimeColumn("time", duration=t_s)
@@ -78,13 +78,17 @@ class ModelScene:
             moved = rr.Transform3D.columns(translation=at_m[:, i], quaternion=turned[:, i])
             rec.send_columns(f"{entity}/body_{body}", [time], moved)
 
-    def _move_base(self, columns: Mapping[str, np.ndarray], row: int) -> None:
-        """Place a floating base by a row of the columns, otherwise on the floor."""
+    def _move_base(self, columns: Mapping[str, np.ndarray], row: int, ghost: bool) -> None:
+        """Place a floating base by a row of the columns, otherwise on the floor.
+
+        A ghost stays beside the robot, whose way is not measured.
+        """
         if self._base is None or "quaternion[0]" not in columns:
             return
         place, turn = self._data.qpos[self._base : self._base + 3], slice(self._base + 3, self._base + 7)
         self._data.qpos[turn] = [columns[f"quaternion[{i}]"][row] for i in range(4)]
-        place[:] = [columns[f"base[{i}]"][row] if f"base[{i}]" in columns else 0.0 for i in range(3)]
+        axes = enumerate(f"base[{i}]" for i in range(3))
+        place[:] = [columns[name][row] if name in columns and (i == 2 or not ghost) else 0.0 for i, name in axes]
         if "base[2]" in columns or self._floor is None:
             return
         place[2] = _ABOVE_M

@@ -32,3 +32,10 @@ def test_each_joint_has_its_delay_friction_and_verdict():
     assert row.delay is still[0]
     assert row.verdict == "accepted", "a delay of 0 is the smallest possible one"
     assert joint_rows(Identification("dog", (), Judgement("", ()), ())) == []
+
+
+def test_the_friction_of_a_group_is_that_of_its_joints():
+    parameters = tuple(estimate(f"{group}_friction", i) for i, group in enumerate(("hip", "calf", "foot")))
+    held_out = tuple(HeldOut(n, n, "rad", 1.0, {"identified": 0.01}) for n in ("FR_hip", "FR_calf", "FR_thigh"))
+    rows = joint_rows(Identification("dog", (), Judgement("", ()), parameters, held_out=held_out))
+    assert [row.friction for row in rows] == [parameters[0], parameters[1], None]

@@ -140,12 +140,15 @@ def test_a_floating_base_turns_as_measured_and_its_foot_is_on_the_floor(tmp_path
     heights = []
     for row in range(2):
         scene._data.qpos[7] = columns["position[0]"][row]
-        scene._move_base(columns, row)
+        scene._move_base(columns, row, ghost=False)
         heights.append(float(scene._data.qpos[2]))
     np.testing.assert_allclose(heights, [0.42, 0.1 + 0.3 * np.cos(np.pi / 3) + 0.02], atol=1e-4)
     # A known place counts.
-    scene._move_base({**columns, **{f"base[{i}]": np.full(2, 0.5 + i) for i in range(3)}}, 0)
+    placed = columns | {f"base[{i}]": np.full(2, 0.5 + i) for i in range(3)}
+    scene._move_base(placed, 0, ghost=False)
     np.testing.assert_allclose(scene._data.qpos[:3], [0.5, 1.5, 2.5])
+    scene._move_base(placed, 0, ghost=True)
+    np.testing.assert_allclose(scene._data.qpos[:3], [0.0, 0.0, 2.5])
     # A model with nothing but geometries for collisions is drawn all the same, without its floor.
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "floating.rrd")
