@@ -97,6 +97,17 @@ def changed(episode, node, **fields):
     return replace(episode, outputs={**episode.outputs, node: {**episode.outputs[node], **fields}})
 
 
+def first(episode, seconds):
+    """Return the begin of an episode."""
+    rows = {node: steps.begun_s < seconds for node, steps in episode.steps.items()}
+    steps = {
+        node: type(steps)(*(getattr(steps, name)[rows[node]] for name in steps.__dataclass_fields__))
+        for node, steps in episode.steps.items()
+    }
+    outputs = {node: {k: v[rows[node]] for k, v in fields.items()} for node, fields in episode.outputs.items()}
+    return replace(episode, steps=steps, outputs=outputs)
+
+
 def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing):
     episode, values, _ = standing
     weighing.check(ROBOT, episode, values)
@@ -108,8 +119,10 @@ def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing
         ROBOT.identifiable(0.06).check(episode)
     assert "--standing" in refused.value.hint
     still = changed(episode, "sensor", velocity=0.0 * episode.outputs["sensor"]["velocity"])
-    with pytest.raises(OtherMotion, match="stands still"):
+    with pytest.raises(OtherMotion, match=r"moves for 0\.0 s of this log: friction"):
         weighing.check(ROBOT, still, values)
+    with pytest.raises(OtherMotion, match=r"moves for [12]\.\d s of this log"):
+        weighing.check(ROBOT, first(episode, 2.5), values)
     turned = np.tile([0.9, 0.43589, 0.0, 0.0], (len(episode.outputs["sensor"]["quaternion"]), 1))
     with pytest.raises(OtherMotion, match="not stand upright"):
         weighing.check(ROBOT, changed(episode, "sensor", quaternion=turned), values)
