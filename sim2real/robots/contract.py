@@ -189,24 +189,19 @@ class Robot:
 
     # -- graphs on hardware
 
-    def recording_nodes(
-        self, session: Session, signal: np.ndarray | None, standing: bool = False
-    ) -> dict[str, BaseNode]:
+    def recording_nodes(self, session: Session, signal: np.ndarray | None) -> dict[str, BaseNode]:
         """Return the graph on hardware that plays an excitation ``(N,)`` or ``(N, actions)``, one row a step.
 
         Without an excitation it only measures: it has the sensor alone, and no node sends a command.
-
-        Args:
-            standing: Whether the robot begins as for its task, such as by standing up.
         """
         if signal is None:
             return {self.roles.sensor: self._sensor(session)}
         rows = np.asarray(signal, np.float64).reshape(-1, len(self.agent.action))
         drive = self.drive
-        rows = drive.around(rows) if standing else drive.approach(session, rows)
+        rows = drive.around(rows) if drive.on_feet else drive.approach(session, rows)
         delay_s = drive.expected_delay_s[1]
         player = Excitation(self.roles.supervisor, self.rate_hz, rows, drive.message, delay=delay_s)
-        return self._on_hardware(session, player, (lambda: drive.begin(session)) if standing else None)
+        return self._on_hardware(session, player, (lambda: drive.begin(session)) if drive.on_feet else None)
 
     def deployment_nodes(
         self, session: Session, policy: Runner, trial: int = 0

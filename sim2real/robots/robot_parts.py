@@ -87,6 +87,7 @@ class RobotDrive(_Part, Protocol):
             a policy with its thread's wake-up [s].
         probe: The steps by which deploy measures the delay; None: the delay is not measured.
         embedded: The emulated robot, for the port ``embedded``; None: there is none.
+        on_feet: Whether a recording begins as the task does, such as by standing up.
     """
 
     rate_hz: float
@@ -96,6 +97,7 @@ class RobotDrive(_Part, Protocol):
     expected_delay_s: tuple[float, float, float] = (0.002, 0.002, 0.002)
     probe: Probe | None = None
     embedded: Embedded | None = None
+    on_feet: bool = False
 
     @abstractmethod
     def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> Session:

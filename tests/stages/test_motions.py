@@ -131,7 +131,7 @@ def test_files_without_a_motion_are_refused(tmp_path):
         goals(tmp_path / "none.csv")
     with pytest.raises(UsageError, match="shorter than 1 s"):
         goals(write(tmp_path / "short.csv", wave()[:20]))
-    with pytest.raises(UsageError, match="neither multisine, chirp, steps nor hand, nor a file"):
+    with pytest.raises(UsageError, match="neither multisine, chirp, steps, hand nor standing, nor a file"):
         replace(ARM.record, excitation="wobble")
 
 

@@ -72,6 +72,8 @@ def find_source(
             "a recording by hand determines no parameter: torque is off, and the hand's torque is not measured",
             hint="record it, play it with `sim2real record PIPELINE --excitation LOG`, and check that",
         )
+    if config.record.standing:
+        raise UsageError("a recording of standing determines the load alone", hint="plan another --record.excitation")
     signal = moving.drive.around(played(config.record, pipeline, moving))
     table = parameters.for_recordings(1)
     values = table.of_recording(table.decode(table.start()), 0)

@@ -64,7 +64,7 @@ class RecordConfig:
         check_view(self.view)
         if self.excitation not in (*GENERATED, HAND, STANDING) and self.motion is None:
             raise UsageError(
-                f"--excitation {self.excitation} is neither {', '.join((*GENERATED, HAND))} nor {STANDING}, nor a file",
+                f"--excitation {self.excitation} is neither {', '.join(GENERATED)}, {HAND} nor {STANDING}, nor a file",
                 hint="a motion is a log (.mcap), or a .csv, .npz, .json or .parquet file",
             )
         if not 1.0 <= self.duration_s <= 3600.0:

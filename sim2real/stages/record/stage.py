@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -46,6 +47,10 @@ def record(
     pipeline, folder = pipeline_of(robot), folder_of(folder)
     config = config_of(config, pipeline.record)
     robot = moving_robot(pipeline)
+    if config.standing:
+        robot = copy.copy(robot)
+        robot.drive = copy.copy(robot.drive)
+        robot.drive.on_feet = True
     log, truth = folder / LOG, folder / TRUTH
     scene = partial(scene_of, pipeline, robot)
     signal = None if config.by_hand else _planned(config, pipeline, robot)
@@ -55,7 +60,7 @@ def record(
         if signal is None:
             session.rig.withhold_torque()
             note("torque is off: move the robot by hand", urgent=True)
-        nodes = robot.recording_nodes(session, signal, config.standing)
+        nodes = robot.recording_nodes(session, signal)
         run_episode(pipeline, robot, session, nodes, {}, log, duration_s, config, "record")
     return Recording.load(log, truth)
 

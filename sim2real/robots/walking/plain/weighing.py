@@ -49,8 +49,7 @@ class Balances:
     Attributes:
         law, speed, direction: Shape ``(K, joints)``: torque of the motors' law [N m], speed [rad/s], and direction of
             the motion, between -1 and 1.
-        share: Shape ``(K, joints)``.
-        rest, size: Shape ``(K,)``.
+        share, rest, size: Shapes ``(K, joints)``, ``(K,)`` and ``(K,)``.
     """
 
     law: np.ndarray
@@ -105,10 +104,6 @@ def check(robot: object, episode: Episode, nominal: Mapping[str, float]) -> None
 
     Args:
         nominal: Values of the parameters, with which the load may be off by half of the robot's mass.
-
-    Raises:
-        UsageError: The robot has no legs.
-        OtherMotion: It does not stand, or does not move.
     """
     if not isinstance(robot, ComposedRobot):
         raise UsageError("this robot does not stand on legs", hint="leave --standing out")
