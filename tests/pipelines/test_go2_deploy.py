@@ -81,7 +81,7 @@ def test_a_robot_that_does_not_walk_refuses_a_velocity(tmp_path, capsys):
 @pytest.mark.full  # `make test` records a deployment of it, above
 @pytest.mark.realtime
 def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
-    command, _ = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)
+    command, *_ = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
     (folder,) = (tmp_path / "go2").glob("*/record")
     recording = Recording.load(folder)

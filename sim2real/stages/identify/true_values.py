@@ -47,12 +47,13 @@ def sensing_delay_s(truth: Truth, steps: Steps, origin_ns: int) -> float:
     samples = truth.of(Kind.SAMPLE)
     if not len(samples):
         return float("nan")
-    # A bus gets a request after its stamp; a robot that publishes its state sent it before.
+    # A bus gets a request near its stamp; a robot that publishes its state, which has no servos, sent it before.
     later = np.clip(np.searchsorted(samples["t_host_ns"], stamp), 0, len(samples) - 1)
     earlier = np.maximum(later - 1, 0)
     off_ns = [np.abs(samples["t_host_ns"][at] - stamp) for at in (earlier, later)]
-    nearest = np.where(off_ns[0] < off_ns[1], earlier, later)
-    matched = np.minimum(*off_ns) < _NEAR_NS
+    publishes = not truth.header.get("servo_ids", True)
+    nearest = np.where(publishes | (off_ns[0] < off_ns[1]), earlier, later)
+    matched = np.abs(samples["t_host_ns"][nearest] - stamp) < _NEAR_NS
     return _mean_s((stamp - samples["t_ns"][nearest])[matched])
 
 

@@ -1,0 +1,25 @@
+"""The true delay of a sensor beside the estimate: of a bus, and of a robot that publishes its state."""
+
+import numpy as np
+import pytest
+
+from sim2real.graph.episode import Steps
+from sim2real.hardware.emulation.truth import Kind, TruthLog, read_truth
+from sim2real.stages.identify.true_values import sensing_delay_s
+
+MS = 1_000_000
+AGE_NS = 5 * MS
+
+
+@pytest.mark.parametrize(("servo_ids", "way_ns"), [([], 400_000), ([], 1_500_000), ([1], -300_000)])
+def test_the_sample_is_the_one_that_was_read(tmp_path, servo_ids, way_ns):
+    """A published state comes by a way of up to its period of 2 ms; a bus gets its request after the stamp."""
+    log = TruthLog(tmp_path / "truth.bin", {"state_names": [], "truth": {}, "servo_ids": servo_ids})
+    period = 2 * MS if not servo_ids else 20 * MS
+    for k in range(500):
+        log.write(Kind.SAMPLE, 0, k * period, k * period - AGE_NS, k * period, 0, (0.0, 0.0, 0.0))
+    log.close()
+    stamps = (np.arange(20, 40) * 20 * MS + way_ns) // 1000
+    steps = Steps(stamps, stamps, stamps, np.full(20, -1), stamps + 100, np.zeros(20, np.int64))
+    found = sensing_delay_s(read_truth(tmp_path / "truth.bin"), steps, 0)
+    assert found == pytest.approx((AGE_NS + way_ns) * 1e-9, abs=2e-6)
