@@ -79,9 +79,8 @@ def legs_identify(report: Mapping[str, Any], two_cores: Mapping[str, Any]) -> st
         lines.append(f"| {label} | {near} of {of} | {v[f'legs_identify/{kind}/worst']:.2g} % |")
     near, _, of, *_ = counted("delay/close")
     lines.append(f"| sum of the delays, within 1 ms | {near} of {of} | {v['legs_identify/delay/worst']:.2f} ms |")
-    if "legs_identify/load/close" in about:
-        near, _, of, *_ = counted("load/close")
-        lines.append(f"| load in the base, within 0.3 kg | {near} of {of} | {v['legs_identify/load/worst']:.2f} kg |")
+    near, _, of, *_ = counted("load/close")
+    lines.append(f"| load in the base, within 0.3 kg | {near} of {of} | {v['legs_identify/load/worst']:.2f} kg |")
     (yes, _, twins, *_), whole = counted("accepted"), about["legs_identify/all_close"]
     interval = whole.rpartition("; ")[2].replace("95 % interval ", "")
     held, _, of, *_ = counted("intervals")

@@ -3,7 +3,7 @@
 import importlib
 import shutil
 import time
-from contextlib import nullcontext
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -39,18 +39,18 @@ def run(config: PlayConfig) -> Walked:
     hidden = None if config.seed is None else HiddenTwin.draw(np.random.default_rng(config.seed), len(robot.joints))
     twin, wanted = Twin(robot, hidden, config.seed or 0), np.array(config.command)
     sources = [gamepad(config.gamepad, robot.commands.most)] if config.gamepad else []
-    shown = _window(twin, wanted) if config.window else _View(twin, config.view) if config.view else None
+    shown: Any = _window(twin, wanted) if config.window else None
 
     def command(_: float) -> np.ndarray:
         for follow in sources:
             follow(wanted)
         return wanted.copy()
 
-    with terminal_keys() if config.view else nullcontext() as keys:
-        sources += [keys] if keys else []
+    with ExitStack() as stack:
+        if config.view:
+            shown = stack.enter_context(closing(_View(twin, config.view)))
+            sources.append(stack.enter_context(terminal_keys()))
         walked = walk(twin, load_bundle(folder), command, config.seconds, config.push, shown=shown)
-    if isinstance(shown, _View):
-        shown.close()
     if config.video:
         write_picture(twin, walked.qpos, config.video)
         wrote(config.video)

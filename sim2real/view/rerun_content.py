@@ -133,7 +133,7 @@ def with_goals(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
 
 
 def readable(plots: Mapping[str, list[Curve]]) -> dict[str, list[Curve]]:
-    """Return the plots that fit beside each other: of very many, goals beside positions, and none that is constant."""
+    """Return the plots to show: of more than fit, each goal is beside its position, and constant ones are omitted."""
     if len(plots) <= _MOST_PLOTS:
         return dict(plots)
     moving = {t: c for t, c in with_goals(plots).items() if any(len(x.values) and np.ptp(x.values) for x in c)}

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.errors import OtherMotion, UsageError
 from sim2real.hardware.emulation.truth import read_truth
 from sim2real.robots.walking.plain import weighing
+from sim2real.stages.estimation.fitted_logs import with_load
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.train.environment.draws import draw_robots
 from sim2real.train.environment.variation import VariationConfig
@@ -82,6 +84,18 @@ def test_the_load_has_an_interval_and_training_draws_it_beside_the_strengths(sta
     strengths = np.mean([v for n, v in draws.items() if n.endswith("_strength")], axis=0)
     assert np.corrcoef(strengths, draws["payload"])[0, 1] > 0.25
     np.testing.assert_array_equal(found.posterior.covariance[:-1, :-1], before.posterior.covariance)
+
+
+def test_a_load_outside_of_its_range_is_a_warning_and_the_rest_stays(standing, capsys):
+    episode, values, load = standing
+    weaker = {n: 0.6 * v if n.endswith("_strength") else v for n, v in values.items()}  # seem to carry 40 % less
+    before = identified(weaker)
+    log = SimpleNamespace(episode=episode)
+    assert with_load(before, ROBOT, log, {}) is before
+    said = capsys.readouterr().err
+    assert "warning: the load is not identified" in said
+    assert "outside of -1 to 3 kg" in said
+    assert with_load(identified(values), ROBOT, log, {}).parameters[-1].estimate == pytest.approx(load, abs=0.06)
 
 
 def test_alternatives_have_the_load_too(standing):

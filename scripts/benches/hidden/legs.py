@@ -44,10 +44,8 @@ def record(
     plant = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:Go2Body", "plant")
     drawn = load_named(f"{Path(robot.mjcf).with_name('plant.py')}:latencies", "plant")
     sensing_s, acting_s, jitter_s = latencies_s or drawn(seed)
-    body, config = (
-        plant("floor" if standing else "stand", seed),
-        UnitreeEmulation(sensing_s, acting_s, jitter_s, seed=seed),
-    )
+    body = plant("floor" if standing else "stand", seed)
+    config = UnitreeEmulation(sensing_s, acting_s, jitter_s, seed=seed)
     truth = TruthLog(path.with_suffix(".truth.bin"), truth_header(body, config, 0))
     legs = EmulatedLegs(body, config, truth, 0)
     # Let the legs hang, then plan the way to the excitation from there; or let the robot stand up.

@@ -34,8 +34,8 @@ class Kind(IntEnum):
             the answer; `late_ns`: lateness against the plan. Values: position [rad], velocity [rad/s] and load, before
             quantisation.
         EFFECT: A command took effect. `t_ns`: its time, a point of the plant's grid, of legs half a step before one, as
-            their integrator moves a joint; `late_ns`: lateness against the
-            plan, possibly negative. Values: mode and goal. `t_host_ns` is 0 for a command of the servo itself.
+            their integrator moves a joint; `late_ns`: lateness against the plan, possibly negative. Values: mode and
+            goal. `t_host_ns` is 0 for a command of the servo itself.
         STATE: The plant's true state at `t_ns`. Values: in the order of the header's `state_names`.
         WATCHDOG: The bus watchdog tripped at `t_ns`.
         LOSS: An answer was lost; times as for SAMPLE.

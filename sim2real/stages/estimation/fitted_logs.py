@@ -1,4 +1,4 @@
-"""Refuse logs that were fitted, as a test of a fit: by the hashes of their files and by their measurements."""
+"""Logs beside those of a fit: a fitted log is no test, by hashes and measurements; a log of standing has the load."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
@@ -8,7 +8,7 @@ import numpy as np
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.manifest import sha256
-from sim2real.errors import UsageError
+from sim2real.errors import OtherMotion, UsageError
 from sim2real.identify.model import IdentifiableModel, position_of
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.terminal.console import note
@@ -58,10 +58,17 @@ def require_standing(robot: RecordedRobot, log: Recording, model: IdentifiableMo
 def with_load(
     identification: Identification, robot: RecordedRobot, log: Recording, truth: Mapping[str, float]
 ) -> Identification:
-    """Return an identification with the load, from a log of the robot on its feet; see ``weighing.weighed``."""
+    """Return an identification with the load, from a log of the robot on its feet; see ``weighing.weighed``.
+
+    A load outside of its bounds is a warning: the rest is identified.
+    """
     from sim2real.robots.walking.plain import weighing
 
-    return weighing.weighed(robot, identification, log.episode, truth)
+    try:
+        return weighing.weighed(robot, identification, log.episode, truth)
+    except OtherMotion as error:
+        note(f"warning: the load is not identified: {error}")
+        return identification
 
 
 def require_apart(

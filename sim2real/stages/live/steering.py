@@ -26,8 +26,8 @@ _EVENT = struct.Struct("=IhBB")
 """``struct js_event`` of linux/joystick.h: time, value, kind, and number of the axis."""
 _AXIS, _AT_START, _LARGEST, _REST = 0x02, 0x80, 32767.0, 0.1
 """Kind of an axis's event, flag of the state at the start, largest value, and share of it at which a stick rests."""
-_STICKS = {1: (0, -1.0), 0: (1, -1.0), 3: (2, -1.0)}
-"""Axis -> entry of the command, and sign: left stick, and the right one from side to side; up and left are negative."""
+_STICKS = {1: 0, 0: 1, 3: 2}
+"""Axis -> entry of the command: left stick up and down, from side to side, and the right one from side to side."""
 
 
 def steer(wanted: np.ndarray, key: int) -> None:
@@ -45,9 +45,6 @@ def gamepad(device: Path, most: Sequence[float]) -> Follow:
     Args:
         device: Such as ``/dev/input/js0``.
         most: Commands of sticks at their ends.
-
-    Raises:
-        UsageError: There is no such device, or it may not be read.
     """
     try:
         descriptor = os.open(device, os.O_RDONLY | os.O_NONBLOCK)
@@ -71,8 +68,8 @@ def gamepad(device: Path, most: Sequence[float]) -> Follow:
                 return
             _, value, kind, number = _EVENT.unpack(data)
             if kind & ~_AT_START == _AXIS and number in _STICKS:
-                (entry, sign), share = _STICKS[number], value / _LARGEST
-                wanted[entry] = sign * share * most[entry] if abs(share) > _REST else 0.0
+                entry, share = _STICKS[number], -value / _LARGEST  # up and left are negative
+                wanted[entry] = share * most[entry] if abs(share) > _REST else 0.0
 
     return follow
 

@@ -33,7 +33,7 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
-    hangs = isinstance(config, RecordConfig) and not config.standing
+    hangs = isinstance(config, RecordConfig) and not robot.drive.on_feet
     connect = robot.drive.connect_to_record if hangs else robot.drive.connect
     with connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
         _require_rig(session.rig)

@@ -28,16 +28,15 @@ from sim2real.robots.walking.world import PAYLOAD
 from sim2real.types import MjData, MjModel
 
 _mj: Any = mujoco
-_SETTLED_S = 0.5
-"""First part of a log that is not used: the gains change from those of standing up [s]."""
+_SETTLED_S, _BEND_S = 0.5, 3.0
+"""First part of a log, which is not used, as the gains change, and shortest motion after it: in one bend down and up
+again, errors of delays and accelerations cancel [s]."""
 _UPRIGHT, _FREE = -0.95, 6
 """Largest vertical part of gravity's direction in the base, and the directions in which the base moves."""
 _MOVING_RAD_S = 0.03
 """Speed at which friction has 3/4 of its size; at rest its direction is open [rad/s]."""
 _SMOOTHED, _BLOCKS, _MOST_SAMPLES, _STEP = 5, 8, 600, 1e-4
 """Samples of a mean speed, parts of a log that are weighed alone, used samples of a log, and step of a derivative."""
-_BEND_S = 3.0
-"""Shortest motion: in one bend down and up again, errors of delays and accelerations cancel [s]."""
 _WIDER = 2.365 / 1.96
 """Factor on a standard error from 8 parts, for a 95 % interval as of a Normal distribution."""
 
@@ -49,7 +48,8 @@ class Balances:
     Attributes:
         law, speed, direction: Shape ``(K, joints)``: torque of the motors' law [N m], speed [rad/s], and direction of
             the motion, between -1 and 1.
-        share, rest, size: Shapes ``(K, joints)``, ``(K,)`` and ``(K,)``.
+        share: Shape ``(K, joints)``: weight of each joint's torque.
+        rest, size: Shape ``(K,)``: the sum of such torques that carries the robot alone, and that for 1 kg of load.
     """
 
     law: np.ndarray
@@ -91,11 +91,9 @@ def weighed(
     load_of = lambda some: balances.load(robot, {**values, **some})  # noqa: E731
     posterior = _with_load(identification.posterior, load_of, scatter, (row.low, row.high))
     deviation = float(np.sqrt(posterior.covariance[-1, -1]))
-    half = 1.96 * deviation
-    estimate = Estimate(
-        PAYLOAD, row.unit, "dynamics", row.about, row.nominal, load, "accepted", deviation, load - half, load + half,
-        row.low, row.high, truth.get(PAYLOAD),
-    )  # fmt: skip
+    ends = load - 1.96 * deviation, load + 1.96 * deviation
+    known = row.unit, "dynamics", row.about, row.nominal, load, "accepted", deviation, *ends, row.low, row.high
+    estimate = Estimate(PAYLOAD, *known, truth.get(PAYLOAD))
     return replace(identification, parameters=(*identification.parameters, estimate), posterior=posterior)
 
 
@@ -122,11 +120,7 @@ def require_load(load: float, low: float, high: float) -> None:
 
 
 def balances_of(robot: ComposedRobot, episode: Episode, values: Mapping[str, float]) -> Balances:
-    """Return a log as balances.
-
-    Raises:
-        OtherMotion: The robot does not stand, or does not move.
-    """
+    """Return a log as balances; refuse one in which the robot does not stand upright, or hardly moves."""
     sensed, sent = episode.outputs[ROLES.sensor], episode.outputs[ROLES.actuator]
     t_s, position = episode.steps[ROLES.sensor].begun_s, sensed["position"].astype(np.float64)
     smooth = np.ones(_SMOOTHED) / _SMOOTHED
