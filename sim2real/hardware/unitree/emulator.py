@@ -39,6 +39,8 @@ _DOMAINS: Final = range(50, 230)
 """Domains of emulators; a real robot has domain 0."""
 _LOCK_PORT: Final = 29_000
 """A domain belongs to the process that has the UDP port of this number plus the domain's."""
+_DDS_PORT, _DDS_PORTS = 7400, 250
+"""Every program in a domain hears on this UDP port plus a number of ports for each domain (DDSI-RTPS, section 9.6)."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -147,16 +149,31 @@ def _serve(
 
 
 def _free_domain() -> tuple[socket.socket, int]:
-    """Return a domain that no other emulator of this machine uses, and the socket that holds it."""
+    """Return a domain that no program of this machine uses, and the socket that holds it.
+
+    The guardian of an earlier robot may still be in that robot's domain, and would be taken for a second program that
+    commands the motors.
+    """
     for domain in _DOMAINS:
-        lock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            lock.bind(("127.0.0.1", _LOCK_PORT + domain))
-        except OSError:
+        lock = _bound("127.0.0.1", _LOCK_PORT + domain)
+        heard = lock and _bound("", _DDS_PORT + _DDS_PORTS * domain)
+        if lock and heard:
+            heard.close()
+            return lock, domain
+        if lock:
             lock.close()
-            continue
-        return lock, domain
     raise HardwareLost("all DDS domains of this machine have an emulator", hint="end emulators that still run")
+
+
+def _bound(host: str, port: int) -> socket.socket | None:
+    """Return a socket that has a UDP port; None if another program has it."""
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind((host, port))
+    except OSError:
+        bound.close()
+        return None
+    return bound
 
 
 if __name__ == "__main__":

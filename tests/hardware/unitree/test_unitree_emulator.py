@@ -12,6 +12,7 @@ from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.hardware.emulation.truth import Kind
 
 pytest.importorskip("cyclonedds")
+from sim2real.hardware.unitree.dds import Address, DdsLink
 from sim2real.hardware.unitree.emulation import UnitreeEmulation
 
 pytestmark = pytest.mark.realtime
@@ -56,3 +57,17 @@ def test_unitrees_own_client_lets_the_emulated_robot_stand_up(unitree_sdk):
     assert height[t_ns < effects["t_ns"][-1]].max() > 0.27
     late_ms = 1e-6 * (effects["t_ns"] - effects["t_host_ns"])
     assert np.median(late_ms) == pytest.approx(6.0, abs=1.0)
+
+
+def test_a_robot_starts_in_a_domain_without_programs():
+    """The guardian of an earlier robot may still be in that robot's: it would count as a second program."""
+    with EmbeddedRobot(BODY, UnitreeEmulation()) as first:
+        left_behind = DdsLink(Address.parse(first.port), "of an earlier robot")
+    try:
+        with EmbeddedRobot(BODY, UnitreeEmulation()) as second:
+            assert second.port != first.port
+            link = DdsLink(Address.parse(second.port), "another")
+            assert link.next_state(5.0) is not None
+            link.close()
+    finally:
+        left_behind.close()
