@@ -7,7 +7,7 @@ from typing import Any
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.robots.servo.datasheet import DataSheet
-from sim2real.robots.servo.parts import Servo, ServoDriven
+from sim2real.robots.servo.parts import Servo, ServoDriven, rubs_only
 
 JOINTS = ("pan", "shoulder", "elbow")
 SHEET = DataSheet(stall=1.4, damping=0.23, armature=0.0045, friction=0.03, p_gain=800, profile_rad_s=5.0)
@@ -78,17 +78,9 @@ class Gantry(composer.Arena):
 
     def _build(self, name: str = "gantry") -> None:
         super()._build(name=name)
-        model = self.mjcf_model
-        model.option.integrator = "implicitfast"
-        # Joints that only rub: after two seconds one step of Newton's method is 0.8 mrad off a hundred of them, at half
-        # the time of four steps.
-        model.option.iterations, model.option.ls_iterations = 1, 4
-        # Frames and links that do not move against each other become one body: 4 instead of 14, and 5 times the speed.
-        model.compiler.fusestatic = True
-        model.compiler.boundmass = model.compiler.boundinertia = 0  # frames between the parts weigh nothing
-        model.option.flag.contact = "disable"
+        rubs_only(self.mjcf_model)
         look = {"contype": 0, "conaffinity": 0}
-        world = model.worldbody
+        world = self.mjcf_model.worldbody
         world.add("geom", name="table", type="plane", size=[0.5, 0.5, 0.05], rgba=[0.8, 0.82, 0.85, 1], **look)
         world.add("geom", name="plate", type="box", size=[0.06, 0.05, 0.005], pos=[0, 0, GANTRY_M + 0.03], **look)
         self.mount = world.add("site", name="mount", pos=[0, 0, GANTRY_M])

@@ -14,7 +14,7 @@ from typing import Any
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.robots.servo.datasheet import StsSheet
-from sim2real.robots.servo.parts import Servo, ServoDriven
+from sim2real.robots.servo.parts import Servo, ServoDriven, rubs_only
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 """LeRobot's names, in the order of the servos' ids."""
@@ -117,15 +117,9 @@ class Table(composer.Arena):
 
     def _build(self, name: str = "table") -> None:
         super()._build(name=name)
-        model = self.mjcf_model
-        # As in pipelines/arm, which lists the cost and the gain of each option.
-        model.option.integrator = "implicitfast"
-        model.option.iterations, model.option.ls_iterations = 1, 4
-        model.compiler.fusestatic = True
-        model.compiler.boundmass = model.compiler.boundinertia = 0
-        model.option.flag.contact = "disable"  # the goals' limits keep it off the table
+        rubs_only(self.mjcf_model)
         look = {"contype": 0, "conaffinity": 0}
-        world = model.worldbody
+        world = self.mjcf_model.worldbody
         world.add("geom", name="top", type="plane", size=[0.6, 0.6, 0.05], rgba=[0.8, 0.82, 0.85, 1], **look)
         self.target = world.add("site", name="target", pos=[0.2, 0, 0.2], size=[0.012], rgba=[0.85, 0.3, 0.2, 1])
         self.opening = world.add("site", name="opening")  # x holds the jaw's angle [rad]

@@ -10,8 +10,8 @@ from sim2real.robots.roles import Roles
 T = TypeVar("T")
 Datum = tuple[str, Callable[[object], bool]]
 """Description of an attribute, and the test of its value."""
-HINT = "sim2real.robots.contract.{} describes each of them"
-"""Of errors about the class of this name."""
+HINT = "{}.{} describes each of them"
+"""Of errors about a class: its module and its name."""
 
 
 def tuple_of(kind: type) -> Callable[[object], bool]:
@@ -44,10 +44,10 @@ def complete(cls: type[T], *args: object, **options: object) -> T:
     del args, options
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
         ours = [base for base in reversed(cls.__mro__) if base.__module__.startswith("sim2real.robots")]
-        base = next(base for base in ours if getattr(base, "__abstractmethods__", ()))
+        base = next(base for base in ours if getattr(base, "__abstractmethods__", frozenset()) >= set(missing))
         raise UsageError(
             f"{cls.__module__}.{cls.__qualname__} is not complete: it "
             + "; it ".join(f"has no {name}()" for name in missing),
-            hint=HINT.format(base.__name__),
+            hint=HINT.format(base.__module__.replace("robot_parts", "contract"), base.__name__),
         )
     return object.__new__(cls)

@@ -44,8 +44,42 @@ from sim2real.robots.roles import ROLES, Roles
 from sim2real.types import PyTree, Scalar
 
 
+class Identified(Protocol):
+    """The methods of a ``RecordedRobot`` that its data does not decide: all but the first have a default."""
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make the robot, if its class has all methods."""
+        return complete(cls, *args, **options)
+
+    @abstractmethod
+    def identifiable(self, max_delay_s: float) -> IdentifiableModel:
+        """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
+
+    def watched(self, max_delay_s: float) -> IdentifiableModel:
+        """Return the model with all parameters that may change between deployments; default: as ``identifiable``.
+
+        Further parameters, such as a payload, have their nominal values at the time of the identification.
+        """
+        return self.identifiable(max_delay_s)
+
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
+        """Return the model with identified values, as MJCF; None: there is none."""
+        del values
+        return None
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
+        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
+        del values
+        return None
+
+    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
+        """Return sentences on positions of a log that the model cannot have; default: none."""
+        del outputs
+        return []
+
+
 @runtime_checkable
-class RecordedRobot(Protocol):
+class RecordedRobot(Identified, Protocol):
     """A robot that was recorded: what identification needs.
 
     Attributes:
@@ -73,21 +107,6 @@ class RecordedRobot(Protocol):
         units: Mapping[str, str]
         roles, profile_rad_s, export_lead_s, causes = ROLES, math.inf, 0.0, MappingProxyType({})
 
-    def __new__(cls, *args: Any, **options: Any) -> Self:
-        """Make the robot, if its class has all methods."""
-        return complete(cls, *args, **options)
-
-    @abstractmethod
-    def identifiable(self, max_delay_s: float) -> IdentifiableModel:
-        """Return the model to identify, with delays of up to ``max_delay_s`` [s]."""
-
-    def watched(self, max_delay_s: float) -> IdentifiableModel:
-        """Return the model with all parameters that may change between deployments; default: as ``identifiable``.
-
-        Further parameters, such as a payload, have their nominal values at the time of the identification.
-        """
-        return self.identifiable(max_delay_s)
-
     def with_optional_terms(self, wanted: str) -> RecordedRobot:
         """Return the robot with further optional terms; default: the robot, which has all of them.
 
@@ -96,21 +115,6 @@ class RecordedRobot(Protocol):
         """
         del wanted
         return self
-
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
-        """Return the model with identified values, as MJCF; None: there is none."""
-        del values
-        return None
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
-        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
-        del values
-        return None
-
-    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
-        """Return sentences on positions of a log that the model cannot have; default: none."""
-        del outputs
-        return []
 
 
 class Robot:

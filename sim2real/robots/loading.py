@@ -71,7 +71,7 @@ def checked(robot: Any, where: str) -> RecordedRobot:
     if gaps:
         raise UsageError(
             f"robot {type(robot).__module__}.{type(robot).__qualname__} is not complete: it " + "; it ".join(gaps),
-            hint=HINT.format("Robot" if isinstance(robot, Robot) else "RecordedRobot"),
+            hint=HINT.format("sim2real.robots.contract", "Robot" if isinstance(robot, Robot) else "RecordedRobot"),
         )
     return robot
 

@@ -153,6 +153,7 @@ class Bounce(composer.NullTask):
         physics.bind(mjcf.get_frame_freejoint(self.ball)).qvel = np.array([0.5, 0, 0, 0, 0, 0])
 
 
+@pytest.mark.full
 def test_three_hundred_steps_with_contacts_agree(double):
     environment = composer.MjxEnvironment(Bounce())
     _, states = rollout(environment, jnp.zeros((300, 0)))
@@ -273,6 +274,7 @@ def test_props_cannot_settle_in_a_compiled_program():
         composer.MjxEnvironment(task)
 
 
+@pytest.mark.full
 def test_giving_up_is_a_flag():
     class Never(Bounce):
         def initialize_episode(self, physics, random_state):
@@ -295,6 +297,7 @@ def test_fields_and_elements_that_are_not_there_are_named():
         composer.MjxEnvironment(task)
 
 
+@pytest.mark.full
 def test_elliptic_cones_are_no_matter_where_nothing_can_touch():
     """MJX 3.17 raises a TypeError there: a joint limit, no contact, and the cones that arenas have."""
     arena = composer.Arena()

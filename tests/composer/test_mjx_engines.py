@@ -145,6 +145,7 @@ BODIES = """
 UNUSED = {"dof_length", "geom_aabb", "actuator_length0"}  # by MJX
 
 
+@pytest.mark.full
 def test_derived_constants_are_those_of_mj_set_const(double):
     model = mujoco.MjModel.from_xml_string(BODIES)
     varied, random = copy.copy(model), np.random.RandomState(0)
@@ -185,6 +186,7 @@ def test_which_constants_are_derived_is_known_before(text):
     assert constants.derived(model, given) == set(jax.eval_shape(lambda m: constants.derive(model, m), given))
 
 
+@pytest.mark.full
 def test_mjx_is_traced_once_for_all_programs_that_a_model_is_in(monkeypatch):
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body><joint type="slide"/><joint type="slide" axis="1 0 0"/><geom size=".1"/>
@@ -244,6 +246,7 @@ def test_an_episode_ends_where_mujoco_warns():
     assert [unstable(v) for v in (1e9, -1e11, np.inf, np.nan)] == [False, True, True, True]
 
 
+@pytest.mark.full
 def test_an_episode_ends_though_a_hook_hides_that_it_diverged():
     class Thrown(composer.NullTask):
         def after_step(self, physics, random_state):

@@ -19,6 +19,7 @@ def test_a_random_task_is_that_of_dm_control(oracle, seed):
     assert compare(seed, "all" if seed % 2 else None)[0] < 1e-12
 
 
+@pytest.mark.full
 def test_random_tasks_are_the_same_on_mjx():
     """Ten tasks whose models differ in their numbers, as copies in one program: compiling more is for ``fuzz``."""
     mine = play_variants_on_mjx(ON_MJX, VARIANTS)

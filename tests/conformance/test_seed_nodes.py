@@ -171,6 +171,7 @@ def test_compiled_it_rolls_out_as_recorded(tutorial, log):
         np.testing.assert_allclose(got, episode.outputs[name][field][: len(got)], atol=tolerance, rtol=0)
 
 
+@pytest.mark.full
 def test_sensor_and_actuator_delay_are_identified_from_the_record(tutorial, open_loop):
     """Recorded actions go in, recorded measurements are compared in the sensor: only the sum of the delays matters."""
     episode = open_loop

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 from foreign_robots import KINDS, draw, goal_scales, imported, save
 
 from sim2real.errors import UsageError
@@ -40,6 +41,7 @@ def wrong(log, path):
     return said
 
 
+@pytest.mark.full
 def test_nothing_is_wrong_silently(tmp_path, repetitions):
     count = repetitions(20, 1000)
     seeds = [*range(count), *range(1000, 1000 + count // 5)]

@@ -146,6 +146,7 @@ def spreads(fitted):
         yield problem.table.unscale(x), uncertainty.from_linearised(problem, at), at
 
 
+@pytest.mark.full
 def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
     problem = fitted[0]
     names = list(problem.table.names)

@@ -34,3 +34,16 @@ def test_the_errors_of_a_recording_are_computed_from_its_own_segments(monkeypatc
     monkeypatch.setattr(per_recording, "linearise", counted)
     identify_each(whole)
     assert live == [len(spans(0)) + len(spans(1)), len(spans(0)), len(spans(1))]
+
+
+def test_each_of_many_recordings_takes_two_steps(monkeypatch):
+    """As descents would, and without one: a descent for each of 120 recordings had not ended after minutes."""
+    episodes = [lag_log(1), lag_log(2, 1.01 * BIAS), lag_log(3)]
+    whole = fit(Model(), episodes, [span for r in range(3) for span in spans(r)], LENGTH_S, CONFIG)
+    descents = identify_each(whole)
+    monkeypatch.setattr(per_recording, "MOST", 2)
+    monkeypatch.delattr(per_recording, "refine")
+    for (values, spread), (expected, errors) in zip(identify_each(whole), descents, strict=True):
+        for name, error in zip(whole.problem.table.names, errors.standard_error, strict=True):
+            assert values[name] == pytest.approx(expected[name], abs=0.1 * error)
+        np.testing.assert_allclose(spread.standard_error, errors.standard_error, rtol=0.1)

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from test_folds import Actuator, Command, Level, Sensor
 
 from sim2real.artifacts.identification import Search
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
-from sim2real.graph.node import BaseNode, BaseWorld
+from sim2real.graph.node import BaseWorld
 from sim2real.identify import fit as fitting
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
@@ -30,20 +31,6 @@ from sim2real.identify.validation.prediction import samples
 TICK_S, PERIOD_S, DURATION_S = 0.01, 0.02, 8.0
 GAIN, TIME_CONSTANT_S = 1.7, 0.13
 NOISE = 0.002
-
-
-@struct.dataclass
-class Level(Base):
-    """A world's state, and what a sensor measures."""
-
-    y: jax.Array
-
-
-@struct.dataclass
-class Command(Base):
-    """What drives it."""
-
-    u: jax.Array
 
 
 @struct.dataclass
@@ -84,23 +71,6 @@ class Lag(BaseWorld):
         else:
             new = p.gain * u + (y - p.gain * u) * jnp.exp(-TICK_S / p.tau)
         return step_state.replace(state=Level(y=new)), Level(y=new)
-
-
-class Sensor(BaseNode):
-    """Passes the level on."""
-
-    def init_output(self, rng=None, graph_state=None):
-        return Level(y=jnp.float32(0.0))
-
-    def step(self, step_state):
-        return step_state, step_state.inputs["world"][-1].data
-
-
-class Actuator(BaseNode):
-    """Plays what was recorded."""
-
-    def init_output(self, rng=None, graph_state=None):
-        return Command(u=jnp.float32(0.0))
 
 
 class Model:
@@ -306,6 +276,7 @@ def test_value_and_jacobian_are_those_of_the_residuals(episode, outside):
     assert at.loss == pytest.approx(loss, rel=1e-5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("count", [9, pytest.param(11, marks=pytest.mark.full)])
 def test_what_is_padded_changes_nothing(episode, count):
     """Segments, fitted ones and measurements are each rounded up: the loss is that of the segments one by one."""

@@ -246,6 +246,7 @@ def three():
     return whole, [trial.rows[k] for k, trial in enumerate(found.by_part)]
 
 
+@pytest.mark.full
 def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
     whole, rows = three
     assert [r.name for r in rows] == ["recording 1", "recording 2", "recording 3"]

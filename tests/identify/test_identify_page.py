@@ -5,6 +5,7 @@ import textwrap
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = "FitConfig(population=8, generations=2, refine=1, refine_steps=3)"
@@ -19,6 +20,7 @@ def code_of(docstring):
     return textwrap.dedent("\n".join(lines[:end]))
 
 
+@pytest.mark.full
 def test_ten_calls_lead_from_a_log_to_a_verdict(monkeypatch, capsys):
     code = code_of(sys.modules["sim2real.identify"].__doc__)
     assert [f"# {i}" in code for i in range(1, 11)] == [True] * 10

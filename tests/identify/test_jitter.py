@@ -99,6 +99,7 @@ def jitter(log):
     return deviation(seen, np.full(len(seen.stamps), delay_s), own.deviation[0], own.noise, late)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("late_s", [1e-3, pytest.param(3e-3, marks=pytest.mark.full)])
 def test_the_deviation_of_commands_is_found(late_s):
     found = jitter(log(10.0, 1, late_s))

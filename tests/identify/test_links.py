@@ -143,6 +143,7 @@ def test_without_losses_a_burst_has_no_length():
     assert found.burst.value is None
 
 
+@pytest.mark.full
 def test_a_problem_knows_its_links(fitted):
     (link,) = links(fitted.problem, fitted.found.z)
     delay_s = fitted.truth["sensor_delay"] + fitted.truth["actuator_delay"]

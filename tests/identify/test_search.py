@@ -122,6 +122,7 @@ def funnels(candidates, around, data, pick):
     return jnp.minimum(right, left) + far
 
 
+@pytest.mark.full
 def test_restarts_find_the_deeper_funnel():
     populations = []
 
@@ -260,6 +261,7 @@ assert found[1].record.evaluations == found[0].record.evaluations
 """
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_two_devices_find_what_one_finds_and_each_simulates_half():
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"

@@ -67,6 +67,7 @@ def test_logs_that_are_too_short(fails, tmp_path, log):
     assert "segments" in said
 
 
+@pytest.mark.full
 def test_a_truncated_log_works_with_a_warning(tmp_path, log, capsys):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(log.read_bytes()[: log.stat().st_size * 4 // 5])

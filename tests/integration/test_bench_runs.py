@@ -40,6 +40,7 @@ def report_of(path):
     return report, {row["name"]: row["value"] for row in report["rows"]}
 
 
+@pytest.mark.full
 def test_demo(commands, tmp_path):
     path = tmp_path / "report.json"
     assert bench.main(["demo", "--quick", "--json", str(path)]) == 0

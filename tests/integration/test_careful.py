@@ -65,6 +65,7 @@ def assert_steps_are_a_log(folder):
     assert np.all(farthest > 0.05), "each step is answered, in its direction"
 
 
+@pytest.mark.full
 def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, resting):
     code, folder = deploy("pendulum", resting, tmp_path)
     assert code == errors.OK

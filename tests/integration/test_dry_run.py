@@ -216,6 +216,7 @@ def steady(robot, folder):
     return save_bundle(folder, weights, contract, np.zeros((1, size)))
 
 
+@pytest.mark.full
 def test_a_session_without_a_rig_of_a_device_is_refused(make_pipeline, tmp_path):
     name = make_pipeline(
         "no_dry_run",

@@ -48,6 +48,7 @@ def assert_off_soon(truth, since_ns):
     assert np.all(modes[off[0] :] == OperatingMode.OFF)
 
 
+@pytest.mark.full
 def test_a_recording_that_is_stopped_and_wakes_again_ends_in_order(tmp_path, lone_robot, start_cli):
     port, end_robot = lone_robot
     process = start_cli("record", "pendulum", "--port", port, "--duration-s", 20, "--runs", tmp_path)

@@ -25,6 +25,7 @@ def tested(tmp_path):
     return run
 
 
+@pytest.mark.full
 def test_steps_tell_what_the_device_takes(tested, capsys):
     folder = tested("--duration-s", "10", "--identify.generations", "0", "--identify.refine", "1")
     found = Latency.load(folder)

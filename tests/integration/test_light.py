@@ -100,6 +100,7 @@ def test_a_motion_from_a_table_is_played(tmp_path):
     assert "which parameters this motion determines is not checked" in said
 
 
+@pytest.mark.full
 def test_a_motion_by_hand_is_recorded_and_seen_and_check_refuses_it(tmp_path):
     hand = ["--excitation", "hand", "--duration-s", "1", "--view", "live.rrd", *PATIENT]
     code, said = call(WITHOUT_JAX, tmp_path, "record", "so101", *hand)
@@ -126,6 +127,7 @@ def test_check_prints_a_recording_as_json_and_the_reason_why_it_ends_there(tmp_p
     assert "hint: copy it to a computer with sim2real" in done.stderr
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("robot", ["arm", pytest.param("so101", marks=pytest.mark.full)])
 def test_check_determines_the_same_parameters_with_and_without_jax(tmp_path, robot):
     seconds = ["--duration-s", "12", *PATIENT]

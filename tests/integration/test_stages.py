@@ -57,6 +57,7 @@ def test_a_resumed_run_is_complete(finished_run_dir):
     assert log == {"path": "record/session.mcap", "sha256": recorded["sha256"]}
 
 
+@pytest.mark.full
 def test_resuming_a_finished_run_does_nothing(run_copy, capsys):
     before = {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
     root = run_copy.parent.parent
@@ -127,6 +128,7 @@ def test_training_on_what_is_not_accepted_must_be_asked_for(finished_run_dir, tm
     assert not (run_dir / "train.2").exists()
 
 
+@pytest.mark.full
 def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkeypatch):
     """Each stage is a function of a robot and of the artifact of another one, opened from Python."""
     text = "\n".join(re.findall(r"^```python\n(.*?)^```", NOTEBOOK.read_text(), re.DOTALL | re.MULTILINE))
@@ -158,6 +160,7 @@ def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkey
         sim2real.train(had["robot"], found, replace(config, world="moon"))
 
 
+@pytest.mark.full
 def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
     run = sim2real.run("pendulum", run_copy.parent.parent, resume=str(run_copy))
     assert run.folder == run_copy
@@ -194,6 +197,7 @@ def test_a_new_recording_is_what_identify_takes_next(finished_run_dir, tmp_path)
     assert (tmp_path / "pendulum" / finished_run_dir.name / "identify.2").is_dir()
 
 
+@pytest.mark.full
 def test_an_interrupted_stage_is_run_again(finished_run_dir, tmp_path, capsys):
     run_dir = tmp_path / "pendulum" / "copy"
     copied(finished_run_dir, run_dir)

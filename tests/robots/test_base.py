@@ -7,6 +7,7 @@ from small_robot import PairRobot
 
 from sim2real.errors import UsageError
 from sim2real.robots.contract import RecordedRobot, Robot, RobotDrive
+from sim2real.robots.from_model.recorded import LoggedRobot
 from sim2real.robots.loading import PARTS, checked
 from sim2real.robots.roles import Roles
 
@@ -55,6 +56,9 @@ def test_a_part_without_its_methods_cannot_be_made(name):
 def test_a_recorded_robot_needs_less():
     with pytest.raises(UsageError, match=r"has no identifiable\(\)"):
         type("Little", (RecordedRobot,), {})()
+    with pytest.raises(UsageError, match=r"has no dynamics\(\); it has no make_nodes\(\)") as caught:
+        type("Logged", (LoggedRobot,), {})()
+    assert caught.value.hint == f"{LoggedRobot.__module__}.LoggedRobot describes each of them"
     robot = type("Little", (RecordedRobot,), {"identifiable": lambda self, max_delay_s: None})()
     with pytest.raises(UsageError, match="it has no units: field -> unit") as caught:
         checked(robot, "here")

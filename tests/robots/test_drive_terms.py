@@ -190,6 +190,7 @@ def played(program, terms):
     return np.asarray(program({n: jnp.asarray(v) for n, v in values.items()}))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("one", [*MECHANICAL, "all"])
 def test_both_engines_say_the_same(engines, one):
     own = ON if one == "all" else OFF | {what: ON[what] for what in OPTIONAL[one]}
@@ -233,6 +234,7 @@ def test_play_and_tilt_are_found_in_a_recording_made_by_hand(by_hands_log):
     assert {n: float(found[n]) for n in PLAY} == pytest.approx(PLAY, rel=0.1)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("share", [1e-4, 1e-6, 1e-9])
 def test_what_a_delay_of_nothing_would_change_is_known(by_hands_log, share):
     """At a bound the search's own unknown changes nothing, and the delay does: 10 ms of it would be seen."""

@@ -56,6 +56,7 @@ def recorded(tmp_path_factory):
     return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kept", [pytest.param(5, marks=pytest.mark.full), 3])
 def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch, kept):
     """Sets of terms are compared on fewer segments where all would take long: a part has as many errors as ever."""

@@ -224,6 +224,7 @@ FOUR_BAR = """<mujoco><default><geom type="capsule" size=".01"/><joint axis="0 1
 <equality><connect body1="coupler" body2="rocker" anchor=".2 0 0"/></equality></mujoco>"""
 
 
+@pytest.mark.full
 def test_a_loop_is_closed_at_the_start(tmp_path):
     """Of a parallelogram the rocker turns with the crank, and the coupler stays level, also beyond half a turn."""
     path = tmp_path / "bar.xml"

@@ -64,6 +64,7 @@ def fitted(robot, episode, terms):
 BOTH = "torque_limit,speed_limit"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("offered", "limits", "chosen", "name", "truth"),
     [
@@ -87,6 +88,7 @@ def test_auto_finds_a_limit_that_was_reached(tmp_path, offered, limits, chosen, 
         assert errors[chosen,] < 0.5 * errors[()]
 
 
+@pytest.mark.full
 def test_a_limit_that_is_named_and_was_not_reached_has_no_number(tmp_path):
     robot, episode = recorded(tmp_path)
     findings = Findings.of(fitted(robot, episode, "torque_limit"))

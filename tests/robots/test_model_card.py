@@ -95,6 +95,7 @@ def check(folder, figures):
     assert float(largest[1]) < 1.0
 
 
+@pytest.mark.full
 def test_the_pendulum_of_a_real_recording(tmp_path):
     values = {"gain": 21.08, "gravity": 112.7, "damping": 0.748, "friction": 8.458, "sensor_delay": 0.0223,
               "actuator_delay": 0.0223}  # fmt: skip
@@ -151,6 +152,7 @@ def two_links(folder, own, commands):
     return robot, Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("own", "commands"),
     [
@@ -183,6 +185,7 @@ def test_the_go2_of_the_public_recording(tmp_path):
     check(card_of(robot, found, tmp_path / "card"), 80)
 
 
+@pytest.mark.full
 def test_a_wrong_delay_or_a_wrong_model_is_seen(tmp_path):
     """The script is no copy of the card's figures: with another delay, or a joint without friction, it fails."""
     robot, episode = two_links(tmp_path, PLAIN, ("goal",))
@@ -219,6 +222,7 @@ def test_the_card_of_a_run(finished_run_dir, tmp_path, monkeypatch, capsys):
     assert "holds no model card" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_the_distribution_of_a_link_s_delay_is_on_the_card(tmp_path):
     """As ``--links`` estimates it; the script computes mean and percentile from the shares."""
     robot, episode = two_links(tmp_path, PLAIN, ("goal",))
@@ -261,6 +265,7 @@ def test_facts_about_the_hardware_come_from_the_log():
     }
 
 
+@pytest.mark.full
 def test_a_card_without_a_simulation_has_the_reason(tmp_path):
     """A world that MuJoCo has not, and an identification without commands: no script computes their errors."""
     robot, episode = two_links(tmp_path, PLAIN, ("goal",))

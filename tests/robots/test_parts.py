@@ -80,6 +80,7 @@ def test_torque_grows_with_the_error_and_ends_at_the_stall_torque():
         assert env.physics.bind(task.robot.actuators).force == pytest.approx(torque)
 
 
+@pytest.mark.full
 def test_c_and_mjx_play_the_same_goals_alike(pair, played):
     _, positions, speeds, rewards = play_on_c(pair, played.params, played.goals)
     assert np.ptp(positions, axis=0).min() > 0.5

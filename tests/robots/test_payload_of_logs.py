@@ -50,6 +50,7 @@ def robot(tmp_path, commands=COMMANDS, **changes) -> MjcfRobot:
     return MjcfRobot(RobotConfig(**{**vars(config), **changes}))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("engine", ["c", pytest.param("compiled", marks=pytest.mark.full)])
 def test_logs_with_different_payloads_give_the_drive_of_all(tmp_path, engine):
     model = robot(tmp_path).identifiable(0.02)

@@ -20,6 +20,7 @@ XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
   <inertial pos="0 0 -0.2" mass="1" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody></mujoco>"""
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("share", [1.0, pytest.param(0.0, marks=pytest.mark.full)])
 def test_the_share_that_follows_the_voltage_is_found(tmp_path, share):
     path = tmp_path / "arm.xml"

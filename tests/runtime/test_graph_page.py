@@ -20,6 +20,7 @@ def names():
     return found
 
 
+@pytest.mark.full
 def test_the_page_says_what_is_so(names):
     nodes = names["nodes"]
     assert (nodes["agent"].phase, nodes["actuator"].phase) == pytest.approx((0.003, 0.007))

@@ -151,6 +151,7 @@ def check(case, held, same):
 PHASES = [Phase.explicit, Phase.reuse, Phase.generate]
 
 
+@pytest.mark.full
 def test_hashes_of_all_that_is_heard_are_equal(repetitions):
     @settings(max_examples=repetitions(2, 8), derandomize=True, phases=PHASES)
     @given(graphs(jax_hash_node), st.booleans())
@@ -160,6 +161,7 @@ def test_hashes_of_all_that_is_heard_are_equal(repetitions):
     equal()
 
 
+@pytest.mark.full
 def test_outputs_are_equal_at_delays_of_every_interpolation(repetitions):
     @settings(max_examples=repetitions(2, 14), derandomize=True, phases=PHASES)
     @given(

@@ -19,6 +19,7 @@ def names():
     return namespace
 
 
+@pytest.mark.full
 def test_the_wall_clock_runs_at_the_nodes_rates(names):
     assert 10 <= int(names["measured"].seq["agent"]) <= 26
     assert float(names["measured"].state["world"].x) < 1.0

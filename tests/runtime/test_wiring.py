@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 import topologies
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -72,6 +73,7 @@ def test_random_graphs(seed, which):
     compare(nodes, supervisor, timeline, eps=1)
 
 
+@pytest.mark.full
 @settings(max_examples=30)
 @given(st.integers(0, 10**6))
 def test_random_graphs_whose_rates_do_not_divide(seed):

@@ -82,6 +82,7 @@ def test_graph(run, traced):
     assert "graph/build/10_episodes_wire_s" in found
 
 
+@pytest.mark.full
 def test_train(run):
     report = run("train", "--seeds", 2)
     name = f"train/{jax.default_backend()}/pendulum/2_seeds"
@@ -206,6 +207,7 @@ def test_the_outcome_of_tests_is_read_from_pytests_report(tmp_path):
     assert found.rooms == {"log": 3.0, "view": 3.0}
 
 
+@pytest.mark.full
 def test_tests_that_cannot_run_are_an_error_with_a_hint(capsys):
     assert bench.main(["suite", "--quick", "--paths", "tests/no_such_room"]) == 1
     told = capsys.readouterr().err
@@ -355,6 +357,7 @@ def test_a_training_on_warp_is_refused_without_a_gpu(capsys, flags):
     assert "needs a GPU, and JAX has none here\n\nhint: " in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_walk_delays(run):
     """The policy that the pipeline ships, which needs no training, on one twin."""
     rows = {r["name"].removeprefix("walk_delays/shipped/10_ms/"): r["value"] for r in run("walk-delays")["rows"]}

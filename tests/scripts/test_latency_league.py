@@ -43,6 +43,7 @@ def test_a_lost_measurement_repeats_the_one_before():
     assert (log.position[at] == log.position[at - 1]).all()
 
 
+@pytest.mark.full
 def test_ours_finds_a_distribution_and_a_correlation_measures_the_lag_of_the_servo_too():
     log, true = links.log("gaussian", 6.0, 1), links.truth("gaussian", 6.0)
     ours, peak = methods.ours(log, 0), methods.correlation(log, 0)

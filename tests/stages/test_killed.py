@@ -113,6 +113,7 @@ def ran(run_dir):
     return done, [(r.number, r.verdict, r.then, len(r.stages)) for r in Iterations.load(run_dir).rows]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "verdicts", [("re-identify", "fine"), pytest.param(("re-train", "fine"), marks=pytest.mark.full)]
 )

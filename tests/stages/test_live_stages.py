@@ -31,6 +31,7 @@ def tiny(stage):
     return [f"--{flag.removeprefix(f'--{stage}.')}" for flag in TINY if flag.startswith(f"--{stage}.")]
 
 
+@pytest.mark.full
 def test_a_search_streams_its_loss_and_its_best_fit(run_copy, tmp_path):
     file = tmp_path / "identify.rrd"
     home = ["--run", str(run_copy), "--runs", str(run_copy.parent.parent)]

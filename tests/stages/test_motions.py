@@ -135,6 +135,7 @@ def test_files_without_a_motion_are_refused(tmp_path):
         replace(ARM.record, excitation="wobble")
 
 
+@pytest.mark.full
 def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsys):
     t_s = np.arange(0.0, 3.0, 0.02)
     volts = 1.2 * np.sin(2 * np.pi * 0.7 * t_s)

@@ -43,6 +43,7 @@ def folder(root, name="train"):
     return next((root / "pendulum").glob(f"*/{name}"))
 
 
+@pytest.mark.full
 def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_path, capsys):
     root = tmp_path / "runs"
     shutil.copytree(runs, root)
@@ -109,6 +110,7 @@ def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
         resume.check_same_parameters(found, other)
 
 
+@pytest.mark.full
 def test_a_sweep_names_what_it_tried_and_no_checkpoint_is_written_where_that_is_said(tmp_path, capsys, monkeypatch):
     report, left = learn_policy.show_progress, []
     monkeypatch.setattr(

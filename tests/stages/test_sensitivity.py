@@ -85,6 +85,7 @@ def judged():
     return sensitivity(robot, env, policy, moves, models, seed=0)
 
 
+@pytest.mark.full
 def test_the_parameter_that_breaks_it_is_found_and_no_other(judged):
     assert judged.success == 1.0
     assert judged.parameters[0].name == "gain"

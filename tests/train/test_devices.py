@@ -68,6 +68,7 @@ def found():
     return json.loads(done.stdout)
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_eight_devices_learn_what_one_learns(found):
     assert len(found["1"]) > 10

@@ -32,6 +32,7 @@ def learnt():
     return train(Sign(), dataclasses.replace(CONFIG, network="gru"), jax.random.key(0))
 
 
+@pytest.mark.full
 def test_it_learns_what_a_perceptron_cannot(learnt):
     blind = train(Sign(), CONFIG, jax.random.key(0))
     assert learnt.history["success"][-1, 0] > 0.9

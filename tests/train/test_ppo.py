@@ -58,6 +58,7 @@ def test_the_best_policy_is_one_that_was_evaluated(bandit):
     assert best.max() == returns[success == success.max()].max()
 
 
+@pytest.mark.full
 def test_a_seed_does_not_depend_on_its_neighbours(bandit):
     result, _, config = bandit
     alone = train(Bandit(), dataclasses.replace(config, num_seeds=1), jax.random.key(0))
@@ -66,6 +67,7 @@ def test_a_seed_does_not_depend_on_its_neighbours(bandit):
     assert not np.allclose(result.history["entropy"][-1, 0], result.history["entropy"][-1, 1])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rollout_steps", [2, pytest.param(8, marks=pytest.mark.full)])
 def test_a_test_within_training_plays_one_whole_episode_per_copy(rollout_steps):
     """Also where it takes several rollouts, and where episodes for training are cut before."""
@@ -207,6 +209,7 @@ def test_training_ends_at_the_first_evaluation_behind_its_time():
     assert len(found.env_steps) == 1
 
 
+@pytest.mark.full
 def test_evaluations_of_few_copies_judge_the_same_policies(bandit):
     full, _, config = bandit
     found = train(Bandit(), dataclasses.replace(config, eval_envs=16), jax.random.key(0))

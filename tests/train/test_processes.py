@@ -192,6 +192,7 @@ def test_each_process_says_who_can_join_and_where_the_coordinator_is_not_reached
     assert "warning" not in str(replace(own, coordinator="first:52700", process=1))
 
 
+@pytest.mark.full
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", [pytest.param("slurm", marks=pytest.mark.full), "open_mpi"])
 def test_processes_of_a_launcher_find_each_other(launcher):

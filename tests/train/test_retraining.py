@@ -22,6 +22,7 @@ def played(env):
     return jax.tree.map(np.asarray, rows)
 
 
+@pytest.mark.full
 def test_all_numbers_of_a_recording_are_in_the_data():
     first, second = environment(0), environment(1)
     exchanged, own = played(first.with_data(second.data)), played(second)

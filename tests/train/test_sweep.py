@@ -27,6 +27,7 @@ def swept():
     return train(Bandit(), CONFIG, KEY, sweep=Sweep(values | {"learning_rate": (1e-3, 5e-3)}))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("own", "rate"), [(slice(0, 2), 1e-3), (slice(2, 4), 5e-3)])
 def test_each_is_as_if_it_were_alone(swept, own, rate):
     alone = train(Bandit(), dataclasses.replace(CONFIG, learning_rate=rate), KEY)

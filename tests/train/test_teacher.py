@@ -37,6 +37,7 @@ def test_a_teacher_sees_what_the_policy_cannot(teacher):
     assert teacher.best.mean.shape == (3,)
 
 
+@pytest.mark.full
 def test_a_student_learns_from_it_what_a_robot_shows(student):
     assert student.history["success"][-1, 0] > 0.9
     assert student.history["imitation_error"][-1, 0] < 0.25

@@ -75,6 +75,7 @@ def test_a_picture_is_drawn_or_its_driver_is_named(joint, tmp_path, monkeypatch)
     assert drawing.placed == ("th",)
 
 
+@pytest.mark.full
 def test_a_model_without_shapes_gets_balls_and_its_one_joint_the_measured_angle(tmp_path, monkeypatch):
     """The export of the pendulum has masses only: without balls the picture is an empty sky."""
     (tmp_path / "robot.xml").write_text(

@@ -149,31 +149,19 @@ def _serve(
 
 
 def _free_domain() -> tuple[socket.socket, int]:
-    """Return a domain that no program of this machine uses, and the socket that holds it.
-
-    The guardian of an earlier robot may still be in that robot's domain, and would be taken for a second program that
-    commands the motors.
-    """
+    """Return a domain that no program of this machine uses, not even an earlier robot's guardian, and its socket."""
     for domain in _DOMAINS:
-        lock = _bound("127.0.0.1", _LOCK_PORT + domain)
-        heard = lock and _bound("", _DDS_PORT + _DDS_PORTS * domain)
-        if lock and heard:
-            heard.close()
-            return lock, domain
-        if lock:
+        lock, heard = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        try:
+            lock.bind(("127.0.0.1", _LOCK_PORT + domain))
+            heard.bind(("", _DDS_PORT + _DDS_PORTS * domain))
+        except OSError:
             lock.close()
+            continue
+        finally:
+            heard.close()
+        return lock, domain
     raise HardwareLost("all DDS domains of this machine have an emulator", hint="end emulators that still run")
-
-
-def _bound(host: str, port: int) -> socket.socket | None:
-    """Return a socket that has a UDP port; None if another program has it."""
-    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        bound.bind((host, port))
-    except OSError:
-        bound.close()
-        return None
-    return bound
 
 
 if __name__ == "__main__":

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import ClassVar, Self
+from typing import ClassVar
 
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode
-from sim2real.identify.model import Channel, PlainSimulation
+from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.later import jax
-from sim2real.robots.completeness import complete, tuple_of
+from sim2real.robots.completeness import tuple_of
+from sim2real.robots.contract import Identified
 from sim2real.robots.roles import ROLES, Roles
 from sim2real.types import PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
 
 
-class LoggedRobot(ABC):
+class LoggedRobot(Identified):
     """A ``RecordedRobot`` without a device; subclasses define its nodes and parameters.
 
     Attributes:
@@ -44,10 +45,6 @@ class LoggedRobot(ABC):
 
     _DATA: ClassVar = {"channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel))}
 
-    def __new__(cls, *args: object, **options: object) -> Self:
-        """Make the robot, if its class has all methods."""
-        return complete(cls, *args, **options)
-
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
         """Return the parameters that can be identified, without the delays."""
@@ -55,11 +52,6 @@ class LoggedRobot(ABC):
     @abstractmethod
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
         """Return sensor, actuator and world, not connected yet; their names are those of the roles."""
-
-    def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
-        """Return sentences on positions of a log that the model cannot have; default: none."""
-        del outputs
-        return []
 
     def started(self, params: Mapping[str, PyTree], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters with an initial state; default: ``start`` of the world's parameters.
@@ -74,24 +66,10 @@ class LoggedRobot(ABC):
         """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
         return IdentifiableRecording(self, max_delay_s)
 
-    def watched(self, max_delay_s: float) -> IdentifiableRecording:
-        """Return the model with all parameters that may change between recordings."""
-        return self.identifiable(max_delay_s)
-
     def with_optional_terms(self, wanted: str) -> LoggedRobot:
         """Return the robot with further optional terms; default: the robot, which has all of them."""
         del wanted
         return self
-
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
-        """Return the model with identified values, as MJCF; None: there is none."""
-        del values
-        return None
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
-        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
-        del values
-        return None
 
 
 class IdentifiableRecording:

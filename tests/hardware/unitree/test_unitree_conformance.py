@@ -6,6 +6,7 @@ pytest.importorskip("cyclonedds")
 from sim2real.hardware.testing import DeviceConformance
 
 
+@pytest.mark.full
 @pytest.mark.realtime
 class TestUnitreeLegs(DeviceConformance):
     patience_s = 2.0

@@ -64,6 +64,7 @@ def run(device, command, seconds, each=lambda: None):
         device.measure()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("robot", ["stand"], indirect=True)
 def test_joints_in_another_order_move_and_are_measured(robot, device):
     device.open()

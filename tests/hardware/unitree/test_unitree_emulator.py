@@ -32,6 +32,7 @@ def unitree_sdk():
     return folder
 
 
+@pytest.mark.full
 def test_unitrees_own_client_lets_the_emulated_robot_stand_up(unitree_sdk):
     client = Path(__file__).with_name("unitree_client.py")
     with EmbeddedRobot(BODY, UnitreeEmulation(0.004, 0.006, 0.0005)) as robot:

@@ -66,6 +66,7 @@ with Rig(device, gate) as rig:
 """
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "number",
     [
