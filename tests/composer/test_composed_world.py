@@ -250,6 +250,7 @@ def test_gymnasium_starts_copies_anew_when_they_are_done(vector):
     np.testing.assert_array_equal(again["x"], starts)
 
 
+@pytest.mark.full
 def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
     vector.reset(seed=0)
     places = jnp.array([[1.0], [jnp.nan], [0.0], [0.0]])

@@ -169,6 +169,7 @@ def test_derived_constants_are_those_of_mj_set_const(double):
         np.testing.assert_allclose(np.reshape(value, expected.shape), expected, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "text",
     [

@@ -170,6 +170,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
     assert np.max(np.abs(off)) < 1e-3
 
 
+@pytest.mark.full
 def test_what_cannot_be_told_is_named_in_all(fitted):
     problem = fitted[0]
     for _, spread, at in spreads(fitted):

@@ -215,6 +215,7 @@ def on_host(candidates, around, pick, fresh):
     return np.asarray(bowl(jnp.asarray(candidates, jnp.float32)), np.float64)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("strategy", ["CMA_ES", pytest.param("SNES", marks=pytest.mark.full), "DifferentialEvolution"])
 def test_losses_outside_of_programs_are_searched_alike(strategy):
     config = replace(CONFIG, strategy=strategy, generations=30)

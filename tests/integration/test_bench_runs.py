@@ -62,6 +62,7 @@ def test_demo_beside_the_nominal_model(commands, tmp_path):
     assert (keep / "seed4" / "nominal").is_dir()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["arm", pytest.param("so101", marks=pytest.mark.full)])
 def test_arm(name, commands, tmp_path, monkeypatch):
     # The run at hand is the pendulum's: it has a success where the arm has a distance.

@@ -38,6 +38,7 @@ def test_steps_tell_what_the_device_takes(tested, capsys):
     assert manifest_of(folder)["status"] == "finished"
 
 
+@pytest.mark.full
 def test_a_dry_one_moves_nothing_and_knows_the_host_and_the_bus(tested, capsys):
     folder = tested("--duration-s", "2", "--dry-run")
     found = Latency.load(folder)

@@ -89,6 +89,7 @@ def log(call):
     return path
 
 
+@pytest.mark.full
 def test_it_is_recorded_by_its_device(log):
     recording = Recording.load(log)
     assert recording.units == {"position": "rad", "velocity": "rad/s", "goal": "rad/s"}

@@ -183,6 +183,7 @@ def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
     assert "identified from" in forced.fitted[0]
 
 
+@pytest.mark.full
 def test_a_new_recording_is_what_identify_takes_next(finished_run_dir, tmp_path):
     copied(finished_run_dir, tmp_path / "pendulum" / finished_run_dir.name)
     assert cli.main(["record", "pendulum", "--duration-s", "1", "--runs", str(tmp_path), *PATIENT]) == 0

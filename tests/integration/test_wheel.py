@@ -49,6 +49,7 @@ def outside(tmp_path):
     return {"cwd": tmp_path, "env": {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_"))}}
 
 
+@pytest.mark.full
 def test_wheel_carries_the_pipelines_inside_the_package(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert "sim2real/_pipelines/pendulum/__init__.py" in names
@@ -57,6 +58,7 @@ def test_wheel_carries_the_pipelines_inside_the_package(wheel):
     assert {name for name in top if not name.endswith(".dist-info")} == {"sim2real"}
 
 
+@pytest.mark.full
 def test_command_runs_from_the_wheel(environment, outside):
     command = environment / "bin" / "sim2real"
     assert "exit codes" in call(command, "--help", **outside)
@@ -64,6 +66,7 @@ def test_command_runs_from_the_wheel(environment, outside):
     assert "--duration-s" in call(command, "record", "pendulum", "--help", **outside)
 
 
+@pytest.mark.full
 def test_imports_come_from_the_wheel(environment, outside):
     code = (
         "import sim2real, sim2real.stages.pipeline.pipeline as p; print(sim2real.__file__, p.load_pipeline('pendulum'))"

@@ -30,6 +30,7 @@ def played(pendulum):
     return env, np.asarray(first), jax.tree.map(np.asarray, rows)
 
 
+@pytest.mark.full
 def test_its_sizes_and_its_period(played):
     env, first, _ = played
     assert (env.observation_size, env.action_size, env.dt, env.max_episode_length) == (19, 1, 0.02, 24)

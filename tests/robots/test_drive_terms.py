@@ -199,6 +199,7 @@ def test_both_engines_say_the_same(engines, one):
     assert np.abs(found - played(engines.c, OFF)).max() > 1e-3
 
 
+@pytest.mark.full
 def test_friction_acts_on_the_compiled_engine_although_the_file_has_none(engines):
     """MJX leaves friction out for good where a model is compiled without any."""
     with_it, without = (played(engines.compiled, OFF | {"frictionloss": v}) for v in (0.3, 0.0))

@@ -63,6 +63,7 @@ def when_recording(root, action, told):
     return thread
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("pipeline", ["pendulum", pytest.param("so101", marks=pytest.mark.full)])
 def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline):
     pytest.importorskip("rerun")
@@ -112,6 +113,7 @@ def test_a_viewer_that_reads_nothing_costs_no_row(tmp_path, capsys):
     assert "the viewer did not take" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_without_a_screen_the_recording_goes_on_and_names_another_viewer(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

@@ -200,6 +200,7 @@ def test_no_stage_identifies_from_it_and_the_message_names_what_to_do(by_hand, c
     assert "a recording by hand determines no parameter" in capsys.readouterr().err
 
 
+@pytest.mark.full
 def test_its_log_is_a_motion_that_the_arm_reaches_slowly(by_hand, tmp_path):
     recording, _ = by_hand
     rows = goals(recording.path)

@@ -63,6 +63,7 @@ def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_pa
     np.testing.assert_allclose(sum(terms), found.history.returns, rtol=1e-4)
 
 
+@pytest.mark.full
 def test_a_stage_folder_and_a_run_name_it_too(runs):
     own = folder(runs)
     for target in (own, own.parent):
@@ -79,6 +80,7 @@ def settings(own, target, **changes):
     return flags.parse(config, words, "", "")
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -92,6 +94,7 @@ def test_other_settings_are_refused(runs, change, message):
         resume.find_interrupted("pendulum", settings(own, own, **change), runs)
 
 
+@pytest.mark.full
 def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
     own, whole = folder(runs), folder(runs / "whole")
     with pytest.raises(UsageError, match="is a training of pendulum, not of arm"):

@@ -94,6 +94,7 @@ def test_the_parameter_that_breaks_it_is_found_and_no_other(judged):
     assert judged.advice.startswith("Measure 'gain' better: 4 half-widths of its 95 % interval ")
 
 
+@pytest.mark.full
 def test_it_breaks_where_the_angle_is_too_far_off(judged):
     gain = judged.parameters[0]
     angle = np.arcsin(np.minimum(gain.values * VOLTS / VALUES["gravity"], 1.0))

@@ -77,6 +77,7 @@ def test_eight_devices_learn_what_one_learns(found):
         np.testing.assert_allclose(eight, one, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_each_device_computes_its_part_of_a_minibatch(found):
     whole = 48 // 4 * 5

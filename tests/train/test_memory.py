@@ -39,6 +39,7 @@ def test_it_learns_what_a_perceptron_cannot(learnt):
     assert blind.history["success"][-1, 0] < 0.6, "half of the signs can be guessed"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("backend", ["numpy", "onnx"])
 def test_the_bundle_remembers_until_it_is_reset(learnt, backend, tmp_path):
     if backend == "onnx":
@@ -56,6 +57,7 @@ def test_the_bundle_remembers_until_it_is_reset(learnt, backend, tmp_path):
     assert forgetful[1] != pytest.approx(found[1], abs=1e-3)
 
 
+@pytest.mark.full
 def test_weights_make_the_same_policy(learnt):
     policy = learnt.best
     again = Policy.from_weights(policy.to_weights(), policy.spec)
@@ -63,6 +65,7 @@ def test_weights_make_the_same_policy(learnt):
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(policy), strict=True))
 
 
+@pytest.mark.full
 def test_an_observation_alone_tells_no_action(learnt):
     with pytest.raises(UsageError, match=r"network 'gru' remembers[\s\S]*hint: call step"):
         learnt.best.get_action(jnp.zeros(2))

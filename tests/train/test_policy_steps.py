@@ -61,6 +61,7 @@ def test_some_rows_have_no_step_of_the_policy(played):
     assert played.rows.valid.tolist() == played.turns[:-1].tolist()
 
 
+@pytest.mark.full
 def test_every_step_is_one_of_the_policy(played):
     assert int(played.state.step_state.seq) == 0
     assert played.steps.valid.all()

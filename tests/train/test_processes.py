@@ -149,6 +149,7 @@ except Sim2RealError as error:
 """
 
 
+@pytest.mark.full
 @pytest.mark.slow
 def test_who_is_ended_by_jax_ends_in_words_and_the_coordinator_listens_where_it_was_told():
     with socket.socket() as free:

@@ -36,6 +36,7 @@ def test_each_is_as_if_it_were_alone(swept, own, rate):
     assert [member["learning_rate"] for member in swept.members[own]] == [rate, rate]
 
 
+@pytest.mark.full
 def test_the_best_is_of_all(swept):
     assert swept.history["return"].shape == (2, 4)
     assert not np.allclose(swept.history["entropy"][-1, :2], swept.history["entropy"][-1, 2:])

@@ -60,6 +60,7 @@ def test_a_driver_that_fails_leaves_a_reason(tmp_path, monkeypatch):
     assert "no such driver" in drawing.reason
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("joint", [pytest.param("th", marks=pytest.mark.full), "arm/lower/th/joint"])
 def test_a_picture_is_drawn_or_its_driver_is_named(joint, tmp_path, monkeypatch):
     """CI may have no driver."""

@@ -175,6 +175,12 @@ class ServoBus(GuardedServos[BusLink]):
         """
         return self._write_goals(reg.GOAL_PWM, goals, reg.pwm_from_fraction, 1.0)
 
+    def write_goal_velocity(self, goals: Mapping[int, float]) -> Transaction:
+        """Command speeds [rad/s] by servo id; otherwise like `write_goal_pwm`."""
+        return self._write_goals(
+            reg.GOAL_VELOCITY, goals, reg.count_from_rad_s, reg.rad_s_from_count(reg.GOAL_VELOCITY.maximum)
+        )
+
     def write_goal_position(self, goals: Mapping[int, float]) -> Transaction:
         """Command positions [rad from each encoder's zero] by servo id; otherwise like `write_goal_pwm`."""
         return self._write_goals(

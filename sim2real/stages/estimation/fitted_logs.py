@@ -88,12 +88,11 @@ def require_apart(
         for (a, ha), (b, hb) in combinations(zip(fitted, hashes, strict=True), 2)
         if ha is not None and ha == hb
     ]
+    positions = [_measured(log, model) for log in fitted]
     for log in held_out:
-        digest, positions = _hash(log), _measured(log, model)
-        for other, other_digest in zip(fitted, hashes, strict=True):
-            if (digest is not None and digest == other_digest) or any(
-                _contains(_measured(other, model), p) for p in _cut(positions)
-            ):
+        digest, pieces = _hash(log), list(_cut(_measured(log, model)))
+        for other, other_digest, whole in zip(fitted, hashes, positions, strict=True):
+            if (digest is not None and digest == other_digest) or any(_contains(whole, p) for p in pieces):
                 messages.append(f"{log.path} is to be held out, and {other.path}, with the same measurements, fitted")
     _refuse(messages, "name each log once, or --force: held-out errors of a fitted log are no test of the fit", force)
 

@@ -105,6 +105,7 @@ def test_a_command_beyond_the_reach_is_not_sent(column, value, words):
         device.command(values)
 
 
+@pytest.mark.full
 def test_torque_that_was_taken_off_stays_off(device):
     device.open()
     device.enable()
