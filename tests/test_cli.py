@@ -16,9 +16,11 @@ import pytest
 from sim2real import cli, errors
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.run import run_folder
+from sim2real.commands import flags
 from sim2real.commands.loop import in_brief
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.validate.config import ValidateConfig
 
 QUICK = {**os.environ, "PYTHONUNBUFFERED": "1"}
 
@@ -186,6 +188,16 @@ def test_flags_reach_the_stage_and_the_result_goes_to_stdout(calls, capsys, tmp_
     assert f"wrote elsewhere/pendulum/{folder.name}/record/result.txt" in out
     assert "seed  0" in out
     assert not err
+
+
+def test_a_flag_takes_all_logs_that_a_shell_finds(calls):
+    """Files of one kind; what follows them may be the value of another flag, or an identification."""
+    logs = ["--log", "a.csv", "b.csv", "c.csv", "--hold-out", "d.csv", "e.csv", "--seed", "3"]
+    assert cli.main(["identify", "pendulum", *logs]) == 0
+    ((_, config, _),) = calls
+    assert (config.log, config.hold_out, config.seed) == (("a.csv", "b.csv", "c.csv"), ("d.csv", "e.csv"), 3)
+    scored = flags.parse(ValidateConfig(), ["--log", "a.json", "b.json", "run/parameters.json"], "validate", "")
+    assert (scored.log, scored.parameters) == (("a.json", "b.json"), Path("run/parameters.json"))
 
 
 def test_a_range_replaces_one_of_the_pipeline_or_is_added_to_them(calls):

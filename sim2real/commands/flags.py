@@ -146,7 +146,7 @@ def parse(
             parsed, unknown = tyro.cli(
                 kind or type(default),
                 default=_without_tables(default),
-                args=_with_viewer(arguments),
+                args=_completed(arguments),
                 prog=prog,
                 description=description,
                 return_unknown_args=True,
@@ -185,14 +185,25 @@ def _with_tables(parsed: Any, default: Any) -> Any:
     return replace(parsed, **changed) if changed else parsed
 
 
-def _with_viewer(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments with a value for each flag ``--view`` that has none: a window."""
-    words = []
+def _completed(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments with a window for each ``--view`` that has no value, and a flag for each of several logs."""
+    words, flag = list[str](), ""
     for word, following in zip(arguments, [*arguments[1:], "-"], strict=False):
+        # A shell makes several files of `--log *.csv`: those of one kind follow the flag.
+        last = Path(words[-1]) if flag and words[-1] != flag else None
+        if last and not word.startswith("-") and _is_log(Path(word), last):
+            words.append(flag)
+        elif last or word.startswith("-"):
+            flag = word if re.fullmatch(r"--(\w+\.)?(log|hold[-_]out)", word) else ""
         words.append(word)
         if re.fullmatch(r"--(\w+\.)?view", word) and following.startswith("-"):
             words.append(WINDOW)
     return words
+
+
+def _is_log(path: Path, last: Path) -> bool:
+    """Return whether an argument after a log is one, too, and not an identification."""
+    return path.suffix == last.suffix and path.name != "parameters.json" and not path.is_dir()
 
 
 def flag_names(config: Any, prefix: str = "") -> list[str]:

@@ -20,7 +20,7 @@ class CheckLogFlags:
     """Predict which parameters a log can determine, before a search."""
 
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """Log to judge, one flag a log."""
+    """Logs to judge."""
     bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
     """Bounds of a parameter instead of the usual ones: NAME LOW HIGH, one flag a parameter."""
     fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)

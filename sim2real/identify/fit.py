@@ -17,6 +17,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.segments import Data, Span
+from sim2real.identify.problem.thinned import MOST_OF_FIT, MOST_OF_SETS, of_recordings, thinned
 from sim2real.identify.search.refine import Refined, refine, remaining
 from sim2real.identify.search.search import SearchResult, search
 from sim2real.identify.uncertainty.uncertainty import Uncertainty, centred, uncertainty
@@ -108,7 +109,8 @@ def fit(
         long_spans: Segments of ``config.long_s`` for the last refinement.
         as_start: Whether the fit only has to be a start for fits with some of the optional terms.
     """
-    problem = windows = Problem(model, recordings, spans, length_s, config, table)
+    windows = Problem(model, recordings, spans, length_s, config, table)
+    problem = thinned(windows, of_recordings(windows), MOST_OF_FIT)
     if on_begin:
         on_begin(problem)
     # Refine from the nominal values, too, with short and with long delays: a delay may imitate an inertia.
@@ -124,9 +126,13 @@ def fit(
     if config.refine and as_start and problem.table.terms:
         refined += _roughly(problem, starts, report)
     elif config.refine:
-        refined.append(_refine(problem, starts, report))
+        # Where all segments take long, the best of several descents on some of them begins the descent on all.
+        few = thinned(problem, np.ones((1, len(problem.train)), bool), MOST_OF_SETS)
+        refined += [_refine(few, starts, report)] if few is not problem else []
+        refined.append(_refine(problem, refined[0].z[None] if refined else starts, report))
     if config.refine and config.long_s and long_spans:
-        problem = problem.recut(long_spans, config.long_s)
+        problem = windows.recut(long_spans, config.long_s)
+        problem = thinned(problem, of_recordings(problem), MOST_OF_FIT)
         refined.append(_refine(problem, refined[-1].z[None], report))
     # Test whether the end is a minimum.
     if refined:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Bound, Promise
+from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Bound, Promise, too_many_broken
 from sim2real.artifacts.identification import HeldOut, HeldOutPart, Identification, Judgement
 from sim2real.identify.validation.verdict import Position
 from sim2real.stages.estimation import estimate, predicted_logs, promises
@@ -53,6 +53,34 @@ def test_a_further_part_stays_below_its_bound_as_often_as_promised(parts):
     kept = [np.exp(row[-1]) < promises.further(np.exp(row[:-1])) for row in logs]
     low, high = stats.binom.interval(0.999, len(kept), 0.95)
     assert low <= sum(kept) <= high
+
+
+def test_of_many_errors_of_two_kinds_one_in_twenty_is_above_its_bound():
+    """Steps are predicted ten times worse than sines: a log-normal bound was exceeded by 12 of 100 errors."""
+    rng = np.random.default_rng(0)
+    for count in (40, 200):
+        kept = []
+        for _ in range(1000):
+            steps = rng.random(count + 1) < 0.2
+            errors = np.where(steps, 0.03, 0.001) * np.exp(0.1 * rng.normal(size=count + 1))
+            kept.append(errors[-1] < promises.further(errors[:-1]))
+        assert 0.93 < np.mean(kept) < 0.99
+
+
+def test_of_twenty_promises_alike_one_may_be_broken():
+    def rows(broken, kept, **changes):
+        made = [Promise(str(i), True, "th", "tilt", "rad", AHEAD, 1.0, 0.02, 0.01) for i in range(broken)]
+        made += [Promise(str(i), True, "th", "tilt", "rad", AHEAD, 1.0, 0.01, 0.01) for i in range(kept)]
+        return [replace(row, **changes) for row in made]
+
+    assert too_many_broken(rows(1, 18))
+    assert not too_many_broken(rows(1, 19))
+    assert too_many_broken(rows(3, 38))
+    assert not too_many_broken(rows(19, 0, fresh=False))
+    assert too_many_broken([*rows(0, 100), *rows(1, 0, column="other")])
+    (sentence,) = promises.broken_sentences(rows(2, 38))
+    assert sentence.startswith("2 of 40 promises are broken, no more than one in twenty; a promise is broken: tilt")
+    assert len(promises.broken_sentences(rows(5, 38))) == 4
 
 
 def test_few_parts_that_differ_by_chance_promise_no_vacuous_bound():

@@ -14,6 +14,9 @@ MAX_ERROR_RATIO = 1.25
 """Largest ratio of an error to its bound at which the promise is not broken: one error in twenty may exceed its bound,
 and it seldom exceeds it by this."""
 
+_ADMIT_ONE = 20
+"""Number of promises about a position and a reach of which one may be broken."""
+
 PROMISE_BROKEN = "promise broken"
 """The verdict on an identification whose errors on held-out data exceed their bounds."""
 
@@ -97,6 +100,18 @@ class Promise:
         bound = "" if self.bound is None else f"; promised was {self.bound:.2g}{unit}{ratio and f': {ratio[2:]}'}"
         wider = f" (for {self.stretch:.2g} times the fitted motion)" if bound and self.stretch > 1.0 else ""
         return f"{self.name} {size} {how} on {where}{bound}{wider}"
+
+
+def too_many_broken(rows: Sequence[Promise]) -> bool:
+    """Return whether promises about data that no estimate depended on are broken; of twenty alike, one may be.
+
+    Bounds are for 95 % of the errors, so of many some are exceeded although each bound is right.
+    """
+    counts: dict[tuple[str, Reach], list[bool]] = {}
+    for r in rows:
+        if r.fresh and r.ratio is not None:
+            counts.setdefault((r.column, r.reach), []).append(r.broken)
+    return any(sum(those) > len(those) // _ADMIT_ONE for those in counts.values())
 
 
 def promises_table(rows: Sequence[Promise]) -> ArtifactTable:

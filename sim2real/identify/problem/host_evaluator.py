@@ -152,9 +152,9 @@ class OutsideEvaluator:
             measured = channel.of(np.asarray(data.measured[channel.position])[segments])
             reaches.append(np.ptp(np.where(counts, measured, measured[:, :1]), axis=1))
         order = np.argsort(-np.array(reaches), axis=1).T.reshape(-1)  # the best of each channel, the second best, ...
-        # Take the first segment of each recording, then the others in that order.
+        # Take the best segment of each recording, then the others in that order.
         recordings = np.asarray(data.recording)[segments]
-        firsts = np.unique(recordings, return_index=True)[1]
+        firsts = order[np.unique(recordings[order], return_index=True)[1]]
         count, alone = most or max(_SEARCHED, 2 * len(reaches)), any(p.per_recording for p in self._residuals.table)
         count = max(count, len(firsts)) if alone else count
         turns = dict.fromkeys([*(firsts if len(firsts) <= count else ()), *order.tolist()])

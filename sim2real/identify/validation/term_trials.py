@@ -15,6 +15,7 @@ import numpy as np
 from sim2real.identify.fit import INSIDE, Fit, opened
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import Data
+from sim2real.identify.problem.thinned import MOST_OF_SETS, thinned
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.noise import above_noise
 from sim2real.identify.uncertainty.uncertainty import Linearised, linearise
@@ -30,7 +31,6 @@ from sim2real.identify.validation.optional_terms import (
 )
 from sim2real.identify.validation.prediction import labels
 from sim2real.identify.validation.refits import Refits
-from sim2real.identify.validation.thinned import thinned
 
 _SHARES = (1.0, 0.25, 0.06)
 """Shares of the linear step without a part that are simulated; the best begins the descent without that part."""
@@ -202,7 +202,7 @@ class Trials:
         self._estimate, self._parts, self._times = estimate, parts, (settle_s, free_run_s)
         self._refits = refits
         self._groups = folds.shared(parts)[0]
-        self._problem = thinned(estimate.problem, self._groups)
+        self._problem = thinned(estimate.problem, folds.masks(estimate.problem, self._groups), MOST_OF_SETS)
         self._masks = folds.masks(self._problem, self._groups)
         self._least = estimate.loss if self._problem is estimate.problem else self._problem.loss(estimate.z)
         self._sigma = dict(zip(labels(self._problem), (s for _, s, _ in self._problem.fields), strict=True))

@@ -17,7 +17,7 @@ class CheckConfig:
     """Predict which parameters a recording, or a planned one, can determine, before a search."""
 
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """MCAP log to judge, one flag a log; default: the newest recording, and without one the planned excitation."""
+    """Logs to judge; default: the newest recording, and without one the planned excitation."""
     plan: bool = False
     """Judge the planned excitation even if there is a recording."""
     bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.artifacts.estimation.posterior import Posterior
-from sim2real.artifacts.estimation.promise import PROMISE_BROKEN
+from sim2real.artifacts.estimation.promise import PROMISE_BROKEN, too_many_broken
 from sim2real.artifacts.identification import (
     ROUND_TRIP,
     Determined,
@@ -153,7 +153,7 @@ def judged(
     elif lack.flags:
         status, reasons = "lacks a term", [*lack.reasons, *broken, *bounds, *reasons]
     else:
-        status = PROMISE_BROKEN if promises.broken(document.promises) else status
+        status = PROMISE_BROKEN if too_many_broken(document.promises) else status
         reasons = [*broken, *bounds, *reasons, *lack.reasons]
     flags = " ".join(f for f in (verdict.next, lack.flags) if f)
     # A fault in fitted data changes no held-out error, so it does not change the status.

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import stdtrit
 
-from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Bound, Promise, Reach
+from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Bound, Promise, Reach, too_many_broken
 from sim2real.artifacts.identification import HeldOutPart, Identification
 from sim2real.identify.validation.draws import SPREAD
 from sim2real.identify.validation.folds import MOVES
@@ -28,6 +28,8 @@ _VAGUE = 4.0
 """Ratio of a bound to the worst error above which the text asks for more recordings."""
 _MOST = 3
 """Most broken promises that are named."""
+_SHARE = 0.95
+"""Share of later errors below their bound."""
 THIS_RECORDING, SUCH_RECORDINGS = "this recording", "recordings like these"
 
 
@@ -35,7 +37,8 @@ def further(errors: np.ndarray, later: np.ndarray | None = None) -> float:
     """Return the error below which a further part stays with 95 % probability.
 
     Errors are taken as log-normal. The deviation of their logarithms is pooled with a prior, as few parts may be alike,
-    or differ, by chance. The result is the upper end of a one-sided prediction interval (Student).
+    or differ, by chance. The result is the upper end of a one-sided prediction interval (Student). Of many errors, the
+    one that a further error is below with this probability, whatever their distribution, is the least bound.
 
     Args:
         errors: Shape ``(K,)``: errors on parts.
@@ -48,8 +51,10 @@ def further(errors: np.ndarray, later: np.ndarray | None = None) -> float:
     freedom = _PRIOR_PARTS + count - len(groups)
     squares = _PRIOR_PARTS * _PRIOR_DEVIATION**2 + sum(float(np.sum((g - g.mean()) ** 2)) for g in groups)
     centre = max(float(np.concatenate(groups).mean()), float(groups[-1].mean()) if len(groups) > 1 else -math.inf)
-    width = stdtrit(freedom, 0.95) * math.sqrt(squares / freedom * (1.0 + 1.0 / count))
-    return math.exp(centre + width)
+    width = stdtrit(freedom, _SHARE) * math.sqrt(squares / freedom * (1.0 + 1.0 / count))
+    rank = math.ceil(_SHARE * (count + 1) - 1e-9)
+    every = np.sort(np.concatenate(groups))
+    return math.exp(max(centre + width, every[rank - 1] if rank <= count else -math.inf))
 
 
 def ledger(
@@ -191,8 +196,11 @@ def broken(rows: Sequence[Promise]) -> list[Promise]:
 
 
 def broken_sentences(rows: Sequence[Promise]) -> list[str]:
-    """Return a sentence for each broken promise, at most ``_MOST``."""
+    """Return a sentence for each broken promise, at most ``_MOST``; a single one where so few may be broken."""
     sentences = [f"a promise is broken: {row.sentence()}" for row in broken(rows)]
+    if sentences and not too_many_broken(rows):
+        count = sum(r.fresh and r.ratio is not None for r in rows)
+        return [f"{len(sentences)} of {count} promises are broken, no more than one in twenty; {sentences[0]}"]
     return sentences[:_MOST] + [f"{len(sentences) - _MOST} more promises are broken"] * (len(sentences) > _MOST)
 
 

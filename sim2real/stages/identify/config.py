@@ -15,12 +15,12 @@ class IdentifyConfig(FitConfig):
     """Identify dynamics, delays and initial states from logs."""
 
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """MCAP log to identify from, one flag a log; default: the newest finished recording of the pipeline."""
+    """Logs to identify from; default: the newest finished recording of the pipeline."""
     begin: str | None = None
     """File at whose values the search begins: parameters.json or partial.json of an identification; default: data
     sheet."""
     hold_out: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """MCAP log that is held out: predicted, not fitted; one flag a log."""
+    """Logs that are held out: predicted, not fitted."""
     standing: str | None = None
     """Log of a robot on its feet (`record --excitation standing`), from which its load is estimated."""
     force: bool = False

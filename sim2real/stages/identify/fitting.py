@@ -58,6 +58,8 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
 
     def on_begin(problem: Problem) -> None:
         note(f"engine: {problem.engine}")
+        if (few := len(problem.train)) < (every := sum(span.fitted for span in inputs.windows)):
+            note(f"the fit takes {few} of {every} segments, those with most motion of each log; all are predicted")
         best.begin(problem)
 
     # Fit the model with all terms that the configuration allows; terms are selected on windows, which takes less time.

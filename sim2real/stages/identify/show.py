@@ -6,7 +6,7 @@ from sim2real.artifacts.estimation.links import links_table
 from sim2real.artifacts.estimation.tried_term import tried_table
 from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
-from sim2real.stages.terminal.console import artifact_table, note
+from sim2real.stages.terminal.console import MOST_PROMISES, artifact_table, note
 
 
 def show(identification: Identification) -> None:
@@ -21,7 +21,7 @@ def show(identification: Identification) -> None:
     if identification.held_out:
         print(artifact_table(identification.held_out_table().without("no better than")))
     if (promises := identification.promises_table()).rows:
-        print(artifact_table(promises))
+        print(artifact_table(promises, MOST_PROMISES))
     if identification.links:
         print(artifact_table(links_table(identification.links)))
     note(f"verdict: {identification.verdict.status}")

@@ -102,9 +102,14 @@ def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -
     )
 
 
-def artifact_table(content: ArtifactTable) -> str:
-    """Return a table of an artifact as aligned plain text."""
-    return table(content.rows, content.headers)
+MOST_PROMISES = 12
+"""Rows of the ledger of promises on the console; 120 logs have 480."""
+
+
+def artifact_table(content: ArtifactTable, most: int | None = None) -> str:
+    """Return a table of an artifact as aligned plain text; a last line counts the rows beyond ``most``."""
+    text, more = table(content.rows[:most], content.headers), len(content.rows) - len(content.rows[:most])
+    return f"{text}\n... and {more} more rows" if more else text
 
 
 def pairs(values: Mapping[str, Any]) -> str:

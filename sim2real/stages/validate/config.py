@@ -14,7 +14,7 @@ class ValidateConfig:
     parameters: Annotated[Positional[Path | None], arg(metavar="PARAMETERS")] = None
     """parameters.json, or the folder of an identification."""
     log: Annotated[tuple[str, ...], UseAppendAction] = ()
-    """Later log, one flag a log."""
+    """Later logs."""
     horizon_s: float = 0.0
     """Horizon of the predictions [s]; 0: that of the identification's verdict."""
     free_run_s: float = 0.0

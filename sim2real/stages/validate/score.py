@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Promise
+from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Promise, too_many_broken
 from sim2real.artifacts.identification import HeldOut, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
@@ -73,7 +73,7 @@ def score(
         "horizon_s": horizon_s,
         "positions": rows,
         "better": not any(row["beaten_by"] for row in rows.values()),
-        "promise_kept": not any(row.broken for row in ledger) if any(row.bound for row in ledger) else None,
+        "promise_kept": not too_many_broken(ledger) if any(row.bound for row in ledger) else None,
         "ledger": ledger,
         "drawn": [
             {"log": logs[k].path.name, "column": column, "low95": low, "high95": high}

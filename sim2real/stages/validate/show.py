@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO, promises_table
 from sim2real.stages.estimation.promises import broken_sentences
-from sim2real.stages.terminal.console import artifact_table, note, table
+from sim2real.stages.terminal.console import MOST_PROMISES, artifact_table, note, table
 from sim2real.stages.validate.result import ACCEPTED
 from sim2real.types import Json
 
@@ -15,7 +15,7 @@ def show(result: Mapping[str, Json]) -> None:
     cells = [[n, *(row["rmse"].get(m) for m in models), row["unit"]] for n, row in result["positions"].items()]
     print(table(cells, [f"off {result['horizon_s']:g} s ahead", *models, "unit"]))
     if (promises := promises_table(result["ledger"])).rows:
-        print(artifact_table(promises))
+        print(artifact_table(promises, MOST_PROMISES))
     print(
         f"all positions: {result['rmse']:.4g} {result['horizon_s']:g} s ahead, "
         f"{result['free_run_rmse']:.4g} in free runs"
@@ -40,6 +40,8 @@ def show(result: Mapping[str, Json]) -> None:
     elif result["promise_kept"] is None:
         note("verdict: better than the baselines on this log; no bound was promised")
     else:
+        for sentence in broken_sentences(result["ledger"]):
+            note(sentence)
         note("verdict: holds on this log")
     if result["identified"] != ACCEPTED:
         note(f"the identification itself was not accepted: {result['identified']}: {'; '.join(result['why'][:1])}")
