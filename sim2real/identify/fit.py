@@ -17,7 +17,7 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.segments import Data, Span
-from sim2real.identify.problem.thinned import MOST_OF_FIT, MOST_OF_SETS, of_recordings, thinned
+from sim2real.identify.problem.thinned import MOST_OF_FIT, few_of, of_recordings, thinned
 from sim2real.identify.search.refine import Refined, refine, remaining
 from sim2real.identify.search.search import SearchResult, search
 from sim2real.identify.uncertainty.uncertainty import Uncertainty, centred, uncertainty
@@ -127,7 +127,7 @@ def fit(
         refined += _roughly(problem, starts, report)
     elif config.refine:
         # Where all segments take long, the best of several descents on some of them begins the descent on all.
-        few = thinned(problem, np.ones((1, len(problem.train)), bool), MOST_OF_SETS)
+        few = few_of(problem)
         refined += [_refine(few, starts, report)] if few is not problem else []
         refined.append(_refine(problem, refined[0].z[None] if refined else starts, report))
     if config.refine and config.long_s and long_spans:
@@ -155,8 +155,8 @@ def refit(problem: Problem, present: np.ndarray, near: np.ndarray) -> dict[str, 
     table = problem.table
     if not present.any():
         return as_numbers(table, near, present)
-    starts = np.stack([table.encode(as_numbers(table, near)), table.start()])
-    return as_numbers(table, refine(problem, starts, problem.part(present=present), coarse=True).z, present)
+    starts, few = np.stack([table.encode(as_numbers(table, near)), table.start()]), few_of(problem)
+    return as_numbers(table, refine(few, starts, few.part(present=present), coarse=True).z, present)
 
 
 def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = None) -> SearchResult:

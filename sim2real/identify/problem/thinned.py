@@ -10,7 +10,7 @@ from sim2real.identify.problem.segments import Span
 MOST_OF_FIT = 4e7
 """Steps of single joints in a Jacobian from which a fit takes fewer segments: about 30 s on two cores."""
 MOST_OF_SETS = 8e6
-"""The same for the first of two descents, and for fits of sets of terms that are compared: about 4 s."""
+"""The same for the first of two descents, for baselines and for sets of terms that are compared: about 4 s."""
 BESIDE = 4
 """Joints whose steps take as long as what a step of a model takes beside its joints."""
 _FEWEST = 2
@@ -38,6 +38,11 @@ def of_recordings(problem: Problem) -> np.ndarray:
     """Return which fitted segments are in each recording, ``(K, S)``, bool."""
     recording = problem.recording[problem.train]
     return recording == np.unique(recording)[:, None]
+
+
+def few_of(problem: Problem) -> Problem:
+    """Return a problem with the segments with most motion, of whichever recording, if all would take long."""
+    return thinned(problem, np.ones((1, len(problem.train)), bool), MOST_OF_SETS)
 
 
 def _liveliest(problem: Problem, parts: np.ndarray, keep: int) -> list[Span]:
