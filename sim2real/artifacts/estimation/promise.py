@@ -14,9 +14,6 @@ MAX_ERROR_RATIO = 1.25
 """Largest ratio of an error to its bound at which the promise is not broken: one error in twenty may exceed its bound,
 and it seldom exceeds it by this."""
 
-_ADMIT_ONE = 20
-"""Number of promises about a position and a reach of which one may be broken."""
-
 PROMISE_BROKEN = "promise broken"
 """The verdict on an identification whose errors on held-out data exceed their bounds."""
 
@@ -111,7 +108,7 @@ def too_many_broken(rows: Sequence[Promise]) -> bool:
     for r in rows:
         if r.fresh and r.ratio is not None:
             counts.setdefault((r.column, r.reach), []).append(r.broken)
-    return any(sum(those) > len(those) // _ADMIT_ONE for those in counts.values())
+    return any(sum(those) > len(those) // 20 for those in counts.values())
 
 
 def promises_table(rows: Sequence[Promise]) -> ArtifactTable:

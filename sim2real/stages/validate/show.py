@@ -27,21 +27,19 @@ def show(result: Mapping[str, Json]) -> None:
         note(f"{', '.join(resting)} did not move here, which neither keeps a promise nor breaks one")
     for sentence in result["beyond"]:
         note(f"beyond the fitted data, so bounds are wider: {sentence}")
+    for sentence in broken_sentences(result["ledger"]) if result["better"] else ():
+        note(sentence)
     if not result["better"]:
         beaten = {n: row["beaten_by"] for n, row in result["positions"].items() if row["beaten_by"]}
         listed = "; ".join(f"{n} by {', '.join(by)}" for n, by in list(beaten.items())[:3])
         note(f"verdict: no improvement on this log: beaten are {listed}")
     elif result["promise_kept"] is False:
-        for sentence in broken_sentences(result["ledger"]):
-            note(sentence)
         note(f"verdict: better than the baselines, but more than {MAX_ERROR_RATIO:g} times as far off as was promised")
     elif result["fitted"]:
         note("verdict: none: a log that was fitted is no test")
     elif result["promise_kept"] is None:
         note("verdict: better than the baselines on this log; no bound was promised")
     else:
-        for sentence in broken_sentences(result["ledger"]):
-            note(sentence)
         note("verdict: holds on this log")
     if result["identified"] != ACCEPTED:
         note(f"the identification itself was not accepted: {result['identified']}: {'; '.join(result['why'][:1])}")
