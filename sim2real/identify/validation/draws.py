@@ -15,8 +15,9 @@ from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.validation.prediction import labels
 
-DRAWS = 16
-"""Draws of the posterior; each costs one simulation of the data."""
+DRAWS, _FEWEST, _RUNS = 16, 4, 640
+"""Draws of the posterior, each of which costs one simulation of the data; fewest draws of many segments; and how many
+segments are simulated before there are fewer draws."""
 LOW, HIGH, SPREAD = "low95", "high95", "spread"
 """Columns of a field: the interval of the drawn trajectories, and their deviation from that of the estimate."""
 _TAIL = 0.025
@@ -43,11 +44,12 @@ def intervals(
     """
     if posterior is None:
         return {}, {}
-    drawn = posterior.sample(np.random.default_rng(0), DRAWS)
+    count = min(DRAWS, max(_FEWEST, _RUNS // problem.segments))
+    drawn = posterior.sample(np.random.default_rng(0), count)
     every, fit_s = np.arange(problem.segments), np.full(problem.segments, settle_s)
     at, names = np.nonzero(problem.ts >= 0), labels(problem)
     offsets = []
-    for i in range(DRAWS):
+    for i in range(count):
         values = {n: drawn[n][i] if n in drawn else v for n, v in estimates.items()}
         rows = {n: np.broadcast_to(v, (problem.segments, *np.shape(v))) for n, v in values.items()}
         offsets.append(problem.predict(rows, every, fit_s)[at] * [sigma for _, sigma, _ in problem.fields])
