@@ -135,6 +135,7 @@ def test_view(run):
     )}  # fmt: skip
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.full
 @pytest.mark.slow
 def test_excitation(run):
