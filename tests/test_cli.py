@@ -17,6 +17,7 @@ from sim2real import cli, errors
 from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.artifacts.run import run_folder
 from sim2real.commands import flags
+from sim2real.commands.config import NewConfig
 from sim2real.commands.loop import in_brief
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -198,6 +199,10 @@ def test_a_flag_takes_all_logs_that_a_shell_finds(calls):
     assert (config.log, config.hold_out, config.seed) == (("a.csv", "b.csv", "c.csv"), ("d.csv", "e.csv"), 3)
     scored = flags.parse(ValidateConfig(), ["--log", "a.json", "b.json", "run/parameters.json"], "validate", "")
     assert (scored.log, scored.parameters) == (("a.json", "b.json"), Path("run/parameters.json"))
+    one = flags.parse(
+        NewConfig(), ["rig", "--log", "a.csv", "b.csv"], "new", ""
+    )  # a flag for one log takes no second one
+    assert (one.log, one.model) == ("a.csv", Path("b.csv"))
 
 
 def test_a_range_replaces_one_of_the_pipeline_or_is_added_to_them(calls):

@@ -23,6 +23,7 @@ from sim2real.stages.train.config import TrainConfig
 
 Config = TypeVar("Config")
 Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
+_OF_LOGS = re.compile(r"[-.](log|hold-out)$")
 OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
 
 
@@ -146,7 +147,7 @@ def parse(
             parsed, unknown = tyro.cli(
                 kind or type(default),
                 default=_without_tables(default),
-                args=_completed(arguments),
+                args=_completed(arguments, default),
                 prog=prog,
                 description=description,
                 return_unknown_args=True,
@@ -185,8 +186,9 @@ def _with_tables(parsed: Any, default: Any) -> Any:
     return replace(parsed, **changed) if changed else parsed
 
 
-def _completed(arguments: Sequence[str]) -> list[str]:
+def _completed(arguments: Sequence[str], default: Any) -> list[str]:
     """Return the arguments with a window for each ``--view`` that has no value, and a flag for each of several logs."""
+    logs = {name for name, value in flags_of(default) if _OF_LOGS.search(name) and isinstance(value, tuple)}
     words, flag = list[str](), ""
     for word, following in zip(arguments, [*arguments[1:], "-"], strict=False):
         # A shell makes several files of `--log *.csv`: those of one kind follow the flag.
@@ -194,7 +196,7 @@ def _completed(arguments: Sequence[str]) -> list[str]:
         if last and not word.startswith("-") and _is_log(Path(word), last):
             words.append(flag)
         elif last or word.startswith("-"):
-            flag = word if re.fullmatch(r"--(\w+\.)?(log|hold[-_]out)", word) else ""
+            flag = word if word.replace("_", "-") in logs else ""
         words.append(word)
         if re.fullmatch(r"--(\w+\.)?view", word) and following.startswith("-"):
             words.append(WINDOW)
@@ -206,17 +208,15 @@ def _is_log(path: Path, last: Path) -> bool:
     return path.suffix == last.suffix and path.name != "parameters.json" and not path.is_dir()
 
 
-def flag_names(config: Any, prefix: str = "") -> list[str]:
-    """Return the flags of a configuration, nested ones with their prefix."""
-    names: list[str] = []
+def flags_of(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the flags of a configuration and their values, nested ones with their prefix."""
     for item in fields(config):
         value = getattr(config, item.name)
         if is_dataclass(value):
             # The flags of StageFlags.config and of a robot have no prefix.
-            names += flag_names(value, prefix if item.name in ("config", "robot") else f"{prefix}{item.name}.")
+            yield from flags_of(value, prefix if item.name in ("config", "robot") else f"{prefix}{item.name}.")
         else:
-            names.append(f"--{prefix}{item.name}".replace("_", "-"))
-    return names
+            yield f"--{prefix}{item.name}".replace("_", "-"), value
 
 
 _MAX_LISTED_FLAGS = 20
@@ -225,7 +225,7 @@ _MAX_LISTED_FLAGS = 20
 
 def _unknown(unknown: Sequence[str], default: Any, prog: str) -> UsageError:
     """Return the error for arguments that no flag took."""
-    names = flag_names(default)
+    names = [name for name, _ in flags_of(default)]
     flags = [word.split("=")[0] for word in unknown if word.startswith("-")]
     if not flags:
         return UsageError(f"unexpected argument {unknown[0]!r}", hint=f"see `{prog} --help`")

@@ -2,14 +2,13 @@
 
 import json
 import os
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 from sim2real.artifacts.run.manifest import plain, versions
 from sim2real.artifacts.run.run_folder import STAGES, attempts, run_folders
 from sim2real.artifacts.run.stage_status import stage_status
-from sim2real.commands.flags import flag_names
+from sim2real.commands.flags import flags_of
 from sim2real.hardware import entries
 from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
@@ -67,8 +66,7 @@ def pipeline(name: str, root: Path, verbose: bool) -> str:
     blocks = [pairs(head)]
     for stage in STAGES:
         config = getattr(definition, stage)
-        rows = [[flag, _value(config, flag)] for flag in flag_names(config)]
-        blocks.append(table(rows, [stage, "default"]))
+        blocks.append(table(flags_of(config), [stage, "default"]))
     return "\n\n".join(blocks)
 
 
@@ -134,8 +132,3 @@ def _one_line(value: Any) -> str:
     """Return a metadata value on one line, cut after 160 characters."""
     text = " ".join(value.split()) if isinstance(value, str) else json.dumps(plain(value))
     return text if len(text) <= 160 else f"{text[:157]}..."
-
-
-def _value(config: Any, flag: str) -> Any:
-    """Return the value of a flag like ``--gate.limit``."""
-    return reduce(getattr, flag.removeprefix("--").replace("-", "_").split("."), config)

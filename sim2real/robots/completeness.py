@@ -44,7 +44,7 @@ def complete(cls: type[T], *args: object, **options: object) -> T:
     del args, options
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
         ours = [base for base in reversed(cls.__mro__) if base.__module__.startswith("sim2real.robots")]
-        base = next(base for base in ours if getattr(base, "__abstractmethods__", frozenset()) >= set(missing))
+        base = max(ours, key=lambda base: len(getattr(base, "__abstractmethods__", frozenset()) & set(missing)))
         raise UsageError(
             f"{cls.__module__}.{cls.__qualname__} is not complete: it "
             + "; it ".join(f"has no {name}()" for name in missing),

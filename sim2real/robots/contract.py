@@ -34,6 +34,7 @@ from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.control_loop.policy_node import PolicyNode, in_numpy
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.robots.control_loop.training_task import LoopTask
+from sim2real.robots.robot_parts import Exported
 from sim2real.robots.robot_parts import RobotAgent as RobotAgent
 from sim2real.robots.robot_parts import RobotDrive as RobotDrive
 from sim2real.robots.robot_parts import RobotModel as RobotModel
@@ -44,7 +45,7 @@ from sim2real.robots.roles import ROLES, Roles
 from sim2real.types import PyTree, Scalar
 
 
-class Identified(Protocol):
+class Identified(Exported, Protocol):
     """The methods of a ``RecordedRobot`` that its data does not decide: all but the first have a default."""
 
     def __new__(cls, *args: Any, **options: Any) -> Self:
@@ -61,16 +62,6 @@ class Identified(Protocol):
         Further parameters, such as a payload, have their nominal values at the time of the identification.
         """
         return self.identifiable(max_delay_s)
-
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
-        """Return the model with identified values, as MJCF; None: there is none."""
-        del values
-        return None
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
-        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
-        del values
-        return None
 
     def doubts(self, outputs: Mapping[str, PyTree]) -> list[str]:
         """Return sentences on positions of a log that the model cannot have; default: none."""

@@ -246,7 +246,21 @@ class RobotTask(_Part, Protocol):
         """
 
 
-class RobotModel(_Part, Protocol):
+class Exported(Protocol):
+    """What a model gives to other simulators; default: nothing."""
+
+    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
+        """Return the model with identified values, as MJCF; None: there is none."""
+        del values
+        return None
+
+    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
+        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
+        del values
+        return None
+
+
+class RobotModel(_Part, Exported, Protocol):
     """The robot in simulation, and the parameters that identification estimates.
 
     Attributes:
@@ -284,16 +298,6 @@ class RobotModel(_Part, Protocol):
     def true_state(self, state: PyTree) -> PyTree:
         """Return the part of the world's state that a value function may observe in simulation; default: all of it."""
         return state
-
-    def identified_mjcf(self, values: Mapping[str, Scalar]) -> str | None:
-        """Return the model with identified values, as MJCF; None: there is none."""
-        del values
-        return None
-
-    def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
-        """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
-        del values
-        return None
 
     def check_task(self, task: TrainingTask) -> None:
         """Raise ``UsageError`` if the world's state lacks a field that the task reads; default: no check."""

@@ -21,7 +21,7 @@ def defaults(nodes, supervisor):
 
 
 class TestSimulatedClock(RuntimeConformance):
-    seeds = range(100, 106)
+    seeds = range(100, 112)
 
     def play(self, nodes, supervisor, timeline, episode):
         recorder = MemoryRecorder()

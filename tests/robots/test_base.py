@@ -1,6 +1,7 @@
 """What is refused as a robot: all that it misses is named at once, before anything is made of it."""
 
 import re
+from abc import ABC, abstractmethod
 
 import pytest
 from small_robot import PairRobot
@@ -59,6 +60,9 @@ def test_a_recorded_robot_needs_less():
     with pytest.raises(UsageError, match=r"has no dynamics\(\); it has no make_nodes\(\)") as caught:
         type("Logged", (LoggedRobot,), {})()
     assert caught.value.hint == f"{LoggedRobot.__module__}.LoggedRobot describes each of them"
+    with pytest.raises(UsageError, match=r"has no identifiable\(\); it has no more\(\)") as caught:
+        type("Mine", (RecordedRobot, ABC), {"more": abstractmethod(lambda self: None)})()
+    assert caught.value.hint.startswith("sim2real.robots.contract.")
     robot = type("Little", (RecordedRobot,), {"identifiable": lambda self, max_delay_s: None})()
     with pytest.raises(UsageError, match="it has no units: field -> unit") as caught:
         checked(robot, "here")
