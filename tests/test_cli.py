@@ -201,7 +201,7 @@ def test_a_flag_takes_all_logs_that_a_shell_finds(calls):
     assert (scored.log, scored.parameters) == (("a.json", "b.json"), Path("run/parameters.json"))
     one = flags.parse(
         NewConfig(), ["rig", "--log", "a.csv", "b.csv"], "new", ""
-    )  # a flag for one log takes no second one
+    )
     assert (one.log, one.model) == ("a.csv", Path("b.csv"))
 
 
