@@ -199,9 +199,7 @@ def test_a_flag_takes_all_logs_that_a_shell_finds(calls):
     assert (config.log, config.hold_out, config.seed) == (("a.csv", "b.csv", "c.csv"), ("d.csv", "e.csv"), 3)
     scored = flags.parse(ValidateConfig(), ["--log", "a.json", "b.json", "run/parameters.json"], "validate", "")
     assert (scored.log, scored.parameters) == (("a.json", "b.json"), Path("run/parameters.json"))
-    one = flags.parse(
-        NewConfig(), ["rig", "--log", "a.csv", "b.csv"], "new", ""
-    )
+    one = flags.parse(NewConfig(), ["rig", "--log", "a.csv", "b.csv"], "new", "")
     assert (one.log, one.model) == ("a.csv", Path("b.csv"))
 
 
