@@ -60,15 +60,21 @@ gc.set_threshold(200_000, 20, 100)
 
 
 KEEP_TIME = ("whole runs", "real time")
+selected_tests = set()  # {"full"} with --full
+# A test that steps back for those that keep time, and compiles, has ended at 300 s beside two others on a slow machine.
+LONG_S = 900
 # Rooms that take longest go to the workers first, so that none is left with a long one at the end.
 LONGEST = (*KEEP_TIME, "robots", "identify", "composer", "stages", "train", "runtime", "view", "hardware", "foreign")
 
 
 @functools.cache
 def room(path):
-    """The folder under tests/ that a module is in; modules whose tests keep real time have two rooms of their own."""
-    if re.search(r"^pytestmark = .*\brealtime\b", (REPOSITORY / path).read_text(), re.MULTILINE):
-        return KEEP_TIME[Path(path).parts[1] != "integration"]
+    """The folder under tests/ that a module is in; modules with tests that keep real time have two rooms of their own.
+
+    With ``--full`` they have one: whole runs compile for minutes there, which would keep others from their deadlines.
+    """
+    if re.search(r"\bpytest\.mark\.realtime\b", (REPOSITORY / path).read_text()):
+        return KEEP_TIME[Path(path).parts[1] != "integration" or "full" in selected_tests]
     return Path(path).parts[1]
 
 
@@ -97,6 +103,10 @@ def pytest_addoption(parser):
     )
 
 
+def pytest_configure(config):
+    selected_tests.update(["full"] if config.option.full else [])
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session):
     skips.check(session)
@@ -104,6 +114,8 @@ def pytest_sessionfinish(session):
 
 def pytest_collection_modifyitems(config, items):
     items[:], others = divided(items, config.option.full)
+    for item in items if config.option.full else ():
+        item.add_marker(pytest.mark.timeout(LONG_S))
     config.hook.pytest_deselected(items=others)
     if "PYTEST_XDIST_WORKER" in os.environ:
         rank = {name: i for i, name in enumerate(LONGEST)}

@@ -89,3 +89,11 @@ def test_the_arms_training_alone(commands, finished_run_dir, tmp_path):
     assert commands[0][:2] == ["train", "arm"]
     assert commands[0][-2:] == flags
     assert {"arm/train/compile_s", "arm/train/time_to_0.95_s", "arm/train/env_steps_per_s"} <= set(rows)
+
+
+@pytest.mark.full
+def test_legs(tmp_path):
+    assert bench.main(["legs", "--quick", "--json", str(tmp_path / "report.json")]) == 0
+    _, rows = report_of(tmp_path / "report.json")
+    assert list(rows) == ["legs/policy_p99", *(f"legs/lateness/{node}_p99" for node in ("sensor", "agent", "actuator"))]
+    assert rows["legs/policy_p99"] > 0

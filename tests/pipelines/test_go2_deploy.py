@@ -96,7 +96,6 @@ def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
     assert ROBOT.drive.embedded.plant_args["place"] == "floor"
 
 
-@pytest.mark.timeout(900)
 @pytest.mark.full
 @pytest.mark.realtime
 def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsys):
@@ -120,7 +119,6 @@ def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsy
     assert "does not test the model" in advice.reasons[-1]
 
 
-@pytest.mark.timeout(900)
 @pytest.mark.full  # test_weighing.py has the load from a log of the emulator's clock
 @pytest.mark.realtime
 def test_the_load_of_a_robot_on_its_feet_over_dds(tmp_path, capsys):

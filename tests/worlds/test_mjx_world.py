@@ -86,7 +86,6 @@ def test_what_mjx_would_do_otherwise_is_refused(model, rate, match):
         MjxWorld("world", rate, model)
 
 
-@pytest.mark.timeout(900)
 @pytest.mark.full
 def test_the_same_graph_runs_on_warp():
     """Started in one program and run in another, which gives every copy a model of its own."""
