@@ -162,6 +162,11 @@ BENCHES = {
         "falls and errors over the true delay of policies trained without delays, with wide and with identified ones",
         (*_WALK, *_LEARN, "scripts/benches/walk.py", "scripts/benches/hidden/legs.py"),
     ),
+    "walk-rival": Bench(
+        "walking.rival",
+        "learnt steps a second of our PPO and of MuJoCo Playground's, both on Warp of one GPU",
+        (*_WALK, *_LEARN, "scripts/benches/walk.py"),
+    ),
     "walk-train": Bench(
         "walking.train",
         "a walking policy on one GPU: its graph over bare steps, learnt steps a second, time to a policy that stays up",

@@ -343,7 +343,9 @@ def test_legs_identify(run):
     assert rows["legs_identify/strength/worst"] == pytest.approx(100 * max(twin["errors"]["strength"]), rel=1e-3)
 
 
-@pytest.mark.parametrize("flags", [("walk-train",), ("walk-delays", "--policies", "wide", "--delays-ms")])
+@pytest.mark.parametrize(
+    "flags", [("walk-train",), ("walk-rival",), ("walk-delays", "--policies", "wide", "--delays-ms")]
+)
 def test_a_training_on_warp_is_refused_without_a_gpu(capsys, flags):
     assert bench.main([*flags, "--quick"]) == 2
     assert "needs a GPU, and JAX has none here\n\nhint: " in capsys.readouterr().err
