@@ -20,6 +20,7 @@ from typing import Any
 
 from benches.figures import Report, Row, row
 from benches.walk import Trial, judged
+from benches.walking.over_bare import first_step
 from benches.walking.train import KERNELS, alone, shown
 from benches.walking.training import PIPELINE, add_training_flags, require_gpu, train
 from sim2real.errors import UsageError
@@ -32,7 +33,7 @@ ROBOT = "Go1JoystickFlatTerrain"
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     add_training_flags(parser)
-    parser.add_argument("--steps", type=int, default=75_000_000, help="steps of each training")
+    parser.add_argument("--steps", type=int, default=60_000_000, help="steps of each training")
     parser.add_argument("--judged", type=int, default=256, help="copies that judge Playground's policy")
 
 
@@ -43,10 +44,10 @@ def run(options: argparse.Namespace) -> Report:
         raise UsageError("MuJoCo Playground is not installed", hint="pip install playground==0.2.0")
     with tempfile.TemporaryDirectory() as scratch:
         os.environ.setdefault(KERNELS, str(Path(scratch) / "kernels"))
-        alone(rival, 4000, options.judged, options.seconds)  # builds Playground's kernels
+        alone(first_step_of_rival)  # builds Playground's kernels
         played = alone(rival, options.steps, options.judged, options.seconds)
         runs = Path(scratch) / "runs"
-        alone(train, 4000, ["--ppo.num-envs=64", "--ppo.minibatches=4"], Path(scratch) / "first", {})
+        alone(first_step)  # builds ours
         done = train(options.steps, shlex.split(options.flags), runs, {VARIABLE: str(Path(scratch) / "programs")})
         ours, last = done.learnt_steps_per_s, played[-1]
         # Compilation is in the first part of the training: rates are of the others.
@@ -55,7 +56,7 @@ def run(options: argparse.Namespace) -> Report:
             [
                 row("walk_rival/ours/learnt_steps_per_s", round(ours), "1/s", f"one seed, {device}"),
                 row("walk_rival/ours/command_s", round(done.command_s, 1), "s", f"{done.steps} steps, to the bundle"),
-                row("walk_rival/playground/learnt_steps_per_s", round(learnt), "1/s", "without its first tenth"),
+                row("walk_rival/playground/learnt_steps_per_s", round(learnt), "1/s", "without its first third"),
                 row("walk_rival/learnt_ratio", round(ours / learnt, 2), "1", "ours over Playground's", ">= 1"),
                 *(of_rival(part) for part in played[1:]),
             ]
@@ -89,9 +90,10 @@ def rival(steps: int, copies: int, seconds: float) -> list[dict[str, Any]]:
     from mujoco_playground.config import locomotion_params
 
     env = without_meshes()
-    settings = dict(locomotion_params.brax_ppo_config(ROBOT)) | {"num_timesteps": steps, "run_evals": False}
+    settings = dict(locomotion_params.brax_ppo_config(ROBOT)) | {"num_timesteps": steps}
+    settings |= {"run_evals": False, "num_evals": 4}
     if steps < 1_000_000:
-        settings |= {"num_envs": 64, "num_minibatches": 2, "batch_size": 32, "num_evals": 2, "num_resets_per_eval": 0}
+        settings |= {"num_envs": 64, "num_minibatches": 2, "batch_size": 32, "num_resets_per_eval": 0}
     net = functools.partial(networks.make_ppo_networks, **settings.pop("network_factory"))
     parts: list[dict[str, Any]] = []
     judging_s = 0.0
@@ -115,6 +117,16 @@ def rival(steps: int, copies: int, seconds: float) -> list[dict[str, Any]]:
     return parts
 
 
+def first_step_of_rival() -> None:
+    """Make a step of Playground's environment."""
+    import jax
+    import jax.numpy as jnp
+
+    env, keys = without_meshes(), jax.random.split(jax.random.PRNGKey(0), 8)
+    state = jax.jit(jax.vmap(env.reset))(keys)
+    jax.block_until_ready(jax.jit(jax.vmap(env.step))(state, jnp.zeros((8, env.action_size))))
+
+
 def without_meshes() -> Any:
     """Return Playground's environment without its meshes: they are only drawn, and lie in another repository."""
     from mujoco_playground import registry
@@ -128,7 +140,10 @@ def without_meshes() -> Any:
         for name, text in read().items()
     }
     mjx_env.ensure_menagerie_exists = lambda: None
-    return registry.load(ROBOT)
+    env: Any = registry.load(ROBOT)
+    # Its solver stops at a limit on purpose; kernels would print a line for each such step.
+    env._mjx_model = env._mjx_model.tree_replace({"opt._impl.warn_overflow": 0})
+    return env
 
 
 def walked(env: Any, policy: Any, copies: int, steps: int) -> dict[str, Any]:
