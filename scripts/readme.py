@@ -55,6 +55,7 @@ TABLES = {
     "walk": ("walk",),
     "legs_identify": ("legs_identify", "legs_identify_two_cores"),
     "walk_delays": ("walk_delays",),
+    "walk_rival": ("walk_rival",),
     "walk_train": ("walk_train",),
     "light": ("light",),
 }
@@ -295,6 +296,7 @@ def tables(reports: Mapping[str, dict[str, Any]]) -> dict[str, str]:
         "walk": lambda chosen: sentences.walk(*chosen.values()),
         "legs_identify": lambda chosen: sentences.legs_identify(*chosen.values()),
         "walk_delays": lambda chosen: walk_delays(*chosen.values()),
+        "walk_rival": lambda chosen: sentences.walk_rival(*chosen.values()),
         "walk_train": lambda chosen: sentences.walk_train(*chosen.values()),
         "light": lambda chosen: sentences.light(*chosen.values()),
     }

@@ -62,6 +62,23 @@ def walk_train(report: Mapping[str, Any]) -> str:
     return "\n".join(lines).replace(" 1 |", " |") + "\n"
 
 
+def walk_rival(report: Mapping[str, Any]) -> str:
+    """Return a sentence about MuJoCo Playground's training beside ours."""
+    v, parts = ({n.removeprefix("walk_rival/"): x for n, x in values(report).items()}, report["playground"])
+    last = parts[-1]
+    flags = report["flags"]
+    return (
+        f"MuJoCo Playground trains its Go1 with brax's PPO, in the same run and with its own settings, at "
+        f"{v['playground/learnt_steps_per_s'] / 1e6:.2f} M learnt steps a second; ours learnt "
+        f"{v['ours/learnt_steps_per_s'] / 1e6:.2f} M. After {last['steps'] / 1e6:.0f} M steps and "
+        f"{last['wall_s']:.0f} s its error was {last['error_m_s']:.2f} m/s, and {last['fell']} of {last['of']} "
+        f"copies fell in {flags['seconds']:g} s. After {flags['steps'] / 1e6:.0f} M steps and "
+        f"{v['ours/command_s']:.0f} s ours was {v['ours/calm/error_m_s']:.2f} m/s, and {v['ours/calm/falls']} of "
+        f"{flags['twins']} twins fell. Each error is of the policy's own simulation: the robots, commands and "
+        "noise differ, and Playground's robot has no delay.\n"
+    )
+
+
 def legs_identify(report: Mapping[str, Any], two_cores: Mapping[str, Any]) -> str:
     """Return a table of the errors of identified Go2s, a row for each kind of parameter.
 
