@@ -64,7 +64,19 @@ selected_tests = set()  # {"full"} with --full
 # A test that steps back for those that keep time, and compiles, has ended at 300 s beside two others on a slow machine.
 LONG_S = 900
 # Rooms that take longest go to the workers first, so that none is left with a long one at the end.
-LONGEST = (*KEEP_TIME, "robots", "identify", "composer", "stages", "train", "runtime", "view", "hardware", "foreign")
+LONGEST = (
+    *KEEP_TIME,
+    "robots",
+    "identify",
+    "scripts",
+    "composer",
+    "stages",
+    "train",
+    "runtime",
+    "view",
+    "hardware",
+    "foreign",
+)
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """Bounds on errors of predictions, and the errors beside the bounds that were given before."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +19,36 @@ PROMISE_BROKEN = "promise broken"
 
 
 @dataclass(frozen=True)
+class Growth:
+    """How errors grow with the motion of a log: with a power of one of its sizes.
+
+    Attributes:
+        size: The name of the size, such as ``largest step`` of the goal.
+        usual: Its median over the recordings.
+        low: Its least value; the bound for a smaller motion is that for this one.
+        high: Its largest value.
+        bound: The bound for a usual motion; 0 before it is computed.
+    """
+
+    size: str
+    power: float
+    usual: float
+    low: float
+    high: float
+    bound: float = 0.0
+
+    def factor(self, sizes: Mapping[str, float], stretch: float) -> float:
+        """Return the factor of a log's bound over that for a usual motion.
+
+        Args:
+            sizes: The sizes of the log's motion.
+            stretch: Factor of a motion that leaves the range of all fitted ones; see ``predicted_logs.stretches``.
+        """
+        value = max(sizes.get(self.size, self.high), self.low)
+        return max((value / self.usual) ** self.power, (min(value, self.high) / self.usual) ** self.power * stretch)
+
+
+@dataclass(frozen=True)
 class Bound:
     """A promise: 95 % of the errors of a position on later logs stay below ``bound``.
 
@@ -28,6 +58,7 @@ class Bound:
         reach: ``ahead``: windows of a horizon, each from a state of its own; ``free run``: one run.
         seconds: The horizon, or the length of the run [s].
         scope: What the bound is about: ``this recording`` or ``recordings like these``.
+        growth: With which a log has a bound of its own; None if errors do not depend on the motion.
     """
 
     column: str
@@ -37,6 +68,14 @@ class Bound:
     seconds: float
     bound: float
     scope: str
+    growth: Growth | None = None
+
+    def on(self, sizes: Mapping[str, float], stretch: float) -> tuple[float, float]:
+        """Return the bound for a log, and its factor over the bound for a usual motion; see ``Growth.factor``."""
+        if self.growth is None or self.growth.size not in sizes:
+            return stretch * self.bound, stretch
+        factor = self.growth.factor(sizes, stretch)
+        return factor * self.growth.bound, factor
 
 
 @dataclass(frozen=True)
@@ -49,8 +88,8 @@ class Promise:
         seconds: The horizon, or the length of the run [s]; 0 for a part in older files.
         error: Root mean square error; None if it is infinite.
         bound: None if too few parts gave one.
-        stretch: Factor of this data in ``bound``: 1, or more if the motion is faster or reaches further than the fitted
-            one, a factor that needs no prediction.
+        stretch: Factor of this data in ``bound``, which needs no prediction: more than 1 if the motion is faster or
+            reaches further than the fitted one. Where errors grow with the motion, its bound over that for a usual one.
     """
 
     source: str
@@ -95,7 +134,7 @@ class Promise:
         size = "diverges" if self.error is None else f"is off by {self.error:.2g}{unit}"
         ratio = "" if self.ratio is None or self.error is None else f", {self.ratio:.2f} times as much"
         bound = "" if self.bound is None else f"; promised was {self.bound:.2g}{unit}{ratio and f': {ratio[2:]}'}"
-        wider = f" (for {self.stretch:.2g} times the fitted motion)" if bound and self.stretch > 1.0 else ""
+        wider = f" ({self.stretch:.2g} times the usual bound, for its motion)" if bound and self.stretch != 1.0 else ""
         return f"{self.name} {size} {how} on {where}{bound}{wider}"
 
 

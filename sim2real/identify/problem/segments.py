@@ -309,7 +309,7 @@ def ranges(
             rows = recordings[span.recording].outputs[node][name][inside].reshape(int(inside.sum()), -1)
             signals = {f"{name!r} of {node!r}": rows}
             if node == model.sensor and np.ptp(t[inside]) > 2 * _RATE_S:
-                signals[f"the speed of {name!r} of {node!r}"] = _rates(t[inside], rows)
+                signals[f"the speed of {name!r} of {node!r}"] = rates(t[inside], rows)
             for label, values in signals.items():
                 ends.setdefault(label, []).append(np.stack([values.min(axis=0), values.max(axis=0)]))
     extents = {}
@@ -320,7 +320,7 @@ def ranges(
     return extents
 
 
-def _rates(t: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def rates(t: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return mean speeds over ``_RATE_S`` of positions ``(N, F)`` at times ``(N,)`` [s]."""
     grid = np.arange(t[0], t[-1], _RATE_S)
     return np.stack([np.diff(np.interp(grid, t, column)) / _RATE_S for column in rows.T], axis=1)

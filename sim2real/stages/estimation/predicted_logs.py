@@ -22,11 +22,13 @@ class Predicted:
         source: Its held-out data, for people.
         later: Whether the bounds on later logs follow from its errors, too.
         stretch: Column -> factor of the bound; see ``stretches``.
+        sizes: Column -> sizes of its motion; see ``growth.sizes``.
     """
 
     source: str
     later: bool
     stretch: Mapping[str, float] = field(default_factory=dict)
+    sizes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
 def stretches(
@@ -54,7 +56,11 @@ def stretches(
 
 
 def predicted(
-    names: Sequence[str], fitted: int, parts: Sequence[HeldOutPart], stretch: Sequence[Mapping[str, float]] = ()
+    names: Sequence[str],
+    fitted: int,
+    parts: Sequence[HeldOutPart],
+    stretch: Sequence[Mapping[str, float]] = (),
+    sizes: Sequence[Mapping[str, Mapping[str, float]]] = (),
 ) -> list[Predicted]:
     """Return the recordings of an identification, in their order.
 
@@ -64,12 +70,13 @@ def predicted(
     Args:
         names: The names of the logs; those that are held out whole come last.
         stretch: For each log the factor of each position's bound.
+        sizes: For each log the sizes of its motion.
     """
     blocks = in_blocks(names[:fitted], parts)
     ends = [f"the held-out end of {name}" if fitted > 1 else "the held-out end" for name in names[:fitted]]
     sources = [(end, blocks) for end in ends] + [(name, True) for name in names[fitted:]]
-    factors = [*stretch, *({} for _ in names[len(stretch) :])]
-    return [Predicted(source, later, f) for (source, later), f in zip(sources, factors, strict=True)]
+    factors, moved = ([*rows, *({} for _ in names[len(rows) :])] for rows in (stretch, sizes))
+    return [Predicted(*source, f, m) for source, f, m in zip(sources, factors, moved, strict=True)]
 
 
 def in_blocks(names: Sequence[str], parts: Sequence[HeldOutPart]) -> bool:

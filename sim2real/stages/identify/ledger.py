@@ -7,7 +7,8 @@ from sim2real.artifacts.identification import HeldOutPart, Identification
 from sim2real.identify.fit import Fit
 from sim2real.identify.problem.segments import beyond, ranges
 from sim2real.identify.validation.verdict import positions
-from sim2real.stages.estimation import promises
+from sim2real.stages.estimation import growth, promises
+from sim2real.stages.estimation.growth import LEAST, Motions
 from sim2real.stages.estimation.predicted_logs import in_blocks, predicted, stretches
 from sim2real.stages.identify.inputs import Inputs
 
@@ -23,9 +24,18 @@ def with_promises(
     before, *later = (ranges(inputs.model, inputs.episodes, s, fit.windows.segment_s) for s in (fitted, *held_out))
     # Compare each error with its bound, then derive the bounds on later errors.
     stretch = [stretches(before, log, measured) for log in later]
-    recordings = predicted(names, inputs.fitted, parts, stretch)
-    document = replace(document, ranges=before, promises=promises.ledger(document, parts, measured, recordings))
     blocks = in_blocks(names[: inputs.fitted], parts)
-    document = replace(document, bounds=promises.bounds(document, recordings, blocks))
+    # Of many whole recordings, take the sizes of the motions, with which errors may grow.
+    motions, sizes = Motions({}), []
+    if not blocks and len(parts) >= LEAST:
+        of = lambda spans: growth.sizes(inputs.model, inputs.episodes, spans, fit.windows.segment_s)  # noqa: E731
+        sizes = [of(those) for those in held_out]
+        named = {name: [s for s in fitted if names[s.recording] == name] for name in dict.fromkeys(names)}
+        motions = Motions({name: of(spans) for name, spans in named.items()})
+    recordings = predicted(names, inputs.fitted, parts, stretch, sizes)
+    growths = promises.growths_of(parts, measured, motions)
+    ledger = promises.ledger(document, parts, measured, recordings, motions, growths)
+    document = replace(document, ranges=before, promises=ledger)
+    document = replace(document, bounds=promises.bounds(document, recordings, blocks, growths))
     outside = dict.fromkeys(text for log in later for text in beyond(before, log))
     return document, [f"held-out data extrapolates: {text}" for text in outside]

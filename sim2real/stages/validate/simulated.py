@@ -13,7 +13,7 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span, beyond, ranges
 from sim2real.identify.validation.verdict import Position
 from sim2real.robots.contract import RecordedRobot
-from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.estimation import growth, held_out_parts
 from sim2real.stages.estimation.predicted_logs import Predicted, stretches
 from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
@@ -60,7 +60,9 @@ def predicted_logs(
     predicted, sentences = [], []
     for r, log in enumerate(logs):
         spans = [s for s in windows.spans if s.recording == r]
-        later = ranges(windows.model, [log.episode for log in logs], spans, windows.segment_s)
-        predicted.append(Predicted(log.path.name, True, stretches(identification.ranges, later, measured)))
+        these = windows.model, [log.episode for log in logs], spans, windows.segment_s
+        later = ranges(*these)
+        stretch = stretches(identification.ranges, later, measured)
+        predicted.append(Predicted(log.path.name, True, stretch, growth.sizes(*these)))
         sentences += [f"{log.path.name}: {sentence}" for sentence in beyond(identification.ranges, later)]
     return predicted, sentences

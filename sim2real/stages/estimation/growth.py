@@ -1,0 +1,101 @@
+"""How errors of predictions grow with the motion: logs of many kinds need a bound for each, not the widest."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim2real.artifacts.estimation.promise import Growth
+from sim2real.graph.episode import Episode
+from sim2real.identify.model import Channel, IdentifiableModel, position_of
+from sim2real.identify.problem.segments import Span, rates
+
+LEAST = 20
+"""Fewest recordings from which a growth is estimated: its two numbers then move a bound by a few per cent."""
+_GAIN = 0.85
+"""Largest ratio of the scatter about a growth to that without one, with which the growth is taken."""
+
+Sizes = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Motions:
+    """The sizes of the motions of recordings: name -> column -> size -> value."""
+
+    of: Mapping[str, Mapping[str, Sizes]]
+
+    def at(self, name: str, column: str) -> Sizes:
+        """Return the sizes of a recording's motion of a position; no sizes for other names."""
+        return self.of.get(name, {}).get(column, {})
+
+
+def sizes(
+    model: IdentifiableModel, recordings: Sequence[Episode], spans: Sequence[Span], length_s: float
+) -> dict[str, Sizes]:
+    """Return the sizes of the motion of each position in some segments: column -> size -> value.
+
+    Args:
+        length_s: Length of a segment [s].
+    """
+    result: dict[str, Sizes] = {}
+    for c in model.channels:
+        parts = [_of_segment(model, recordings[s.recording], c, s.begin_s, s.begin_s + length_s) for s in spans]
+        parts = [part for part in parts if part]
+        if not parts:
+            continue
+        names = set.intersection(*(set(part) for part in parts))
+        squares = {n for n in names if n.startswith("mean")}
+        result[position_of(c)] = {
+            n: float(np.sqrt(np.mean([p[n] ** 2 for p in parts])) if n in squares else max(p[n] for p in parts))
+            for n in sorted(names)
+        }
+    return result
+
+
+def _of_segment(model: IdentifiableModel, log: Episode, c: Channel, begin_s: float, end_s: float) -> dict[str, float]:
+    """Return the sizes of a position's motion in a segment."""
+    t = log.steps[model.sensor].begun_s
+    inside = (t >= begin_s) & (t <= end_s)
+    if inside.sum() < 2:
+        return {}
+    t, q = t[inside], np.asarray(c.of(log.outputs[model.sensor][c.position]), np.float64)[inside]
+    speed = rates(t, q[:, None])[:, 0]
+    result = {"range": float(np.ptp(q))}
+    if speed.size:
+        result |= {"largest speed": float(np.abs(speed).max()), "mean speed": float(np.sqrt(np.mean(speed**2)))}
+    for node in model.given:
+        if c.goal is None or c.goal not in log.outputs[node]:
+            continue
+        # Take the goals from the newest one before the segment on.
+        sent_s = log.steps[node].begun_s
+        goals = np.asarray(c.of(log.outputs[node][c.goal]), np.float64)
+        first, last = max(0, np.searchsorted(sent_s, begin_s) - 1), np.searchsorted(sent_s, end_s)
+        newest = np.clip(np.searchsorted(sent_s, t, side="right") - 1, 0, len(goals) - 1)
+        off = np.abs(goals[newest] - q)
+        steps = np.abs(np.diff(goals[first:last]))
+        result |= {"largest lag": float(off.max()), "mean lag": float(np.sqrt(np.mean(off**2)))}
+        result |= {"largest step": float(steps.max())} if steps.size else {}
+    return result
+
+
+def growth(errors: Sequence[float], motions: Sequence[Sizes]) -> Growth | None:
+    """Return the size of a motion with a power that errors grow with, if that leaves them closer together; else None.
+
+    Args:
+        errors: Errors on recordings.
+        motions: The sizes of each recording's motion.
+    """
+    if len(errors) < LEAST:
+        return None
+    logs = np.log(np.maximum(errors, 1e-300))
+    best, least = None, _GAIN * float(logs.std())
+    for name in sorted(set.intersection(*(set(m) for m in motions))):
+        values = np.array([m[name] for m in motions])
+        if values.min() <= 0.0 or np.ptp(x := np.log(values)) < 1e-6:
+            continue
+        power, offset = np.polyfit(x, logs, 1)
+        scatter = float((logs - offset - power * x).std())
+        if power > 0.0 and scatter < least:
+            usual, low, high = float(np.median(values)), float(values.min()), float(values.max())
+            best, least = Growth(name, float(power), usual, low, high), scatter
+    return best
