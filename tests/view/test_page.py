@@ -254,6 +254,16 @@ def test_a_deployment_without_a_simulation_is_shown(run):
     assert "1.340" not in words
 
 
+def test_the_success_shown_is_that_of_the_policy_in_the_bundle(only):
+    """The best evaluation of the best seed, as on the console; later evaluations may be worse."""
+    history = synthetic_run.history(2)
+    history["success"] = [[0.1, 0.2] for _ in history["success"]]
+    history["success"][-2] = [0.3, 0.87]
+    run = only("train")
+    (run / "train" / "history.json").write_text(json.dumps({**history, "best_seed": 1}))
+    assert "87%" in Page(report(run).read_text(encoding="utf-8")).words
+
+
 def test_one_seed_and_missing_numbers_are_shown(only):
     run = only("identify", "train")
     (run / "train" / "history.json").write_text(json.dumps({**synthetic_run.history(1), "best_seed": 0}))

@@ -45,8 +45,8 @@ def train_section(artifact: StageFolder) -> PageSection:
     whose = (
         f"seed {curves.best_seed}, the best of {seeds}" if curves.best_seed is not None else f"median of {seeds} seeds"
     )
-    # Show the success of the policy in the bundle.
-    shown = last[curves.best_seed] if curves.best_seed is not None else np.nanmedian(last)
+    # Show the success of the policy in the bundle, that of the best evaluation.
+    shown = np.nanmedian(last) if curves.best_seed is None else np.nanmax(curves.success[:, curves.best_seed])
     tiles = [
         Tile("success in simulation", f"{shown:.0%}", whose if seeds > 1 else "one seed"),
         Tile("steps in simulation", number(int(curves.steps[-1]))),
