@@ -59,3 +59,15 @@ def test_a_free_run_that_breaks_its_promise_does_not_hold(capsys):
     assert "elbow is off by 0.031 rad in a free run of 20 s on b.mcap; promised was 0.02 rad: 1.55 times" in err
     assert "beyond the fitted data, so bounds are wider" in err
     assert "holds on this log" not in err
+
+
+def test_of_many_logs_a_few_intervals_are_printed_and_the_others_counted(capsys):
+    logs = [f"{i:02d}.csv" for i in range(30)]
+    rows = [Promise(log, True, "q", "elbow", "rad", FREE_RUN, 5.0, 0.01, 0.02) for log in logs]
+    drawn = [{"log": log, "column": "q", "low95": 0.01, "high95": 0.02} for log in logs]
+    row = position_row(SCORE, rows, False)
+    show({**RESULT, "positions": {"elbow": row}, "ledger": rows, "drawn": drawn, "promise_kept": True})
+    out, err = capsys.readouterr()
+    assert out.count("for 95 % of draws") == 12
+    assert "and 18 more intervals of draws: --json has all" in err
+    assert "verdict: holds on these 30 logs" in err
