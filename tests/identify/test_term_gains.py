@@ -7,10 +7,12 @@ import pytest
 
 from sim2real.artifacts.estimation.noise import Noise
 from sim2real.artifacts.estimation.tried_term import TriedTerm, tried_table
+from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.validation.optional_terms import Trial
 from sim2real.identify.validation.term_gains import gains
 from sim2real.identify.validation.verdict import Position
+from sim2real.stages.identify import missing_terms
 from sim2real.stages.identify.missing_terms import Misfit, misfit
 from sim2real.view.identification.tried import tried_blocks
 
@@ -57,6 +59,41 @@ def test_a_term_that_was_not_chosen_but_helps_mends():
     assert "torque_limit 8 to 4" in reason
     assert "--terms drag,torque_limit" in reason
     assert "--terms" not in found.reasons(automatic=True)[0]
+
+
+@pytest.mark.parametrize(
+    ("error", "automatic", "how", "flags"),
+    [
+        (0.4, False, "the term load mends most of it: --terms drag,load", "--terms drag,load"),
+        (5.0, False, "the term load lowers that error by 38%: --terms drag,load", ""),
+        (0.4, True, "load 8 to 0.4", ""),
+    ],
+)
+def test_a_model_lacks_the_term_that_halves_its_errors_beside_small_free_runs(
+    error, automatic, how, flags, monkeypatch
+):
+    """Of 120 logs the residuals were 75 times the noise, and no command offered the term that lowers them by 97 %."""
+    tried = (TriedTerm("load", 8.0, error, "mends"),)
+    found = Misfit(ARM, 75.0, 1e-3, tried, ("drag",))
+    monkeypatch.setattr(missing_terms, "misfit", lambda *_: found)
+    monkeypatch.setattr(missing_terms, "with_trials", lambda *_: found)
+    monkeypatch.setattr(missing_terms, "noises", lambda *_: ())
+    monkeypatch.setattr(missing_terms, "positions", lambda *_: [ARM])
+    monkeypatch.setattr(missing_terms, "in_world", lambda *_: None)
+    monkeypatch.setattr(missing_terms, "with_one_more", lambda *_: None)
+    document = Identification("rig", (), Judgement("", ()), (), tried=tried)
+    config = SimpleNamespace(terms="auto" if automatic else "own", folds=5, world="")
+    fit = SimpleNamespace(converged=True, problem=SimpleNamespace(train=np.arange(9)))
+    inputs = SimpleNamespace(
+        config=config,
+        model=None,
+        units={},
+        robot=SimpleNamespace(units={}),
+        pipeline=SimpleNamespace(load=lambda: None),
+    )
+    _, result = missing_terms.lack(document, inputs, fit)
+    assert result.flags == flags
+    assert how in result.reasons[0]
 
 
 def test_nothing_is_said_up_to_three_times_the_noise():

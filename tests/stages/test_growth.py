@@ -1,6 +1,7 @@
 """Bounds that follow the size of a log's motion, on simulated recordings whose kinds are predicted unlike well."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,8 @@ from sim2real.artifacts.identification import Identification
 from sim2real.identify.model import Channel
 from sim2real.identify.problem.segments import Span
 from sim2real.stages.estimation import growth, predicted_logs, promises
+from sim2real.stages.identify import ledger
+from sim2real.stages.identify.inputs import Inputs
 
 
 def rig(rng, count):
@@ -101,6 +104,40 @@ def test_the_growth_is_written_and_read(tmp_path):
     doc.save(tmp_path)
     assert Identification.load(tmp_path).bounds == doc.bounds
     assert isinstance(doc.bounds[0].growth, Growth)
+
+
+def swing_log(step, seconds=8.0):
+    """A joint that follows a goal of steps of a size, 100 readings a second."""
+    t = np.arange(0.0, seconds, 0.01)
+    goal = step * np.sign(np.sin(2.0 * np.pi * 0.5 * t))
+    return SimpleNamespace(
+        steps={"sensor": SimpleNamespace(begun_s=t), "actuator": SimpleNamespace(begun_s=t + 0.002)},
+        outputs={"sensor": {"th": goal}, "actuator": {"goal": goal}},
+    )
+
+
+def test_an_identification_of_many_logs_has_their_growth_in_its_bounds(monkeypatch):
+    """Parts, fitted logs and held-out ends have names of their own, under which their motions are found."""
+    rng = np.random.default_rng(4)
+    steps = rng.uniform(0.05, 1.5, 30)
+    errors = 0.1 * steps**0.7 * np.exp(0.1 * rng.normal(size=30))
+    logs = [SimpleNamespace(path=Path(f"{i:03d}.csv"), episode=swing_log(s)) for i, s in enumerate(steps)]
+    channel = Channel("th", None, 1e-3, 1.0, goal="goal")
+    model = SimpleNamespace(channels=[channel], sensor="sensor", given={"actuator": "goal"})
+    windows = [Span(r, begin, begin < 5.0) for r in range(30) for begin in (0.0, 2.0, 4.0, 6.0)]
+    rows = {"logs": logs, "fitted": 30, "model": model, "units": {}, "windows": windows}
+    inputs = SimpleNamespace(**rows, episodes=[log.episode for log in logs])
+    inputs.names = Inputs.names.fget(inputs)
+    parts = [left(n, float(e)) for n, e in zip(inputs.names, errors, strict=True)]
+    doc = document(parts, [0.1 * s**0.7 for s in steps])
+    monkeypatch.setattr(ledger, "positions", lambda *_: [ANGLE])
+    fit = SimpleNamespace(windows=SimpleNamespace(segment_s=2.0))
+    doc, _ = ledger.with_promises(doc, inputs, fit, parts)
+    (bound,) = doc.bounds
+    assert bound.growth.power == pytest.approx(0.7, abs=0.1)
+    ratios = [r.ratio for r in doc.promises if r.fresh]
+    assert len(ratios) == 30
+    assert 0.6 < np.mean(ratios) < 1.0
 
 
 def test_the_sizes_of_a_motion_are_those_of_its_segments():

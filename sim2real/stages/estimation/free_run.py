@@ -29,7 +29,7 @@ TERM = "direction"
 """A constant force, or friction that differs by direction: the term that models lack most often."""
 _FAR = 0.1
 """Error of a free run, as a share of the position's range, above which the term is tried."""
-_MENDS = 0.5
+MENDS = 0.5
 """The model lacks the term if the error with it is below this share."""
 
 
@@ -132,7 +132,7 @@ def lacking(
     # Fit with the further term, and compare the errors of the worst position.
     errors = [number(r.rmse) for r in attempt() if _is(r, worst) and r.model == "identified"]
     mended = float(np.mean(errors)) if errors else math.inf
-    if not mended < _MENDS * error:
+    if not mended < MENDS * error:
         return Lack((message, f"the term {term} does not mend that"))
     such = ", such as a constant force," if term == TERM else ""
     why = f"with the term {term}{such} it would be off by {mended:.2g}{unit}: the model lacks it"

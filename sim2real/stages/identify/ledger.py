@@ -30,8 +30,8 @@ def with_promises(
     if not blocks and len(parts) >= LEAST:
         of = lambda spans: growth.sizes(inputs.model, inputs.episodes, spans, fit.windows.segment_s)  # noqa: E731
         sizes = [of(those) for those in held_out]
-        named = {name: [s for s in fitted if names[s.recording] == name] for name in dict.fromkeys(names)}
-        motions = Motions({name: of(spans) for name, spans in named.items()})
+        spans = [[s for s in fitted if s.recording == r] for r in range(inputs.fitted)]
+        motions = Motions({name: of(those) for name, those in zip(inputs.names, spans, strict=True)})
     recordings = predicted(names, inputs.fitted, parts, stretch, sizes)
     growths = promises.growths_of(parts, measured, motions)
     ledger = promises.ledger(document, parts, measured, recordings, motions, growths)

@@ -19,7 +19,7 @@ from sim2real.identify.validation.term_trials import Trials
 from sim2real.identify.validation.verdict import Position, positions
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.free_run import TERM, Lack, fitted_to, free_runs, lacking, with_one_more
+from sim2real.stages.estimation.free_run import MENDS, TERM, Lack, fitted_to, free_runs, lacking, with_one_more
 from sim2real.stages.identify.inputs import Inputs, table_of
 
 _FAR = 3.0
@@ -53,9 +53,19 @@ class Misfit:
         return self.ratio > _FAR
 
     @property
-    def best(self) -> str:
-        """The term that lowers the error most, beyond those of the model; "" if none lowers it by 5 %."""
-        return next((t.term for t in self.tried if t.outcome == "mends"), "")
+    def best(self) -> TriedTerm | None:
+        """The term that lowers the error most, beyond those of the model; None if no term lowers it by 5 %."""
+        return next((t for t in self.tried if t.outcome == "mends"), None)
+
+    @property
+    def flags(self) -> str:
+        """Flags of an identification with the best term; "" without one."""
+        return f"--terms {','.join([*self.chosen, self.best.term])}" if self.best else ""
+
+    @property
+    def lacks(self) -> bool:
+        """Whether the model lacks the best term: with it the error on held-out parts is less than half."""
+        return self.far and self.best is not None and (self.best.gain or 0.0) > MENDS
 
     def reasons(self, automatic: bool) -> tuple[str, ...]:
         """Return sentences: the ratio, and the trials; none if the residuals are near the noise.
@@ -74,9 +84,10 @@ class Misfit:
         tried = f"tried{took}, with errors on held-out parts in deviations of a measurement: {fitted or 'no term'}"
         if automatic:
             return (f"{sentence}; {tried}",)
-        flag = f"--terms {','.join([*self.chosen, self.best])}"
-        mends = f"the term {self.best} mends most of it: {flag}" if self.best else "none of them mends that"
-        return (f"{sentence}; {tried}; {mends}",)
+        if self.best is None:
+            return (f"{sentence}; {tried}; none of them mends that",)
+        how = "mends most of it" if self.lacks else f"lowers that error by {self.best.gain:.0%}"
+        return (f"{sentence}; {tried}; the term {self.best.term} {how}: {self.flags}",)
 
 
 def misfit(document: Identification, noises: Sequence[Noise], positions: Sequence[Position]) -> Misfit | None:
@@ -135,12 +146,13 @@ def lack(document: Identification, inputs: Inputs, fit: Fit) -> tuple[Identifica
         worst = replace(worst, tried=document.tried)
     elif worst and worst.far and fit.converged and config.folds and len(fit.problem.train) >= held_out_parts.LEAST:
         worst = with_trials(worst, inputs, fit)
-        document, term = replace(document, tried=worst.tried), worst.best or TERM
+        document, term = replace(document, tried=worst.tried), worst.best.term if worst.best else TERM
     more = worst.reasons(automatic) if worst else ()
+    flags = worst.flags if worst and worst.lacks and not automatic else ""
     wider = with_one_more(in_world(inputs.pipeline.load(), config.world), document.terms, config, term)
     if not fit.converged or wider is None:
         lacks = lacking(document, measured, None)
-        return document, replace(lacks, reasons=(*more, *lacks.reasons))
+        return document, Lack((*more, *lacks.reasons), flags)
     robot, more_terms = wider
 
     def attempt() -> list[FreeRun]:
@@ -151,4 +163,4 @@ def lack(document: Identification, inputs: Inputs, fit: Fit) -> tuple[Identifica
         return free_runs(refitted, episodes, inputs.fitted, more_terms, {"identified": refitted.values})[0]
 
     lacks = lacking(document, measured, attempt, term)
-    return document, replace(lacks, reasons=(*more, *lacks.reasons))
+    return document, Lack((*more, *lacks.reasons), lacks.flags or flags)

@@ -38,7 +38,7 @@ _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),
     "hit a bound": ("doubt", "Hit a bound: an estimate is at a bound of the search"),
     "not identifiable": ("doubt", "Not identifiable: the data does not determine every parameter"),
-    "lacks a term": ("doubt", "Lacks a term: free runs have large errors, and one more term of the model reduces them"),
+    "lacks a term": ("doubt", "Lacks a term: errors are large, and one more term of the model halves them"),
     "promise broken": ("doubt", "Promise broken: an error on held-out data is above its bound"),
     "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
 }
