@@ -44,7 +44,8 @@ def test_the_size_with_which_errors_grow_is_found_with_its_power():
     assert found.power == pytest.approx(0.8, abs=0.1)
     errors, sizes = rig(rng, 60)
     assert growth.growth(rng.permutation(errors), sizes) is None
-    assert growth.growth(errors[:19], sizes[:19]) is None
+    assert growth.growth(errors[:12], sizes[:12]).size == "largest step"
+    assert growth.growth(errors[:11], sizes[:11]) is None
     assert growth.growth(1.0 / errors, sizes) is None, "errors that fall with the motion are of another cause"
     assert growth.growth(errors, [{"largest step": 0.0}] * 60) is None
 
@@ -65,6 +66,14 @@ def test_each_log_has_a_bound_of_its_own_that_holds_and_is_not_vacuous():
     assert np.mean(over) < 0.02
     assert np.median(wide) < 2.0
     assert np.median(plain) > 10.0
+
+
+def test_twelve_recordings_of_one_kind_seldom_have_a_growth_by_chance():
+    rng, count = np.random.default_rng(5), 0
+    for _ in range(200):
+        sizes = [{f"size {i}": float(s) for i, s in enumerate(np.exp(0.8 * rng.normal(size=7)))} for _ in range(12)]
+        count += growth.growth(0.01 * np.exp(0.5 * rng.normal(size=12)), sizes) is not None
+    assert count < 14
 
 
 def test_a_later_log_is_beside_the_bound_for_its_motion():

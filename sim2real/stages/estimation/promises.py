@@ -4,7 +4,7 @@ A bound follows from the errors on parts of the recordings, each of a fit withou
 are blocks of it, which are alike; what comes after it differs, in time and in temperature. So the held-out quarter
 counts as a part, and the bound on later data begins at its error if that is larger.
 
-Many recordings are of several kinds: steps are predicted ten times worse than sines. From twenty on, errors are
+Many recordings are of several kinds: steps are predicted ten times worse than sines. From twelve on, errors are
 compared in proportion to a power of the motion's size, and each log has a bound of its own (``growth``).
 """
 
