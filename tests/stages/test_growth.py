@@ -29,7 +29,7 @@ def with_bounds(errors, sizes, ends=(), of_ends=()):
     names = [f"log {i}" for i in range(len(errors))]
     later = [f"later {i}" for i in range(len(ends))]
     doc = document([left(n, float(e)) for n, e in zip(names, errors, strict=True)], [1e-3] * len(names) + list(ends))
-    motions = growth.Motions({n: {"th": s} for n, s in zip(names, sizes, strict=True)})
+    motions = {n: {"th": s} for n, s in zip(names, sizes, strict=True)}
     own = [{"th": s} for s in [*sizes, *of_ends]]
     recordings = predicted_logs.predicted([*names, *later], len(names), doc.left_out, [{}] * len(own), own)
     growths = promises.growths_of(doc.left_out, [ANGLE], motions)

@@ -1,7 +1,6 @@
 """How errors of predictions grow with the motion: logs of many kinds need a bound for each, not the widest."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,17 +16,8 @@ _GAIN = 0.75
 distance is from the growth of the others, because of seven sizes one fits few errors by chance."""
 
 Sizes = Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class Motions:
-    """The sizes of the motions of recordings: name -> column -> size -> value."""
-
-    of: Mapping[str, Mapping[str, Sizes]]
-
-    def at(self, name: str, column: str) -> Sizes:
-        """Return the sizes of a recording's motion of a position; no sizes for other names."""
-        return self.of.get(name, {}).get(column, {})
+Motions = Mapping[str, Mapping[str, Sizes]]
+"""Recording -> column -> the sizes of its motion."""
 
 
 def sizes(
@@ -41,8 +31,7 @@ def sizes(
     result: dict[str, Sizes] = {}
     for c in model.channels:
         parts = [_of_segment(model, recordings[s.recording], c, s.begin_s, s.begin_s + length_s) for s in spans]
-        parts = [part for part in parts if part]
-        if not parts:
+        if not (parts := [part for part in parts if part]):
             continue
         names = set.intersection(*(set(part) for part in parts))
         squares = {n for n in names if n.startswith("mean")}
@@ -99,6 +88,6 @@ def growth(errors: Sequence[float], motions: Sequence[Sizes]) -> Growth | None:
         power, leverage = float(x @ off / (x @ x)), 1.0 / count + x**2 / (x @ x)
         scatter = float(np.sqrt(np.mean(((off - power * x) / np.maximum(1.0 - leverage, 1e-9)) ** 2)))
         if power > 0.0 and scatter < least:
-            usual, low, high = float(np.median(values)), float(values.min()), float(values.max())
-            best, least = Growth(name, power, usual, low, high), scatter
+            ends = float(values.min()), float(values.max())
+            best, least = Growth(name, power, float(np.median(values)), *ends), scatter
     return best

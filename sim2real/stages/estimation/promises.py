@@ -35,7 +35,6 @@ _MOST = 3
 _SHARE = 0.95
 """Share of later errors below their bound."""
 Growths = Mapping[tuple[str, Reach], Growth]
-NO_MOTIONS: Motions = Motions({})
 NO_GROWTHS: Growths = {}
 THIS_RECORDING, SUCH_RECORDINGS = "this recording", "recordings like these"
 
@@ -69,7 +68,7 @@ def ledger(
     parts: Sequence[HeldOutPart],
     positions: Sequence[Position],
     recordings: Sequence[Predicted],
-    motions: Motions = NO_MOTIONS,
+    motions: Motions | None = None,
     growths: Growths = NO_GROWTHS,
 ) -> tuple[Promise, ...]:
     """Return each error on held-out parts and on held-out data, beside the bound from the other parts.
@@ -88,7 +87,8 @@ def ledger(
             errors = [(part, error) for part, error in errors if error is not None]
             # Each held-out part beside the other parts, then held-out data beside all parts.
             grown = growths.get((p.column, reach))
-            factors = [grown.factor(motions.at(part.name, p.column), 1.0) if grown else 1.0 for part, _ in errors]
+            sizes = [(motions or {}).get(part.name, {}).get(p.column, {}) for part, _ in errors]
+            factors = [grown.factor(those, 1.0) if grown else 1.0 for those in sizes]
             usual = [error / factor for (_, error), factor in zip(errors, factors, strict=True)]
             for k, (part, error) in enumerate(errors):
                 others, run_s = usual[:k] + usual[k + 1 :], seconds if reach == AHEAD else part.run_s
@@ -107,7 +107,7 @@ def growths_of(parts: Sequence[HeldOutPart], positions: Sequence[Position], moti
         for reach in (AHEAD, FREE_RUN):
             errors = [(part.name, _of_part(part, p, reach)) for part in parts]
             errors = [(name, error) for name, error in errors if error is not None and math.isfinite(error)]
-            grown = growth([e for _, e in errors], [motions.at(name, p.column) for name, _ in errors])
+            grown = growth([e for _, e in errors], [motions.get(name, {}).get(p.column, {}) for name, _ in errors])
             growths |= {(p.column, reach): grown} if grown else {}
     return growths
 

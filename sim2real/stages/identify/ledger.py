@@ -8,7 +8,6 @@ from sim2real.identify.fit import Fit
 from sim2real.identify.problem.segments import beyond, ranges
 from sim2real.identify.validation.verdict import positions
 from sim2real.stages.estimation import growth, promises
-from sim2real.stages.estimation.growth import LEAST, Motions
 from sim2real.stages.estimation.predicted_logs import in_blocks, predicted, stretches
 from sim2real.stages.identify.inputs import Inputs
 
@@ -25,14 +24,10 @@ def with_promises(
     # Compare each error with its bound, then derive the bounds on later errors.
     stretch = [stretches(before, log, measured) for log in later]
     blocks = in_blocks(names[: inputs.fitted], parts)
-    # Of many whole recordings, take the sizes of the motions, with which errors may grow.
-    motions, sizes = Motions({}), []
-    if not blocks and len(parts) >= LEAST:
-        of = lambda spans: growth.sizes(inputs.model, inputs.episodes, spans, fit.windows.segment_s)  # noqa: E731
-        sizes = [of(those) for those in held_out]
-        spans = [[s for s in fitted if s.recording == r] for r in range(inputs.fitted)]
-        motions = Motions({name: of(those) for name, those in zip(inputs.names, spans, strict=True)})
-    recordings = predicted(names, inputs.fitted, parts, stretch, sizes)
+    # Take the sizes of the motions, with which errors of many recordings may grow.
+    of = lambda spans: growth.sizes(inputs.model, inputs.episodes, spans, fit.windows.segment_s)  # noqa: E731
+    motions = {name: of([s for s in fitted if s.recording == r]) for r, name in enumerate(inputs.names)}
+    recordings = predicted(names, inputs.fitted, parts, stretch, [of(spans) for spans in held_out])
     growths = promises.growths_of(parts, measured, motions)
     ledger = promises.ledger(document, parts, measured, recordings, motions, growths)
     document = replace(document, ranges=before, promises=ledger)
