@@ -71,9 +71,9 @@ def walk_rival(report: Mapping[str, Any]) -> str:
         f"MuJoCo Playground trains its Go1 with brax's PPO, in the same run and with its own settings, at "
         f"{v['playground/learnt_steps_per_s'] / 1e6:.2f} M learnt steps a second; ours learnt "
         f"{v['ours/learnt_steps_per_s'] / 1e6:.2f} M. After {last['steps'] / 1e6:.0f} M steps and "
-        f"{last['wall_s']:.0f} s its error was {last['error_m_s']:.2f} m/s, and {last['fell']} of {last['of']} "
+        f"{last['wall_s']:.0f} s its error was {last['error_m_s']:.3f} m/s, and {last['fell']} of {last['of']} "
         f"copies fell in {flags['seconds']:g} s. After {flags['steps'] / 1e6:.0f} M steps and "
-        f"{v['ours/command_s']:.0f} s ours was {v['ours/calm/error_m_s']:.2f} m/s, and {v['ours/calm/falls']} of "
+        f"{v['ours/command_s']:.0f} s ours was {v['ours/calm/error_m_s']:.3f} m/s, and {v['ours/calm/falls']} of "
         f"{flags['twins']} twins fell. Each error is of the policy's own simulation: the robots, commands and "
         "noise differ, and Playground's robot has no delay.\n"
     )

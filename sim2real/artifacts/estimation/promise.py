@@ -20,13 +20,13 @@ PROMISE_BROKEN = "promise broken"
 
 @dataclass(frozen=True)
 class Growth:
-    """How errors grow with the motion of a log: with a power of one of its sizes.
+    """How errors grow with the motion of a log: in proportion to a power of one size of the motion.
 
     Attributes:
-        size: The name of the size, such as ``largest step`` of the goal.
+        size: The name of the size, such as ``largest step`` of the goal; see ``growth.sizes``.
+        power: The exponent of the size.
         usual: Its median over the recordings.
-        low: Its least value; the bound for a smaller motion is that for this one.
-        high: Its largest value.
+        low, high: Its least and largest values; the bound for a motion below ``low`` is that for ``low``.
         bound: The bound for a usual motion; 0 before it is computed.
     """
 
@@ -41,7 +41,7 @@ class Growth:
         """Return the factor of a log's bound over that for a usual motion.
 
         Args:
-            sizes: The sizes of the log's motion.
+            sizes: The sizes of the log's motion; without this size the motion counts as the largest.
             stretch: Factor of a motion that leaves the range of all fitted ones; see ``predicted_logs.stretches``.
         """
         value = max(sizes.get(self.size, self.high), self.low)
@@ -58,7 +58,7 @@ class Bound:
         reach: ``ahead``: windows of a horizon, each from a state of its own; ``free run``: one run.
         seconds: The horizon, or the length of the run [s].
         scope: What the bound is about: ``this recording`` or ``recordings like these``.
-        growth: With which a log has a bound of its own; None if errors do not depend on the motion.
+        growth: How the bound of a single log follows its motion; None if errors do not depend on the motion.
     """
 
     column: str

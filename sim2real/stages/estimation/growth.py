@@ -12,8 +12,8 @@ from sim2real.identify.problem.segments import Span, rates
 LEAST = 12
 """Fewest recordings from which a growth is estimated."""
 _GAIN = 0.75
-"""Largest ratio of the scatter about a growth to that without one, with which the growth is taken; each recording's
-distance is from the growth of the others, because of seven sizes one fits few errors by chance."""
+"""Largest ratio of the errors' scatter about a growth to their scatter without one. Each error is compared with the
+growth that is fitted to the other errors, because one of seven sizes fits a few errors by chance."""
 
 Sizes = Mapping[str, float]
 Motions = Mapping[str, Mapping[str, Sizes]]
@@ -34,10 +34,9 @@ def sizes(
         if not (parts := [part for part in parts if part]):
             continue
         names = set.intersection(*(set(part) for part in parts))
-        squares = {n for n in names if n.startswith("mean")}
+        columns = {n: np.array([part[n] for part in parts]) for n in sorted(names)}
         result[position_of(c)] = {
-            n: float(np.sqrt(np.mean([p[n] ** 2 for p in parts])) if n in squares else max(p[n] for p in parts))
-            for n in sorted(names)
+            n: float(np.sqrt(np.mean(v**2)) if n.startswith("mean") else v.max()) for n, v in columns.items()
         }
     return result
 
@@ -69,7 +68,7 @@ def _of_segment(model: IdentifiableModel, log: Episode, c: Channel, begin_s: flo
 
 
 def growth(errors: Sequence[float], motions: Sequence[Sizes]) -> Growth | None:
-    """Return the size of a motion with a power that errors grow with, if that leaves them closer together; else None.
+    """Return how errors grow with the size of the motion that explains them best; None if no size explains enough.
 
     Args:
         errors: Errors on recordings.
