@@ -219,6 +219,8 @@ def test_a_joint_beyond_its_range_widens_the_bounds_of_the_others_and_whole_turn
     assert predicted_logs.stretches(two, far, [ANGLE, place]) == {"th": 2.0, "x": 2.0}
     turning, more = ({**SLOW, "'th' of 'sensor'": (0.0, turns * 7.0)} for turns in (1.0, 5.0))
     assert predicted_logs.stretches(turning, more, [ANGLE]) == {"th": 1.0}
+    over = {**SLOW, "'th' of 'sensor'": (-1.0, 20.0)}  # three turns reach no more than one
+    assert predicted_logs.stretches(SLOW, over, [ANGLE]) == {"th": pytest.approx(1.0 + (2 * np.pi - 2.0) / 2.0)}
     assert predicted_logs.stretches({}, SLOW, [ANGLE]) == {"th": 1.0}  # a file of before
 
 
@@ -232,6 +234,9 @@ def test_the_error_of_a_faster_end_is_taken_per_motion():
     assert not promises.broken(doc.promises)
     (bound,) = promises.bounds(doc, faster, True)
     assert bound.bound == pytest.approx(promises.further(np.full(5, 0.01), np.array([0.01])))
+    # A deployment moves as the held-out end did: its bound is that of the end, not that of the slower parts.
+    doc = replace(doc, bounds=(bound,), held_out=(HeldOut("tilt", "th", "rad", 1.0, {"identified": 0.03}),))
+    assert promises.room(doc, "th") == pytest.approx(3.0 * bound.bound / 0.03)
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def stretches(
     """Return the factor of each position's bound for data whose motion is faster or reaches further than the fitted.
 
     The factor is the ratio of the largest speeds, times one more than the excess of the range of any position, as a
-    share of its fitted range. A hinge whose fitted range is a whole turn has been everywhere.
+    share of its fitted range. A hinge has been everywhere after a whole turn, and goes nowhere else by more turns.
 
     Args:
         fitted: Ranges of the fitted segments; see ``segments.ranges``.
@@ -48,8 +48,10 @@ def stretches(
     excess, faster = 0.0, dict[str, float]()
     for p in positions:
         (low, high), (lowest, highest) = (range_of(r, p.column) for r in (fitted, later))
-        if not (p.unit == "rad" and high - low >= 2 * math.pi):
-            excess = max(excess, (max(low - lowest, 0.0) + max(highest - high, 0.0)) / max(high - low, 1e-300))
+        further = max(low - lowest, 0.0) + max(highest - high, 0.0)
+        if p.unit == "rad":
+            further = min(further, max(2 * math.pi - (high - low), 0.0))
+        excess = max(excess, further / max(high - low, 1e-300))
         before, now = (max(map(abs, speed_range_of(r, p.column))) for r in (fitted, later))
         faster[p.column] = max(1.0, now / before) if before > 0.0 else 1.0
     return {column: min(ratio * (1.0 + excess), _MAX_STRETCH) for column, ratio in faster.items()}

@@ -244,10 +244,17 @@ def broken_sentences(rows: Sequence[Promise]) -> list[str]:
 
 
 def room(document: Identification, column: str) -> float:
-    """Return the ratio of a position's bound to its error on held-out data: the same at each horizon."""
+    """Return the ratio of a position's bound to its error on held-out data: the same at each horizon.
+
+    The bound is that for the held-out motion: where it went further than the fitted one, its error was larger for that.
+    """
     bound = of(document).get((column, AHEAD))
     error = next((row.rmse["identified"] or 0.0 for row in document.held_out if row.column == column), 0.0)
-    return 1.0 if bound is None or error <= 0.0 else max(1.0, bound.bound / error)
+    if bound is None or error <= 0.0:
+        return 1.0
+    rows = [r.stretch for r in document.promises if r.fresh and (r.column, r.reach) == (column, AHEAD)]
+    stretch = 1.0 if bound.growth else max(rows, default=1.0)
+    return max(1.0, stretch * bound.bound / error)
 
 
 def _promise(
