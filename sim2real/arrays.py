@@ -21,3 +21,12 @@ def namespace(*values: object) -> Any:
 
             return jnp
     return np
+
+
+def beside_damping(armature: Any, damping: Any, step_s: Any) -> Any:
+    """Return the armature to set in a model of MuJoCo: the rotor's, without what its integrator adds; 0 at least.
+
+    MuJoCo integrates damping implicitly, which acts like an inertia of half a step times the damping: at 2.5 ms that is
+    6 % of the rotors' inertia of pipelines/arm, and 0.0018 kg m^2 for a damping of 1.4 N m s/rad.
+    """
+    return namespace(armature, damping).maximum(armature - 0.5 * step_s * damping, 0.0)

@@ -97,8 +97,6 @@ class Arm(ServoDriven):
         self.servos = tuple(Servo(j, s.axis, SHEET) for j, s in zip(JOINTS, SHAPES, strict=True))
         ends = [s.at for s in SHAPES[1:]] + [(0.0, 0.0, 0.0)]
         for servo, joint, shape, end in zip(self.servos, JOINTS, SHAPES, ends, strict=True):
-            # Friction that stops a joint within a time step: at the default impedance it creeps as slow motions go.
-            servo.joint.solreffriction, servo.joint.solimpfriction = (2 * STEP_S, 1.0), (0.999, 0.999, 0.001, 0.5, 2)
             self.attach(servo, place)
             link = Link(f"{joint}_link", shape, end)
             servo.attach(link, servo.horn)

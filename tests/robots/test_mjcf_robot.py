@@ -172,7 +172,7 @@ def test_parameters_by_pattern_stand_where_they_belong(model_file):
     world = model.params({**values, "delay": 0.0}, jnp.zeros(4))["world"].model
     # In the model's order: hip, knee.
     np.testing.assert_allclose(world.dof_damping, [3.0 / 6.0, 0.3], rtol=1e-6)
-    np.testing.assert_allclose(world.dof_armature, [0.05, 0.02], rtol=1e-6)
+    np.testing.assert_allclose(world.dof_armature, [0.05 - 0.001 * 0.5, 0.02 - 0.001 * 0.3], rtol=1e-6)
     np.testing.assert_allclose(world.dof_frictionloss, [0.22, 0.11], rtol=1e-6)
     np.testing.assert_allclose(world.jnt_actfrcrange, [[-3, 3], [-1.5, 1.5]])
     body = robot.model.body("lower").id
@@ -210,7 +210,7 @@ def test_identified_friction_leaves_as_mjcf(model_file):
     text = robot.identified_mjcf({"damping": 0.33, "armature_left_hip": 0.07, "armature_left_knee": 0.08})
     model = mujoco.MjModel.from_xml_string(text)
     np.testing.assert_allclose(model.dof_damping, [0.33, 0.33, 0.0])
-    np.testing.assert_allclose(model.dof_armature, [0.07, 0.08, 0.0])
+    np.testing.assert_allclose(model.dof_armature, [0.07 - 0.001 * 0.33, 0.08 - 0.001 * 0.33, 0.0])
 
 
 def test_urdf_is_read(tmp_path):
@@ -265,3 +265,25 @@ def test_placing_nothing_changes_nothing(model_file):
     world = robot.make_nodes()[2]
     base = robot.base(world.init_params())
     assert place((), {}, base, world.joints, world.qvel_at).model.dof_damping is base.model.dof_damping
+
+
+def test_the_armature_is_the_rotors_whatever_the_time_step(tmp_path):
+    """A damped joint coasts as the equation says; MuJoCo's own steps add half a step of damping to the inertia."""
+    path = tmp_path / "rotor.xml"
+    path.write_text(
+        '<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="left_hip" axis="0 1 0"/>'
+        '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/></body></worldbody></mujoco>'
+    )
+    terms = (ParameterPattern("armature"), ParameterPattern("damping"), ParameterPattern("frictionloss"))
+    robot = MjcfRobot(config(path, joints=("left_hip",), commands=("torque",), step_s=0.005, terms=terms))
+    values = {"armature": 0.03, "damping": 1.0, "frictionloss": 1e-9}
+    world = robot.identifiable(0.02).params({**values, "delay": 0.0}, jnp.zeros(2))["world"].model
+    model = mujoco.MjModel.from_xml_string(robot.identified_mjcf(values))
+    np.testing.assert_allclose(world.dof_armature, model.dof_armature, rtol=1e-6)
+    data = mujoco.MjData(model)
+    data.qvel[0] = 1.0
+    mujoco.mj_step(model, data, 16)
+    assert data.qvel[0] == pytest.approx(np.exp(-0.08 * 1.0 / 0.04), rel=0.01)
+    # So much inertia is the integrator's already that no rotor is left.
+    heavy = MjcfRobot(config(path, joints=("left_hip",), commands=("torque",), step_s=0.1, terms=terms))
+    assert mujoco.MjModel.from_xml_string(heavy.identified_mjcf(values)).dof_armature[0] == 0.0

@@ -1,12 +1,17 @@
-"""Dry friction of a robot from its MJCF holds a joint; MuJoCo's default impedance lets it creep."""
+"""Dry friction holds a joint; MuJoCo's default impedance lets it creep, and too few iterations let it shiver."""
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 
+from pipelines.arm import task as arm_task
+from pipelines.so101.task import Reach
+from sim2real import composer
 from sim2real.robots.from_model.mjcf import driven, read_model
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.from_model.usual_parameters import usual_terms
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 XML = """<mujoco><worldbody><body><joint name="lift" axis="0 1 0" frictionloss="1" {own}/>
 <inertial pos="0.1 0 0" mass="0.5" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody></mujoco>"""
@@ -50,3 +55,56 @@ def test_the_identified_model_holds_its_joints_as_the_identification_did(model_f
     np.testing.assert_allclose(exported.dof_solref, robot.model.dof_solref)
     np.testing.assert_allclose(exported.dof_solimp, robot.model.dof_solimp)
     assert crept(exported) < 1e-3
+
+
+def pulled(task):
+    """Return a composed servo robot at its middle, without gravity: friction holds it at 0.8 of what would move it."""
+    task.root_entity.mjcf_model.option.gravity = (0.0, 0.0, 0.0)
+    for joint in task.joints:
+        joint.frictionloss = 0.2
+    stiffness = np.array([servo.actuator.kp for servo in task.robot.servos])
+    return np.array(0.16 / stiffness)
+
+
+@pytest.mark.parametrize("name", ["so101", "arm"])
+def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
+    """With a single iteration of the solver, as in training, its joints shiver and creep."""
+    robot = load_pipeline(name).load()
+    model = mujoco.MjModel.from_xml_string(robot.identified_mjcf(robot.nominal()))
+    model.opt.gravity[:], model.dof_frictionloss[:] = 0.0, 0.2
+
+    def fastest():
+        data = mujoco.MjData(model)
+        data.ctrl[:] = data.qpos + 0.16 / model.actuator_gainprm[:, 0]
+        speeds = []
+        for _ in range(round(3.0 / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+            speeds.append(np.abs(data.qvel).max())
+        return max(speeds[len(speeds) // 3 :])
+
+    assert fastest() < 1e-3
+    model.opt.iterations, model.opt.ls_iterations = 1, 4
+    assert fastest() > 1e-2, "few iterations do suffice: training may have them, too"
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("task", [Reach, arm_task.Reach])
+def test_in_single_precision_too(task):
+    """On MJX, as in training; at an impedance of 0.999 single precision does not find the holding force."""
+    task = task()
+    off = pulled(task)
+    environment = composer.MjxEnvironment(task)
+    environment.iterate(6, 20)
+
+    def moved(key):
+        start = environment.reset(key)
+        goal = start.data.qpos + off
+
+        def step(state, _):
+            after = environment.step(state, goal)
+            return after, after.data.qvel
+
+        return jax.lax.scan(step, start, None, length=200)[1]
+
+    speeds = np.asarray(jax.jit(jax.vmap(moved))(jax.random.split(jax.random.key(0), 8)))
+    assert np.abs(speeds[:, 100:]).max() < 5e-3

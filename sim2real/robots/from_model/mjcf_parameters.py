@@ -10,6 +10,7 @@ import distrax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.arrays import beside_damping
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, Transform
 from sim2real.robots.from_model.joints.joint_patterns import require_quick
@@ -183,6 +184,11 @@ def place(
         else:
             field = ON_DOF[p.what]
             model[field] = model.get(field, getattr(base.model, field)).at[dofs[at]].set(value)
+
+    if model.keys() & {"dof_armature", "dof_damping"}:
+        armature, damping = (model.get(f, getattr(base.model, f)) for f in ("dof_armature", "dof_damping"))
+        rotor = beside_damping(armature[dofs], damping[dofs], base.model.opt.timestep)
+        model["dof_armature"] = armature.at[dofs].set(rotor)
 
     # Replace the fields.
     if any(p.what in TILT for p in placed):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 
+from sim2real.arrays import beside_damping
 from sim2real.artifacts.files import check
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
@@ -285,6 +286,9 @@ class MjcfRobot(LoggedRobot):
                     model.dof_damping[dofs[i]] = (drives[i].most or NO_LIMIT) / value
                 elif p.what in ON_DOF:
                     getattr(model, ON_DOF[p.what])[dofs[i]] = value
+        if any(p.what in ("armature", "damping", "speed") for p in self.placed):
+            armature, damping = model.dof_armature[dofs], model.dof_damping[dofs]
+            model.dof_armature[dofs] = beside_damping(armature, damping, config.step_s)
         copy_back(spec, model)
         return spec.to_xml()
 

@@ -7,11 +7,13 @@ gear, and gain, damping and inertia by its square.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sim2real.arrays import beside_damping
 from sim2real.composer.models.mjcf.translate import mj
+from sim2real.identify.export.card.plain import converged
 from sim2real.identify.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.robots.servo.datasheet import DataSheet
@@ -22,7 +24,6 @@ from sim2real.types import MjSpec, PyTree, Scalar
 if TYPE_CHECKING:
     from sim2real.hardware.joint import Joint
 
-T = TypeVar("T", float, "jax.Array")
 _NAMES = ("gain", "damping", "armature", "friction")
 MISSES = "goal_offset"
 """Constant difference between a servo's position and its goal [rad]: of the zeros, or of worn gears."""
@@ -114,7 +115,7 @@ def place(
     )
     worn = {STRIBECK: _stacked(of_joints(values, "stribeck", joints, _NEVER_RAD_S)) / gear} if sheet.worn else {}
     stiffness, zero = gain * gear**2, 0.0 * gain
-    armature = jnp.maximum(_beside_damping(inertia, damping, step_s), 0.0)
+    armature = beside_damping(inertia, damping, step_s)
     return {
         "gain": jnp.stack([stiffness, *[zero] * 9], axis=-1),
         "bias": jnp.stack([gain * off * gear, -stiffness, *[zero] * 8], axis=-1),
@@ -145,20 +146,10 @@ def identified_mjcf(
         gain, damping, armature, friction, full, off = (float(n) for n in numbers)
         joint, motor = spec.joint(element.full_identifier), spec.actuator(actuator.full_identifier)
         joint.damping = [damping * gear**2, *joint.damping[1:]]
-        joint.armature = max(_beside_damping(armature, damping, spec.option.timestep), 0.0) * gear**2
+        joint.armature = float(beside_damping(armature, damping, spec.option.timestep)) * gear**2
         joint.frictionloss = friction * gear
         stiffness, most = gain * gear**2, gain * full * gear
         motor.gainprm = [stiffness, *motor.gainprm[1:]]
         motor.biasprm = [gain * off * gear, -stiffness, *motor.biasprm[2:]]
         motor.forcerange = [-most, most]
-    spec.compile()
-    return spec.to_xml()
-
-
-def _beside_damping(armature: T, damping: T, step_s: float) -> T:
-    """Return the inertia to set in the model: the rotor's, minus the inertia that the integrator adds.
-
-    MuJoCo's implicit integration of damping acts like an additional inertia of half a step times the damping. At 2.5 ms
-    that is 6 % of the rotors' inertia of pipelines/arm.
-    """
-    return armature - 0.5 * step_s * damping
+    return converged(spec)

@@ -23,6 +23,10 @@ GOAL, REFERENCE = "goal", "reference"
 """Variables of the physics, each ``(joints,)`` [rad]: the goal positions, and the setpoints of the servos' position
 controllers, which move to the goals no faster than the profile velocity."""
 
+_SOON, _STOPS = (1e-4, 1.0), (0.995, 0.995, 0.001, 0.5, 2)
+"""Friction stops a joint within two time steps, to which MuJoCo lengthens the time constant. At the default impedance
+joints creep as slow motions go; at 0.999 the solver's single precision does not find the force that holds a joint."""
+
 
 class Servo(Robot):
     """A position-controlled servo: torque = gain * (setpoint - angle), limited to the stall torque.
@@ -43,6 +47,8 @@ class Servo(Robot):
             damping=sheet.damping * gear**2,
             armature=sheet.armature * gear**2,
             frictionloss=sheet.friction * gear,
+            solreffriction=_SOON,
+            solimpfriction=_STOPS,
         )
         self.horn = horn.add("site", name="horn")
         most = (-sheet.stall * gear, sheet.stall * gear)
@@ -152,7 +158,8 @@ class GoalTask(Task):
 def rubs_only(model: mjcf.RootElement) -> None:
     """Make the steps of an arena's model fast, for joints that rub and links that touch nothing."""
     model.option.integrator = "implicitfast"
-    # After two seconds one step of Newton's method is 0.8 mrad off a hundred of them, at half the time of four steps.
+    # After two seconds one step of Newton's method is 0.8 mrad off a hundred of them, at a seventh of the time of
+    # training. Only joints that friction should hold shiver, by 0.05 rad/s, and creep; see ``Environment.iterate``.
     model.option.iterations, model.option.ls_iterations = 1, 4
     # Frames and links that do not move against each other become one body: of an arm of three joints 4 instead of 14,
     # and 5 times the speed.
