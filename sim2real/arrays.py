@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.types import Scalar
+
 
 def is_jax(value: object) -> bool:
     """Return whether a value is a JAX array or tracer, without importing JAX."""
@@ -23,7 +25,7 @@ def namespace(*values: object) -> Any:
     return np
 
 
-def beside_damping(armature: Any, damping: Any, step_s: Any) -> Any:
+def beside_damping(armature: Scalar, damping: Scalar, step_s: Scalar) -> Any:
     """Return the armature to set in a model of MuJoCo: the rotor's, without what its integrator adds; 0 at least.
 
     MuJoCo integrates damping implicitly, which acts like an inertia of half a step times the damping: at 2.5 ms that is

@@ -6,12 +6,14 @@ the initial states, so a search is over dynamics and delays alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import NotInstalled, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.schedule import draw
@@ -64,6 +66,7 @@ class Problem:
         data: The segments, as an argument of programs.
         spans: The segments, recording by recording.
         train: Numbers of the fitted segments.
+        readings: Field -> its measurements ``(E, K, ...)``.
 
     Raises:
         Sim2RealError: When a log lacks a node or a field, or holds NaN.
@@ -108,7 +111,7 @@ class Problem:
         steps = cuts.ts.shape[1]
         tables[model.sensor] = padded(tables[model.sensor], rounded(steps), axis=1)
         self.data: Data = data_of(cuts, tables, from_s, len(self.fields), len(self.table))
-        self._measured, self._ts = cuts.measured, np.where(cuts.ts >= from_s, cuts.ts, -1.0)
+        self.readings, self._ts = cuts.measured, np.where(cuts.ts >= from_s, cuts.ts, -1.0)
         # Choose derivatives and evaluator, or share those of the other problem.
         if like is None:
             self.residuals.choose_derivative(self.data)
@@ -151,7 +154,7 @@ class Problem:
     def measured(self, column: int) -> np.ndarray:
         """Return the measurements of a column of the residuals, ``(E, K)``."""
         field, _, entry = self.fields[column]
-        return np.asarray(entry(self._measured[field]))
+        return np.asarray(entry(self.readings[field]))
 
     def part(self, without: Sequence[int] | np.ndarray = (), present: np.ndarray | None = None) -> Data:
         """Return the data without some segments, and with some of the parameters.
@@ -224,6 +227,14 @@ class Problem:
         """
         residuals = self.evaluator.with_values(np.asarray(z), rows, self.data)
         return residuals[:, : len(self.train), : self._ts.shape[1]]
+
+    def with_readings(self, readings: Mapping[str, np.ndarray]) -> Problem:
+        """Return the same segments with other measurements, ``(E, K, ...)`` of each field; both share programs."""
+        other, measured = copy.copy(self), {f: np.array(rows) for f, rows in self.data.measured.items()}
+        for field, rows in readings.items():
+            measured[field][: rows.shape[0], : rows.shape[1]] = rows
+        other.readings, other.data = readings, self.data._replace(measured=pytree.map(jnp.asarray, measured))
+        return other
 
     def recut(self, spans: Sequence[Span], length_s: float, moved: Retimed = lambda recorded: recorded) -> Problem:
         """Return the same recordings cut into other segments; both problems share programs.

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 
-from sim2real.arrays import beside_damping
 from sim2real.artifacts.files import check
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
@@ -44,6 +43,7 @@ from sim2real.robots.from_model.mjcf_parameters import (
     WHOLE,
     ParameterPattern,
     Placed,
+    beside_damping,
     expand,
     of_each,
     optional,

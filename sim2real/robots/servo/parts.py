@@ -159,7 +159,7 @@ def rubs_only(model: mjcf.RootElement) -> None:
     """Make the steps of an arena's model fast, for joints that rub and links that touch nothing."""
     model.option.integrator = "implicitfast"
     # After two seconds one step of Newton's method is 0.8 mrad off a hundred of them, at a seventh of the time of
-    # training. Only joints that friction should hold shiver, by 0.05 rad/s, and creep; see ``Environment.iterate``.
+    # training. Only joints that friction should hold shiver, by 0.05 rad/s, and creep: a deployment takes more.
     model.option.iterations, model.option.ls_iterations = 1, 4
     # Frames and links that do not move against each other become one body: of an arm of three joints 4 instead of 14,
     # and 5 times the speed.

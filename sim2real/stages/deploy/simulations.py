@@ -24,8 +24,6 @@ from sim2real.train.environment.variation import VariationConfig
 from sim2real.types import PyTree
 
 _MIN_SIMULATIONS, _MIN_PER_EPISODE = 32, 8
-_ITERATIONS = 6, 20
-"""Steps of the solver, and of its line search, with which friction holds a joint in single precision."""
 States = tuple[np.ndarray, dict[str, np.ndarray]]
 """Times ``(N,)`` [s], and columns: states ``(N,)``, and the commands, one a step."""
 
@@ -78,7 +76,7 @@ def simulate(
     for node in nodes.values():
         if isinstance(node, ComposedWorld):
             # A robot rests where friction holds it, and with as few iterations as in training its joints creep.
-            node.environment.iterate(*_ITERATIONS)
+            node.environment.mjx_model = resting(node.environment.mjx_model)
     count = len(parameters)
     timeline = draw(nodes, duration_s, count, 0)
     make_room(nodes, timeline)
@@ -99,6 +97,11 @@ def simulate(
         (_states(graph, records, robot, e, scored_node), _states(graph, records, robot, e, robot.roles.sensor))
         for e in range(count)
     ], timeline
+
+
+def resting(model: PyTree) -> PyTree:
+    """Return an ``mjx.Model`` whose solver finds the friction that holds a joint, in single precision."""
+    return model.replace(opt=model.opt.replace(iterations=6, ls_iterations=20))
 
 
 def _states(graph: CompiledGraph, records: Mapping[str, Any], robot: Robot, e: int, node: str) -> States:

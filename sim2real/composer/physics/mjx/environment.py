@@ -207,16 +207,6 @@ class MjxEnvironment:
         state = jax.eval_shape(self.reset, key)
         return state, jax.eval_shape(self.step, state, action)
 
-    def iterate(self, iterations: int, ls_iterations: int) -> None:
-        """Let the solver take more iterations than the model's option has, for programs that are compiled later.
-
-        Args:
-            iterations, ls_iterations: The largest numbers of steps, and of those of a line search.
-        """
-        if self._warp is None:
-            option = self.mjx_model.opt.replace(iterations=iterations, ls_iterations=ls_iterations)
-            self.mjx_model = self.mjx_model.replace(opt=option)
-
     def reset(
         self,
         key: jax.Array,
