@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from test_folds import BIAS, CONFIG, GAIN, NOISE, TAU_S, Model, lag_log
 
+from sim2real.artifacts.estimation.noise import Noise
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
+from sim2real.identify.validation import prediction
+from sim2real.stages.estimation.replay import _of_noise
 
 LENGTH_S, SPLIT_S = 0.93, 0.4
 SPANS = [Span(0, 0.4 + 0.9 * i, fitted=i != 4) for i in range(9)]
@@ -81,3 +84,19 @@ def test_predictions_do_not_depend_on_how_many_there_are(problem):
     for i in (0, 10, 26):
         one = problem.predict({n: v[i : i + 1] for n, v in rows.items()}, many[i : i + 1], fit_s[i : i + 1])
         np.testing.assert_allclose(one[0], whole[i], atol=1e-4)
+
+
+@pytest.mark.parametrize(("tau_s", "least", "most"), [(TAU_S, 0.8, 1.3), (-0.2, 2.0, 20.0)])
+def test_an_unchanged_robot_is_predicted_from_noisy_readings_as_well_as_its_equilibrium_allows(
+    problem, tau_s, least, most
+):
+    """A lag forgets the error of its initial state; with the other sign the error grows by e each 0.2 s."""
+    robot, every = TRUE | {"tau": tau_s}, np.ones(problem.segments, bool)
+    columns = prediction.samples(problem, {"identified": robot}, SPLIT_S, every)
+    (name,) = prediction.labels(problem)
+    exact, noisy = (
+        _of_noise(problem, columns, [Noise(name, "", deviation, 0.0, 0.0)], robot, SPLIT_S, LENGTH_S - SPLIT_S)[name]
+        for deviation in (0.0, NOISE)
+    )
+    assert exact < 0.3 * noisy
+    assert least * NOISE < noisy < most * NOISE
