@@ -41,7 +41,7 @@ TABLES = {
     "on_a_gpu": ("arm_h200", "train_h200"),
     "faults": ("faults",),
     "warp": ("compose_warp_h200",),
-    "drift": tuple(f"drift_{name}" for name in ("pendulum", "arm", "arm_more", "so101", "so101_more", "so101_none")),
+    "drift": ("drift_pendulum", "drift_arm", "drift_so101", "drift_so101_more"),
     "restored": (
         *("drift_restore", "drift_pendulum_restore_delay", "drift_pendulum_restore_friction", "drift_arm_restore"),
         *("drift_arm_restore_friction", "drift_so101_restore", "drift_so101_restore_delay"),

@@ -18,6 +18,7 @@ STEP_S, PERIOD, DELAY, SECONDS, NOISE, KP, DAMPING = 0.002, 5, 2, 4.0, 2e-4, 12.
 RIG = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="rod">
   <joint name="servo" axis="0 1 0" damping="0.4" armature="0.02"/>
   <inertial pos="0 0 -0.05" mass="0.1" diaginertia="1e-4 1e-4 1e-4"/>{held}</body></worldbody></mujoco>"""
+FINE = 20
 HELD = '<body pos="0 0 {at}"><inertial pos="0 0 0" mass="{kg}" diaginertia="1e-9 1e-9 1e-9"/></body>'
 LOADS = ((0.5, 0.1), (1.3, 0.15))
 COMMANDS = ("goal", "payload", "payload_reach")
@@ -25,14 +26,15 @@ COMMANDS = ("goal", "payload", "payload_reach")
 
 def recorded(kg: float, reach: float) -> Episode:
     model = mujoco.MjModel.from_xml_string(RIG.format(held=HELD.format(at=-reach, kg=kg)))
+    model.opt.timestep = STEP_S / FINE  # a robot has no time steps
     data = mujoco.MjData(model)
     t = STEP_S * PERIOD * np.arange(round(SECONDS / STEP_S / PERIOD))
     goals = (0.8 * np.sin(3.1 * t) + 0.3 * np.sin(9.3 * t))[:, None]
     data.qpos[:], angles = goals[0], []
     for before, goal in zip((goals[0], *goals), goals, strict=False):
         angles.append(data.qpos.copy())
-        for step in range(PERIOD):
-            data.qfrc_applied[:] = KP * ((before if step < DELAY else goal) - data.qpos)
+        for step in range(PERIOD * FINE):
+            data.qfrc_applied[:] = KP * ((before if step < DELAY * FINE else goal) - data.qpos)
             mujoco.mj_step(model, data)
     at = np.arange(len(t)) * round(1e6 * STEP_S * PERIOD)
     steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
