@@ -91,7 +91,7 @@ def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
 @pytest.mark.full
 @pytest.mark.parametrize("task", [Reach, arm_task.Reach])
 def test_in_single_precision_too(task):
-    """On MJX, as in training; at an impedance of 0.999 single precision does not find the holding force."""
+    """On MJX, as beside a deployment; at an impedance of 0.999 single precision does not find the holding force."""
     task = task()
     off = pulled(task)
     environment = composer.MjxEnvironment(task)

@@ -115,7 +115,8 @@ def _of_noise(
         errors = prediction.errors(noisy, predicted, ["identified"], settle_s, [ahead_s])
         rmse = next(e.rmse for e in errors if e.held_out and e.model == "identified")
         for column in fields:
-            rows[column].append(rmse.get(column) or 0.0)
+            error = rmse.get(column)  # of a prediction that diverged no bound follows
+            rows[column].append(error if error is not None and math.isfinite(error) else 0.0)
     return {column: float(np.quantile(errors, 0.95)) for column, errors in rows.items()}
 
 
