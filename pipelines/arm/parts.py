@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from sim2real import composer
-from sim2real.composer import mjcf
 from sim2real.robots.servo.datasheet import DataSheet
-from sim2real.robots.servo.parts import Servo, ServoDriven, rubs_only
+from sim2real.robots.servo.parts import Servo, ServoDriven, Unobserved, rubs_only
 
 JOINTS = ("pan", "shoulder", "elbow")
 SHEET = DataSheet(stall=1.4, damping=0.23, armature=0.0045, friction=0.03, p_gain=800, profile_rad_s=5.0)
@@ -30,8 +29,8 @@ class Link(composer.Entity):
         com: tuple[float, ...],
         inertia: tuple[float, ...],
     ) -> None:
-        self._model = mjcf.RootElement(model=name)
-        body = self._model.worldbody.add("body", name="link")
+        self.mjcf_model.model = name
+        body = self.mjcf_model.worldbody.add("body", name="link")
         body.add("inertial", pos=com, mass=mass, diaginertia=inertia)
         look = {"contype": 0, "conaffinity": 0, "mass": 0.0}
         body.add("geom", name="rod", type="capsule", fromto=(0, 0, 0, *end), size=[0.009], rgba=_BLUE, **look)
@@ -40,11 +39,6 @@ class Link(composer.Entity):
         )
         self.end = body.add("site", name="end", pos=end)
 
-    @property
-    def mjcf_model(self) -> Any:
-        """The model."""
-        return self._model
-
 
 class Arm(ServoDriven):
     """Three servos and three links."""
@@ -52,7 +46,7 @@ class Arm(ServoDriven):
     low, high = (-1.4, -1.4, -1.6), (1.4, 1.4, 1.6)
 
     def _build(self, name: str = "arm") -> None:
-        self._model = mjcf.RootElement(model=name)
+        self.mjcf_model.model = name
         forward, down = SHOULDER_M
         links = (
             Link("bracket", (forward, 0, down), 0.082, (0.02, 0, -0.02), (4e-5, 6e-5, 5e-5)),
@@ -67,13 +61,8 @@ class Arm(ServoDriven):
             place = link.end
         self.tip = place
 
-    @property
-    def mjcf_model(self) -> Any:
-        """The model."""
-        return self._model
 
-
-class Gantry(composer.Arena):
+class Gantry(Unobserved, composer.Arena):
     """A plate that the arm hangs from, over a table, and a target."""
 
     def _build(self, name: str = "gantry") -> None:
@@ -85,11 +74,6 @@ class Gantry(composer.Arena):
         world.add("geom", name="plate", type="box", size=[0.06, 0.05, 0.005], pos=[0, 0, GANTRY_M + 0.03], **look)
         self.mount = world.add("site", name="mount", pos=[0, 0, GANTRY_M])
         self.target = world.add("site", name="target", pos=[0.2, 0, 0.25], size=[0.012], rgba=[0.85, 0.3, 0.2, 1])
-
-    def _build_observables(self) -> composer.Observables:
-        observables = super()._build_observables()
-        observables.disable_all()  # each would be computed in every step, and the graph's sensor needs none
-        return observables
 
     @composer.observable
     def target_position(self, physics: Any) -> Any:

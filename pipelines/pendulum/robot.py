@@ -68,7 +68,7 @@ class HingeDrive(RobotDrive):
     rate_hz = 50.0
     command, message = "action", Command
     units = {"action": "V", "voltage": "V", "command": "V"}
-    probe = Probe(step=1.5, lag_s=0.004)
+    probe = Probe(step=1.5, lag_s=0.0015)
 
     def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:
         self._mounting = mounting

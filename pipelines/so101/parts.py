@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim2real import composer
-from sim2real.composer import mjcf
 from sim2real.robots.servo.datasheet import StsSheet
-from sim2real.robots.servo.parts import Servo, ServoDriven, rubs_only
+from sim2real.robots.servo.parts import Servo, ServoDriven, Unobserved, rubs_only
 
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 """LeRobot's names, in the order of the servos' ids."""
@@ -71,19 +70,14 @@ class Link(composer.Entity):
     """A rigid link."""
 
     def _build(self, name: str, shape: Shape, end: tuple[float, float, float]) -> None:
-        self._model = mjcf.RootElement(model=name)
-        body = self._model.worldbody.add("body", name="link")
+        self.mjcf_model.model = name
+        body = self.mjcf_model.worldbody.add("body", name="link")
         inertia = [1e-6 * i for i in shape.inertia]
         body.add("inertial", pos=shape.com, mass=shape.mass, fullinertia=inertia)
         look = {"contype": 0, "conaffinity": 0, "mass": 0.0, "rgba": (0.95, 0.75, 0.2, 1.0)}
         if math.hypot(*end) > 0:
             body.add("geom", name="rod", type="capsule", fromto=(0, 0, 0, *end), size=[0.012], **look)
         self.end = body.add("site", name="end", pos=end)
-
-    @property
-    def mjcf_model(self) -> Any:
-        """The model."""
-        return self._model
 
 
 class Arm(ServoDriven):
@@ -92,8 +86,8 @@ class Arm(ServoDriven):
     low, high = (-1.4, -1.65, 0.2, -1.6, -1.5, -0.8), (1.4, -0.3, 1.6, -1.0, 1.5, 0.8)
 
     def _build(self, name: str = "so101") -> None:
-        self._model = mjcf.RootElement(model=name)
-        place: Any = self._model.worldbody.add("site", name="base", pos=SHAPES[0].at)
+        self.mjcf_model.model = name
+        place: Any = self.mjcf_model.worldbody.add("site", name="base", pos=SHAPES[0].at)
         self.servos = tuple(Servo(j, s.axis, SHEET) for j, s in zip(JOINTS, SHAPES, strict=True))
         ends = [s.at for s in SHAPES[1:]] + [(0.0, 0.0, 0.0)]
         for servo, joint, shape, end in zip(self.servos, JOINTS, SHAPES, ends, strict=True):
@@ -104,13 +98,8 @@ class Arm(ServoDriven):
             if joint == "wrist_roll":
                 self.tip = link.mjcf_model.worldbody.body["link"].add("site", name="tip", pos=(TIP_M, 0, 0))
 
-    @property
-    def mjcf_model(self) -> Any:
-        """The model."""
-        return self._model
 
-
-class Table(composer.Arena):
+class Table(Unobserved, composer.Arena):
     """A table, a target, and how far the jaws shall be open there."""
 
     def _build(self, name: str = "table") -> None:
@@ -121,11 +110,6 @@ class Table(composer.Arena):
         world.add("geom", name="top", type="plane", size=[0.6, 0.6, 0.05], rgba=[0.8, 0.82, 0.85, 1], **look)
         self.target = world.add("site", name="target", pos=[0.2, 0, 0.2], size=[0.012], rgba=[0.85, 0.3, 0.2, 1])
         self.opening = world.add("site", name="opening")  # x holds the jaw's angle [rad]
-
-    def _build_observables(self) -> composer.Observables:
-        observables = super()._build_observables()
-        observables.disable_all()  # each would be computed in every step, and the graph's sensor needs none
-        return observables
 
     @composer.observable
     def target_position(self, physics: Any) -> Any:

@@ -24,6 +24,8 @@ configured one; least number of undisturbed steps."""
 _RISE_RAD = 0.05
 """The answer is fitted up to this angle; beyond it, weight and friction make it no polynomial."""
 _GRID_S = 0.0005
+_TURNS = 10
+"""Turns of the fit; more change the median of the embedded robots' delays by less than a step of the grid."""
 _AGAIN = 5
 """Samples after which a command is sent again: it must not become stale."""
 _STILL_RAD_S, _STILL_S, _REST_S = 0.05, 0.1, 3.0
@@ -118,8 +120,9 @@ def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
 def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
     """Return the start of each answer.
 
-    An answer is 0 until the delay is over, and then a square and a cube, the same for all: the delay and the factors
-    that fit all best are found first, then the delay of each.
+    An answer is 0 until the delay is over, and then a square and a cube, the same for all, times a factor of its own:
+    a joint that came to rest elsewhere is held by another weight and friction. The curve, and delay and factor of each
+    answer, are fitted in turn, from the delay that fits all best.
 
     Args:
         answers: Each of shape ``(N, 2)``: time since the command [s], and motion since then in its direction [rad].
@@ -133,9 +136,14 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
     grid = np.arange(0.0, end_s - 4 * _PERIOD_S, _GRID_S)
     answers = [a[a[:, 0] <= end_s] for a in answers]  # the same samples for every delay: otherwise no samples fit best
     samples = np.concatenate(answers)
-    delay = min(grid, key=lambda d: _misfit(samples, d, _fit(samples, d)))
-    curve = _fit(samples, delay)
-    return StepAnswers(np.array([min(grid, key=lambda d: _misfit(a, d, curve)) for a in answers]))
+    residual = [np.linalg.lstsq(_powers(samples[:, 0], d), samples[:, 1], rcond=None)[1].sum() for d in grid]
+    delays, factors = [grid[np.argmin(residual)]] * len(answers), [1.0] * len(answers)
+    for _ in range(_TURNS):
+        powers = [f * _powers(a[:, 0], d) for a, d, f in zip(answers, delays, factors, strict=True)]
+        curve = np.linalg.lstsq(np.concatenate(powers), samples[:, 1], rcond=None)[0]
+        best = [min(_scaled(a, d, curve) for d in grid) for a in answers]
+        delays, factors = [d for _, d, _ in best], [f for *_, f in best]
+    return StepAnswers(np.array(delays))
 
 
 def _answers(witness: Witness, probe: Probe) -> list[np.ndarray]:
@@ -199,10 +207,8 @@ def _powers(t_s: np.ndarray, delay_s: float) -> np.ndarray:
     return since ** np.array([2, 3])
 
 
-def _fit(samples: np.ndarray, delay_s: float) -> np.ndarray:
-    """Return the coefficients of the polynomial that fits best behind a delay."""
-    return np.linalg.lstsq(_powers(samples[:, 0], delay_s), samples[:, 1], rcond=None)[0]
-
-
-def _misfit(samples: np.ndarray, delay_s: float, curve: np.ndarray) -> float:
-    return float(np.mean((samples[:, 1] - _powers(samples[:, 0], delay_s) @ curve) ** 2))
+def _scaled(answer: np.ndarray, delay_s: float, curve: np.ndarray) -> tuple[float, float, float]:
+    """Return the misfit of the curve behind a delay, that delay, and the factor on the curve that fits best."""
+    shape = _powers(answer[:, 0], delay_s) @ curve
+    factor = float(shape @ answer[:, 1] / max(shape @ shape, 1e-12))
+    return float(np.sum((answer[:, 1] - factor * shape) ** 2)), delay_s, factor

@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from virtual_bus import kill_when_ready
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.bus.packets import Instruction
@@ -254,13 +255,7 @@ while True:
     bus.write_goal_pwm({{1: 0.7}})
     time.sleep(0.02)
 """
-    host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert host.stdout.readline() == "ready\n"
-    time.sleep(0.3)
-    killed_ns = time.monotonic_ns()
-    host.kill()
-    host.wait()
-    time.sleep(0.25)
+    killed_ns = kill_when_ready(code)
     effects = effects_of(robot)
     before = effects[effects["t_ns"] <= killed_ns]
     assert before["values"][-1, 1] == pytest.approx(0.7, abs=1e-3)

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from flax import struct
+from virtual_bus import IdleDevice
 
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.graph.base import Base
@@ -66,7 +67,7 @@ class JointCommands(Base):
     tau: jax.Array
 
 
-class Legs(Device):
+class Legs(IdleDevice):
     """Two joints of inertia 0.1 kg m2 without gravity, whose motors are controllers; a sample each 2 ms."""
 
     motors = ("FR_hip", "FL_hip")
@@ -78,14 +79,6 @@ class Legs(Device):
     def __init__(self, period_s=0.002):
         self.period_s, self.begin_s, self.heard = period_s, time.monotonic(), []
         self.position, self.speed, self.quaternion = np.array([0.2, -0.1]), np.zeros(N), np.array([1.0, 0, 0, 0])
-
-    def open(self): ...
-    def close(self): ...
-    def enable(self): ...
-    def disable(self): ...
-    def check(self): ...
-    def make_safe(self): ...
-    def withhold_torque(self): ...
 
     def without_host(self):
         return (WithoutHost("leg", self.motors, Alone.DAMPS, 0.5, "this test"),)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from virtual_bus import IdleDevice
 
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.device import DUTY, POSITION, VOLTAGE, CommandKind, Counters, Device, Reading, Transaction
+from sim2real.hardware.device import DUTY, POSITION, VOLTAGE, CommandKind, Counters, Reading, Transaction
 from sim2real.hardware.emulation.mounted_plant import MountedPlant
 from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.plant import OperatingMode
@@ -25,7 +26,7 @@ mounting = st.tuples(st.floats(-2.0, 2.0), st.sampled_from([1, -1]), st.sampled_
 mountings = st.tuples(*[mounting] * N)
 
 
-class Bench(Device):
+class Bench(IdleDevice):
     """Two motors in memory; their joints are known to the test, which writes the mounting down once more.
 
     A command accelerates its joint, or pulls it to its angle. Everything on this side is the motors'.
@@ -55,13 +56,6 @@ class Bench(Device):
             return self.direction * motor / self.gear
         return self.direction * motor * (self.gear if self.commanded is TORQUE else 1.0)
 
-    def open(self): ...
-    def close(self): ...
-    def enable(self): ...
-    def disable(self): ...
-    def check(self): ...
-    def make_safe(self): ...
-    def withhold_torque(self): ...
     def without_host(self):
         return ()
 

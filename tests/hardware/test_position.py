@@ -2,12 +2,11 @@
 
 import math
 import os
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
+from virtual_bus import kill_when_ready
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.bus.packets import Instruction
@@ -242,13 +241,7 @@ while True:
     rig.measure()
     time.sleep(0.02)
 """
-    host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert host.stdout.readline() == "ready\n"
-    time.sleep(0.3)
-    killed_ns = time.monotonic_ns()
-    host.kill()
-    host.wait()
-    time.sleep(0.25)
+    killed_ns = kill_when_ready(code)
     rows, modes, goals = effects(robot)
     assert goals[rows["t_ns"] <= killed_ns][-3:] == pytest.approx([0.2] * 3, abs=COUNT_RAD)
     assert sorted(rows["servo_id"][-3:]) == list(IDS)

@@ -1,5 +1,9 @@
+import subprocess
+import sys
+import time
 from pathlib import Path
 
+from sim2real.hardware.device import Device
 from sim2real.hardware.emulation.emulated_bus import truth_header
 from sim2real.hardware.emulation.truth import TruthLog, read_truth
 from sim2real.hardware.plant import load_plant
@@ -42,3 +46,27 @@ class VirtualBus:
     def truth(self):
         self.close()
         return read_truth(self._path)
+
+
+def kill_when_ready(code):
+    """Run a host that prints "ready", kill it 0.3 s later, and return when [ns], 0.25 s after that."""
+    host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert host.stdout.readline() == "ready\n"
+    time.sleep(0.3)
+    killed_ns = time.monotonic_ns()
+    host.kill()
+    host.wait()
+    time.sleep(0.25)
+    return killed_ns
+
+
+class IdleDevice(Device):
+    """A device without hardware: opening, torque and checks do nothing."""
+
+    def open(self): ...
+    def close(self): ...
+    def enable(self): ...
+    def disable(self): ...
+    def check(self): ...
+    def make_safe(self): ...
+    def withhold_torque(self): ...

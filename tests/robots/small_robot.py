@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real import composer
-from sim2real.composer import mjcf
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.messages import EpisodeStart, Goals
@@ -26,15 +25,13 @@ VALUES = {"gain": 4.2, "damping": 0.15, "armature": 0.008, "friction_left": 0.03
 
 class Pair(ServoDriven):
     def _build(self, sheet, joints, name="pair"):
-        self._model = mjcf.RootElement(model=name)
+        self.mjcf_model.model = name
         self.servos = tuple(Servo(joint, (0.0, 1.0, 0.0), sheet) for joint in joints)
         for servo, y, mass in zip(self.servos, (-0.1, 0.1), (0.05, 0.1), strict=True):
             servo.joint.parent.add("inertial", pos=(0, 0, -0.1), mass=mass, diaginertia=[1e-4] * 3)
-            self.attach(servo, self._model.worldbody.add("site", name=f"at_{servo.mjcf_model.model}", pos=(0, y, 0)))
-
-    @property
-    def mjcf_model(self):
-        return self._model
+            self.attach(
+                servo, self.mjcf_model.worldbody.add("site", name=f"at_{servo.mjcf_model.model}", pos=(0, y, 0))
+            )
 
 
 class PairTask(GoalTask):

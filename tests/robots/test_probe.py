@@ -26,6 +26,14 @@ def test_the_delay_is_found(delay_s):
     assert found.jitter_s < 0.002
 
 
+def test_answers_of_a_joint_that_came_to_rest_elsewhere_are_no_jitter():
+    """Weight and friction help some steps and hinder others: their motion differs, not their delay."""
+    rng = np.random.default_rng(3)
+    found = delays_of([answer(0.045, rng, acceleration=a, jerk=-2.5 * a) for a in (44, 36, 29, 24, 22, 21, 20, 19)])
+    assert found.delay_s == pytest.approx(0.045, abs=0.0015)
+    assert np.ptp(found.delays_s) < 0.004
+
+
 def test_jitter_is_told_from_delay():
     rng = np.random.default_rng(1)
     found = delays_of([answer(0.045 + off, rng) for off in rng.uniform(-0.02, 0.02, 16)])

@@ -38,8 +38,8 @@ class Servo(Robot):
 
     def _build(self, name: Joint | str, axis: tuple[float, float, float], sheet: DataSheet) -> None:
         gear = self.gear = gear_of(name)
-        self._model = mjcf.RootElement(model=name_of(name))
-        horn = self._model.worldbody.add("body", name="horn")
+        self.mjcf_model.model = name_of(name)
+        horn = self.mjcf_model.worldbody.add("body", name="horn")
         self.joint = horn.add(
             "joint",
             name="joint",
@@ -52,15 +52,10 @@ class Servo(Robot):
         )
         self.horn = horn.add("site", name="horn")
         most = (-sheet.stall * gear, sheet.stall * gear)
-        self.actuator = self._model.actuator.add(
+        self.actuator = self.mjcf_model.actuator.add(
             "position", name="motor", joint=self.joint, kp=sheet.gain * gear**2, forcerange=most, forcelimited=True
         )
         self.profile_rad_s = sheet.profile_rad_s / gear
-
-    @property
-    def mjcf_model(self) -> PyTree:
-        """The servo's model."""
-        return self._model
 
     @property
     def actuators(self) -> list[Any]:
@@ -68,7 +63,16 @@ class Servo(Robot):
         return [self.actuator]
 
 
-class ServoDriven(Robot):
+class Unobserved(composer.Entity):
+    """Has no enabled observables: each would be computed in every step, and the graph's sensor needs none."""
+
+    def _build_observables(self) -> composer.Observables:
+        observables = super()._build_observables()
+        observables.disable_all()
+        return observables
+
+
+class ServoDriven(Unobserved, Robot):
     """A robot made of servos, whose setpoints move to their goals with limited speed, as in the firmware.
 
     Subclasses set ``servos`` when they build their model. The action is one goal per servo, in the same order.
@@ -92,11 +96,6 @@ class ServoDriven(Robot):
     def actuators(self) -> list[Any]:
         """The motors of the servos."""
         return [s.actuator for s in self.servos]
-
-    def _build_observables(self) -> composer.Observables:
-        observables = super()._build_observables()
-        observables.disable_all()  # each would be computed in every step, and the graph's sensor needs none
-        return observables
 
     @composer.observable
     def joint_positions(self, physics: Any) -> PyTree:
