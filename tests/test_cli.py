@@ -377,7 +377,8 @@ def run(pipeline, config, root, run_dir):
     with run_folder.open_stage(root, pipeline.name, "record", config) as stage:
         try:
             print("started", flush=True)
-            time.sleep(30)
+            for _ in range(300):  # a signal between the print and a sleep does not end that sleep
+                time.sleep(0.1)
         finally:
             print("torque off", flush=True)
             time.sleep(0.3)

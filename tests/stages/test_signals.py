@@ -38,7 +38,8 @@ def run(pipeline, config, root, run_dir):
                 gc.callbacks.clear()
             else:
                 Slow()
-            time.sleep(20)
+            for _ in range(200):
+                time.sleep(0.1)
         except KeyboardInterrupt:
             raise ImportError("initialising an extension failed") from None  # as some do
         finally:
