@@ -75,7 +75,7 @@ def _plan(
         missing = f"needs a run of this machine: --{_OTHER_RUN} RUN"
     if flags.get("data") and data is not None:
         flags["data"] = data
-    arguments = (bench, *_words(module_of(bench), flags), "--json", str(path))
+    arguments = (bench, "--json", str(path), *_words(module_of(bench), flags))
     return Plan(path, arguments, needs, commit, f"stale: {why}" if why else "current", missing)
 
 
@@ -91,7 +91,7 @@ def _words(module: ModuleType, flags: Mapping[str, Any]) -> list[str]:
             continue
         listed = [str(v) for v in value] if isinstance(value, list) else [str(value)]
         if not action.option_strings:
-            after = ["--", *listed]
+            after = ["--", *listed] if listed else []
         else:
             words += [action.option_strings[-1], *([] if action.nargs == 0 else listed)]
     return [*words, *after]
@@ -109,8 +109,11 @@ def measure_all(rows: Sequence[Plan], measure: Callable[[Sequence[str]], int], q
         if p.missing:
             print(f"reports/{p.report.name} is not measured: {p.missing}")
             continue
-        json_at = p.arguments.index("--json")
-        arguments = [p.arguments[0], *(["--quick"] if quick else []), *p.arguments[1:]]
-        print(f"python scripts/bench.py {shlex.join(p.arguments[:json_at])} --json reports/{p.report.name}")
-        worst = max(worst, measure(arguments))
+        bench, *rest = p.arguments
+        print(f"python scripts/bench.py {shlex.join([bench, '--json', f'reports/{p.report.name}', *rest[2:]])}")
+        try:
+            worst = max(worst, measure([bench, *(["--quick"] if quick else []), *rest]))
+        except Exception as error:  # what fails must not lose the reports behind it
+            print(f"reports/{p.report.name} is not measured: {type(error).__name__}: {error}")
+            worst = max(worst, 1)
     return worst

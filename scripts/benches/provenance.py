@@ -25,7 +25,8 @@ def state(paths: Sequence[str], root: Path, commit: str | None = None) -> dict[s
     changes = _git(root, "status", "--porcelain") if head else None
     return {
         "commit": head or commit,
-        "dirty": [line[3:] for line in (changes or "").splitlines()],
+        # A report that was written by the same command is no change of the code.
+        "dirty": [line[3:] for line in (changes or "").splitlines() if not line[3:].startswith("reports/")],
         "measured": digest(paths, root),
     }
 

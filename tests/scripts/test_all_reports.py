@@ -1,5 +1,6 @@
 """``bench.py all``: it measures the reports that this machine can, and names the machine that each other one needs."""
 
+import importlib
 import importlib.util
 import json
 from pathlib import Path
@@ -62,6 +63,39 @@ def test_flags_of_a_report_are_those_of_its_command(bench):
     assert _words(arm, flags) == ["--seeds", "3", "4", "--no-nominal", "--", "--ppo.num-envs", "64"]
     _, options = bench.parse(["arm", *_words(arm, flags)])
     assert (options.seeds, options.no_nominal) == ([3, 4], True)
+
+
+def test_the_command_of_each_report_has_its_flags_and_its_file(bench):
+    from benches.all_reports import plans
+    from benches.catalogue import BENCHES
+
+    from sim2real.artifacts.run.manifest import plain
+
+    def module_of(name):
+        return importlib.import_module(f"benches.{BENCHES[name].module}")
+
+    for plan in plans(ROOT / "reports", module_of, Path("data"), []):
+        flags = json.loads(plan.report.read_text()).get("flags", {})
+        _, options = bench.parse(plan.arguments)
+        again = plain(bench.reported_flags(vars(options)))
+        assert options.json == plan.report
+        assert {n: again[n] for n in flags.keys() & again} == {n: flags[n] for n in flags.keys() & again}, plan.report
+
+
+def test_a_report_that_fails_does_not_lose_the_others(bench, folder, monkeypatch, capsys):
+    (folder / "early.json").write_text((folder / "log.json").read_text())
+    measured = []
+
+    def fails_first(arguments):
+        measured.append(arguments[2])
+        if len(measured) == 1:
+            raise RuntimeError("no such luck")
+        return 0
+
+    monkeypatch.setattr(bench, "main", fails_first)
+    assert bench.measure_all(["--reports", str(folder)]) == 1
+    assert [Path(path).name for path in measured] == ["early.json", "log.json"]
+    assert "reports/early.json is not measured: RuntimeError: no such luck" in capsys.readouterr().out
 
 
 def test_an_unknown_report_is_refused(bench, folder, capsys):
