@@ -125,7 +125,8 @@ def test_the_league_has_a_line_a_set_in_one_unit(script, league):
 def test_a_bound_of_the_report_stands_beside_the_error_on_a_real_motor(script):
     reports = {name: script.read_reports()[name] for name in script.TABLES["real"]}
     bounds = {
-        **{"identify_disk": {"disk/promised/th": 31.4}, "identify_xl330": {}},
+        "identify_disk": {"disk/promised/th": 31.4},
+        "identify_xl330": {},
         "identify_so101": {"so101/promised/elbow": 12.5},
     }
     for name, rows in bounds.items():

@@ -121,7 +121,7 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
     """Return the start of each answer.
 
     An answer is 0 until the delay is over, and then a square and a cube, the same for all, times a factor of its own:
-    a joint that came to rest elsewhere is held by another weight and friction. The curve, and delay and factor of each
+    weight and friction differ with the angle at which the joint came to rest. The curve, and delay and factor of each
     answer, are fitted in turn, from the delay that fits all best.
 
     Args:

@@ -187,6 +187,4 @@ def report(tmp_path_factory, runs, repetitions):
 def test_a_fault_leaves_the_motor_safe_and_its_reason_said(report, runs, name):
     rows = {row["name"].removeprefix(f"faults/{name}/"): row["value"] for row in report["rows"]}
     assert (rows["code_and_reason"], rows["log_readable"]) == (runs, runs), report["wrong"]
-    median_s, longest_s = rows["safe_s"]
-    assert median_s < 2 * faults.SAFE_S, report["wrong"]
-    assert longest_s < 4 * faults.SAFE_S, report["wrong"]  # one run may meet a busy machine; scripts/bench.py faults
+    assert rows["safe_s"][1] < 2 * faults.SAFE_S, report["wrong"]

@@ -29,9 +29,7 @@ class Pair(ServoDriven):
         self.servos = tuple(Servo(joint, (0.0, 1.0, 0.0), sheet) for joint in joints)
         for servo, y, mass in zip(self.servos, (-0.1, 0.1), (0.05, 0.1), strict=True):
             servo.joint.parent.add("inertial", pos=(0, 0, -0.1), mass=mass, diaginertia=[1e-4] * 3)
-            self.attach(
-                servo, self.mjcf_model.worldbody.add("site", name=f"at_{servo.mjcf_model.model}", pos=(0, y, 0))
-            )
+            self.attach(servo, self.mjcf_model.worldbody.add("site", name=f"at_{servo.name}", pos=(0, y, 0)))
 
 
 class PairTask(GoalTask):

@@ -79,7 +79,8 @@ def test_the_command_of_each_report_has_its_flags_and_its_file(bench):
         _, options = bench.parse(plan.arguments)
         again = plain(bench.reported_flags(vars(options)))
         assert options.json == plan.report
-        assert {n: again[n] for n in flags.keys() & again} == {n: flags[n] for n in flags.keys() & again}, plan.report
+        shared = flags.keys() & again  # a bench may have lost a flag since
+        assert {n: again[n] for n in shared} == {n: flags[n] for n in shared}, plan.report
 
 
 def test_a_report_that_fails_does_not_lose_the_others(bench, folder, monkeypatch, capsys):

@@ -43,6 +43,8 @@ def test_a_report_names_commit_and_changes(tree, report):
     assert report["commit"] == git(tree, "rev-parse", "HEAD").strip()
     assert report["dirty"] == []
     (tree / "room" / "code.py").write_text("pass\n")
+    (tree / "reports").mkdir()
+    (tree / "reports" / "one.json").write_text("{}")
     assert provenance.state(PATHS, tree)["dirty"] == ["room/code.py"]
 
 

@@ -64,7 +64,7 @@ class Servo(Robot):
 
 
 class Unobserved(composer.Entity):
-    """Has no enabled observables: each would be computed in every step, and the graph's sensor needs none."""
+    """An entity with disabled observables: each would be computed in every step, and the graph's sensor needs none."""
 
     def _build_observables(self) -> composer.Observables:
         observables = super()._build_observables()
