@@ -217,14 +217,7 @@ class Robot:
         rate, rig, acting_s = self.rate_hz, session.rig, self.drive.expected_delay_s[2]
         roles, drive = self.roles, self.drive
         actuator = ServoActuator(
-            roles.actuator,
-            rate,
-            rig,
-            drive.command,
-            drive.message,
-            roles.supervisor,
-            begin,
-            delay=acting_s,
+            roles.actuator, rate, rig, drive.command, drive.message, roles.supervisor, begin, delay=acting_s
         )
         return control_nodes(self._sensor(session), agent, actuator)
 

@@ -147,7 +147,17 @@ def test_check_determines_the_same_parameters_with_and_without_jax(tmp_path, rob
     ]
     np.testing.assert_allclose(*errors_of, rtol=2e-3)  # programs compute in single precision
     assert light.pop("condition") == pytest.approx(whole.pop("condition"), rel=2e-3)
+    # Sentences print these errors with two digits, so one just between two roundings differs in the last.
+    (light_words, light_figures), (whole_words, whole_figures) = (_figures_apart(c.pop("recommendation")) for c in both)
+    assert light_words == whole_words
+    assert light_figures == pytest.approx(whole_figures, rel=0.06)
     assert light == whole
+
+
+def _figures_apart(sentences: list[str]) -> tuple[list[str], list[float]]:
+    """The sentences without the figures before a unit, and these figures."""
+    figure = re.compile(r"\b\d+(?:\.\d+)?(?= ?%| s\b)")
+    return [figure.sub("?", s) for s in sentences], [float(f) for s in sentences for f in figure.findall(s)]
 
 
 def test_the_page_s_robot_runs_without_jax_and_trains_with_it(tmp_path):

@@ -68,15 +68,7 @@ class EmbeddedRobot:
         self.truth_path.parent.mkdir(parents=True, exist_ok=True)
         self._messages_path = folder / "messages.txt"
         # The settings become flags. -P: files in the user's working directory must not be imported as modules.
-        command = [
-            sys.executable,
-            "-P",
-            "-m",
-            config.program,
-            "--until-stdin-closes",
-            "--plant",
-            plant,
-        ]
+        command = [sys.executable, "-P", "-m", config.program, "--until-stdin-closes", "--plant", plant]
         command += ["--emulation", f"{type(config).__module__}:{type(config).__qualname__}"]
         command += ["--truth", str(self.truth_path), "--plant-args", json.dumps(dict(plant_args or {}))]
         for name, value in asdict(config).items():

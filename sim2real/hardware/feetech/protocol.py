@@ -16,13 +16,7 @@ from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Packet, PacketFo
 
 HEADER: Final = b"\xff\xff"
 
-ALARMS: Final[dict[int, str]] = {
-    0: "input voltage",
-    1: "encoder",
-    2: "overheating",
-    3: "overcurrent",
-    5: "overload",
-}
+ALARMS: Final[dict[int, str]] = {0: "input voltage", 1: "encoder", 2: "overheating", 3: "overcurrent", 5: "overload"}
 """Bit of the error byte, and of the register Status -> its name. Every status packet carries them."""
 
 

@@ -44,8 +44,7 @@ class LerobotSettings:
             import_module(self.module)
         except ImportError as error:
             raise UsageError(
-                f"the device 'lerobot' cannot import a robot of LeRobot: {error}",
-                hint=with_extra("lerobot"),
+                f"the device 'lerobot' cannot import a robot of LeRobot: {error}", hint=with_extra("lerobot")
             ) from error
         kinds = RobotConfig.get_known_choices()
         if self.kind not in kinds:

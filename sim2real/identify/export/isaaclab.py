@@ -76,8 +76,4 @@ def _events(terms: Terms, joint: str) -> list[str]:
 
 def _event(name: str, function: str, params: str) -> list[str]:
     attribute = re.sub(r"\W", "_", name)
-    return [
-        f"    {attribute} = EventTerm(",
-        f'        func={function}, mode="startup", params={{{params}}}',
-        "    )",
-    ]
+    return [f"    {attribute} = EventTerm(", f'        func={function}, mode="startup", params={{{params}}}', "    )"]

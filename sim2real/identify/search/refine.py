@@ -16,13 +16,14 @@ from sim2real.errors import Sim2RealError
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.segments import Data
+from sim2real.identify.search.tether import Tether
 from sim2real.identify.uncertainty.uncertainty import (
     centred,
     determined,
+    deviation,
     linearise,
     loss_variance,
     root_of_inverse,
-    shift_range,
     time_shift,
 )
 
@@ -34,10 +35,6 @@ _ROUNDS, _BACK = 4, 4
 """Most rounds of a descent, and how often a round goes half the way back to its start."""
 _NEAR = 1e-5
 """Relative change of the point at which a descent ends, if the evaluator resolves it."""
-_PIN = 10.0
-"""How stiffly the delays' common shift is held in the middle at first: what all of it costs, in norms of the residuals.
-A log does not determine the shift, and the loss has a minimum for each tick of the world: descents from all starts end
-in the one next to the middle."""
 _LEFT = 0.1
 """A descent has converged if the next Gauss-Newton step is shorter [standard errors]."""
 _POLLED, _REACH, _BETTER = 12, 0.5, 1e-3
@@ -101,13 +98,13 @@ def refine(
     # Descend roughly from each start, with the shift of the delays held.
     fine = problem.evaluator.precision
     first_gain = gain or (_ROUGH if coarse else _COARSE if settle else fine)
-    ends = [descent.down(z, first_gain, _PIN) for z, loss in zip(starts, first, strict=True) if np.isfinite(loss)]
+    ends = [descent.down(z, first_gain, pinned=True) for z in np.asarray(starts)[np.isfinite(first)]]
     z, loss = min(ends, key=lambda end: end[1])
     if coarse or not settle:
         return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
     # Descend from the best end to the minimum.
-    if descent.shift.any():
-        z, loss = descent.down(z, fine, _PIN)
+    if descent.tether.shift.any():
+        z, loss = descent.down(z, fine, pinned=True)
     z, loss = descent.down(z, fine)
     # Test the end; if it is no minimum, continue from a better point nearby.
     left, converged = remaining(problem, z, data), False
@@ -138,7 +135,8 @@ def remaining(problem: Problem, z: np.ndarray, data: Data | None = None) -> floa
     J, variance = at.jacobian.reshape(-1, len(at.x))[:, rest], loss_variance(problem, at)
     root = root_of_inverse(J.T @ J / variance + at.prior[np.ix_(rest, rest)])
     covariance = root @ root.T
-    step = -covariance @ (J.T @ at.residuals.reshape(-1)) / variance
+    away, slope = Tether(problem.table, problem.data if data is None else data).rows(at.x)
+    step = -covariance @ (J.T @ at.residuals.reshape(-1) / variance + slope[:, rest].T @ away)
     low, high = problem.table.low[rest] - at.x[rest], problem.table.high[rest] - at.x[rest]
     return float(np.max(np.abs(np.clip(step, low, high)) / np.sqrt(np.diag(covariance)), initial=0.0))
 
@@ -147,8 +145,8 @@ class _Descent:
     """Descends on one problem and data.
 
     Attributes:
-        shift: Shape ``(P,)``: the delays' common shift, which a log does not determine; zeros where initial states are
-            not fitted, and the log does.
+        tether: Holds what the log does not determine. Where initial states are not fitted, it does determine the
+            delays' common shift.
         steps: Evaluations so far.
     """
 
@@ -156,7 +154,7 @@ class _Descent:
         self._problem, self._data, self._on_step, self._on_compile = problem, data, on_step, on_compile
         self._best: tuple[float, np.ndarray] = (np.inf, np.zeros(0))
         free = problem.config.initial_state == "free"
-        self.shift = time_shift(problem.table) if free else np.zeros(len(problem.table))
+        self.tether = Tether(problem.table, data, time_shift(problem.table) if free else None)
         self.steps = 0
 
     def at(self, z: np.ndarray) -> float:
@@ -165,7 +163,7 @@ class _Descent:
         self._report(loss, z)
         return loss
 
-    def down(self, z: np.ndarray, gain: float, pin: float = 0.0) -> tuple[np.ndarray, float]:
+    def down(self, z: np.ndarray, gain: float, pinned: bool = False) -> tuple[np.ndarray, float]:
         """Descend from a point until a round gains a smaller share of the loss; return where that ends, and its loss.
 
         In a round initial states may keep the derivatives that they have at its start. Where the loss is larger at its
@@ -173,26 +171,26 @@ class _Descent:
 
         Args:
             z: Shape ``(P,)``: the point.
-            pin: How stiffly the delays' common shift is held in the middle, see ``_PIN``.
+            pinned: Whether the delays' common shift is held in its middle.
         """
         z = np.asarray(z, np.float64)
-        if pin and self.shift.any():
-            z = centred(self._problem.table, z)
+        z = centred(self._problem.table, z) if pinned and self.tether.shift.any() else z
         loss = self.at(z)
         # Rounds of Levenberg-Marquardt; a round that ends worse goes half way back.
-        for _ in range(1 if self._problem.evaluator.fresh else _ROUNDS):
+        for _ in range(_ROUNDS):
             z, loss = self._off_bounds(z, loss)
-            end = self._round(z, gain, pin)
-            after = self.at(end)
+            end = self._round(z, gain, pinned)
+            held, after = loss + self._held(z), self.at(end)
             for _ in range(_BACK):
-                if after <= loss:
+                if after + self._held(end) <= held:
                     break
                 end = (z + end) / 2.0
                 after = self.at(end)
-            if not after < loss:
+            if not after + self._held(end) < held:
                 break
-            gained, z, loss = loss - after, end, after
-            if gained < gain * loss:
+            gained, z, loss = held - after - self._held(end), end, after
+            # Where initial states are fresh, a further round only holds more loosely, as residuals are smaller.
+            if gained < gain * loss or (self._problem.evaluator.fresh and self._held(z) < gain * loss):
                 break
         return z, loss
 
@@ -235,7 +233,11 @@ class _Descent:
                 return there, lower
         return z, loss
 
-    def _round(self, z: np.ndarray, gain: float, pin: float) -> np.ndarray:
+    def _held(self, z: np.ndarray) -> float:
+        """Return what the tether adds to the loss."""
+        return 0.5 * float(np.sum(self.tether.rows(self._problem.table.scale(z)[0])[0] ** 2) / self._data.count)
+
+    def _round(self, z: np.ndarray, gain: float, pinned: bool) -> np.ndarray:
         """Return where least squares ends from a point."""
         from scipy.optimize import least_squares  # 0.2 s
 
@@ -245,29 +247,32 @@ class _Descent:
         if not (np.isfinite(first).all() and np.isfinite(J).all()):
             return z
         # End where no step can gain that share: steps that fail took 12 evaluations of each refit without a part.
-        if self._gainable(J, first) < gain:
+        basis = np.linalg.qr(J[:, np.asarray(self._data.present)])[0]
+        left = first - basis @ (basis.T @ first)
+        if 1.0 - (left @ left) / max(float(first @ first), 1e-300) < gain:
             return z
-        # Pin directions that the data does not determine, so that steps stay finite.
-        pin *= float(np.linalg.norm(first))
+        # Hold what the data does not determine by the residuals that the next step leaves, if the slope is right.
+        self.tether.deviation = self._deviation(left)
+        table, norm = self._problem.table, float(np.linalg.norm(first)) if pinned else 0.0
 
-        def pinned(y: np.ndarray) -> np.ndarray:
+        def tethered(y: np.ndarray) -> np.ndarray:
             self._report(np.inf, y)
-            return np.nan_to_num(np.concatenate([value(y), pin * self._pinned(y)[0]]), nan=np.inf)
+            return np.nan_to_num(np.append(value(y), self.tether.rows(table.scale(y)[0], norm)[0]), nan=np.inf)
 
-        def pinned_slope(y: np.ndarray) -> np.ndarray:
-            return np.concatenate([slope(y), pin * self._pinned(y)[1]])
+        def tethered_slope(y: np.ndarray) -> np.ndarray:
+            x, stretch = table.scale(y)
+            return np.vstack([slope(y), self.tether.rows(x, norm)[1] * stretch])
 
         # Descend with scipy.
-        most = max(1, self._problem.config.refine_steps)
-        near = max(_NEAR, self._problem.evaluator.precision)
-        options: Any = {"jac": pinned_slope, "gtol": None}  # scipy's stubs have neither functions nor None
-        solution = least_squares(pinned, z, ftol=gain, xtol=near, max_nfev=most, **options)
-        return np.asarray(solution.x, np.float64)
+        most, near = max(1, self._problem.config.refine_steps), max(_NEAR, self._problem.evaluator.precision)
+        options: Any = {"jac": tethered_slope, "gtol": None}  # scipy's stubs have neither functions nor None
+        return np.asarray(least_squares(tethered, z, ftol=gain, xtol=near, max_nfev=most, **options).x, np.float64)
 
-    def _gainable(self, J: np.ndarray, residuals: np.ndarray) -> float:
-        """Return the share of the sum of squares that the next Gauss-Newton step gains, if the slope is right."""
-        reach = np.linalg.qr(J[:, np.asarray(self._data.present)])[0].T @ residuals
-        return float(reach @ reach) / max(float(residuals @ residuals), 1e-300)
+    def _deviation(self, stacked: np.ndarray) -> float:
+        """Return the deviation of an independent residual, from those of the segments with those of the priors."""
+        priors = sum(c.parameter.prior is not None for c in self._problem.table.columns)
+        of_segments = stacked[: len(stacked) - priors]
+        return deviation(of_segments.reshape(len(self._data.fitted), -1, len(self._problem.fields)))
 
     def _report(self, loss: float, z: np.ndarray) -> None:
         self.steps += 1
@@ -275,16 +280,3 @@ class _Descent:
             self._best = (loss, z.copy())
         if self._on_step and np.isfinite(self._best[0]):
             self._on_step(*self._best)
-
-    def _pinned(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far the delays' common shift is from its middle, ``(1,)`` in shares of it, and the slope."""
-        table, shift = self._problem.table, self.shift
-        if not shift.any():
-            return np.zeros(0), np.zeros((0, z.size))
-        x, stretch = table.scale(z)
-        width = float(table.span[shift != 0.0].min())
-        middle = lambda x: sum(shift_range(table, x, shift)) / 2.0 / width  # noqa: E731
-        step = 1e-3 * width
-        moves = step * np.diag((shift != 0.0).astype(float))
-        slope = np.array([(middle(x + m) - middle(x - m)) / (2.0 * step) for m in moves])
-        return np.array([middle(x)]), (slope * stretch)[None]

@@ -194,6 +194,12 @@ def loss_variance(problem: Problem, at: Linearised) -> float:
     return float(np.sum(at.residuals**2)) / max(count - free, 1) * inflation
 
 
+def deviation(residuals: np.ndarray) -> float:
+    """Return the deviation of a residual ``(S, K, F)``, larger where residuals are correlated in time."""
+    rho = _correlation_in_time(residuals)
+    return float(np.sqrt(np.sum(residuals**2) / max(np.count_nonzero(residuals), 1) * (1 + rho) / (1 - rho)))
+
+
 def _freedom(problem: Problem, at: Linearised) -> tuple[int, int, float]:
     """Return how many residuals there are, how many numbers were fitted, and the factor for correlation in time."""
     states = 2 * len(problem.channels) * len(at.residuals) * bool(problem.config.initial_state == "free")

@@ -225,8 +225,7 @@ def _with_numbers(
     empty = ", ".join(measured.sources[i] for i in places[~with_numbers])
     if hints.joints or not with_numbers.any():
         raise UsageError(
-            f"{empty} in {path} has no number in any sample",
-            hint="name only the other joints with --joints",
+            f"{empty} in {path} has no number in any sample", hint="name only the other joints with --joints"
         )
     names = tuple(label for label, k in zip(labels, with_numbers.tolist(), strict=True) if k)
     return places[with_numbers], names, [f"skipped: {empty} has no number in any sample"]

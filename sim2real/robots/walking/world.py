@@ -42,11 +42,7 @@ class WalkingWorld(ComposedWorld):
     _table: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
 
     def __init__(
-        self,
-        task: Ground,
-        parameters: Mapping[str, tuple[Any, str]],
-        loads: tuple[float, float],
-        **options: Any,
+        self, task: Ground, parameters: Mapping[str, tuple[Any, str]], loads: tuple[float, float], **options: Any
     ) -> None:
         super().__init__(ROLES.world, task, ROLES.actuator, "q", parameters, **options)
         model = self.environment.model

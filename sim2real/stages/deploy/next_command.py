@@ -22,11 +22,7 @@ ENOUGH_S = 12.0
 
 
 def with_command(
-    advice: Advice,
-    pipeline: Pipeline,
-    identification: Identification | None,
-    folder: Path,
-    deployment: Deployment,
+    advice: Advice, pipeline: Pipeline, identification: Identification | None, folder: Path, deployment: Deployment
 ) -> Advice:
     """Return advice with the command that carries it out.
 

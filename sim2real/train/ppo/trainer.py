@@ -27,15 +27,7 @@ from sim2real.train.ppo.initial_state import make_initial_state, make_networks, 
 from sim2real.train.ppo.result import Progress as Progress
 from sim2real.train.ppo.result import TrainResult as TrainResult
 from sim2real.train.ppo.result import find_best, history_of
-from sim2real.train.ppo.rollout import (
-    Copies,
-    PolicyEvaluation,
-    add_rows,
-    averages,
-    collect,
-    evaluate,
-    new_evaluation,
-)
+from sim2real.train.ppo.rollout import Copies, PolicyEvaluation, add_rows, averages, collect, evaluate, new_evaluation
 from sim2real.train.ppo.teacher import TeacherEnvironment
 from sim2real.train.ppo.update import TrainState, keys, make_policy, update
 from sim2real.train.scale.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint

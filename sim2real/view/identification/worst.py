@@ -73,7 +73,4 @@ def worst_figure(result: Identification, name: str) -> FigureBlock | None:
     size = ""
     if worst.of_motion is not None and worst.times_noise is not None:
         size = f", {worst.of_motion:.0%} of the joint's motion and {worst.times_noise:.0f} times the noise"
-    return FigureBlock(
-        svg,
-        f"The worst second: {worst.text(result.logs)}{size}. Residual: measured \u2212 identified.",
-    )
+    return FigureBlock(svg, f"The worst second: {worst.text(result.logs)}{size}. Residual: measured \u2212 identified.")

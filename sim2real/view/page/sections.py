@@ -89,9 +89,4 @@ def _drawn_blocks(artifact: StageFolder) -> list[Block]:
     return [FigureBlock(episodes_svg(drawn, "train-episodes"), caption)]
 
 
-SECTIONS = {
-    "record": record_section,
-    "identify": identify_section,
-    "train": train_section,
-    "deploy": deploy_section,
-}
+SECTIONS = {"record": record_section, "identify": identify_section, "train": train_section, "deploy": deploy_section}
