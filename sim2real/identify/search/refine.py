@@ -270,8 +270,7 @@ class _Descent:
 
     def _deviation(self, stacked: np.ndarray) -> float:
         """Return the deviation of an independent residual, from those of the segments with those of the priors."""
-        priors = sum(c.parameter.prior is not None for c in self._problem.table.columns)
-        of_segments = stacked[: len(stacked) - priors]
+        of_segments = stacked[: len(stacked) - sum(c.parameter.prior is not None for c in self._problem.table.columns)]
         return deviation(of_segments.reshape(len(self._data.fitted), -1, len(self._problem.fields)))
 
     def _report(self, loss: float, z: np.ndarray) -> None:

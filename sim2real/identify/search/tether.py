@@ -49,8 +49,7 @@ class Tether:
 
     def _shifted(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return how far the delays' common shift is from its middle, in shares of it, and the slope ``(P,)``."""
-        moved = self.shift != 0.0
-        width = float(self._table.span[moved].min())
+        width = float(self._table.span[self.shift != 0.0].min())
         middle = lambda x: sum(shift_range(self._table, x, self.shift)) / 2.0 / width  # noqa: E731
-        step = 1e-3 * width
-        return middle(x), np.array([(middle(x + m) - middle(x - m)) / (2.0 * step) for m in step * np.diag(moved)])
+        moves = 1e-3 * width * np.diag(self.shift != 0.0)
+        return middle(x), np.array([(middle(x + m) - middle(x - m)) / (2e-3 * width) for m in moves])
