@@ -10,6 +10,7 @@ from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty.ensemble import posterior
 from sim2real.identify.uncertainty.identifiability import from_linearised as judged
 from sim2real.identify.uncertainty.negligible import negligible
+from sim2real.identify.uncertainty.profile import ONE_SIDED, Profile
 from sim2real.identify.uncertainty.uncertainty import Linearised, from_linearised
 
 SEGMENTS, SAMPLES = 30, 40
@@ -179,6 +180,13 @@ def test_of_a_limit_that_no_motion_reaches_only_a_lower_bound_is_said(estimate, 
     assert drawn.min() >= spread.low[1] * (1 - 1e-9)
     assert drawn.max() <= 8.0
     assert np.percentile(drawn, 90) > 2.0, "any higher limit explains the recordings as well"
+
+
+def test_the_loss_below_a_limit_grows_from_what_was_reached_on():
+    """Values are 2 % apart: a bound between the last without effect and the next was 0.7 % too high."""
+    values, reached = np.array([3.0, 1.0102, 0.9892, 0.9688]), 1.0
+    curve = Profile(values, (1200.0 * np.maximum(reached - values, 0.0)) ** 2, np.zeros((4, 1)), np.zeros((4, 1)))
+    assert curve.bound() == pytest.approx(reached - ONE_SIDED / 1200.0, abs=1e-6)
 
 
 def test_a_limit_that_is_reached_stays_as_it_was():
