@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import distrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -296,8 +297,9 @@ def test_an_absent_effect_stays_at_its_bound():
 
 
 def test_priors_take_part():
-    problem = Stub(lambda x: x - 1.0, table_of(1), prior=lambda x: 2.0 * (x - 6.0))
-    np.testing.assert_allclose(problem.values(problem.refined([0.0]).z), [5.0], atol=1e-2)
+    table = ParameterTable([Parameter("a", "1", 0.0, -WIDE, WIDE, "linear", prior=distrax.Normal(6.0, 0.5))])
+    problem = Stub(lambda x: x - 1.0, table, prior=lambda x: 2.0 * (x - 6.0))
+    np.testing.assert_allclose(problem.values(problem.refined([0.0]).z), [5.0], atol=1e-3)
 
 
 @pytest.mark.parametrize(("weight", "expected"), [(1e-4, -3.0), (10.0, 9.0)])

@@ -269,7 +269,7 @@ class _Descent:
         return np.asarray(least_squares(tethered, z, ftol=gain, xtol=near, max_nfev=most, **options).x, np.float64)
 
     def _deviation(self, stacked: np.ndarray) -> float:
-        """Return the deviation of an independent residual, from those of the segments with those of the priors."""
+        """Return the deviation of the residuals of segments, behind which those of the priors stand, ``(N,)``."""
         of_segments = stacked[: len(stacked) - sum(c.parameter.prior is not None for c in self._problem.table.columns)]
         return deviation(of_segments.reshape(len(self._data.fitted), -1, len(self._problem.fields)))
 

@@ -23,7 +23,7 @@ class Tether:
 
     Attributes:
         shift: Shape ``(P,)``: that shift; zeros where the log determines it.
-        deviation: That of an independent residual, by which parameters are held.
+        deviation: Deviation of a residual, larger with correlation in time; it scales the rows of parameters.
     """
 
     def __init__(self, table: ParameterTable, data: Data, shift: np.ndarray | None = None) -> None:
@@ -34,7 +34,7 @@ class Tether:
         self._nominal = table.scale(table.encode({p.name: p.nominal for p in table}))[0]
 
     def rows(self, x: np.ndarray, pinned: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals ``(R,)``, and their slope ``(R, P)``.
+        """Return the rows of residuals ``(R,)``, and their derivatives ``(R, P)``.
 
         Args:
             x: Shape ``(P,)``: a point on the parameters' scales.

@@ -39,7 +39,7 @@ class Profile:
         """Return the end of a one-sided interval of 95 %; None if the data does not bound the parameter."""
         if (a := self.last()) is None:
             return None
-        # The square root grows like the value itself, as in a linear model; that of a limit from an unknown value on.
+        # The square root grows like the value itself, as in a linear model; of a limit, from where it acts on.
         limit = self.values[0] > self.values[-1] and np.isfinite(self.worse[a + 1 : a + 3]).sum() == 2
         (near, far), (low, high) = (column[[a + limit, a + limit + 1]] for column in (self.values, np.sqrt(self.worse)))
         return float(np.clip(near + (ONE_SIDED - low) / (high - low) * (far - near), *sorted(self.values[[a, a + 1]])))
