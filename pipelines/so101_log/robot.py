@@ -60,9 +60,8 @@ class SO101(LoggedRobot):
             Parameter("weight_forearm", "rad", 0.01, -0.1, 0.2, linear, leaf="world.gravity.forearm", about="forearm"),
             Parameter("weight_hand", "rad", 0.001, -0.1, 0.2, linear, leaf="world.gravity.hand", about="hand"),
             Parameter("table_height", "rad", 0.95, 0.6, 1.6, linear, leaf="world.table.height", about="contact"),
-            Parameter(
-                "table_ratio", "1", 0.85, 0.1, 2.6, leaf="world.table.ratio", about="pitch's share of the contact"
-            ),
+            # The hand's lever about the shoulder over that about the elbow: one touch of the table fitted 0.3.
+            Parameter("table_ratio", "1", 0.85, 0.5, 2.0, leaf="world.table.ratio", about="pitch's share of contact"),
             Parameter("table_stiffness", "1", 0.8, 0.05, 4.0, leaf="world.table.stiffness", about="contact over servo"),
         ]
         return rows

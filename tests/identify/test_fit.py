@@ -233,8 +233,8 @@ def test_the_first_part_of_a_segment_is_simulated_but_not_compared(episode):
     assert np.abs(error[early & (ts >= 0)]).max() > 1.0
     np.testing.assert_array_equal(skipped, np.where(early[:, None], 0.0, error))
     np.testing.assert_array_equal(later, np.where(early, -1.0, ts))
-    assert rest.measurements == sum(int((everything.ts[e] >= 0.4).sum()) for e in rest.train)
-    assert rest.measurements < 0.7 * everything.measurements
+    assert int(rest.data.count) == sum(int((everything.ts[e] >= 0.4).sum()) for e in rest.train)
+    assert int(rest.data.count) < 0.7 * int(everything.data.count)
 
 
 @pytest.mark.parametrize("skip_s", [-0.1, 10.5, float("nan")])
@@ -272,7 +272,7 @@ def test_value_and_jacobian_are_those_of_the_residuals(episode, outside):
     size = np.abs(exact).max()
     np.testing.assert_allclose(at.jacobian, exact, atol=(2e-3 if outside else 1e-5) * size)
     prior = smooth.table.prior_residuals(jnp.asarray(z, jnp.float32))
-    loss = 0.5 * (np.sum(at.residuals**2) + np.sum(np.asarray(prior) ** 2)) / problem.measurements
+    loss = 0.5 * (np.sum(at.residuals**2) + np.sum(np.asarray(prior) ** 2)) / int(problem.data.count)
     assert at.loss == pytest.approx(loss, rel=1e-5)
 
 
@@ -295,7 +295,7 @@ def test_what_is_padded_changes_nothing(episode, count):
     assert at.residuals.shape == (count, width, 1)
     squares, moved = (np.concatenate([getattr(one, n).ravel() for one in apart]) for n in ("residuals", "raw"))
     counted = int((problem.ts[problem.train] >= 0).sum())
-    assert np.count_nonzero(moved) == counted == problem.measurements
+    assert np.count_nonzero(moved) == counted == int(problem.data.count)
     assert at.loss == pytest.approx(0.5 * np.sum(squares**2) / counted, rel=1e-5)
     assert at.loss == pytest.approx(0.5 * np.mean(at.residuals[problem.ts[problem.train] >= 0] ** 2), rel=1e-6)
     np.testing.assert_allclose(np.sum(at.jacobian**2), sum(np.sum(one.jacobian**2) for one in apart), rtol=1e-4)

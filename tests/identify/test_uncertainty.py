@@ -278,7 +278,7 @@ def test_an_inverse_of_what_doubles_do_not_resolve_has_no_negative_variances():
 def test_intervals_widen_gradually_with_what_chance_does_not_explain(freedom):
     ratio = np.linspace(0.5, 4.0, 7001)
     quantile = 1.96
-    wider = uncertainty._widening(ratio, np.full(len(ratio), freedom), quantile)
+    wider = uncertainty._widening(ratio, np.full(len(ratio), freedom), quantile, np.ones(len(ratio), bool))
     assert np.all(np.diff(wider) >= 0.0)
     assert np.diff(wider).max() < 0.01
     chance = stats.chi2.sf(freedom * ratio**2, freedom)
@@ -287,5 +287,23 @@ def test_intervals_widen_gradually_with_what_chance_does_not_explain(freedom):
     np.testing.assert_allclose(wider[chance < 0.05], full[chance < 0.05], rtol=1e-9)
 
 
-def test_with_less_than_two_degrees_of_freedom_blocks_say_nothing():
-    assert uncertainty._widening(np.array([9.0]), np.array([1.9]), 1.96) == 1.0
+@pytest.mark.parametrize("share", [(1.0,), (0.75, 0.25), (0.5, 0.5)])
+@pytest.mark.parametrize(("wrong", "least"), [(0.0, 1.0), (0.3, 2.0), (1.0, 4.0)])
+def test_what_one_block_determines_widens_as_what_many_determine(share, wrong, least):
+    """Gains differ from block to block, and the third acts in one or two: these cannot show that it differs."""
+    rng = np.random.default_rng(1)
+    X = rng.normal(size=(20, 60, 1, 3)) * np.exp(rng.normal(0.0, 0.4, (20, 1, 1, 1)))
+    X[..., 2] = 0.0
+    for block, part in enumerate(share, 3):
+        X[block, ..., 2] = np.sqrt(part) * rng.normal(size=(60, 1))
+    made = [rng.normal(size=X.shape[:-1]) + X @ np.zeros(3) for _ in range(200)]
+    found = [regression(X, y + np.sum(wrong * rng.normal(size=(20, 1, 1, 3)) * X, axis=-1)) for y in made]
+    held = np.mean([(u.low[2] <= 0.0) & (u.high[2] >= 0.0) for u, _, _ in found])
+    widening = np.median([u.widening[2] for u, _, _ in found])
+    assert held > 0.9
+    assert widening == 1.0 if wrong == 0.0 else widening > least
+
+
+def test_where_blocks_determine_nothing_repeatedly_they_say_nothing():
+    one = np.array([9.0])
+    assert uncertainty._widening(one, np.array([1.9]), 1.96, np.array([False])) == 1.0

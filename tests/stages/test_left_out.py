@@ -68,6 +68,21 @@ def test_otherwise_intervals_stay(known, rows):
     assert found.high[0] == pytest.approx(1.02)
 
 
+def test_what_one_part_alone_determines_widens_as_the_others():
+    table = ParameterTable([Parameter(n, "1", 1.0, 0.0, 100.0, "linear") for n in ("gain", "touch")])
+    two, error = np.ones(2), 0.01 * np.ones(2)
+    square = np.diag(error**2)
+    spread = Uncertainty(square, square, error, 0.98 * two, 1.02 * two, ("accepted",) * 2, np.eye(2), 1.0, 1.0, two)
+    values, shares = np.array([0.9, 1.0, 1.1, 1.05, 0.95]), [0.0, 0.9, 0.1, 0.0, 0.0]
+    rows = [
+        HeldOutPart(str(k), (), {"gain": v, "touch": 1.0 + 5.0 * s}, {"gain": 0.2, "touch": s}, {"th": 0.1})
+        for k, (v, s) in enumerate(zip(values, shares, strict=True))
+    ]
+    found = widened(spread, table, two, rows)
+    assert found.widening[0] > 5.0
+    assert found.widening[1] == pytest.approx(found.widening[0])
+
+
 def test_a_wider_interval_may_no_longer_be_accepted(known):
     far = widened(known.spread, known.table, known.x, [left(str(k), 1.0 + k) for k in range(5)])
     assert far.verdict == ("not identifiable",)

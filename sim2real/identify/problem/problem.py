@@ -146,11 +146,6 @@ class Problem:
         """Time of each measurement ``(E, K)`` [s from the segment's start]; -1 without a comparison."""
         return self._ts
 
-    @property
-    def measurements(self) -> int:
-        """Number of measured numbers in the fitted segments."""
-        return int(self.data.count)
-
     def measured(self, column: int) -> np.ndarray:
         """Return the measurements of a column of the residuals, ``(E, K)``."""
         field, _, entry = self.fields[column]

@@ -27,8 +27,8 @@ _RESOLVED = 1e-13
 """Least eigenvalue of a precision with a diagonal of ones: smaller ones are rounding errors of doubles."""
 _LEAST_FREEDOM = 2.0
 """With fewer degrees of freedom Satterthwaite's approximation fails: Tipton, Psychological Methods 20 (2015)."""
-_ALONE = 0.5
-"""Share of the information about a parameter above which a single part determines it."""
+_ALONE, _WHOLLY = 0.5, 0.9
+"""Share of the information about a parameter of one part that determines it, and of one that leaves no variance."""
 _BY_CHANCE = (0.2, 0.05)
 """Intervals begin to widen where chance alone would make blocks differ as much in this share of recordings, and widen
 in full in this one: a sharp limit doubled an interval, or did not, by the last digits of a fit."""
@@ -153,7 +153,7 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     quantile = float(special.stdtrit(max(count / inflation - free, 1.0), 0.975))
     linear, wider = np.sqrt(np.diag(cov)), np.ones(size)
     error, freedom = _by_blocks(*_blocks(problem, at, rest), (at.prior * variance)[np.ix_(rest, rest)])
-    wider[rest] = _widening(error / linear[rest], freedom, quantile)
+    wider[rest] = _widening(error / linear[rest], freedom, quantile, freedom >= _LEAST_FREEDOM)
     # No standard error grows beyond that of a uniform distribution within the bounds.
     wider = np.minimum(wider, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(linear, 1e-30)))
     cov *= np.outer(wider, wider)
@@ -196,15 +196,13 @@ def loss_variance(problem: Problem, at: Linearised) -> float:
 
 def deviation(residuals: np.ndarray) -> float:
     """Return the deviation of a residual ``(S, K, F)``, larger where residuals are correlated in time."""
-    rho = _correlation_in_time(residuals)
-    return float(np.sqrt(np.sum(residuals**2) / max(np.count_nonzero(residuals), 1) * (1 + rho) / (1 - rho)))
+    return float(np.sqrt(np.sum(residuals**2) / max(np.count_nonzero(residuals), 1) * _inflation(residuals)))
 
 
 def _freedom(problem: Problem, at: Linearised) -> tuple[int, int, float]:
     """Return how many residuals there are, how many numbers were fitted, and the factor for correlation in time."""
     states = 2 * len(problem.channels) * len(at.residuals) * bool(problem.config.initial_state == "free")
-    rho = _correlation_in_time(at.residuals)
-    return int(np.count_nonzero(at.residuals)), len(at.x) + states, (1 + rho) / (1 - rho)
+    return int(np.count_nonzero(at.residuals)), len(at.x) + states, _inflation(at.residuals)
 
 
 def between_parts(
@@ -213,8 +211,8 @@ def between_parts(
     """Return wider intervals if estimates without a part of the recordings differ more than by chance.
 
     The standard error is that of the jackknife over parts (Efron and Stein, Annals of Statistics 9, 1981). Parts are
-    recordings, or long blocks, and show differences that shorter blocks do not show. Intervals of a parameter stay
-    unchanged if one part has more information about it than all others together.
+    recordings, or long blocks, and show differences that shorter blocks do not show. If one part has more information
+    about a parameter than all others together, its interval widens as that of the median parameter.
 
     Args:
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
@@ -225,12 +223,10 @@ def between_parts(
     error = np.sqrt((parts - 1) / parts * np.sum((moved - moved.mean(axis=0)) ** 2, axis=0))
     errors = np.sqrt(np.diag(spread.scale_covariance))
     shifts = time_shift(table) != 0.0
-    factor = _widening(
-        error / np.maximum(errors, 1e-30), np.full(len(x), parts - 1.0), float(special.stdtrit(1e3, 0.975))
-    )
-    factor = np.where((share.max(axis=0) > _ALONE) | shifts, 1.0, factor)
+    ratio, repeated = error / np.maximum(errors, 1e-30), (share.max(axis=0) <= _ALONE) & ~shifts
+    factor = _widening(ratio, np.full(len(x), parts - 1.0), float(special.stdtrit(1e3, 0.975)), repeated)
     factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(errors, 1e-30)))
-    return scaled(spread, table, x, factor)
+    return scaled(spread, table, x, np.where(shifts, 1.0, factor))
 
 
 def scaled(spread: Uncertainty, table: ParameterTable, x: np.ndarray, factor: np.ndarray) -> Uncertainty:
@@ -347,7 +343,10 @@ def _by_blocks(gradients: np.ndarray, informations: np.ndarray, prior: np.ndarra
     diagonal = np.einsum("pbr,pbr->pb", pulls, moves)[:, :, None] * np.eye(len(shares))
     between = diagonal - pulls @ pulls.transpose(0, 2, 1)
     trace, square = np.trace(between, axis1=1, axis2=2), np.sum(between**2, axis=(1, 2))
-    return np.sqrt(variance), trace**2 / np.maximum(square, 1e-300)
+    # The estimate follows a block that alone determines a parameter, so no variance is left.
+    content = np.einsum("pq,bqr,pr->bp", root, shares, root)
+    wholly = content.max(axis=0) > _WHOLLY * content.sum(axis=0)
+    return np.sqrt(variance), np.where(wholly, 0.0, trace**2 / np.maximum(square, 1e-300))
 
 
 def root_of_inverse(precision: np.ndarray) -> np.ndarray:
@@ -361,24 +360,29 @@ def root_of_inverse(precision: np.ndarray) -> np.ndarray:
     return unit[:, None] * axes / np.sqrt(np.maximum(values, _RESOLVED))
 
 
-def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float) -> np.ndarray:
+def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float, repeated: np.ndarray) -> np.ndarray:
     """Return factors by which intervals widen, ``(Q,)``.
+
+    A parameter that one block determines does not show how much it would differ in others: it widens as the median
+    parameter. Without that, its intervals held the truth in 26 to 75 % of simulated recordings of a wrong model.
 
     Args:
         ratio: Shape ``(Q,)``: standard error by blocks over the linearised one.
         freedom: Shape ``(Q,)``: degrees of freedom of the former.
         quantile: Factor on the latter for an interval of 95 %.
+        repeated: Shape ``(Q,)``, bool: whether several blocks determine a parameter.
     """
-    freedom = np.maximum(freedom, 1.0)
+    if not repeated.any():
+        return np.ones_like(ratio)
+    ratio, freedom = (np.where(repeated, v, np.median(v[repeated])) for v in (ratio, freedom))
     begin, full = _BY_CHANCE
     share = np.clip((begin - special.chdtrc(freedom, freedom * ratio**2)) / (begin - full), 0.0, 1.0)
-    wider = np.maximum(ratio * special.stdtrit(freedom, 0.975) / quantile, 1.0)
-    return np.where(freedom >= _LEAST_FREEDOM, 1.0 + share * (wider - 1.0), 1.0)
+    return 1.0 + share * (np.maximum(ratio * special.stdtrit(freedom, 0.975) / quantile, 1.0) - 1.0)
 
 
-def _correlation_in_time(r: np.ndarray) -> float:
-    """Return the correlation of successive residuals within segments, ``(E, C, F)``, between 0 and 0.95."""
+def _inflation(r: np.ndarray) -> float:
+    """Return the factor on the variance for the correlation of successive residuals in segments, ``(E, C, F)``."""
     now, later = r[:, :-1], r[:, 1:]
     both = (now != 0.0) & (later != 0.0)
-    rho = float((now * later)[both].sum() / np.maximum((now**2)[both].sum(), 1e-12))
-    return float(np.clip(rho, 0.0, 0.95))
+    rho = float(np.clip((now * later)[both].sum() / np.maximum((now**2)[both].sum(), 1e-12), 0.0, 0.95))
+    return (1 + rho) / (1 - rho)
