@@ -71,12 +71,22 @@ def _plan(
         missing = f"needs {cores} cores, this machine has {os.cpu_count()}"
     elif flags.get("data") and data is None:
         missing = "needs the public recordings: --data DIR"
+    elif unknown := sorted(_names(module_of(bench)) - set(flags)):
+        # Their present default values may be others than those of the bench that measured it.
+        missing = f"measured by a bench without {', '.join(unknown)}: name their values, and measure it by hand"
     elif flags.get(_OTHER_RUN):
         missing = f"needs a run of this machine: --{_OTHER_RUN} RUN"
     if flags.get("data") and data is not None:
         flags["data"] = data
     arguments = (bench, "--json", str(path), *_words(module_of(bench), flags))
     return Plan(path, arguments, needs, commit, f"stale: {why}" if why else "current", missing)
+
+
+def _names(module: ModuleType) -> set[str]:
+    """Return the names of the flags of a bench."""
+    parser = argparse.ArgumentParser(add_help=False)
+    module.add_flags(parser)
+    return {action.dest for action in parser._actions}
 
 
 def _words(module: ModuleType, flags: Mapping[str, Any]) -> list[str]:

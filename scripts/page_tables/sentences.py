@@ -213,7 +213,7 @@ def on_the_wall_clock(report: Mapping[str, Any]) -> str:
         return f"{upright} of {runs} were upright, {still} of these slower than 0.5 rad/s"
 
     return (
-        f"{flags['robots']} of the worn robots were also deployed on the wall clock, as emulated servos, "
+        f"{flags['robots']} worn robots were also deployed on the wall clock, as emulated servos, "
         f"{flags['trials']} deployments each. After training on the\nestimate alone {of('point')};\nafter training on "
         f"posterior, misfit, timing and noise {of('all')}.\n"
     )
@@ -263,10 +263,12 @@ def _of(happened: int, could: int) -> str:
     return f"{happened} of {could}" if could else "-"
 
 
-def on_two_devices(report: Mapping[str, Any]) -> str:
-    """Return the speed of a training on two devices against one."""
+def on_more_devices(report: Mapping[str, Any]) -> str:
+    """Return the speed of a training on all devices of a host against one."""
     v = {name.rpartition("train/")[2]: value for name, value in values(report).items()}
+    count = next(name.removesuffix("_over_1") for name in v if name.endswith("_over_1"))
+    cards = f"{count} {report['flags']['name'].upper()}s"
     return (
-        f"Two {report['flags']['name'].upper()}s of one host make {v['2_over_1']:.2f} times the steps of one, "
-        f"{v['2_devices/env_steps_per_s'] / 1e6:.1f} million policy steps per second\nof a single policy.\n"
+        f"{cards} of one host make {v[f'{count}_over_1']:.2f} times the steps of one, "
+        f"{v[f'{count}_devices/env_steps_per_s'] / 1e6:.1f} million policy steps per second\nof a single policy.\n"
     )

@@ -40,6 +40,16 @@ def test_reports_are_listed_with_machine_commit_and_state(bench, folder, capsys)
     assert "no bench makes it" in lines["by_hand"]
 
 
+def test_a_report_without_a_flag_of_its_bench_is_not_measured_with_the_default(bench, folder, capsys):
+    """The default may describe other robots than those of the report."""
+    report = json.loads((folder / "log.json").read_text())
+    name = min(report["flags"])
+    report["flags"].pop(name)
+    (folder / "log.json").write_text(json.dumps(report))
+    assert bench.main(["all", "--list", "--reports", str(folder)]) == 0
+    assert f"measured by a bench without {name}: name" in capsys.readouterr().out
+
+
 def test_reports_of_this_machine_are_measured_again(bench, folder, capsys):
     before = {p.name: p.read_text() for p in folder.glob("*.json")}
     report = json.loads(before["log.json"])
