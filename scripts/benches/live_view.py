@@ -30,6 +30,7 @@ import numpy as np
 
 from benches.figures import Report, Row, row
 from benches.runner import BAUD, JOINTS, LIMIT_V, SUPPLY_V, nodes_of
+from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
@@ -211,22 +212,22 @@ def _grown(source: Path | None, target: Path, seconds: float) -> Iterator[None]:
 def _viewed(target: str, folder: Path) -> Iterator[str]:
     """Open a viewer on the logs of a folder; yield the port of a viewer of its own."""
     port = str(random.randint(20_000, 30_000))
-    address = {
-        "file": str(folder / "live.rrd"),
-        "web": "web",
-        "window": f"rerun+http://127.0.0.1:{port}/proxy",
-    }[target]
+    address = {"file": str(folder / "live.rrd"), "web": "web", "window": f"rerun+http://127.0.0.1:{port}/proxy"}[target]
     columns = {f"joint_{i}": f"position[{i}]" for i in range(JOINTS)}
+    viewers: dict[int, float] = {}
     with ExitStack() as stack:
         if target == "window":
             from rerun.experimental import ViewerClient
 
             path = str(Path(sysconfig.get_path("scripts")) / "rerun")
             stack.enter_context(ViewerClient.spawn(headless=True, port=int(port), executable_path=path))
-            for viewer in _processes(port):  # a viewer that `--view` opens inherits this from its process
+            viewers = _processes(port)
+            for viewer in viewers:  # a viewer that `--view` opens inherits this from its process
                 os.sched_setscheduler(viewer, os.SCHED_IDLE, os.sched_param(0))
         stack.enter_context(live_view(address, folder, "bench", lambda: {"mjcf": _chain(), "columns": columns}))
         yield port
+        if viewers.keys() - _processes(port).keys():  # a viewer that has ended costs nothing
+            raise UsageError("the viewer ended early", hint="it needs a renderer: apt-get install mesa-vulkan-drivers")
 
 
 def _chain() -> str:

@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-METHODS = {
-    "ours": "sim2real",
-    "sysid": "mujoco.sysid",
-    "pace": "PACE",
-    "correlation": "peak of the cross-correlation",
-}
+METHODS = {"ours": "sim2real", "sysid": "mujoco.sysid", "pace": "PACE", "correlation": "peak of the cross-correlation"}
 
 
 def latency(report: Mapping[str, Any]) -> str:

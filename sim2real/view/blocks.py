@@ -78,7 +78,9 @@ class TableBlock:
         units = [header == "unit" for header in table.headers]
         readable = [_in_ms(row, units) for row in table.rows]
         rows = [[cell_text(cell, unit) for cell, unit in zip(row, units, strict=True)] for row in readable]
-        text = [i for i, column in enumerate(zip(*table.rows, strict=True)) if i and any(map(_is_text, column))]
+        # A cell is aligned left if it is text; a number with decimals that its artifact chose is none.
+        is_text = lambda cell: isinstance(cell, bool) or (isinstance(cell, str) and not _NUMBER.fullmatch(cell))  # noqa: E731
+        text = [i for i, column in enumerate(zip(*table.rows, strict=True)) if i and any(map(is_text, column))]
         return TableBlock(caption, [_with_minus(header) for header in table.headers], rows, text)
 
 
@@ -211,11 +213,6 @@ def _scaled(cell: Cell, factor: float) -> Cell:
     if isinstance(cell, Interval):
         return Interval(*(None if x is None else factor * x for x in _ends(cell)))
     return factor * cell if isinstance(cell, float) else cell
-
-
-def _is_text(cell: Cell) -> bool:
-    """Return whether a cell is aligned left; a number with decimals that its artifact chose is not."""
-    return isinstance(cell, bool) or (isinstance(cell, str) and not _NUMBER.fullmatch(cell))
 
 
 def _with_minus(text: str) -> str:

@@ -106,7 +106,8 @@ class ModelScene:
         # Some models have no other geometries than those for collisions.
         drawn = [g for g in visible if model.geom_group[g] in _GROUPS] or visible
         return {
-            g: (rr.Transform3D(**_pose(model.geom_pos[g], model.geom_quat[g])), shape)
+            # MuJoCo's quaternions begin with the real part, Rerun's end with it.
+            g: (rr.Transform3D(translation=model.geom_pos[g], quaternion=np.roll(model.geom_quat[g], -1)), shape)
             for g in drawn
             if (shape := self._shape(g, ghost)) is not None
         }
@@ -141,8 +142,3 @@ class ModelScene:
                 albedo_factor=look["colors"][0],
             )
         return None
-
-
-def _pose(at_m: np.ndarray, quaternion: np.ndarray) -> dict[str, Any]:
-    """Return a pose as Rerun takes it; MuJoCo's quaternions begin with the real part."""
-    return {"translation": at_m, "quaternion": np.roll(quaternion, -1)}

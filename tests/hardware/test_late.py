@@ -1,10 +1,18 @@
 """Answers that come late, or not at all: the time of a sample is right, or said to be unsure."""
 
+import os
+import signal
+import time
+from contextlib import suppress
+
 import numpy as np
 import pytest
 
+from sim2real.errors import HardwareLost
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.emulation.truth import Kind
+from sim2real.hardware.plant import OperatingMode
 
 pytestmark = pytest.mark.realtime
 
@@ -50,3 +58,25 @@ def test_a_late_answer_is_not_that_of_another_register(start_robot, open_bus):
     for register in registers * 5:
         assert bus.read(1, register) == register.default, register.name
     assert bus.counters.late_replies >= 3
+
+
+@pytest.mark.parametrize("fault", [{"late": 1.0, "late_s": 0.05}, {"silent_after_s": 0.0}], ids=["late", "silent"])
+def test_the_torque_goes_off_at_once_on_a_bus_that_was_lost(start_robot, open_bus, fault):
+    """A goal, a read, and then the end of the torque wait for an answer, which is late, or never comes."""
+    robot = start_robot(config=EmulatorConfig(on_signal=True, **fault))
+    bus = open_bus(robot, mode=OperatingMode.PWM, max_silence_s=0.3, silence_s=2.5)
+    os.kill(robot.pid, signal.SIGUSR1)
+    time.sleep(0.1)
+    with suppress(HardwareLost):  # a late answer to the same goal counts
+        bus.link.write(1, reg.GOAL_PWM, 9)
+    with pytest.raises(HardwareLost, match=r"no answer to read of the state"):
+        bus.read_state()
+    lost_ns = time.monotonic_ns()
+    with suppress(HardwareLost):
+        bus.torque(False)
+    assert (time.monotonic_ns() - lost_ns) * 1e-9 < 0.2
+    if "late" in fault:  # a servo that is silent has lost its line, and stops itself
+        robot.stop()
+        last = robot.truth().of(Kind.EFFECT)[-1]
+        assert last["values"][0] == OperatingMode.OFF
+        assert (last["t_ns"] - lost_ns) * 1e-9 < 0.2

@@ -105,7 +105,8 @@ def _run_iterations(
             plan = Plan((), f"the last iteration: it would {plan.words}")
         # Write the plan before its first stage starts, so that an interrupted run continues with it.
         rows = (*rows, replace(row, then=plan.words))
-        plan = replace(plan, before=_finished_folders(run_dir))
+        finished = tuple(a.folder.name for stage in STAGES for a in attempts(run_dir, stage) if a.finished)
+        plan = replace(plan, before=finished)
         console.wrote(Iterations(rows, plan if plan.stages else None).save(run_dir))
         console.note(f"iteration {row.number}: {row.verdict}; {plan.words}")
         if not plan.stages:
@@ -194,11 +195,6 @@ def _run_with_retries(
     retries = MAX_RETRIES.get(stage, 0) if flags.iterations > 1 else 0
     attempts_made = run_with_retries(lambda config: call(stage, config, run_dir), config, following, retries)
     return [folder for _, folder in attempts_made]
-
-
-def _finished_folders(run_dir: Path) -> tuple[str, ...]:
-    """Return the names of the finished stage folders of a run."""
-    return tuple(a.folder.name for stage in STAGES for a in attempts(run_dir, stage) if a.finished)
 
 
 @dataclass

@@ -30,7 +30,7 @@ _MIN_LOSSES: Final = 3  # fewer missing answers in a long time mean that this pr
 _PADS: Final = 4
 _SCANNED: Final = 20
 _CONFIRMING_BYTES: Final = 17  # no other read is as long, so a late answer to another read cannot confirm
-_BARRIER_BYTES: Final = (18, 19)  # in turn, so that a late answer to the barrier before is none to this one
+_BARRIER_BYTES: Final = 18  # and more: the shortest read that only a barrier makes
 
 
 class ServoLink(ABC):
@@ -62,7 +62,8 @@ class ServoLink(ABC):
         self._parser = Parser(self.form)
         self._waiting: list[Packet] = []
         self._pad = self._barriers = 0
-        self._unheard: set[int] = set()  # lengths of answers that are missing and may still come
+        self._unheard: set[int] = set()  # lengths of answers to reads that are missing and may still come
+        self._silent_ns, self._missed = (0, 0), 0  # begin and end of the present silence, and its missing answers
         self._sent_ns = 0
         self._serial = open_port(config)
         self.fd = cast(int, self._serial.fileno())
@@ -219,6 +220,9 @@ class ServoLink(ABC):
         request = f"{what}{of_servos(servo_ids)}"
         with self.hold():
             began_ns = time.monotonic_ns()
+            # A bus that was lost just now is lost for the next instruction, too, after a single missing answer.
+            if began_ns - self._silent_ns[1] > 1e9 * self.config.max_silence_s:
+                self._silent_ns, self._missed = (began_ns, began_ns), 0
             while True:
                 # Show the guardian that this process lives, as often as the bus is used.
                 if self.guardian is not None:
@@ -226,7 +230,8 @@ class ServoLink(ABC):
                 packet, length = instruction()
                 try:
                     answers = None
-                    if not servo_ids or length not in self._unheard or self._passed(servo_ids[-1]):
+                    # A write never waits for an empty line: it may take the torque off.
+                    if not length or length not in self._unheard or self._passed(servo_ids[-1]):
                         answers = self._attempt(packet, servo_ids, length)
                         self._unheard |= {length} if answers is None else set()
                 except OSError as failure:
@@ -234,13 +239,16 @@ class ServoLink(ABC):
                     raise HardwareLost(f"{self.config.port} failed during {request}: {failure}") from failure
                 now_ns = time.monotonic_ns()
                 if answers is not None:
+                    self._silent_ns = (0, 0) if servo_ids else self._silent_ns
                     late_ns = self._count_answer(now_ns, self._wire_ns(packet, servo_ids, length))
                     break
                 # An answer is missing: ask for more bytes next time, and give up after the longest silence.
                 losses += 1
                 self._lost += 1
+                self._missed += 1
+                self._silent_ns = (self._silent_ns[0], now_ns)
                 self._pad = (self._pad + 1) % _PADS
-                self._require_heard(losses, (now_ns - began_ns) * 1e-9, request)
+                self._require_heard(request)
                 self._retries += 1
             transaction = Transaction(self._sent_ns, began_ns - requested_ns, now_ns - began_ns, losses, late_ns)
         # Outside of the lock, as the error's cause is read from the servo.
@@ -251,10 +259,12 @@ class ServoLink(ABC):
 
     def _passed(self, servo_id: int) -> bool:
         """Read as many bytes as no other read; the line keeps the order, so no late answer comes after them."""
-        # Ask the last servo that is read: those before it have answered by then.
+        # Ask the last servo that is read: those before it have answered by then. Each barrier has another length: with
+        # two lengths in turn, answers that were 50 ms late ended barriers of later reads.
         self._barriers += 1
-        length = _BARRIER_BYTES[self._barriers % len(_BARRIER_BYTES)]
-        query = self.form.read((servo_id,), self.table.torque.address, length)
+        begin = self.table.torque.address
+        length = _BARRIER_BYTES + self._barriers % (self.table.size - begin - _BARRIER_BYTES + 1)
+        query = self.form.read((servo_id,), begin, length)
         if self._attempt(query, (servo_id,), length) is None:
             return False
         self._unheard.clear()
@@ -326,11 +336,12 @@ class ServoLink(ABC):
         self._late += late_ns > 1e9 * self.config.late_after_s
         return late_ns
 
-    def _require_heard(self, losses: int, silent_s: float, what: str) -> None:
-        if losses >= _MIN_LOSSES and silent_s > self.config.max_silence_s:
+    def _require_heard(self, what: str) -> None:
+        silent_s = 1e-9 * (self._silent_ns[1] - self._silent_ns[0])
+        if self._missed >= _MIN_LOSSES and silent_s > self.config.max_silence_s:
             self._require_watching()
             raise HardwareLost(
-                f"no answer to {what} on {self.config.port}: {losses} missed in a row, {1e3 * silent_s:.0f} ms",
+                f"no answer to {what} on {self.config.port}: {self._missed} missed in a row, {1e3 * silent_s:.0f} ms",
                 hint="check power, cable, ids and baud rate; is a USB adapter's latency timer longer than "
                 "reply_timeout_s?",
             )

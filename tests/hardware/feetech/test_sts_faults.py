@@ -88,7 +88,7 @@ def test_what_a_bus_survives(serve, connect, faults):
 ALL = {
     "all answers lost": {"reply_loss": 1.0},
     "all answers corrupted": {"corrupt": 1.0},
-    "all answers too late": {"late": 1.0, "late_s": 0.3},
+    "all answers too late": {"late": 1.0, "late_s": 1.0},
     "all answers from a wrong id": {"wrong_id": 1.0},
     "all answers cut": {"cut": 1.0},
 }
