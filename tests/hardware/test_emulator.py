@@ -49,11 +49,15 @@ class Sdk:
         )
         return register.decode(value.to_bytes(register.size, "little")), result, error
 
-    def raw(self, packet, wait_s=0.02):
+    def raw(self, packet, patience_s=2.0):
         self.port.clearPort()
         self.port.writePort(packet)
-        time.sleep(wait_s)
-        return [found for found, _ in Parser(PROTOCOL).feed(bytes(self.port.readPort(1000)))]
+        parser, end_s = Parser(PROTOCOL), time.monotonic() + patience_s
+        while time.monotonic() < end_s:
+            if answers := [found for found, _ in parser.feed(bytes(self.port.readPort(1000)))]:
+                return answers
+            time.sleep(0.005)
+        return []
 
 
 @pytest.fixture(scope="module")
