@@ -296,7 +296,7 @@ def test_what_one_block_determines_widens_as_what_many_determine(share, wrong, l
     X[..., 2] = 0.0
     for block, part in enumerate(share, 3):
         X[block, ..., 2] = np.sqrt(part) * rng.normal(size=(60, 1))
-    made = [rng.normal(size=X.shape[:-1]) + X @ np.zeros(3) for _ in range(200)]
+    made = [rng.normal(size=X.shape[:-1]) for _ in range(200)]
     found = [regression(X, y + np.sum(wrong * rng.normal(size=(20, 1, 1, 3)) * X, axis=-1)) for y in made]
     held = np.mean([(u.low[2] <= 0.0) & (u.high[2] >= 0.0) for u, _, _ in found])
     widening = np.median([u.widening[2] for u, _, _ in found])

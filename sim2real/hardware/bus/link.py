@@ -62,7 +62,7 @@ class ServoLink(ABC):
         self._parser = Parser(self.form)
         self._waiting: list[Packet] = []
         self._pad = self._barriers = 0
-        self._unheard: set[int] = set()  # lengths of answers to reads that are missing and may still come
+        self._unheard: set[int] = set()  # lengths of answers that are missing and may still come
         self._silent_ns, self._missed = (0, 0), 0  # begin and end of the present silence, and its missing answers
         self._sent_ns = 0
         self._serial = open_port(config)
