@@ -79,11 +79,14 @@ def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, resti
 def test_15_ms_more_of_delay_are_refused(make_pipeline, tmp_path, resting, capsys):
     latency = load_pipeline("pendulum").load().drive.embedded.emulator.actuation_latency_s + 0.015
     name = make_pipeline("late_pendulum", f"\n    embedded = faulty_emulator(actuation_latency_s={latency})\n")
-    code, folder = deploy(name, resting, tmp_path)
-    assert code == errors.SAFETY_STOP
-    said = capsys.readouterr().err
+    for turn in range(3):
+        code, folder = deploy(name, resting, tmp_path / str(turn))
+        assert code == errors.SAFETY_STOP
+        said = capsys.readouterr().err
+        assert "--force" in said
+        if "delays that vary" not in said:  # what an emulated motor on a busy machine does, too
+            break
     assert "the policy was trained with 43 to 47 ms" in said
-    assert "--force" in said
     assert not (folder / "episode_0.mcap").exists(), "the policy never ran"
     assert_steps_are_a_log(folder)
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
