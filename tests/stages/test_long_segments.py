@@ -1,12 +1,15 @@
-"""Segments of the last refinement: which configuration has them, and which samples they contain."""
+"""Where segments begin: those of the last refinement, and held-out ones beside fitted ones."""
 
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from sim2real.stages.estimation.segment_split import long_spans, with_length
+from sim2real.stages.estimation.segment_split import long_spans, reach, spans, split_of, with_length
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY
 
@@ -18,14 +21,24 @@ def lasting(*seconds):
 
 
 def test_they_contain_all_fitted_samples_of_each_fitted_log():
-    spans = long_spans(lasting(24.8, 20.0, 30.0), 2, CONFIG)
-    assert {s.recording for s in spans} == {0, 1}, "the third log is held out whole"
+    longer = long_spans(lasting(24.8, 20.0, 30.0), 2, CONFIG)
+    assert {s.recording for s in longer} == {0, 1}, "the third log is held out whole"
     for r, end in ((0, 18.6), (1, 15.0)):
-        begins = [s.begin_s for s in spans if s.recording == r]
+        begins = [s.begin_s for s in longer if s.recording == r]
         assert begins[0] == 0.0
         assert begins[-1] + 5.0 == pytest.approx(end)
         assert all(later - begin <= 5.0 + 1e-9 for begin, later in pairwise(begins))
-    assert len([s for s in spans if s.recording == 1]) == 3, "15 s are three segments without overlap"
+    assert len([s for s in longer if s.recording == 1]) == 3, "15 s are three segments without overlap"
+
+
+@given(st.floats(8.0, 100.0), st.sampled_from(["measured", "free"]))
+def test_fitted_and_held_out_segments_begin_on_one_grid(seconds, initial_state):
+    config = replace(CONFIG, initial_state=initial_state, long_s=0.0)
+    (episode,) = lasting(seconds)
+    steps = [(s.begin_s - reach(episode, config)[0]) / 0.01 for s in spans([episode], 1, config, 1.3)]
+    assert steps == pytest.approx(np.round(steps), abs=1e-3)
+    begin, end = reach(episode, config)
+    assert 0.0 <= begin + 0.75 * (end - begin) - split_of(episode, True, config) < 0.1
 
 
 def test_a_log_shorter_than_two_segments_has_none():

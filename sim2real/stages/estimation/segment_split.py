@@ -13,25 +13,22 @@ from sim2real.identify.problem.segments import Span
 from sim2real.stages.identify.config import IdentifyConfig
 
 _WINDOW_SPACING_S = 0.5
+"""Distance between the starts of held-out segments [s]."""
 _LONG_S = 5.0
 """Length of the segments of the last refinement of a robot that follows no goals [s]."""
+_GRID_S = 0.1
+"""The held-out part begins at a multiple of this, as fitted segments do: in a world that takes messages at its steps,
+those of a regular log would act at other times there than where the delays were fitted."""
 _EDGES_S = (0.3, 0.2)
 """Unused time at the beginning and at the end of a log whose initial states are estimated [s]."""
 
 
-def spans(
-    episodes: Sequence[Episode],
-    fitted: int,
-    config: IdentifyConfig,
-    length_s: float,
-    spacing_s: float = _WINDOW_SPACING_S,
-) -> list[Span]:
+def spans(episodes: Sequence[Episode], fitted: int, config: IdentifyConfig, length_s: float) -> list[Span]:
     """Return segments of one length, fitted and held out.
 
     Args:
         episodes: The logs; those that are held out whole come last.
         length_s: Length of a segment [s].
-        spacing_s: Distance between the starts of held-out segments [s].
 
     Raises:
         UsageError: When the logs are too short.
@@ -43,7 +40,7 @@ def spans(
         last = end - length_s + 1e-6
         step_s = config.spacing_s or length_s
         segments += [Span(r, float(b)) for b in np.arange(begin, min(split - length_s, last) + 1e-6, step_s)]
-        segments += [Span(r, float(b), False) for b in np.arange(split, last, spacing_s)]
+        segments += [Span(r, float(b), False) for b in np.arange(split, last, _WINDOW_SPACING_S)]
     fit_count = sum(s.fitted for s in segments)
     if not fit_count or fit_count == len(segments) or (config.initial_state == "free" and fit_count < 3):
         lengths = ", ".join(f"{e.duration_s:.1f} s" for e in episodes)
@@ -62,13 +59,10 @@ def with_length(config: IdentifyConfig, model: IdentifiableModel) -> IdentifyCon
 
 
 def long_spans(episodes: Sequence[Episode], fitted: int, config: IdentifyConfig) -> list[Span]:
-    """Return the segments of the last refinement, which together contain all fitted samples.
+    """Return the segments of the last refinement, which together contain all fitted samples; none if no log has two.
 
     Args:
         fitted: Number of fitted logs; the later ones are held out whole.
-
-    Returns:
-        Segments of ``config.long_s``; none if it is 0, or if no log has two of them.
     """
     ends = [(reach(e, config)[0], split_of(e, True, config)) for e in episodes[:fitted]]
     return covering(ends, config.long_s or 0.0)
@@ -101,4 +95,5 @@ def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
         fitted: Whether the log is fitted; else it is held out whole.
     """
     begin, end = reach(episode, config)
-    return begin + (1.0 - config.held_out) * (end - begin) if fitted else begin
+    share = (1.0 - config.held_out) * (end - begin)
+    return begin + math.floor(share / _GRID_S + 1e-6) * _GRID_S if fitted else begin
