@@ -26,7 +26,7 @@ from page_tables.walk_delays import walk_delays
 TABLES = {
     "evidence": ("randomise", "league"),
     "demo": ("demo",),
-    "arm": ("arm_cpu", "arm_h200"),
+    "arm": ("arm_cpu",),
     "so101": ("so101_cpu",),
     "demo_time": ("demo",),
     "so101_time": ("so101_cpu",),
@@ -38,21 +38,18 @@ TABLES = {
     "worst_joint": ("league",),
     "wall": ("randomise_wall",),
     "compiled": ("graph_h200",),
-    "on_a_gpu": ("arm_h200", "train_h200"),
+    "on_a_gpu": ("train_h200",),
     "faults": ("faults",),
     "warp": ("compose_warp_h200",),
     "drift": ("drift_pendulum", "drift_arm", "drift_so101"),
-    "restored": (
-        *("drift_pendulum_restore", "drift_arm_restore", "drift_arm_restore_friction", "drift_so101_restore"),
-        *("drift_so101_restore_delay", "drift_so101_restore_payload"),
-    ),
+    "restored": ("drift_pendulum_restore", "drift_arm_restore", "drift_so101_restore"),
     "devices": ("scaling_h200",),
     "view": ("view",),
     "excitation": ("excitation",),
     "twin": ("twin",),
     "carried": ("carried",),
     "walk": ("walk",),
-    "legs_identify": ("legs_identify", "legs_identify_two_cores"),
+    "legs_identify": ("legs_identify",),
     "walk_delays": ("walk_delays",),
     "walk_rival": ("walk_rival",),
     "walk_train": ("walk_train",),
@@ -213,8 +210,8 @@ def what_training_knows(ideal: Mapping[str, Any], worn: Mapping[str, Any]) -> st
     return "\n".join([*body, "</svg>", ""])
 
 
-def arm(what: str, cpu: dict[str, Any], gpu: dict[str, Any] | None = None) -> str:
-    """Return the table of an arm: the first seed of the run on a CPU, and training on an accelerator if measured."""
+def arm(what: str, cpu: dict[str, Any]) -> str:
+    """Return the table of an arm: the first seed of the run."""
     seed = cpu["seeds"][0]
 
     def reached(key: str) -> str:
@@ -234,11 +231,6 @@ def arm(what: str, cpu: dict[str, Any], gpu: dict[str, Any] | None = None) -> st
         ("the same without identification", reached("nominal_distances_m")),
         ("time", f"{seed['total_s']:.0f} s on two CPU cores ({stages} s)"),
     ]
-    if gpu is not None:
-        trained = {r["name"].removeprefix("arm/train/"): r["value"] for r in reversed(gpu["rows"])}
-        device = gpu["rows"][0]["yardstick"].partition("--")[0].strip()
-        took = f"{trained['train_s']:.0f} s, and {trained['compile_s']:.0f} s to compile ({device})"
-        lines.append(("training on a GPU", took))
     return "".join(f"| {a} | {b} |\n" for a, b in lines)
 
 

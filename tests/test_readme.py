@@ -71,7 +71,7 @@ def test_a_report_without_its_state_is_refused_until_told(script, monkeypatch, t
     assert script.main([]) == 1
     told = capsys.readouterr().err
     assert "reports/demo.json: it has no digest of the state of the code" in told
-    assert "hint: measure again, or --stale-ok randomise league demo arm_cpu arm_h200 so101_cpu identify_disk" in told
+    assert "hint: measure again, or --stale-ok randomise league demo arm_cpu so101_cpu identify_disk" in told
     assert {name: (tmp_path / name).read_text() for name in pages} == pages
     assert script.main(["--stale-ok", *reports]) == 0
     assert "Commit that was measured: not recorded (demo)." in (tmp_path / "docs" / "results.md").read_text()
@@ -174,7 +174,7 @@ def test_the_robots_of_several_reports_are_counted_together(script):
 def test_a_table_whose_reports_are_not_all_there_is_left_as_it_is(script):
     reports = script.read_reports()
     assert set(script.tables(reports)) >= {"demo", "arm", "real"}
-    few = {name: reports[name] for name in ("demo", "so101_cpu", "arm_cpu", *script.TABLES["real"])}
+    few = {name: reports[name] for name in ("demo", "so101_cpu", "randomise", *script.TABLES["real"])}
     assert set(script.tables(few)) == {"demo", "so101", "demo_time", "so101_time", "real"}
 
 
