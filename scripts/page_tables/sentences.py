@@ -92,7 +92,8 @@ def legs_identify(report: Mapping[str, Any]) -> str:
     near, _, of, *_ = counted("load/close")
     # A fit that did not converge estimates no load.
     loads = [float(twin["load_off_kg"]) for twin in report["twins"] if float(twin["load_off_kg"]) < float("inf")]
-    lines.append(f"| load in the base, within 0.3 kg | {near} of {of} | {max(loads):.2f} kg of {len(loads)} |")
+    worst = f"{max(loads):.2f} kg, the worst of {len(loads)}"
+    lines.append(f"| load in the base, within 0.3 kg | {near} of {of} | {worst} |")
     (yes, _, twins, *_), whole = counted("accepted"), about["legs_identify/all_close"]
     interval = whole.rpartition("; ")[2].replace("95 % interval ", "")
     held, _, of, *_ = counted("intervals")

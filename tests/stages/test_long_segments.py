@@ -38,7 +38,8 @@ def test_fitted_and_held_out_segments_begin_on_one_grid(seconds, initial_state):
     steps = [(s.begin_s - reach(episode, config)[0]) / 0.01 for s in spans([episode], 1, config, 1.3)]
     assert steps == pytest.approx(np.round(steps), abs=1e-3)
     begin, end = reach(episode, config)
-    assert 0.0 <= begin + 0.75 * (end - begin) - split_of(episode, True, config) < 0.1
+    earlier = begin + 0.75 * (end - begin) - split_of(episode, True, config)
+    assert -1e-6 <= earlier < 0.1, "a rounding of the share below a multiple counts as the multiple"
 
 
 def test_a_log_shorter_than_two_segments_has_none():
