@@ -14,6 +14,8 @@ _IDENTIFY = (
     *("sim2real/graph", "sim2real/runtime", "sim2real/worlds", "sim2real/robots", "sim2real/identify"),
     *("sim2real/artifacts", "sim2real/log", "scripts/benches/identify"),
 )
+_JUDGED = ("sim2real/stages/identify", "sim2real/stages/estimation")
+"""What the stage does besides the estimation: which part is held out, how it is predicted, terms, and the verdict."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ BENCHES = {
     "carried": Bench(
         "identify.carried",
         "a simulated arm of seven joints whose controller carries its weight, from two logs to a verdict",
-        _IDENTIFY,
+        (*_IDENTIFY, *_JUDGED),
     ),
     "compose": Bench(
         "compose.bench",
@@ -55,8 +57,7 @@ BENCHES = {
         "how often the drift test detects and names a change of a hidden robot, and the effect of one iteration",
         (
             *(*_GRAPH, "sim2real/identify", "sim2real/train", "sim2real/stages/deploy/verdict.py"),
-            *("sim2real/stages/deploy/next_command.py", "sim2real/stages/estimation/replay.py"),
-            "sim2real/stages/estimation/replay_problem.py",
+            *("sim2real/stages/deploy/next_command.py", "sim2real/stages/excitation", *_JUDGED),
             *("scripts/benches/hidden", "pipelines/arm", "pipelines/so101"),
         ),
     ),
@@ -74,7 +75,10 @@ BENCHES = {
     "identify": Bench(
         "identify.bench",
         "recordings of real motors, fitted on one part and judged on another",
-        (*_IDENTIFY, "pipelines/{case}"),
+        (
+            *(*_IDENTIFY, "sim2real/stages/estimation", "!sim2real/stages/estimation/segment_split.py"),
+            *("sim2real/stages/config.py", "pipelines/{case}"),
+        ),
     ),
     "identify-time": Bench(
         "processor_time.identify_time",
@@ -95,17 +99,21 @@ BENCHES = {
         (
             *(*_IDENTIFY, "pipelines/disk", "pipelines/xl330", "pipelines/so101", "scripts/benches/jobs.py"),
             *("sim2real/composer/physics/c", "sim2real/stages/config.py", "sim2real/stages/pipeline/from_model.py"),
+            "sim2real/stages/estimation",
         ),
     ),
     "legs": Bench(
         "runs.legs",
         "the Go2's policy over DDS with the emulator beside it: its computation, and lateness at 50 Hz",
-        ("sim2real/robots", "sim2real/hardware", "sim2real/policy", "sim2real/runtime", "pipelines/go2"),
+        (
+            *("sim2real/robots", "sim2real/hardware", "sim2real/policy", "sim2real/runtime", "sim2real/stages/deploy"),
+            "pipelines/go2",
+        ),
     ),
     "legs-identify": Bench(
         "runs.legs_identify",
         "hidden Go2s in a stand: the errors of identified parameters and delays, and the time of an identification",
-        (*_IDENTIFY, "pipelines/go2", "scripts/benches/hidden/legs.py"),
+        (*_IDENTIFY, *_JUDGED, "sim2real/stages/excitation", "pipelines/go2", "scripts/benches/hidden/legs.py"),
     ),
     "light": Bench(
         "processor_time.light",
@@ -116,7 +124,7 @@ BENCHES = {
     "randomise": Bench(
         "hidden.randomise",
         "success on hidden robots of policies that were trained on all estimates of an identification, or on fewer",
-        (*_GRAPH, "sim2real/identify", "sim2real/train", "sim2real/stages/train/training_setup.py"),
+        (*_GRAPH, "sim2real/identify", *_JUDGED, "sim2real/train", "sim2real/stages/train/training_setup.py"),
     ),
     "runner": Bench(
         "runner",
@@ -129,7 +137,7 @@ BENCHES = {
     "scaling": Bench(
         "scaling",
         "training and identification on all devices of a host against one",
-        (*_GRAPH, "sim2real/train", "sim2real/identify", "scripts/benches/train.py"),
+        (*_GRAPH, "sim2real/train", "sim2real/identify", *_JUDGED, "scripts/benches/train.py"),
     ),
     "so101": Bench("runs.arm", "the SO-101's whole run, or its training alone", (*_STAGES, "pipelines/so101")),
     "suite": Bench(
@@ -160,17 +168,20 @@ BENCHES = {
     "walk-delays": Bench(
         "walking.delays",
         "falls and errors over the true delay of policies trained without delays, with wide and with identified ones",
-        (*_WALK, *_LEARN, "scripts/benches/walk.py", "scripts/benches/hidden/legs.py"),
+        (
+            *(*_WALK, *_LEARN, "sim2real/identify", *_JUDGED, "sim2real/stages/excitation", "scripts/benches/walk.py"),
+            "scripts/benches/hidden/legs.py",
+        ),
     ),
     "walk-rival": Bench(
         "walking.rival",
         "learnt steps a second of our PPO and of MuJoCo Playground's, both on Warp of one GPU",
-        (*_WALK, *_LEARN, "scripts/benches/walk.py"),
+        (*_WALK, *_LEARN, "sim2real/stages/train/training_setup.py", "scripts/benches/walk.py"),
     ),
     "walk-train": Bench(
         "walking.train",
         "a walking policy on one GPU: its graph over bare steps, learnt steps a second, time to a policy that stays up",
-        (*_WALK, *_LEARN, "scripts/benches/walk.py"),
+        (*_WALK, *_LEARN, "sim2real/stages/train/training_setup.py", "scripts/benches/walk.py"),
     ),
 }
 

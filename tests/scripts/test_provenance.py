@@ -1,5 +1,7 @@
 """Which state of the code a report is of: what counts as a change, and what is said where the history is lacking."""
 
+import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -116,3 +118,24 @@ def test_quick_reports_and_old_ones_are_refused(tree, report):
 @pytest.mark.parametrize("name", BENCHES)
 def test_every_bench_measures_files_that_are_there(name):
     assert len(provenance.files(measures(name, {"case": "disk"}), provenance.ROOT)) > 3
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_every_bench_measures_the_stages_that_it_uses(name):
+    scripts, stages = provenance.ROOT / "scripts", "sim2real.stages."
+    read, waiting, used = set(), {f"benches.{BENCHES[name].module}"}, set()
+    while waiting:
+        module = waiting.pop()
+        read.add(module)
+        text = (scripts / f"{module.replace('.', '/')}.py").read_text()
+        imports = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.ImportFrom) and n.module]
+        names = {n.module for n in imports} | {f"{n.module}.{a.name}" for n in imports for a in n.names}
+        waiting |= {m for m in names if (scripts / f"{m.replace('.', '/')}.py").is_file()} - read
+        # Those of "pipeline" find and load a robot.
+        used |= {m for m in names if m.startswith(stages) and not m.startswith(f"{stages}pipeline")}
+        if re.search(r'sim2real\.identify\(|"sim2real\.cli", "identify"', text):
+            used.add(f"{stages}identify.stage")
+    if f"{stages}identify.stage" in used:
+        used.add(f"{stages}estimation.promises")
+    of_them = {p for m in used if (p := provenance.ROOT / f"{m.replace('.', '/')}.py").is_file()}
+    assert of_them <= set(provenance.files(measures(name, {"case": "disk"}), provenance.ROOT))
