@@ -1,7 +1,5 @@
 """Configuration of a fit; every field is a flag. Does not import JAX, to keep ``--help`` fast."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """From recordings to an estimate: search on windows, refine, refine on longer segments."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base
@@ -300,6 +302,25 @@ def test_too_few_recordings_are_divided_into_blocks(three):
         assert [f.parts[0][0] for f in found] == [0, 0, 1, 1, 2, 2]
         assert all(a.parts[0][2] == b.parts[0][1] for a, b in zip(found[::2], found[1::2], strict=True))
     assert found[0].name.startswith("all, 0 to ")
+
+
+@settings(max_examples=30)
+@given(st.integers(8, 40), st.integers(2, 7), st.floats(0.0, 1.0))
+def test_blocks_begin_where_segments_may(count, blocks, begin_s):
+    """In a world that takes messages at its steps, a regular log's would act at other times there."""
+    begun = [Span(0, begin_s + 0.7 * i) for i in range(count)]
+    problem = SimpleNamespace(spans=begun, train=np.arange(count), segment_s=0.7)
+    found = folds_of(problem, blocks)
+    edges = [f.parts[0][1:] for f in found]
+    assert edges[0][0] == begin_s
+    assert edges[-1][1] == pytest.approx(begin_s + 0.7 * count)
+    inner = np.array([end for _, end in edges[:-1]])
+    np.testing.assert_allclose((inner - begin_s) / 0.1, np.round((inner - begin_s) / 0.1), atol=1e-6)
+    assert [begin for begin, _ in edges[1:]] == inner.tolist()
+    # A segment that ends where a block begins is none of it, whatever the rounding.
+    touched = sum(f.touches(begun, 0.7).astype(int) for f in found)
+    apart = np.min(np.abs(inner[:, None] - [s.begin_s for s in begun]), axis=1)
+    assert touched.sum() == count + np.sum(apart > 1e-6)
 
 
 def test_too_little_to_leave_out_is_refused(one):

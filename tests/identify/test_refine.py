@@ -16,7 +16,7 @@ from sim2real.identify import fit as fitting
 from sim2real.identify.config import FitConfig
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.problem.problem import Evaluation
-from sim2real.identify.search.refine import refine, remaining
+from sim2real.identify.search.refine import _Descent, refine, remaining
 from sim2real.identify.uncertainty.uncertainty import from_linearised, linearise
 
 WIDE = 20.0
@@ -217,6 +217,16 @@ def test_from_where_the_derivative_is_wrong_a_better_point_around_leads_on():
     found = problem.refined(start)
     assert found.converged
     assert np.all(np.abs(problem.values(found.z) - best) < 0.1 * error)
+
+
+def test_a_descent_that_got_stuck_goes_on_from_the_best_point_that_it_has_seen():
+    """The middle of the delays' common shift was worse by 1 %, and no point around it was better."""
+    problem = Stub(line)
+    descent = _Descent(problem, problem.data, None, None)
+    best, stuck = (problem.table.at_scale(best_line()[0] + off) for off in (0.0, 3.0))
+    lower = descent.at(best)
+    assert descent.around(stuck, descent.at(stuck)).tolist() == best.tolist()
+    assert descent.around(best, lower) is None
 
 
 def test_a_minimum_between_kinks_is_one_although_a_step_is_left():

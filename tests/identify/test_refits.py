@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sim2real.artifacts.estimation.tried_term import TriedTerm
 from sim2real.identify.validation.refits import REFITS, Refits
 from sim2real.stages.identify.inputs import prepare
 from sim2real.stages.pipeline.open_log import open_recording
@@ -93,3 +94,21 @@ def test_the_digest_covers_logs_bounds_terms_and_settings_but_no_start(pendulum)
         prepare(pipeline, replace(config, folds=4), [log], []),
     )
     assert len({digest, *(inputs.digest for inputs in changed)}) == 1 + len(changed)
+
+
+def test_what_further_terms_gain_is_computed_once(tmp_path):
+    rows, calls = (TriedTerm("drag", 2.0, 1.0, "mends"),), []
+
+    def compute():
+        calls.append(1)
+        return rows
+
+    assert filled(tmp_path / REFITS).tried(TERMS, compute) == rows
+    again = Refits(tmp_path / "other.json", "same", [tmp_path / REFITS])
+    again.begin(TERMS, Z, 2.0001)
+    assert again.tried(TERMS, compute) == rows
+    assert len(calls) == 1
+    # Beside another minimum it is another gain.
+    again.begin(TERMS, END, 1.8)
+    assert again.tried(TERMS, compute) == rows
+    assert len(calls) == 2

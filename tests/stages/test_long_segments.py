@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim2real.stages.estimation.segment_split import long_spans, reach, spans, split_of, with_length
+from sim2real.stages.estimation.segment_split import covering, long_spans, reach, spans, split_of, with_length
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY
 
@@ -35,11 +35,21 @@ def test_they_contain_all_fitted_samples_of_each_fitted_log():
 def test_fitted_and_held_out_segments_begin_on_one_grid(seconds, initial_state):
     config = replace(CONFIG, initial_state=initial_state, long_s=0.0)
     (episode,) = lasting(seconds)
-    steps = [(s.begin_s - reach(episode, config)[0]) / 0.01 for s in spans([episode], 1, config, 1.3)]
+    some = [*spans([episode], 1, config, 1.3), *long_spans([episode], 1, replace(config, long_s=5.0))]
+    steps = [(s.begin_s - reach(episode, config)[0]) / 0.01 for s in some]
     assert steps == pytest.approx(np.round(steps), abs=1e-3)
     begin, end = reach(episode, config)
     earlier = begin + 0.75 * (end - begin) - split_of(episode, True, config)
     assert -1e-6 <= earlier < 0.1, "a rounding of the share below a multiple counts as the multiple"
+
+
+@given(st.floats(10.0, 200.0), st.integers(10, 80))
+def test_long_segments_leave_nothing_out(end_s, tenths):
+    longer = covering([(0.0, end_s)], length_s := tenths / 10)
+    begins = [s.begin_s for s in longer]
+    assert begins[0] == 0.0
+    assert begins[-1] + length_s == pytest.approx(end_s)
+    assert all(0.0 < later - begin <= length_s + 1e-6 for begin, later in pairwise(begins))
 
 
 def test_a_log_shorter_than_two_segments_has_none():

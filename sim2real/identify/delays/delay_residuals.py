@@ -1,7 +1,5 @@
 """The residuals of a problem at every possible delay of a measurement, and their derivative by its unknowns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import jax

@@ -6,8 +6,6 @@ density of the measurement at that delay. Parameters of the dynamics, initial st
 and the shares maximise the product over all measurements.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ Biometrika 58, 1971). Errors of the model look like pushes, too, but do not depe
 one size for all commands have a second variance, which absorbs them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial

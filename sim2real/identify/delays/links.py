@@ -6,8 +6,6 @@ motion as a whole. Its mean adds to that of the measurements, and a log determin
 estimated afterwards, from the effect of late commands on the motion (``jitter``).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

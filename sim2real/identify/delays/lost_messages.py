@@ -1,7 +1,5 @@
 """Lost messages: their reader repeats the value before, in every digit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test whether a later log is still of the identified robot: of each parameter, and of causes that move several."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 

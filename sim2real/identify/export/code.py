@@ -1,7 +1,5 @@
 """Parts that the Python files for other simulators share: their head, numbers, ranges, and lags in steps."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

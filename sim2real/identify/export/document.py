@@ -1,7 +1,5 @@
 """The JSON document with all results, for programs; docs/guides/export.md describes it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Actuators and events for Isaac Lab (2.x, on Isaac Sim 5 and later): https://isaac-sim.github.io/IsaacLab."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

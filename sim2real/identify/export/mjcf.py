@@ -1,7 +1,5 @@
 """MJCF that C MuJoCo takes as it is: delays and profiles in MuJoCo's own terms, intervals as numerics."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

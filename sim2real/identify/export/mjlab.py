@@ -1,7 +1,5 @@
 """Actuators and domain randomisation for mjlab (1.6): https://mujocolab.github.io/mjlab."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from sim2real.identify.export.code import check_drives, driven, head, lags, n, pattern, span

@@ -4,8 +4,6 @@ No table says which parameter belongs to which field. Each robot drawn from the 
 differs between those models is what was identified: shared parameters and derived limits come out right by themselves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

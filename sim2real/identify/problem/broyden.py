@@ -1,7 +1,5 @@
 """Jacobians that a descent corrects from step to step, as each costs a rollout for every parameter."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.identify.problem.evaluator import Stacked

@@ -4,8 +4,6 @@ Rollouts take most of the time. Joints of separate kinematic trees move independ
 each tree. The states at the last points are cached, as a descent uses them again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from itertools import zip_longest
 

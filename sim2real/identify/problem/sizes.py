@@ -1,7 +1,5 @@
 """Sizes of compiled programs: counts are rounded up, so that logs of similar length share programs."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real import pytree

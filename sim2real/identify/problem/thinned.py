@@ -1,7 +1,5 @@
 """Fewer segments to fit, where a Jacobian of all of them takes long: those with most motion."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.identify.problem.problem import Problem

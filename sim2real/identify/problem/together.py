@@ -1,7 +1,5 @@
 """Parameters that finite differences move together, as no residual depends on two of them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 _RESPONDS = 1e-9

@@ -1,7 +1,5 @@
 """The minimum of any loss within bounds, by the search that identification uses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Helpers over pytrees whose leaves share leading axes."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import jax

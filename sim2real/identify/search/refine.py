@@ -4,8 +4,6 @@ scipy's trust-region method takes the steps on the host; an evaluator computes r
 loss that decides is that with initial states solved for at the point itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -195,7 +193,10 @@ class _Descent:
         return z, loss
 
     def around(self, z: np.ndarray, loss: float) -> np.ndarray | None:
-        """Return a point within about a standard error that is better; None if none of those tried is."""
+        """Return a point that is better, seen before or within about a standard error; None if none of those is."""
+        # The middle of the delays' common shift can be worse than where it was held before.
+        if self._best[0] < (1.0 - _BETTER) * loss:
+            return self._best[1]
         table = self._problem.table
         at = linearise(self._problem, z, self._data)
         J, variance = at.jacobian.reshape(-1, len(at.x)), loss_variance(self._problem, at)

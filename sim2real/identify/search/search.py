@@ -1,7 +1,5 @@
 """Global search by evolution strategies: without gradients, with restarts and common random numbers."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

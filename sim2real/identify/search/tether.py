@@ -1,7 +1,5 @@
 """Rows of least squares that hold what a log does not determine, so that steps stay finite."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim2real.identify.parameters import ParameterTable

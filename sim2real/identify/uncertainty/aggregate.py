@@ -1,7 +1,5 @@
 """One estimate from several recordings of the same robot, with the spread between them."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import chdtri, stdtrit
 

@@ -1,7 +1,5 @@
 """Flags with which to identify again after an estimate at a bound."""
 
-from __future__ import annotations
-
 from sim2real.identify.parameters import Parameter
 from sim2real.identify.uncertainty.round_trip import RoundTrip
 

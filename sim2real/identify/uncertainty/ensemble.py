@@ -1,7 +1,5 @@
 """Models that explain the recordings as well as the estimate: other terms, and other optima of the search."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

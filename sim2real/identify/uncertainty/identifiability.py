@@ -1,7 +1,5 @@
 """The parameters that recordings determine: conditioning, and combinations of parameters that they leave open."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from fractions import Fraction
 

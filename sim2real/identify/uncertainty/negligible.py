@@ -5,8 +5,6 @@ standard error as wide as the bounds; simulations with larger values give an upp
 reaches, such as a torque's, is the mirror image: the data gives it a lower bound.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

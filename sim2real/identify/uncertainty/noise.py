@@ -1,7 +1,5 @@
 """Noise of the sensor, and the spread of parameters that covers the remaining errors of the model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Each recording identified alone, from the estimate of all: how much a robot differs between recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Profiles: the increase of the loss along one parameter, with the others fitted to the linearised residuals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

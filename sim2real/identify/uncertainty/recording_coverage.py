@@ -1,7 +1,5 @@
 """Coverage of a recording: the ranges of its signals, the time in motion, and the frequencies that drive it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The sum of all delays, which a log determines even if it does not separate the delays."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

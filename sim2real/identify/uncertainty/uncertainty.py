@@ -1,7 +1,5 @@
 """Covariance and intervals of the parameters by the recordings, and parameters that they do not determine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

@@ -4,8 +4,6 @@ Where an arm sticks is decided by how it came to rest: two models within the pos
 apart. One predicted trajectory promises nothing there, so the interval of many is given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Refits without parts of the recordings, one at a time, and their errors on these parts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -25,6 +23,9 @@ MOST = 12
 """Most fits without parts: each takes about as long as the fit to all of them."""
 MOVES = 10.0
 """Range of a joint's positions in motion, in deviations of a measurement."""
+_GRID_S, _ROUNDING_S = 0.1, 1e-6
+"""Blocks begin at multiples of this after the first segment, as fitted segments do: in a world that takes messages at
+its steps, those of a regular log would act at other times there. And the largest error of such a time."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class Fold:
         recording, begins = np.array([s.recording for s in spans]), np.array([s.begin_s for s in spans])
         touched = np.zeros(len(spans), bool)
         for r, begin, end in self.parts:
-            touched |= (recording == r) & (begins < end) & (begins + length_s > begin)
+            within = (begins < end - _ROUNDING_S) & (begins + length_s > begin + _ROUNDING_S)
+            touched |= (recording == r) & within
         return touched
 
 
@@ -82,7 +84,9 @@ def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: in
         folds = []
         for r in recordings:
             members = [s.begin_s for s in spans if s.recording == r]
-            edges = np.linspace(min(members), max(members) + problem.segment_s, -(-blocks // len(recordings)) + 1)
+            first, last = min(members), max(members) + problem.segment_s
+            edges = np.linspace(first, last, -(-blocks // len(recordings)) + 1)
+            edges[1:-1] = first + np.round((edges[1:-1] - first) / _GRID_S) * _GRID_S
             which = f"{name_of[r]}, " if len(recordings) > 1 else ""
             folds += [Fold(f"{which}{a:.0f} to {b:.0f} s", ((r, a, b),)) for a, b in pairwise(edges)]
     # Require that each part leaves segments to fit, and holds some.

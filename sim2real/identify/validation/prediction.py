@@ -1,7 +1,5 @@
 """Errors of a model's predictions, over horizons and in free runs, beside baselines without a model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import jax

@@ -4,15 +4,14 @@ A refit is used again only for the same inputs: the file's digest covers logs, p
 must still give the loss that the fit of all parts had. Other data or another model gives another loss.
 """
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from sim2real.artifacts.estimation.tried_term import TriedTerm
 from sim2real.artifacts.files import read_json, write_json
 from sim2real.errors import Sim2RealError
 from sim2real.identify.problem.problem import Problem
@@ -30,11 +29,13 @@ class Stored:
     Attributes:
         z: The fit of all parts, ``(P,)``.
         ends: Part -> the estimate without it, ``(P,)``.
+        tried: What further terms gain beside the set; empty: none was tried.
     """
 
     z: list[float]
     loss: float
     ends: dict[str, list[float]] = field(default_factory=dict)
+    tried: list[TriedTerm] = field(default_factory=list)
 
 
 @dataclass
@@ -95,6 +96,14 @@ class Refits:
         self._document.sets[_key(terms)].ends[part] = z.tolist()
         self._write()
         return z
+
+    def tried(self, terms: Sequence[str], compute: Callable[[], Sequence[TriedTerm]]) -> tuple[TriedTerm, ...]:
+        """Return what further terms gain beside a set whose fit is stored; it is computed once."""
+        stored = self._document.sets[_key(terms)]
+        if not stored.tried:
+            stored.tried = list(compute())
+            self._write()
+        return tuple(stored.tried)
 
     def _has_loss(self, z: np.ndarray, loss: float, problem: Problem, data: Data) -> bool:
         if len(z) != len(problem.table):

@@ -1,7 +1,5 @@
 """The initial state and the commands of each held-out segment, for a comparison with another simulator."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import jax

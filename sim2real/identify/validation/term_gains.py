@@ -1,7 +1,5 @@
 """What each optional term gains on held-out parts, from the sets that were fitted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ A fit with many terms may end before its minimum. A set therefore begins at the 
 a larger loss, and the choice compares simulations of the sets, not approximations of the largest one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations

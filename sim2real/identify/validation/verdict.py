@@ -1,7 +1,5 @@
 """The verdict on an identification: judged on held-out data, position by position."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

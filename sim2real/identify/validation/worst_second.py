@@ -1,7 +1,5 @@
 """The search for the second in which the identified model explains a joint worst."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 

@@ -17,8 +17,8 @@ _WINDOW_SPACING_S = 0.5
 _LONG_S = 5.0
 """Length of the segments of the last refinement of a robot that follows no goals [s]."""
 _GRID_S = 0.1
-"""The held-out part begins at a multiple of this, as fitted segments do: in a world that takes messages at its steps,
-those of a regular log would act at other times there than where the delays were fitted."""
+"""The held-out part and long segments begin at multiples of this, as fitted segments do: in a world that takes messages
+at its steps, those of a regular log would act at other times there than where the delays were fitted."""
 _EDGES_S = (0.3, 0.2)
 """Unused time at the beginning and at the end of a log whose initial states are estimated [s]."""
 
@@ -74,7 +74,9 @@ def covering(ends: Sequence[tuple[float, float]], length_s: float) -> list[Span]
     for r, (begin, end) in enumerate(ends if length_s else ()):
         # The last segment ends at the end; the others are spread evenly, and may overlap.
         if (count := math.ceil((end - begin) / length_s - 1e-6)) > 1:
-            segments += [Span(r, float(b)) for b in np.linspace(begin, end - length_s, count)]
+            after = np.linspace(0.0, end - length_s - begin, count)
+            after[:-1] = np.ceil(after[:-1] / _GRID_S - 1e-6) * _GRID_S
+            segments += [Span(r, float(begin + a)) for a in after]
     return segments
 
 

@@ -37,7 +37,7 @@ class Misfit:
         noise: Deviation of the noise [unit of the position].
         tried: What the optional terms gain; empty if none was tried.
         chosen: The terms of the model.
-        seconds: Duration of the trials [s].
+        seconds: Duration of the trials; 0 if an identification of the same inputs made them [s].
     """
 
     position: Position
@@ -80,7 +80,7 @@ class Misfit:
         if not self.tried:
             return (f"{sentence}: the model lacks something; no optional term was tried",)
         fitted = ", ".join(str(t) for t in self.tried if t.outcome != "not fitted")
-        took = f" in {self.seconds:.0f} s" if self.seconds else ""
+        took = f" in {self.seconds:.0f} s" if self.seconds >= 0.5 else ""
         tried = f"tried{took}, with errors on held-out parts in deviations of a measurement: {fitted or 'no term'}"
         if automatic:
             return (f"{sentence}; {tried}",)
@@ -106,18 +106,25 @@ def misfit(document: Identification, noises: Sequence[Noise], positions: Sequenc
 
 
 def with_trials(of: Misfit, inputs: Inputs, fit: Fit) -> Misfit:
-    """Return the misfit with what optional terms gain, one at a time, beside the model of a fit.
+    """Return the misfit with what optional terms gain, one at a time, beside the model of a fit."""
+    chosen, began_s = fit.problem.table.terms, time.monotonic()
+    rows = inputs.refits.tried(chosen, lambda: _tried(inputs, fit))
+    return replace(of, tried=rows, chosen=chosen, seconds=time.monotonic() - began_s)
+
+
+def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
+    """Return what optional terms gain, one at a time, beside the model of a fit.
 
     The three most promising ones by linear algebra and the limits are fitted, without refits: about as long as the fit.
     """
-    config, chosen, began_s = inputs.config, fit.problem.table.terms, time.monotonic()
+    config, chosen = inputs.config, fit.problem.table.terms
     robot = held_out_parts.offering(in_world(inputs.pipeline.load(), config.world), ",".join(["auto", *chosen]))
     model, episodes = robot.identifiable(config.max_delay_s), inputs.episodes
     bounded = model.parameters.with_bounds(config.bounds).with_reached(model.reached(episodes[: inputs.fitted]))
     table = held_out_parts.widest(bounded, "all").with_fixed(config.fix)
     further = set(table.terms) - set(chosen)
     if not further or not set(fit.values) <= {p.name for p in table}:
-        return of
+        return ()
     # Put the estimate into the model with all terms, and compare single terms.
     length_s = config.settle_s + config.horizon_s
     problem = Problem(model, episodes, inputs.windows, length_s, config, table)
@@ -127,8 +134,7 @@ def with_trials(of: Misfit, inputs: Inputs, fit: Fit) -> Misfit:
     parts = held_out_parts.parts_of(whole, config, inputs.names)
     present = np.array([name in chosen for name in problem.table.terms])
     trials = Trials(whole, parts, config.settle_s, 0.0).singles(z, present)
-    rows = tuple(r for r in gains(trials, trials[0], problem.table) if r.term in further)
-    return replace(of, tried=rows, chosen=chosen, seconds=time.monotonic() - began_s)
+    return tuple(r for r in gains(trials, trials[0], problem.table) if r.term in further)
 
 
 def of_selection(selection: Selection, table: ParameterTable) -> tuple[TriedTerm, ...]:

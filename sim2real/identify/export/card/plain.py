@@ -1,7 +1,5 @@
 """A robot as a simulation in plain MuJoCo: a model, the law of its drives with its equations, and its timing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal

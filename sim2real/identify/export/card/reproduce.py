@@ -5,8 +5,6 @@
 much they differ.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import sys
