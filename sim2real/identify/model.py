@@ -1,5 +1,7 @@
 """The part of a robot that identification uses: its measured fields, and a graph that predicts them."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable

@@ -1,5 +1,7 @@
 """Read and replace a leaf of a parameter tree by its path, ``node.field.field[index]``."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace

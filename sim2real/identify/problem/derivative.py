@@ -1,5 +1,7 @@
 """Derivatives of functions that JAX cannot differentiate, or only with too much memory."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

@@ -1,5 +1,7 @@
 """The engine of rollouts: the graph's program, or C MuJoCo between two programs without physics."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple

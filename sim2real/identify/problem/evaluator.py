@@ -1,5 +1,7 @@
 """Evaluation of a problem's residuals: by compiled programs, or on C MuJoCo between two programs."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, Protocol
 

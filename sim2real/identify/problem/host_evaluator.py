@@ -4,6 +4,8 @@ Both programs are small and have no callback, so a compilation cache keeps them.
 derivatives by a segment's initial state are reused while parameters change little, and padding is not rolled out.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Compiled programs of identification: one for each form of the arguments, shared by all problems of a model."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any

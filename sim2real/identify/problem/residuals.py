@@ -3,6 +3,8 @@
 ``Data`` is an argument and holds everything that differs between logs, so compiled programs depend on shapes alone.
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable, Mapping
 from typing import NamedTuple

@@ -1,5 +1,7 @@
 """Robust losses: a few large residuals do not decide the fit."""
 
+from __future__ import annotations
+
 from typing import Any
 
 from sim2real.identify.config import Loss

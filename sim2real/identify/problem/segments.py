@@ -1,5 +1,7 @@
 """Recordings cut into segments: timing, commands and measurements of each, padded to one width."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,5 +1,7 @@
 """Covariance and intervals of the parameters by the recordings, and parameters that they do not determine."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
