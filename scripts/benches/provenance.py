@@ -17,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+_POSTPONED = "from __future__ import annotations"
+"""A line that changes no figure: whether annotations are evaluated."""
 
 
 def state(paths: Sequence[str], root: Path, commit: str | None = None) -> dict[str, Any]:
@@ -52,7 +54,7 @@ def files(paths: Sequence[str], root: Path) -> list[Path]:
 
 
 def essence(file: Path) -> str:
-    """Return the part of a file that can change a figure: the lines of Python without comments and docstrings."""
+    """Return the part of a file that can change a figure: of Python, the lines without comments and docstrings."""
     at = file.stat()
     return _essence(file, at.st_mtime_ns, at.st_size)
 
@@ -76,7 +78,7 @@ def _essence(file: Path, mtime_ns: int, size: int) -> str:
         for number, line in enumerate(text.splitlines(), 1)
         if number not in docstrings
     ]
-    return "\n".join(line for line in lines if line)
+    return "\n".join(line for line in lines if line and line != _POSTPONED)
 
 
 def why_stale(report: Mapping[str, Any], paths: Sequence[str], root: Path) -> str | None:

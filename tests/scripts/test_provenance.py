@@ -55,6 +55,7 @@ def test_a_report_names_commit_and_changes(tree, report):
     [
         ("room/code.py", CODE.replace("Return twice", "Return the double").replace("# twice", "# it is")),
         ("room/code.py", '"""Another\n\ntext."""\n\n# why\n' + CODE.split("\n", 2)[2]),
+        ("room/code.py", CODE.replace("\n\n\ndef", "\n\nfrom __future__ import annotations\n\n\ndef")),
         ("room/view/page.py", "pass\n"),
         ("pipeline/other.py", "pass\n"),
         ("README.md", "words\n"),
