@@ -15,7 +15,7 @@ _IDENTIFY = (
     *("sim2real/artifacts", "sim2real/log", "scripts/benches/identify"),
 )
 _JUDGED = ("sim2real/stages/identify", "sim2real/stages/estimation")
-"""What the stage does besides the estimation: which part is held out, how it is predicted, terms, and the verdict."""
+"""The stage around the fit: which part is held out, how it is predicted, which terms are tried, and the verdict."""
 
 
 @dataclass(frozen=True)

@@ -220,7 +220,7 @@ def test_from_where_the_derivative_is_wrong_a_better_point_around_leads_on():
 
 
 def test_a_descent_that_got_stuck_goes_on_from_the_best_point_that_it_has_seen():
-    """The middle of the delays' common shift was worse by 1 %, and no point around it was better."""
+    """A hidden Go2's ended in the middle of its delays' common shift: worse by 1 %, and no point around was better."""
     problem = Stub(line)
     descent = _Descent(problem, problem.data, None, None)
     best, stuck = (problem.table.at_scale(best_line()[0] + off) for off in (0.0, 3.0))
