@@ -21,7 +21,7 @@ def lasting(*seconds):
 
 
 def test_they_contain_all_fitted_samples_of_each_fitted_log():
-    longer = long_spans(lasting(24.8, 20.0, 30.0), 2, CONFIG)
+    longer = long_spans(lasting(24.9, 20.1, 30.0), 2, CONFIG)
     assert {s.recording for s in longer} == {0, 1}, "the third log is held out whole"
     for r, end in ((0, 18.6), (1, 15.0)):
         begins = [s.begin_s for s in longer if s.recording == r]
@@ -41,6 +41,18 @@ def test_fitted_and_held_out_segments_begin_on_one_grid(seconds, initial_state):
     begin, end = reach(episode, config)
     earlier = begin + 0.75 * (end - begin) - split_of(episode, True, config)
     assert -1e-6 <= earlier < 0.1, "a rounding of the share below a multiple counts as the multiple"
+    left = seconds - (0.2 if initial_state == "free" else 0.0) - end
+    assert 0.05 - 1e-6 <= left < 0.15 + 1e-6
+
+
+@given(st.integers(90, 1000), st.floats(-0.049, 0.049), st.floats(-0.049, 0.049), st.sampled_from(["measured", "free"]))
+def test_logs_of_nearly_one_length_have_the_same_segments(tenths, one, other, initial_state):
+    """So they share compiled programs, whose sizes are those of the segments and of the held-out part."""
+    config = replace(CONFIG, initial_state=initial_state)
+    a, b = lasting(tenths / 10 + one, tenths / 10 + other)
+    assert spans([a], 1, config, 1.3) == spans([b], 1, config, 1.3)
+    assert long_spans([a], 1, config) == long_spans([b], 1, config)
+    assert (reach(a, config), split_of(a, True, config)) == (reach(b, config), split_of(b, True, config))
 
 
 @given(st.floats(10.0, 200.0), st.integers(10, 80))

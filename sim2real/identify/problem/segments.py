@@ -21,6 +21,9 @@ from sim2real.types import Array, PyTree
 
 _LEAST_SAMPLES = 4
 """Smallest number of samples around the start of a segment."""
+GRID_S = 0.1
+"""Fitted segments, blocks and the held-out part begin at multiples of this after the begin of the part of a log that is
+used: in a world that takes messages at its steps, those of a regular log would act at other times elsewhere."""
 Retimed = Callable[[Timeline], Timeline]
 """Recorded timing of segments -> changed timing."""
 
@@ -240,6 +243,11 @@ def _near(t: np.ndarray, begin_s: float) -> np.ndarray:
     period = float(np.median(np.diff(t)))
     near = np.sort(np.argsort(np.abs(t - begin_s - period), kind="stable")[:8])
     return near[np.abs(t[near] - begin_s) < 12 * period]
+
+
+def on_grid(after_s: np.ndarray | float, whole: Callable[[np.ndarray], np.ndarray] = np.round) -> np.ndarray:
+    """Return times as multiples of the grid: the nearest, or those below or above; rounding errors do not count."""
+    return whole(np.round(np.asarray(after_s) / GRID_S, 5)) * GRID_S
 
 
 def _in_gap(t: np.ndarray, begin_s: float) -> bool:

@@ -12,7 +12,7 @@ from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
 from sim2real.identify.fit import Fit
 from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Data, Span
+from sim2real.identify.problem.segments import Data, Span, on_grid
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.uncertainty import linearise
 from sim2real.identify.validation import optional_terms
@@ -23,9 +23,8 @@ MOST = 12
 """Most fits without parts: each takes about as long as the fit to all of them."""
 MOVES = 10.0
 """Range of a joint's positions in motion, in deviations of a measurement."""
-_GRID_S, _ROUNDING_S = 0.1, 1e-6
-"""Blocks begin at multiples of this after the first segment, as fitted segments do: in a world that takes messages at
-its steps, those of a regular log would act at other times there. And the largest error of such a time."""
+_ROUNDING_S = 1e-6
+"""Largest rounding error of a time."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: in
             members = [s.begin_s for s in spans if s.recording == r]
             first, last = min(members), max(members) + problem.segment_s
             edges = np.linspace(first, last, -(-blocks // len(recordings)) + 1)
-            edges[1:-1] = first + np.round((edges[1:-1] - first) / _GRID_S) * _GRID_S
+            edges[1:-1] = first + on_grid(edges[1:-1] - first)
             which = f"{name_of[r]}, " if len(recordings) > 1 else ""
             folds += [Fold(f"{which}{a:.0f} to {b:.0f} s", ((r, a, b),)) for a, b in pairwise(edges)]
     # Require that each part leaves segments to fit, and holds some.

@@ -9,16 +9,13 @@ import numpy as np
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.model import IdentifiableModel
-from sim2real.identify.problem.segments import Span
+from sim2real.identify.problem.segments import GRID_S, Span, on_grid
 from sim2real.stages.identify.config import IdentifyConfig
 
 _WINDOW_SPACING_S = 0.5
 """Distance between the starts of held-out segments [s]."""
 _LONG_S = 5.0
 """Length of the segments of the last refinement of a robot that follows no goals [s]."""
-_GRID_S = 0.1
-"""The held-out part and long segments begin at multiples of this, as fitted segments do: in a world that takes messages
-at its steps, those of a regular log would act at other times there than where the delays were fitted."""
 _EDGES_S = (0.3, 0.2)
 """Unused time at the beginning and at the end of a log whose initial states are estimated [s]."""
 
@@ -75,7 +72,7 @@ def covering(ends: Sequence[tuple[float, float]], length_s: float) -> list[Span]
         # The last segment ends at the end; the others are spread evenly, and may overlap.
         if (count := math.ceil((end - begin) / length_s - 1e-6)) > 1:
             after = np.linspace(0.0, end - length_s - begin, count)
-            after[:-1] = np.ceil(after[:-1] / _GRID_S - 1e-6) * _GRID_S
+            after[:-1] = on_grid(after[:-1], np.ceil)
             segments += [Span(r, float(begin + a)) for a in after]
     return segments
 
@@ -83,11 +80,12 @@ def covering(ends: Sequence[tuple[float, float]], length_s: float) -> list[Span]
 def reach(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
     """Return the begin and the end of the part of a log that can be cut into segments [s].
 
-    An estimate of an initial state needs samples before and after the start of the segment.
+    An estimate of an initial state needs samples before and after the start of the segment. The end is half a step of
+    the grid early: logs of 19.96 s and of 20.04 s have the same segments, and therefore share compiled programs.
     """
-    if config.initial_state != "free":
-        return config.after_s, episode.duration_s
-    return max(_EDGES_S[0], config.after_s), episode.duration_s - _EDGES_S[1]
+    before, after = _EDGES_S if config.initial_state == "free" else (0.0, 0.0)
+    begin = max(before, config.after_s)
+    return begin, begin + float(on_grid(episode.duration_s - after - begin - GRID_S / 2, np.floor))
 
 
 def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
@@ -97,5 +95,4 @@ def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
         fitted: Whether the log is fitted; else it is held out whole.
     """
     begin, end = reach(episode, config)
-    share = (1.0 - config.held_out) * (end - begin)
-    return begin + math.floor(share / _GRID_S + 1e-6) * _GRID_S if fitted else begin
+    return begin + float(on_grid((1.0 - config.held_out) * (end - begin), np.floor)) if fitted else begin
