@@ -93,17 +93,23 @@ def test_15_ms_more_of_delay_are_refused(make_pipeline, tmp_path, resting, capsy
 
 
 def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
-    robot, truth, said = load_pipeline("pendulum").load().drive.embedded, tmp_path / "truth.bin", tmp_path / "said.txt"
-    bundle = faults.swinging_bundle(tmp_path / "bundle")
-    with faults.emulated(robot.emulator, robot.plant, truth) as (port, _):
-        patient = ("--gate.stop-s=2", "--gate.max-sample-age-s=1")  # on a busy machine commands come late
-        child = faults.deployed(port, bundle, tmp_path, said, 0.4, *patient)
-        faults.wait_until_moving(truth, said, child)
-        time.sleep(0.5)
-        os.kill(child.pid, signal.SIGINT)
-        assert faults.ended(child) == 130, said.read_text()
+    robot, bundle = load_pipeline("pendulum").load().drive.embedded, faults.swinging_bundle(tmp_path / "bundle")
+    for turn in range(3):
+        runs, truth, said = (tmp_path / str(turn) / name for name in ("runs", "truth.bin", "said.txt"))
+        runs.mkdir(parents=True)
+        with faults.emulated(robot.emulator, robot.plant, truth) as (port, _):
+            patient = ("--gate.stop-s=2", "--gate.max-sample-age-s=1")  # on a busy machine commands come late
+            child = faults.deployed(port, bundle, runs, said, 0.4, *patient)
+            faults.wait_until_moving(truth, said, child)
+            time.sleep(0.5)
+            if child.is_alive():
+                os.kill(child.pid, signal.SIGINT)
+            code = faults.ended(child)
+        if "missed in a row" not in said.read_text():  # a busy machine may hold up an emulated motor for 0.1 s
+            break
+    assert code == 130, said.read_text()
     assert "coming to rest; Ctrl-C stops at once" in said.read_text()
-    (log,) = tmp_path.glob("pendulum/*/deploy/episode_0.mcap")
+    (log,) = runs.glob("pendulum/*/deploy/episode_0.mcap")
     _, modes, goals = motor(read_truth(truth))
     last = int(np.flatnonzero(modes == OperatingMode.PWM)[-1])
     assert modes[-1] == OperatingMode.OFF
