@@ -22,8 +22,8 @@ from sim2real.types import Array, PyTree
 _LEAST_SAMPLES = 4
 """Smallest number of samples around the start of a segment."""
 GRID_S = 0.1
-"""Fitted segments, blocks and the held-out part begin at multiples of this after the begin of the part of a log that is
-used: in a world that takes messages at its steps, those of a regular log would act at other times elsewhere."""
+"""Segments and held-out parts begin at multiples of this after the first one: a world that takes messages at its steps
+would take those of a regular log at other times in a segment that begins between two multiples."""
 Retimed = Callable[[Timeline], Timeline]
 """Recorded timing of segments -> changed timing."""
 

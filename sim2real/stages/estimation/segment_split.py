@@ -80,8 +80,8 @@ def covering(ends: Sequence[tuple[float, float]], length_s: float) -> list[Span]
 def reach(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
     """Return the begin and the end of the part of a log that can be cut into segments [s].
 
-    An estimate of an initial state needs samples before and after the start of the segment. The end is half a step of
-    the grid early: logs of 19.96 s and of 20.04 s have the same segments, and therefore share compiled programs.
+    An estimate of an initial state needs samples before and after the start of the segment. The end is 0.05 to
+    0.15 s early, at a multiple of the grid: logs of 19.96 s and 20.04 s have the same segments and share programs.
     """
     before, after = _EDGES_S if config.initial_state == "free" else (0.0, 0.0)
     begin = max(before, config.after_s)
