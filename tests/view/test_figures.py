@@ -24,7 +24,7 @@ from sim2real.view.identification import figures as identify_figures
 from sim2real.view.identification import intervals, residuals
 from sim2real.view.identification.worst import worst_figure
 from sim2real.view.page import figures
-from sim2real.view.signals import pairs_of, signals_of, simulated_series
+from sim2real.view.signals import ComparedSeries, Series, pairs_of, signals_of, simulated_series
 
 SVG = "{http://www.w3.org/2000/svg}"
 QUANTITIES = [
@@ -296,3 +296,13 @@ def test_the_truth_is_on_the_clock_of_the_log_and_cut_to_it(log):
     assert 0 <= true.t_s[0] < 0.006
     assert true.t_s[-1] <= log.episode.duration_s
     np.testing.assert_allclose(true.values, np.sin(true.t_s + 0.012), atol=1e-9)
+
+
+def test_the_second_with_the_largest_difference_is_given_with_its_root_mean_square():
+    t_s = np.arange(400) / 100
+    wave = np.where((t_s >= 1) & (t_s <= 2), 0.3 * np.sin(2 * np.pi * t_s), 0.0)
+    robot, simulation = (Series("th", "sensor", t_s, np.cos(t_s) + off) for off in (wave, 0.0))
+    block = figures.largest_difference([[ComparedSeries("th", robot, simulation)]], ["th"], {"th": "rad"}, "name")
+    # A sine of 0.3 rad, over its period.
+    assert "th in episode 0, from 1.0 s, root mean square 2" in block.caption
+    assert float(block.caption.split()[-2]) == pytest.approx(300 / 2**0.5, rel=0.01)

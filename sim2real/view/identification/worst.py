@@ -73,4 +73,5 @@ def worst_figure(result: Identification, name: str) -> FigureBlock | None:
     size = ""
     if worst.of_motion is not None and worst.times_noise is not None:
         size = f", {worst.of_motion:.0%} of the joint's motion and {worst.times_noise:.0f} times the noise"
-    return FigureBlock(svg, f"The worst second: {worst.text(result.logs)}{size}. Residual: measured \u2212 identified.")
+    residual = "Residual: measured \u2212 identified; the error is its root mean square in this second."
+    return FigureBlock(svg, f"The worst second: {worst.text(result.logs)}{size}. {residual}")

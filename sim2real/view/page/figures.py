@@ -84,7 +84,7 @@ def largest_difference(
 ) -> FigureBlock | None:
     """Draw the measurement with the largest difference to its simulation; None without a simulation.
 
-    It is the largest mean over a second, as a share of the motion on the robot.
+    It is the largest root mean square over a second, as a share of the motion on the robot.
 
     Args:
         positions: Names of the measurements to choose from; empty: all.
@@ -109,9 +109,8 @@ def largest_difference(
     line = Line(pair.robot.t_s, off, f"difference [{unit}]" if unit else "difference", "residual")
     label = with_unit(pair.label, units, pair.robot.name)
     svg = compared(_lines(pair), line, label, (begin_s, end_s), name)
-    where = f"{pair.label} in episode {number}, {begin_s:.1f} s, {with_small_unit(error, unit)}"
-    caption = f"The largest difference, as a share of the motion: {where}."
-    return FigureBlock(svg, caption)
+    where = f"{pair.label} in episode {number}, from {begin_s:.1f} s, root mean square {with_small_unit(error, unit)}"
+    return FigureBlock(svg, f"The second with the largest difference, as a share of the motion: {where}.")
 
 
 def _lines(pair: ComparedSeries) -> list[Line]:
