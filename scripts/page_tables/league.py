@@ -119,7 +119,7 @@ def evidence(ideal: Mapping[str, Any], judged: Mapping[str, Any]) -> str:
         ("measured on", "sim2real", "worst part (promised)", "compared with"),
         ("---", "---:", "---:", "---:"),
         (
-            f"success of policies on {count} robots with hidden parameters and delays, {trials} deployments each",
+            f"success on {count} nearly ideal robots with hidden parameters and delays, {trials} deployments each",
             f"{share['all/success']:.0f} %",
             "",
             f"{share['data_sheet/success']:.0f} % trained on the data sheet",
