@@ -122,6 +122,11 @@ def test_every_command_has_help(capsys, command):
         (["log"], "Available: recover"),
         (["log", "mend"], "Available: recover"),
         (["log", "recover"], "log recover FILE"),
+        (["validate", "--parameters", "run"], "write its value without --parameters"),
+        (["validate", "--no-force", "--mjcf=robot.xml", "--log", "b.npz"], "unknown flag --mjcf. Available: --log,"),
+        (["validate", "--lgo", "b.npz"], "did you mean --log?"),
+        (["new", "--model", "robot.xml"], "write its value without --model"),
+        (["compare", "--runs-to-compare", "a", "b"], "unknown flag --runs-to-compare. Available: --runs,"),
         (["info", "pendulm"], "did you mean pendulum?"),
         (["identfy", "pendulum"], "did you mean identify?"),
         (["identify", "pendulm"], "did you mean pendulum?"),
@@ -135,6 +140,7 @@ def test_wrong_commands_exit_2_and_name_what_there_is(capsys, calls, arguments, 
     assert err.startswith("error: ")
     assert "\n\nhint: " in err or named in err.splitlines()[0]
     assert named in err
+    assert "----" not in err, "the parser prints its reason in a box"
     assert not out
     assert not calls
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 
 import tyro
 
@@ -156,7 +156,7 @@ def parse(
         if not end.code:
             print(f"\n{epilog}" if epilog else "", flush=True)
             raise
-        raise _usage_error(end, talk.getvalue(), prog) from None
+        raise _usage_error(end, talk.getvalue(), prog, default, arguments) from None
     if unknown:
         raise _unknown(unknown, default, prog)
     return _with_tables(parsed, default)
@@ -225,27 +225,43 @@ _MAX_LISTED_FLAGS = 20
 
 def _unknown(unknown: Sequence[str], default: Any, prog: str) -> UsageError:
     """Return the error for arguments that no flag took."""
-    names = [name for name, _ in flags_of(default)]
+    names, alone = _names(default)
     flags = [word.split("=")[0] for word in unknown if word.startswith("-")]
     if not flags:
         return UsageError(f"unexpected argument {unknown[0]!r}", hint=f"see `{prog} --help`")
-    close = difflib.get_close_matches(flags[0].replace("_", "-"), names, n=1)
+    first = flags[0].replace("_", "-")
+    close = difflib.get_close_matches(first, names, n=1)
     available = f". Available: {', '.join(names)}" if len(names) <= _MAX_LISTED_FLAGS else ""
     guess = f"did you mean {close[0]}? " if close else ""
+    guess = f"write its value without {first}. " if first in alone else guess
     return UsageError(f"unknown flag {', '.join(flags)}{available}", hint=f"{guess}`{prog} --help` lists all flags")
 
 
-def _usage_error(end: BaseException, talk: str, prog: str) -> Sim2RealError:
+def _names(default: Any) -> tuple[list[str], list[str]]:
+    """Return the names of all flags, and of the arguments whose value stands without a flag."""
+    hints = get_type_hints(type(default), include_extras=True)
+    marks = {f"--{name}".replace("_", "-"): getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    alone = [name for name, _ in flags_of(default) if tyro.conf.Positional in marks.get(name, ())]
+    return [name for name, _ in flags_of(default) if name not in alone], alone
+
+
+def _usage_error(end: BaseException, talk: str, prog: str, default: Any, arguments: Sequence[str]) -> Sim2RealError:
     """Return why the parser gave up: the configuration's own error, or the text that the parser printed in a box."""
     cause: BaseException | None = end
     while cause is not None:
         if isinstance(cause, Sim2RealError):
             return cause
         cause = cause.__context__
-    lines = [line.strip("│| ") for line in talk.splitlines() if line[:1] in "│|"]
-    # Below the first rule of the box the parser repeats the help.
-    body = " ".join(line for line in lines[: next((i for i, x in enumerate(lines) if re.match("[─-]{4}", x)), None)])
-    return UsageError(body or talk.strip(), hint=f"see `{prog} --help`")
+    # The reason stands between the first two rules of the box, which has other characters where the output is ASCII.
+    lines = [line.strip("│| ") for line in talk.splitlines()]
+    rules = [i for i, line in enumerate(lines) if re.match("╭|╰|[─-]{4}", line)]
+    body = " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else talk.strip()
+    # With an unknown flag, the parser calls a missing value that stands without a flag a list.
+    taken = [*(names := _names(default)[0]), *(f"--no-{name[2:]}" for name in names)]
+    flags = [word for word in arguments if word.startswith("--") and word.split("=")[0].replace("_", "-") not in taken]
+    if flags and body.endswith("not list"):
+        return _unknown(flags, default, prog)
+    return UsageError(body, hint=f"see `{prog} --help`")
 
 
 @contextlib.contextmanager

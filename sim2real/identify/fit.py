@@ -98,6 +98,7 @@ def fit(
     report: OnProgress | None = None,
     on_begin: Callable[[Problem], None] | None = None,
     as_start: bool = False,
+    end: np.ndarray | None = None,
 ) -> Fit:
     """Identify a model.
 
@@ -106,32 +107,34 @@ def fit(
         length_s: Length of a segment [s].
         long_spans: Segments of ``config.long_s`` for the last refinement.
         as_start: Whether the fit only has to be a start for fits with some of the optional terms.
+        end: Shape ``(P,)``: where a fit of nearly this model ended. Only the last refinement is made, from there: one
+            on windows may leave a minimum that long segments have.
     """
     windows = Problem(model, recordings, spans, length_s, config, table)
     problem = thinned(windows, of_recordings(windows), MOST_OF_FIT)
     if on_begin:
         on_begin(problem)
     # Refine from the nominal values, too, with short and with long delays: a delay may imitate an inertia.
-    starts, result = problem.table.starts(), None
+    starts, result = problem.table.starts() if end is None else end[None], None
     z, loss = starts[0], float("nan")
     # Search globally; its best candidates are further starts of the refinement.
-    if config.generations:
+    if config.generations and end is None:
         result = run_search(problem, starts[0], report)
         starts = np.stack([*result.finalists[: config.refine], starts[0]])
         z, loss = result.z, result.loss
     # Refine by least squares, first on windows, then on long segments.
-    refined = []
+    refined, longer = list[Refined](), bool(config.refine and config.long_s and long_spans)
     if config.refine and as_start and problem.table.terms:
         refined += _roughly(problem, starts, report)
-    elif config.refine:
+    elif config.refine and (end is None or not longer):
         # Where all segments take long, the best of several descents on some of them begins the descent on all.
-        few = few_of(problem)
+        few = few_of(problem) if end is None else problem
         refined += [_refine(few, starts, report)] if few is not problem else []
         refined.append(_refine(problem, refined[0].z[None] if refined else starts, report))
-    if config.refine and config.long_s and long_spans:
-        problem = windows.recut(long_spans, config.long_s)
+    if longer:
+        problem = windows.recut(long_spans, config.long_s or 0.0)
         problem = thinned(problem, of_recordings(problem), MOST_OF_FIT)
-        refined.append(_refine(problem, refined[-1].z[None], report))
+        refined.append(_refine(problem, refined[-1].z[None] if refined else starts, report))
     # Test whether the end is a minimum.
     if refined:
         z, loss, left, converged = refined[-1].z, refined[-1].loss, refined[-1].left, refined[-1].converged
@@ -176,17 +179,10 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
     # Centre the delays: a log does not determine how their sum is shared between both sides of the world.
     middle = lambda z: centred(problem.table, z) if free else z  # noqa: E731
     loss_of = lambda z: problem.loss(middle(z), on_compile=compiling)  # noqa: E731
-    arguments = (data, np.asarray(data.weight), advance)
     result = search(
-        problem.evaluator.searched(data),
-        start,
-        config,
-        *arguments,
-        problem.residuals.searches,
-        compiling,
-        loss_of,
-        host=problem.engine.name == "c",
-    )
+        problem.evaluator.searched(data), start, config, data, np.asarray(data.weight), advance,
+        problem.residuals.searches, compiling, loss_of, host=problem.engine.name == "c",
+    )  # fmt: skip
     finalists = np.array([middle(z) for z in result.finalists])
     result = replace(result, z=finalists[0], finalists=finalists)
     if report:  # this loss is exact; a generation's losses linearise initial states at its middle

@@ -305,3 +305,29 @@ def test_what_is_padded_changes_nothing(episode, count):
     without = problem.part(gone)
     assert problem.at(z, without).loss == pytest.approx(0.5 * np.mean(rest**2), rel=1e-5)
     assert problem.losses(z[None], z, without)[0] == pytest.approx(0.5 * np.mean(rest**2), rel=1e-5)
+
+
+def test_from_where_another_fit_ended_only_the_last_refinement_is_made(found, episode, monkeypatch):
+    """A descent on windows would leave a minimum that long segments have."""
+    cuts, descend = [], fitting._refine
+
+    def followed(problem, starts, *rest):
+        cuts.append((problem.segment_s, starts))
+        return descend(problem, starts, *rest)
+
+    monkeypatch.setattr(fitting, "_refine", followed)
+    monkeypatch.setattr(fitting, "run_search", lambda *_: pytest.fail("nothing is searched for"))
+    longer, end = [Span(0, 0.4 + 2.0 * i) for i in range(3)], found.fit.z + 0.05
+    config = replace(CONFIG, long_s=2.0)
+    again = fit(Model(), [episode], SPANS, LENGTH_S, config, long_spans=longer, end=end)
+    ((length_s, starts),) = cuts
+    assert length_s == again.problem.segment_s == pytest.approx(2.0)
+    np.testing.assert_array_equal(starts, end[None])
+    assert again.converged
+    assert again.values["gain"] == pytest.approx(GAIN, rel=0.01)
+    # Without longer segments, the windows are the last refinement.
+    cuts.clear()
+    short = fit(Model(), [episode], SPANS, LENGTH_S, CONFIG, end=end)
+    ((length_s, starts),) = cuts
+    assert length_s == short.problem.segment_s == pytest.approx(LENGTH_S)
+    np.testing.assert_allclose(short.z, found.fit.z, atol=2e-3)

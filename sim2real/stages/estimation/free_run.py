@@ -85,15 +85,17 @@ def fitted_to(
     report: OnProgress | None = None,
     on_begin: Callable[[Problem], None] | None = None,
     as_start: bool = False,
+    end: np.ndarray | None = None,
 ) -> Fit:
     """Return the fit of a model to logs.
 
     Args:
         windows: Segments to fit, and segments to predict.
         as_start: Whether it only has to be a start for fits with some of the optional terms.
+        end: Where a fit of nearly this model ended, as in ``fit``.
     """
     longer, length_s = long_spans(episodes, fitted, config), config.settle_s + config.horizon_s
-    return fit(model, list(episodes), windows, length_s, config, table, longer, report, on_begin, as_start)
+    return fit(model, list(episodes), windows, length_s, config, table, longer, report, on_begin, as_start, end)
 
 
 def far_off(document: Identification, positions: Sequence[Position]) -> list[tuple[Position, float, float]]:

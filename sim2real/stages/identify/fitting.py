@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim2real.identify.fit import Fit, OnProgress, as_numbers
-from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty.identifiability import from_linearised
 from sim2real.identify.uncertainty.negligible import ABSENT
@@ -95,16 +94,16 @@ def determined(inputs: Inputs, fits: Fits, findings: Findings) -> tuple[Fits, li
         The fits, and a sentence for each held parameter.
     """
     estimate, groups, sentences = fits.estimate, findings.check.undetermined, list[str]()
-    table, tried = estimate.problem.table, set[str]()
+    table, tried, data = estimate.problem.table, set[str](), (inputs.model, inputs.episodes, inputs.fitted)
     absent = [n for n, verdict in zip(table.names, findings.spread.verdict, strict=True) if verdict in ABSENT]
-    config = replace(inputs.config, generations=0)
-    while names := [n for group in groups for n in group if n not in tried and _may_be_held(table, n)]:
+    config, able = inputs.config, {p.name for p in table if p.kind == "dynamics" and not (p.term or p.per_recording)}
+    while names := [n for group in groups for n in group if n in able - tried]:
         # Begin with parameters that a model may be without, such as an inertia of the rotor.
         name = min(names, key=lambda n: not table[n].vanishes)
         tried.add(name)
-        begin = {n: float(np.squeeze(v)) for n, v in estimate.values.items() if not table[n].per_recording}
-        held = estimate.problem.table.with_fixed({name: table[name].nominal}).with_begin(begin)
-        again = fitted_to(inputs.model, inputs.episodes, inputs.fitted, inputs.windows, config, held)
+        held = estimate.problem.table.with_fixed({name: table[name].nominal})
+        end = estimate.z[[c.parameter.name != name for c in estimate.problem.table.columns]]
+        again = fitted_to(*data, inputs.windows, config, held, end=end)
         if not again.converged or again.loss > (1.0 + _AS_GOOD) * estimate.loss:
             continue
         estimate = again
@@ -116,10 +115,6 @@ def determined(inputs: Inputs, fits: Fits, findings: Findings) -> tuple[Fits, li
             "data as well; the other estimates are for this value"
         )
     return replace(fits, estimate=estimate), sentences
-
-
-def _may_be_held(table: ParameterTable, name: str) -> bool:
-    return any(p.name == name and p.kind == "dynamics" and not p.term and not p.per_recording for p in table)
 
 
 @contextmanager

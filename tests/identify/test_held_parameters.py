@@ -1,0 +1,55 @@
+"""A parameter that the data does not determine is held at its nominal value, if the fit stays as good."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_fit import GAIN, LENGTH_S, SPANS, LagParams, Model, episode  # noqa: F401
+
+from sim2real.identify import fit as fitting
+from sim2real.identify.fit import fit
+from sim2real.identify.parameters import Parameter, ParameterTable
+from sim2real.stages.estimation.estimate import Findings
+from sim2real.stages.estimation.segment_split import long_spans
+from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.identify.fitting import Fits, determined
+
+CONFIG = IdentifyConfig(max_delay_s=0.02, generations=0, refine=1, terms="auto", horizon_s=LENGTH_S, settle_s=0.0)
+
+
+class Twice(Model):
+    """A lag whose gain is a product of two parameters: any share of one is made up for by the other."""
+
+    def __init__(self):
+        super().__init__(outside=False)
+        shares = [Parameter("first", "1", 1.3, 0.25, 4.0), Parameter("second", "1", 1.1, 0.25, 4.0)]
+        self.parameters = ParameterTable([*shares, *(p for p in self.parameters if p.name != "gain")])
+
+    def params(self, values, start):
+        return {"world": LagParams(values["first"] * values["second"], values["tau"], start[0])}
+
+
+@pytest.mark.parametrize("long_s", [0.0, 2.0])
+def test_one_factor_of_a_product_is_held_and_the_other_is_for_that_value(episode, long_s, monkeypatch):  # noqa: F811
+    config = replace(CONFIG, long_s=long_s)
+    longer = long_spans([episode], 1, config)
+    assert bool(longer) == bool(long_s)
+    model = Twice()
+    wide = fit(model, [episode], SPANS, LENGTH_S, config, long_spans=longer)
+    assert Findings.of(wide, ()).check.undetermined
+    inputs = SimpleNamespace(model=model, episodes=[episode], fitted=1, windows=SPANS, config=config)
+    lengths, descend = [], fitting._refine
+    monkeypatch.setattr(
+        fitting, "_refine", lambda problem, *rest: lengths.append(problem.segment_s) or descend(problem, *rest)
+    )
+    fits, sentences = determined(inputs, Fits(wide, wide, None), Findings.of(wide, ()))
+    values, (sentence,) = fits.estimate.values, sentences
+    held, other = ("first", "second") if "first is held" in sentence else ("second", "first")
+    assert f"{held} is held at its nominal value" in sentence
+    assert held not in fits.estimate.problem.table.names
+    assert values[other] * model.parameters[held].nominal == pytest.approx(GAIN, rel=0.01)
+    assert fits.estimate.converged
+    assert fits.estimate.loss == pytest.approx(wide.loss, rel=3e-4)
+    # Only the last descent is repeated: one on windows could leave the minimum of long segments.
+    np.testing.assert_allclose(lengths, [long_s or LENGTH_S])
