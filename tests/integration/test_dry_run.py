@@ -49,7 +49,7 @@ def tapped(tmp_path_factory):
 
 def test_the_wiretap_hears_what_moves_a_motor(tapped):
     tap, _ = tapped()
-    with ServoBus(BusConfig(tap.port, max_silence_s=1.0, silence_s=1.0)) as bus:
+    with ServoBus(BusConfig(tap.port, reply_timeout_s=0.2, max_silence_s=1.0, silence_s=1.0)) as bus:
         bus.handshake({1: None})
         bus.setup(OperatingMode.PWM)
         assert tap.motions() == []
