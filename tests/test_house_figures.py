@@ -8,7 +8,7 @@ import pytest
 
 HOUSE = Path(__file__).resolve().parent.parent / "scripts" / "house.py"
 LIMITS = {
-    "lines without composer": 71_750,
+    "lines without composer": 71_800,
     "lines of composer": 12_330,
     "files in the fullest folder": 15,
     "docstring lines [%]": 20.0,

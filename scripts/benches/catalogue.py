@@ -17,6 +17,9 @@ _IDENTIFY = (
 _JUDGED = ("sim2real/stages/identify", "sim2real/stages/estimation")
 """The stage around the fit: which part is held out, how it is predicted, which terms are tried, and the verdict."""
 
+_LINKS, _WITH_LINKS = "!sim2real/identify/delays", ("latency-league", "light", "suite")
+"""What only ``identify --links`` runs, and the benches that measure it; the others identify without that flag."""
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -191,4 +194,5 @@ def measures(name: str, flags: Mapping[str, object]) -> tuple[str, ...]:
     bench = BENCHES[name]
     folder, _, module = bench.module.rpartition(".")
     own_path = f"scripts/benches/{folder or f'{module}.py'}"
-    return (*(path.format(**flags) for path in bench.measures), own_path, *_COMMON)
+    unused = () if name in _WITH_LINKS else (_LINKS,)
+    return (*(path.format(**flags) for path in bench.measures), *unused, own_path, *_COMMON)

@@ -93,7 +93,7 @@ def jitter(log):
     """Find the link, then the jitter of the commands."""
     linearise, moved, again, unknowns = watch(log)
     start = np.concatenate([[np.log(GAIN) + 0.1, np.log(RATE) - 0.2], np.zeros(unknowns - 2)])
-    own = find(linearise, start, 0.01, again, np.array([COUNT_RAD / NOISE_RAD])).hidden
+    own = find(linearise, start, 0.01, again).hidden
     delay_s = own.mean[0]
     seen, late = linearise(own.x, delay_s), moved(own.x, delay_s)
     return deviation(seen, np.full(len(seen.stamps), delay_s), own.deviation[0], own.noise, late)

@@ -52,6 +52,13 @@ def test_ours_finds_a_distribution_and_a_correlation_measures_the_lag_of_the_ser
     assert peak.mean > true.mean + 0.02
 
 
+@pytest.mark.full
+@pytest.mark.parametrize(("kind", "seed"), [("tail", 101), ("steps", 200), ("usb", 107)])
+def test_ours_finds_the_mean_from_a_start_far_from_it(kind, seed):
+    """From one start the first ended 4 ms away and the third 2.5, and the first estimate of the second diverged."""
+    assert methods.ours(links.log(kind, 8.0, seed), 0).mean == pytest.approx(links.truth(kind, 8.0).mean, abs=1.5e-3)
+
+
 @pytest.mark.full  # `make test` runs the other methods
 def test_sysid_finds_a_constant_delay_and_paces_is_a_multiple_of_its_step(monkeypatch):
     log, true = links.log("fixed", 3.0, 1), links.truth("fixed", 3.0)

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from benches.identify import sysid as rigs
 from benches.identify.sysid import Recording
-from benches.latency.links import COUNT_RAD, NOISE_RAD, Log, motion
+from benches.latency.links import NOISE_RAD, Log, motion
 from benches.league import mujoco_joints
 from sim2real.identify.delays.likelihood import DelayEvidence
 from sim2real.identify.delays.links import describe, find
@@ -67,7 +67,7 @@ def ours(log: Log, seed: int) -> Estimate:
         return DelayEvidence(log.t - log.t.mean(), grid, errors[:, None] / NOISE_RAD, J, 1e-2 * np.eye(len(x)))
 
     again = np.concatenate([[False], np.diff(log.position) == 0.0])
-    estimate = find(linearise, first.x[:-1], float(first.x[-1]), again, np.array([COUNT_RAD / NOISE_RAD]))
+    estimate = find(linearise, first.x[:-1], float(first.x[-1]), again)
     link = describe("measurements", ("measurements", "commands"), estimate)
     ends = [(float(r.low95 or 0.0), float(r.high95 or 0.0)) for r in (link.mean, link.p95)]
     return Estimate(float(link.mean.value or 0.0), float(link.p95.value or 0.0), float(link.lost.value or 0.0), *ends)

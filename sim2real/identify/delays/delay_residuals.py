@@ -29,7 +29,6 @@ class Watched:
         x: Shape ``(P,)``: the unknowns at the estimate.
         delay_s: The measurements' delay at the estimate [s].
         again: Shape ``(N,)``, bool: whether a measurement repeats the previous values.
-        quantum: Shape ``(F,)``: resolution of the measurements, in deviations.
         pick: Shape ``(E,)``: the segments that are used.
         counts: Shape ``(E, C)``, bool: which of their measurements are the ``N`` that count.
     """
@@ -38,7 +37,6 @@ class Watched:
     x: np.ndarray
     delay_s: float
     again: np.ndarray
-    quantum: np.ndarray
     pick: np.ndarray
     counts: np.ndarray
 
@@ -75,8 +73,7 @@ def motion(problem: Problem, z: np.ndarray, late: str) -> Watched:
             jacobian[e, :, :, len(moved) + states * e : len(moved) + states * (e + 1)] = np.moveaxis(by_state[e], 0, -1)
         return DelayEvidence(stamps[counts], delays, np.moveaxis(errors, 0, -1)[counts], jacobian[counts], prior)
 
-    again, quantum = _again(problem, data, pick)
-    return Watched(linearise, x, delay_s, again[counts], quantum, pick, counts)
+    return Watched(linearise, x, delay_s, _again(problem, data, pick)[counts], pick, counts)
 
 
 def _programs(
@@ -133,13 +130,11 @@ def _apart(problem: Problem) -> np.ndarray:
     return np.array(chosen)
 
 
-def _again(problem: Problem, data: Data, pick: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which measurements ``(E, C)`` have the values of the one before, and the fields' resolution ``(F,)``."""
-    same, quantum = np.ones((len(pick), data.ts.shape[1]), bool), []
-    for field, sigma, entry in problem.fields:
+def _again(problem: Problem, data: Data, pick: np.ndarray) -> np.ndarray:
+    """Return which measurements ``(E, C)`` have the values of the one before."""
+    same = np.ones((len(pick), data.ts.shape[1]), bool)
+    same[:, 0] = False
+    for field, _, entry in problem.fields:
         rows = np.asarray(entry(np.asarray(data.measured[field])), np.float64)[pick]
-        same[:, 0] = False
         same[:, 1:] &= rows[:, 1:] == rows[:, :-1]
-        gaps = np.diff(np.unique(rows))
-        quantum.append(float(gaps.min()) / sigma if gaps.size else 1.0)
-    return same, np.array(quantum)
+    return same

@@ -58,7 +58,7 @@ class Likelihood:
     """
 
     def __init__(self, evidence: DelayEvidence, grid: np.ndarray, drift: float) -> None:
-        self.evidence, self.grid = evidence, grid
+        self.evidence, self.grid, self.drift = evidence, grid, drift
         self.fields, self.unknowns = evidence.jacobian.shape[1:]
         self.bumps = _bumps(grid)
         self.size = self.unknowns + self.fields + self.bumps.shape[1]

@@ -15,14 +15,13 @@ from sim2real.errors import UsageError
 from sim2real.identify.delays import jitter
 from sim2real.identify.delays.delay_residuals import Watched, motion
 from sim2real.identify.delays.hidden_delays import Hidden, Linearise, hidden
-from sim2real.identify.delays.likelihood import DelayEvidence, Likelihood
+from sim2real.identify.delays.likelihood import Likelihood
 from sim2real.identify.delays.lost_messages import Losses, losses
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 
-_AT_REST, _MOVES = 0.02, 2.0
-"""Limits of motion that shows losses: the probability of the previous value, and the motion between two measurements in
-counts and deviations of the noise. Below them a repeated value is no evidence: a joint at rest repeats its counts."""
+_LOST = 0.5
+"""Probability of a loss from which on a repeated value counts as lost; below, its delay counts as the others do."""
 _WIDTH = 1.96
 """Half the width of an interval, in standard errors."""
 
@@ -40,32 +39,37 @@ class StreamEstimate:
     losses: Losses
 
 
-def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray, quantum: np.ndarray) -> StreamEstimate:
+def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray) -> StreamEstimate:
     """Estimate delays, losses, drift, noise and the unknowns of a model together.
 
     Args:
         x: Shape ``(P,)``: a first estimate of the unknowns.
         delay_s: A first estimate of the mean delay [s].
-        again: Shape ``(N,)``, bool: measurements that repeat the previous values, perhaps because of a lost message.
-        quantum: Shape ``(F,)``: resolution of the measurements, in their deviations.
+        again: Shape ``(N,)``, bool: measurements that repeat the previous values. Either the message was lost, or it
+            came and shows the same motion: the robot rests, or its device measures more seldom than it is read.
     """
+    first = np.maximum.accumulate(np.where(again, 0, np.arange(len(again))))
 
-    def fresh(x: np.ndarray, about_s: float) -> DelayEvidence:
-        return linearise(x, about_s).rows(~again)
-
-    # Estimate the delays from new values, then the losses from repeated ones.
-    estimate = hidden(fresh, x, delay_s)
-    chance = np.ones(len(again))
-    if again.any():
+    def estimated(came: np.ndarray, x: np.ndarray, delay_s: float) -> tuple[float, StreamEstimate]:
+        estimate = hidden(lambda x, about_s: linearise(x, about_s).rows(came), x, delay_s)
         evidence = linearise(estimate.x, estimate.mean[0])
-        density = Likelihood(evidence.rows(again), estimate.delays, estimate.drift)(estimate.place)[2]
-        share = np.exp(density - 0.5 * len(quantum) * np.log(2 * np.pi)) * quantum.prod()
-        slopes = evidence.at(np.full((len(again), 1), estimate.mean[0]))[1][:, :, 0]
-        moved = np.abs(slopes) * np.diff(evidence.stamps, prepend=evidence.stamps[0])[:, None]
-        moves = np.any(moved > _MOVES * np.maximum(quantum, estimate.noise), axis=1)
-        informative = moves[again] & (share < _AT_REST)
-        chance[again] = np.where(informative, share, 1.0)
-    return StreamEstimate(estimate, losses(again, chance))
+        density = Likelihood(evidence, estimate.delays, estimate.drift)(estimate.place)[2]
+        # A repeated value of a message that came is as probable, beside the new value, as its age is among the delays.
+        chance = np.exp(np.minimum(density - density[first], 0.0))
+        lost = losses(again, chance)
+        share = np.clip(lost.each.mean(), 0.5 / len(again), 0.5)
+        height = np.where(again, np.log(share + (1.0 - share) * chance), np.log(1.0 - share) + density)
+        return float(height.sum()), StreamEstimate(estimate, lost)
+
+    # Estimate from new values; then, too, from repeated ones that came, which have longer delays.
+    best = estimated(~again, x, delay_s)
+    came = ~again | (best[1].losses.each < _LOST)
+    if (came != ~again).any():
+        best = estimated(came, best[1].hidden.x, best[1].hidden.mean[0])
+    # If a slow device repeats values, no new one is as old as these: compare with an estimate from all.
+    if not came.all():
+        best = max(best, estimated(np.ones_like(again), x, delay_s), key=lambda one: one[0])
+    return best[1]
 
 
 def links(problem: Problem, z: np.ndarray) -> tuple[Link, ...]:
@@ -79,7 +83,7 @@ def links(problem: Problem, z: np.ndarray) -> tuple[Link, ...]:
     """
     late = measured(problem.table)
     evidence = motion(problem, z, late)
-    estimate = find(evidence.linearise, evidence.x, evidence.delay_s, evidence.again, evidence.quantum)
+    estimate = find(evidence.linearise, evidence.x, evidence.delay_s, evidence.again)
     held, parts = _commands(problem.table, z)
     return (replace(describe(late, (late, *parts), estimate, held), jitter=_jitter(problem, z, evidence, estimate)),)
 
@@ -118,19 +122,19 @@ def describe(name: str, parts: tuple[str, ...], estimate: StreamEstimate, held_s
     return Link(
         name=name,
         parts=parts,
-        mean=_around(mean + held_s, mean_error),
-        deviation=replace(_around(deviation, error), low95=max(deviation - _WIDTH * error, 0.0)),
-        p95=Ranged(p95 + held_s, low + held_s, high + held_s),
+        mean=_around(mean + held_s, mean_error, 0.0),
+        deviation=_around(deviation, error, 0.0),
+        p95=Ranged(p95 + held_s, max(low + held_s, 0.0), high + held_s),
         lost=estimate.losses.share,
         burst=estimate.losses.burst,
-        drift=_around(hidden_delays.drift, hidden_delays.drift_error),
+        drift=_around(hidden_delays.drift, hidden_delays.drift_error, -np.inf),
         delays=hidden_delays.delays + held_s,
         share=hidden_delays.share,
     )
 
 
-def _around(value: float, error: float) -> Ranged:
-    return Ranged(value, value - _WIDTH * error, value + _WIDTH * error)
+def _around(value: float, error: float, least: float) -> Ranged:
+    return Ranged(value, max(value - _WIDTH * error, least), value + _WIDTH * error)
 
 
 def _commands(table: ParameterTable, z: np.ndarray) -> tuple[float, tuple[str, ...]]:
