@@ -125,7 +125,7 @@ def hidden(linearise: Linearise, x: np.ndarray, delay_s: float) -> Hidden:
     """
     # First estimates by least squares; a step that does not lower the errors is taken in part.
     size, drift, error_s, evidence = len(x), 0.0, 0.0, linearise(x, delay_s)
-    ones = np.ones(evidence.errors.shape[1])
+    ones, first = np.ones(evidence.errors.shape[1]), _local(evidence, x, drift, delay_s)
     for _ in range(3):
         move, errors = straight(evidence, drift, delay_s, _FIRST_S, ones)
         error_s = float(errors[0])
@@ -147,9 +147,9 @@ def hidden(linearise: Linearise, x: np.ndarray, delay_s: float) -> Hidden:
     while abs(best) < _TRIES and local(best + step)[0] > local(best)[0]:
         best += step
 
-    # Maximise the likelihood there with a new linearisation, twice.
-    at, _, _ = _climb(linearise, local(best)[1])
-    at, likelihood, p = _climb(linearise, at)
+    # Maximise the likelihood there and near the first one, each with a new linearisation, twice.
+    ends = [_climb(linearise, _climb(linearise, start)[0]) for _, start in (first, local(best))]
+    at, likelihood, p = max(ends, key=lambda end: end[1](end[2])[0])
 
     # Errors of the estimate.
     _, (mean_error, drift_error) = straight(likelihood.evidence, at.drift, at.mean_s, at.deviation_s, at.noise)
@@ -209,8 +209,8 @@ def straight(
     """
     columns, rest = _weighed(evidence, drift, delay_s, deviation_s, noise)
     size = columns.shape[2]
-    prior = np.zeros((size, size))
-    prior[:-2, :-2] = evidence.prior
+    prior = 1e-12 * np.eye(size)
+    prior[:-2, :-2] += evidence.prior
     inverse = np.linalg.inv(np.einsum("nfp,nfq->pq", columns, columns) + prior)
     move = -inverse @ np.einsum("nfp,nf->p", columns, rest)
     gradient = np.einsum("nfp,nf->np", columns, rest + columns @ move)
