@@ -30,11 +30,18 @@ PLANTS = Path(__file__).parent / "plants.py"
 OK = 0
 
 
+class Patient(PortHandler):
+    """A port that waits longer for an answer than the SDK's 34 ms: a busy machine may hold up both processes."""
+
+    def setPacketTimeout(self, packet_length):
+        self.setPacketTimeoutMillis(300.0)
+
+
 class Sdk:
     """A host that uses the SDK as its documentation shows."""
 
     def __init__(self, port):
-        self.port = PortHandler(port)
+        self.port = Patient(port)
         assert self.port.openPort()
         assert self.port.setBaudRate(1_000_000)
         self.packets = PacketHandler(2.0)
