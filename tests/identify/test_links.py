@@ -40,8 +40,6 @@ def lag(kind, n, rng):
         return 0.001 + 0.016 * ((0.37 - PERIOD_S / 0.016 * np.arange(n) + 0.1 * rng.random(n)) % 1.0), lost
     if kind == "held":  # the device measures each 16 ms, and a message has its newest value
         return 0.001 + PERIOD_S * np.arange(n) % 0.016, lost
-    if kind == "tail":
-        return np.minimum(0.003 + 0.001 * (1.0 + rng.pareto(1.5, n)), 0.035), lost
     if kind == "bursts":
         for i in range(1, n):
             lost[i] = rng.random() < (0.7 if lost[i - 1] else 0.04)

@@ -37,7 +37,7 @@ class Hidden:
         noise: Shape ``(F,)``: deviation of the noise, in deviations of the measurement.
         delays: Shape ``(K,)``: a grid of delays, in the middle of the recording [s].
         share: Shape ``(K,)``: share of the measurements that have each delay.
-        mean_error: Standard error of the mean by least squares, for which the distribution has no shape [s].
+        mean_error: Standard error of the mean by least squares, which assume no shape of the distribution [s].
         by_shape: Shape ``(K, M)``: d share / d weight of the splines.
         covariance: Of unknowns, logarithms of the noise and weights of the splines, in this order.
         place: The point of the largest likelihood, in the same order; 0 for unknowns, as offsets from ``x``.
@@ -58,7 +58,8 @@ class Hidden:
     def mean(self) -> tuple[float, float]:
         """The mean delay and its standard error [s].
 
-        The likelihood knows the mean too well: it takes edges of the distribution for the splines' own.
+        The error is at least that of least squares. The likelihood's own is too small where the distribution has edges
+        that the splines cannot follow.
         """
         return float(self.share @ self.delays), max(self._error(self.delays @ self.by_shape), self.mean_error)
 
@@ -73,8 +74,8 @@ class Hidden:
         """Return the delay that a share ``q`` of the messages does not exceed, and the ends of its interval [s].
 
         The ends are the quantiles at ``q`` minus and plus the error of the distribution there: a quantile within a gap
-        of the distribution has no standard error. What the mean's error exceeds the likelihood's by, and half a step of
-        the grid, its resolution, widen the interval.
+        of the distribution has no standard error. Two things widen the interval: the part of the mean's error that the
+        likelihood lacks, and half a step of the grid, its resolution.
         """
         below = np.cumsum(self.share) - 0.5 * self.share
         error = self._error(np.array(_at(self._below(), below, q)))
@@ -140,14 +141,14 @@ def hidden(linearise: Linearise, x: np.ndarray, delay_s: float) -> Hidden:
         else:
             break
 
-    # The likelihood has many maxima: begin at delays on both sides of this one, too, and go on while it gets larger.
+    # The likelihood has many maxima: start from delays on both sides, too, and go further while it gets larger.
     begins = delay_s + _APART * error_s * np.arange(-_TRIES, _TRIES + 1)
     local = functools.cache(lambda k: _local(evidence, x, drift, float(begins[_TRIES + k])))
     best, step = 0, 1 if local(1)[0] > local(-1)[0] else -1
     while abs(best) < _TRIES and local(best + step)[0] > local(best)[0]:
         best += step
 
-    # Maximise the likelihood there and near the first one, each with a new linearisation, twice.
+    # Linearise twice more, from the best of these and from the caller's estimate: far steps may have looked too good.
     ends = [_climb(linearise, _climb(linearise, start)[0]) for _, start in (first, local(best))]
     at, likelihood, p = max(ends, key=lambda end: end[1](end[2])[0])
 

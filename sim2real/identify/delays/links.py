@@ -54,7 +54,7 @@ def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray)
         estimate = hidden(lambda x, about_s: linearise(x, about_s).rows(came), x, delay_s)
         evidence = linearise(estimate.x, estimate.mean[0])
         density = Likelihood(evidence, estimate.delays, estimate.drift)(estimate.place)[2]
-        # A repeated value of a message that came is as probable, beside the new value, as its age is among the delays.
+        # How probable a repetition is if the message came: the density of its age over that of the new value's.
         chance = np.exp(np.minimum(density - density[first], 0.0))
         lost = losses(again, chance)
         share = np.clip(lost.each.mean(), 0.5 / len(again), 0.5)
@@ -66,7 +66,7 @@ def find(linearise: Linearise, x: np.ndarray, delay_s: float, again: np.ndarray)
     came = ~again | (best[1].losses.each < _LOST)
     if (came != ~again).any():
         best = estimated(came, best[1].hidden.x, best[1].hidden.mean[0])
-    # If a slow device repeats values, no new one is as old as these: compare with an estimate from all.
+    # The repetitions of a slow device are older than any new value: compare with an estimate in which all came.
     if not came.all():
         best = max(best, estimated(np.ones_like(again), x, delay_s), key=lambda one: one[0])
     return best[1]
