@@ -17,8 +17,17 @@ _IDENTIFY = (
 _JUDGED = ("sim2real/stages/identify", "sim2real/stages/estimation")
 """The stage around the fit: which part is held out, how it is predicted, which terms are tried, and the verdict."""
 
-_LINKS, _WITH_LINKS = "!sim2real/identify/delays", ("latency-league", "light", "suite")
-"""What only ``identify --links`` runs, and the benches that measure it; the others identify without that flag."""
+_USED_BY = {
+    "sim2real/identify/delays": ("latency-league", "light", "suite"),
+    "sim2real/robots/walking/plain/weighing.py": ("legs-identify", "light", "suite"),
+    "sim2real/robots/control_loop/hardware.py": (
+        *("arm", "demo", "excitation", "faults", "identify-time", "legs", "light", "randomise-wall", "runner", "so101"),
+        *("suite", "twin"),
+    ),
+}
+"""What only ``identify --links``, ``identify --standing``, or a robot on hardware or emulated in real time runs, and
+the benches that measure it; the lists of the others leave it out. ``randomise-wall`` is the one with ``--clock wall``.
+"""
 
 
 @dataclass(frozen=True)
@@ -194,5 +203,6 @@ def measures(name: str, flags: Mapping[str, object]) -> tuple[str, ...]:
     bench = BENCHES[name]
     folder, _, module = bench.module.rpartition(".")
     own_path = f"scripts/benches/{folder or f'{module}.py'}"
-    unused = () if name in _WITH_LINKS else (_LINKS,)
+    names = {name, f"{name}-{flags.get('clock')}"}
+    unused = [f"!{path}" for path, benches in _USED_BY.items() if not names & set(benches)]
     return (*(path.format(**flags) for path in bench.measures), *unused, own_path, *_COMMON)

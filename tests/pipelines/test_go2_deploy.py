@@ -134,7 +134,7 @@ def test_the_load_of_a_robot_on_its_feet_over_dds(tmp_path, capsys):
     assert "not determined by this log: foot_friction, roughness" in found.verdict.reasons
     load = found.parameters[-1]
     assert load.name == "payload"
-    assert load.estimate == pytest.approx(load.truth, abs=0.3)
+    assert load.estimate == pytest.approx(load.truth, abs=0.15)
     assert load.high95 - load.low95 < 0.8
     manifest = json.loads((folder / "manifest.json").read_text())
     assert "standing" in manifest["inputs"]

@@ -1,5 +1,6 @@
 """A servo robot on hardware: the real nodes, rig and bus, on the arm's embedded robot."""
 
+from copy import copy
 from dataclasses import asdict, dataclass, replace
 from types import SimpleNamespace
 
@@ -16,6 +17,8 @@ from sim2real.robots.control_loop.hardware import Excitation
 from sim2real.robots.control_loop.messages import Goals
 from sim2real.robots.gate_limits import GateLimits
 from sim2real.stages.on_robot.episode import run_episode
+from sim2real.stages.pipeline.load_robot import moving_robot
+from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pytestmark = pytest.mark.realtime
 
@@ -200,6 +203,21 @@ def test_a_robot_without_an_embedded_twin_has_no_such_port(pair, tmp_path):
         pair.drive.connect("embedded", GATE, tmp_path / "truth.bin", 0)
     assert "--port" in caught.value.hint
     assert not (tmp_path / "truth.bin").exists()
+
+
+@pytest.mark.parametrize("name", ["go2", "so101", "arm", "pendulum"])
+def test_no_command_leaps_where_a_recording_outlasts_its_excitation(name):
+    """A Go2 on its feet was told to stretch all legs for the last one or two steps of each log of its load."""
+    robot = copy(moving_robot(load_pipeline(name)))
+    robot.drive = copy(robot.drive)
+    robot.drive.on_feet = name == "go2"
+    rest = SimpleNamespace(position_rad=np.full(len(robot.agent.action), 0.1))
+    session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: rest, wait_until_still=lambda *_: rest))
+    signal = 0.5 + 0.1 * np.linspace(0.0, 1.0, 100)[:, None] * np.ones(len(robot.agent.action))
+    agent = robot.recording_nodes(session, signal)["agent"]
+    played = np.array([getattr(agent.step(SimpleNamespace(seq=k))[1], robot.drive.command) for k in range(200)])
+    assert np.abs(np.diff(played[98:], axis=0)).max() < 0.03
+    np.testing.assert_array_equal(played[-50:], np.tile(played[-1], (50, 1)))
 
 
 def test_an_excitation_of_no_numbers_is_refused():

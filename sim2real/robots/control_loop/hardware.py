@@ -215,7 +215,8 @@ class Excitation(BaseNode):
 
     Args:
         rate: Steps per second [Hz].
-        signal: Shape ``(N, servos)``: one command per step; after its end zeros are sent.
+        signal: Shape ``(N, servos)``: one command per step; after its end the last one is sent, as a goal of 0 would be
+            a leap.
         **options: Options of ``BaseNode``.
 
     Raises:
@@ -244,6 +245,5 @@ class Excitation(BaseNode):
 
     def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Return the next command."""
-        seq = int(step_state.seq)
-        over = seq >= len(self._signal)
-        return step_state, self._message(np.zeros(self._signal.shape[1]) if over else self._signal[seq])
+        row = min(int(step_state.seq), len(self._signal) - 1)
+        return step_state, self._message(self._signal[row])

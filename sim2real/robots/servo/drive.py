@@ -126,7 +126,7 @@ class ServoDrive(RobotDrive):
 
 def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> np.ndarray:
     """Return goals ``(N, joints)`` that begin at positions ``(joints,)`` and reach the given goals at 1 rad/s [rad]."""
-    # After its end an excitation would be 0, which may be outside of the limits: repeat the last goals.
+    # Repeat the last goals: joints that began farther away than the excitation lasts go on towards them.
     goals = np.vstack([goals, np.repeat(goals[-1:], round(_HOLD_S * rate_hz), axis=0)])
     offset = position_rad - goals[0]
     covered = np.arange(len(goals))[:, None] * HOME_RAD_S / rate_hz

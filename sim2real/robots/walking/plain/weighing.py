@@ -76,14 +76,13 @@ def weighed(
         truth: Known parameters of the embedded robot.
 
     Raises:
-        OtherMotion: The load is outside of its bounds.
+        OtherMotion: The load and its interval are outside of its bounds.
     """
     if identification.posterior is None or not isinstance(robot, ComposedRobot):
         return identification
     values, balances = identification.values, balances_of(robot, episode, identification.values)
     load = balances.load(robot, values)
     row = next(p for p in robot.walking.around() if p.name == PAYLOAD)
-    require_load(load, row.low, row.high)
     # The spread of parts of the log is the error of the balances; the posterior adds that of the other parameters.
     edges = np.linspace(0, len(balances.size), _BLOCKS + 1).astype(int)
     parts = [balances.load(robot, values, slice(a, b)) for a, b in pairwise(edges)]
@@ -91,8 +90,10 @@ def weighed(
     load_of = lambda some: balances.load(robot, {**values, **some})  # noqa: E731
     posterior = _with_load(identification.posterior, load_of, scatter, (row.low, row.high))
     deviation = float(np.sqrt(posterior.covariance[-1, -1]))
-    ends = load - 1.96 * deviation, load + 1.96 * deviation
-    known = row.unit, "dynamics", row.about, row.nominal, load, "accepted", deviation, *ends, row.low, row.high
+    # A load that only its error may have put outside of its bounds lies on one of them.
+    require_load(load, row.low, row.high, 1.96 * deviation)
+    load, left, right = np.clip(load + 1.96 * deviation * np.array([0.0, -1.0, 1.0]), row.low, row.high).tolist()
+    known = row.unit, "dynamics", row.about, row.nominal, load, "accepted", deviation, left, right, row.low, row.high
     estimate = Estimate(PAYLOAD, *known, truth.get(PAYLOAD))
     return replace(identification, parameters=(*identification.parameters, estimate), posterior=posterior)
 
@@ -109,9 +110,9 @@ def check(robot: object, episode: Episode, nominal: Mapping[str, float]) -> None
     require_load(balances_of(robot, episode, nominal).load(robot, nominal), -0.5 * mass_kg, 0.5 * mass_kg)
 
 
-def require_load(load: float, low: float, high: float) -> None:
-    """Refuse a load outside of bounds [kg]."""
-    if not low <= load <= high:
+def require_load(load: float, low: float, high: float, error: float = 0.0) -> None:
+    """Refuse a load that is outside of bounds by more than its error [kg]."""
+    if not low - error <= load <= high + error:
         raise OtherMotion(
             f"in the log of standing the joints carry {load:+.3g} kg beside the robot's own weight, outside of "
             f"{low:.3g} to {high:.3g} kg",
@@ -191,7 +192,7 @@ def _with_load(
         posterior,
         names=(*posterior.names, PAYLOAD),
         transform=(*posterior.transform, "linear"),
-        mean=np.append(posterior.mean, load),
+        mean=np.append(posterior.mean, np.clip(load, *ends)),
         covariance=np.block([[covariance, cross[:, None]], [cross[None], slope @ cross + scatter**2]]),
         low=np.append(posterior.low, ends[0]),
         high=np.append(posterior.high, ends[1]),
