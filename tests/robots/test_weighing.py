@@ -142,20 +142,41 @@ def first(episode, seconds):
     return replace(episode, steps=steps, outputs=outputs)
 
 
+def test_a_leap_of_the_last_targets_and_a_robot_that_sinks_do_not_change_the_load(standing):
+    episode, values, _ = standing
+    found = weighing.balances_of(ROBOT, episode, values).load(ROBOT, values)
+    # The last two targets stretch all legs, before a measurement shows that they move.
+    sent = episode.outputs["actuator"]["q"].copy()
+    sent[-2:] = 0.0
+    leap = changed(episode, "actuator", q=sent)
+    assert weighing.balances_of(ROBOT, leap, values).load(ROBOT, values) == pytest.approx(found, abs=0.01)
+    # Without gains the legs give way, faster and faster.
+    end, kp = -20, episode.outputs["actuator"]["kp"].copy()
+    kp[end:] = 0.0
+    fast = episode.outputs["sensor"]["velocity"].copy()
+    fast[end:] += np.linspace(0.5, 1.7, -end)[:, None]
+    sinks = changed(changed(episode, "actuator", kp=kp), "sensor", velocity=fast)
+    assert weighing.balances_of(ROBOT, sinks, values).load(ROBOT, values) == pytest.approx(found, abs=0.06)
+
+
 def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing):
     episode, values, _ = standing
     weighing.check(ROBOT, episode, values)
     hanging, _, _ = logged(tmp_path, 1)
-    with pytest.raises(OtherMotion, match="beside the robot's own weight") as refused:
+    with pytest.raises(OtherMotion, match=r"legs move slowly for \d\.\d s of this log") as refused:
         weighing.check(ROBOT, hanging, values)
+    assert "on its feet" in refused.value.hint
+    slow = changed(hanging, "sensor", velocity=0.1 * hanging.outputs["sensor"]["velocity"])
+    with pytest.raises(OtherMotion, match="beside the robot's own weight") as refused:
+        weighing.check(ROBOT, slow, values)
     assert "not in a stand" in refused.value.hint
     with pytest.raises(OtherMotion, match="base of the robot moved") as refused:
         ROBOT.identifiable(0.06).check(episode)
     assert "--standing" in refused.value.hint
     still = changed(episode, "sensor", velocity=0.0 * episode.outputs["sensor"]["velocity"])
-    with pytest.raises(OtherMotion, match=r"moves for 0\.0 s of this log: friction"):
+    with pytest.raises(OtherMotion, match=r"legs move slowly for 0\.0 s of this log: rest"):
         weighing.check(ROBOT, still, values)
-    with pytest.raises(OtherMotion, match=r"moves for [12]\.\d s of this log"):
+    with pytest.raises(OtherMotion, match=r"legs move slowly for [12]\.\d s of this log"):
         weighing.check(ROBOT, first(episode, 2.5), values)
     turned = np.tile([0.9, 0.43589, 0.0, 0.0], (len(episode.outputs["sensor"]["quaternion"]), 1))
     with pytest.raises(OtherMotion, match="not stand upright"):

@@ -215,8 +215,7 @@ class Excitation(BaseNode):
 
     Args:
         rate: Steps per second [Hz].
-        signal: Shape ``(N, servos)``: one command per step; after its end the last one is sent, as a goal of 0 would be
-            a leap.
+        signal: Shape ``(N, servos)``: one command per step; after its end the last one, as 0 may be a leap.
         **options: Options of ``BaseNode``.
 
     Raises:

@@ -33,8 +33,8 @@ _SETTLED_S, _BEND_S = 0.5, 3.0
 again, errors of delays and accelerations cancel [s]."""
 _UPRIGHT, _FREE = -0.95, 6
 """Largest vertical part of gravity's direction in the base, and the directions in which the base moves."""
-_MOVING_RAD_S = 0.03
-"""Speed at which friction has 3/4 of its size; at rest its direction is open [rad/s]."""
+_MOVING_RAD_S, _FAST_RAD_S = 0.03, 0.6
+"""Speed at which friction has 3/4 of its size; at rest its direction is open; and one faster than legs bend [rad/s]."""
 _SMOOTHED, _BLOCKS, _MOST_SAMPLES, _STEP = 5, 8, 600, 1e-4
 """Samples of a mean speed, parts of a log that are weighed alone, used samples of a log, and step of a derivative."""
 _WIDER = 2.365 / 1.96
@@ -127,14 +127,15 @@ def balances_of(robot: ComposedRobot, episode: Episode, values: Mapping[str, flo
     smooth = np.ones(_SMOOTHED) / _SMOOTHED
     speed = np.stack([np.convolve(v, smooth, "same") for v in sensed["velocity"].T.astype(np.float64)], axis=1)
     upright = np.array([gravity_of(q.astype(np.float64))[2] for q in sensed["quaternion"]])
-    used = np.flatnonzero(t_s > t_s[0] + _SETTLED_S)
+    used = np.flatnonzero(t_s > t_s[0] + _SETTLED_S)[: -(_SMOOTHED // 2)]  # the last mean speeds are of fewer samples
     if upright[used].max(initial=-1.0) > _UPRIGHT:
         raise OtherMotion("the robot does not stand upright in this log", hint="record it with --excitation standing")
-    moving = np.abs(speed[used]).max(axis=1) > _MOVING_RAD_S
+    fastest = np.abs(speed[used]).max(axis=1)
+    moving = (fastest > _MOVING_RAD_S) & (fastest < _FAST_RAD_S)
     if moving.sum() < max(0.5 * len(used), _BEND_S * robot.rate_hz):
         raise OtherMotion(
-            f"the robot moves for {moving.sum() / robot.rate_hz:.1f} s of this log: friction at rest hides its weight",
-            hint="record it with --excitation standing, which bends the legs",
+            f"the legs move slowly for {moving.sum() / robot.rate_hz:.1f} s of this log: rest and leaps hide a weight",
+            hint="record it on its feet with --excitation standing, which bends the legs",
         )
     used = used[moving][:: max(1, int(moving.sum()) // _MOST_SAMPLES)]
     # The command in effect when the state was sampled.
