@@ -174,7 +174,7 @@ def test_logs_that_are_not_of_a_robot_on_its_feet_are_refused(tmp_path, standing
         ROBOT.identifiable(0.06).check(episode)
     assert "--standing" in refused.value.hint
     still = changed(episode, "sensor", velocity=0.0 * episode.outputs["sensor"]["velocity"])
-    with pytest.raises(OtherMotion, match=r"legs move slowly for 0\.0 s of this log: rest"):
+    with pytest.raises(OtherMotion, match=r"legs move slowly for 0\.0 s of this log, too short"):
         weighing.check(ROBOT, still, values)
     with pytest.raises(OtherMotion, match=r"legs move slowly for [12]\.\d s of this log"):
         weighing.check(ROBOT, first(episode, 2.5), values)

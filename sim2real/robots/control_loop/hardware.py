@@ -215,7 +215,7 @@ class Excitation(BaseNode):
 
     Args:
         rate: Steps per second [Hz].
-        signal: Shape ``(N, servos)``: one command per step; after its end the last one, as 0 may be a leap.
+        signal: Shape ``(N, servos)``: one command a step; after its end the last one again: a goal of 0 may be a leap.
         **options: Options of ``BaseNode``.
 
     Raises:

@@ -34,7 +34,7 @@ again, errors of delays and accelerations cancel [s]."""
 _UPRIGHT, _FREE = -0.95, 6
 """Largest vertical part of gravity's direction in the base, and the directions in which the base moves."""
 _MOVING_RAD_S, _FAST_RAD_S = 0.03, 0.6
-"""Speed at which friction has 3/4 of its size; at rest its direction is open; and one faster than legs bend [rad/s]."""
+"""Speed at which friction has 3/4 of its size; at rest its direction is open; a speed no bending leg has [rad/s]."""
 _SMOOTHED, _BLOCKS, _MOST_SAMPLES, _STEP = 5, 8, 600, 1e-4
 """Samples of a mean speed, parts of a log that are weighed alone, used samples of a log, and step of a derivative."""
 _WIDER = 2.365 / 1.96
@@ -134,7 +134,7 @@ def balances_of(robot: ComposedRobot, episode: Episode, values: Mapping[str, flo
     moving = (fastest > _MOVING_RAD_S) & (fastest < _FAST_RAD_S)
     if moving.sum() < max(0.5 * len(used), _BEND_S * robot.rate_hz):
         raise OtherMotion(
-            f"the legs move slowly for {moving.sum() / robot.rate_hz:.1f} s of this log: rest and leaps hide a weight",
+            f"the legs move slowly for {moving.sum() / robot.rate_hz:.1f} s of this log, too short to weigh the robot",
             hint="record it on its feet with --excitation standing, which bends the legs",
         )
     used = used[moving][:: max(1, int(moving.sum()) // _MOST_SAMPLES)]
