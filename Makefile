@@ -9,20 +9,30 @@ WARP_READY := .venv/.ready-warp
 EXTRAS := --all-extras --no-extra lerobot
 SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never UV_COMPILE_BYTECODE=1 VIRTUAL_ENV= $(BIN)/uv sync --locked --inexact --quiet
 
-.PHONY: demo test test-all bench docs format wheel
+.PHONY: demo test night bench docs format wheel
 
 demo: $(READY)
 	$(BIN)/sim2real demo
 
-# Three workers on two cores: those that keep time mostly wait. Types are checked beside them.
+# The gate. Tests with real processes run alone, one after another; one that fails is repeated once.
+PYTEST := $(BIN)/python -m pytest
+PROCESS := $(PYTEST) -m "process and not night"
 test: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	@nice $(BIN)/pyright & types=$$!; $(BIN)/python -m pytest --numprocesses 3; tests=$$?; wait $$types && exit $$tests
+	$(BIN)/pyright
+	$(PYTEST) -m "not process and not night" --numprocesses 2 --dist loadfile
+	$(PROCESS) || $(PROCESS) --last-failed --last-failed-no-failures none
 
-# The tests and repetitions that `test` leaves out: together, both run everything once. Warp's among them, on the CPU.
-test-all: $(WARP_READY)
-	$(BIN)/python -m pytest --full --numprocesses 3
+# What blocks nothing: long tests, those that depend on chance, and drawn examples from a new seed, on which no test ends
+# the others. SEED=N repeats a night.
+SEED ?= $(shell date +%s)
+night: $(WARP_READY)
+	@echo "SEED=$(SEED)"
+	$(PYTEST) -m "(night or hypothesis) and not process" --numprocesses 2 --dist loadfile \
+	  --hypothesis-profile=night --hypothesis-seed=$(SEED); tests=$$?; \
+	$(PYTEST) -m "night and process"; process=$$?; \
+	[ $$tests = 0 ] && [ $$process = 0 ]
 
 bench: $(READY)
 	for bench in graph train async log demo; do $(BIN)/python scripts/bench.py $$bench || exit 1; done
@@ -53,7 +63,7 @@ define INSTALL
 	@touch $@
 endef
 
-# Warp's wheel has 149 MB, and is needed by the tests of `test-all` only.
+# Warp's wheel has 149 MB, and is needed by the tests of `night` only.
 $(READY): pyproject.toml uv.lock | $(BIN)/uv
 	@echo "setting up .venv from uv.lock" >&2
 	$(call INSTALL,--no-extra warp)

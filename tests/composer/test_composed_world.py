@@ -156,7 +156,7 @@ def test_hooks_find_the_start_that_a_reset_is_given(witness):
     np.testing.assert_array_equal(at_rest.variables["found"], [0.0, 0.0])
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_world_starts_where_its_parameters_say(witness):
     nothing = witness.init_params()
     assert (nothing.qpos, nothing.qvel) == (None, None)
@@ -179,7 +179,7 @@ def environment():
     return composer.MjxEnvironment(Push(start=0.1), time_limit=0.2)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_brax_runs_the_task_with_its_own_wrappers(environment):
     env = composer.BraxEnv(environment)
     assert (env.observation_size, env.action_size, env.backend, env.dt) == (3, 1, "mjx", 0.02)
@@ -202,7 +202,7 @@ def test_brax_runs_the_task_with_its_own_wrappers(environment):
     assert (np.asarray(observations)[:, 8, 2] > np.asarray(first)[:, 2]).all()
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_brax_s_wrapper_must_not_go_on_past_the_time_limit(environment):
     wrapped = EpisodeWrapper(composer.BraxEnv(environment), episode_length=1000, action_repeat=1)
 
@@ -215,7 +215,7 @@ def test_brax_s_wrapper_must_not_go_on_past_the_time_limit(environment):
     assert np.isnan(reward).tolist() == [False] * 10 + [True]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_brax_may_save_the_fresh_starts(environment):
     """Episodes then start from the same state, and go on with numbers of their own."""
     env = composer.BraxEnv(environment, fresh_starts=False)
@@ -231,7 +231,7 @@ def vector(environment):
     return composer.MjxVectorEnv(environment, 4)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_gymnasium_starts_copies_anew_when_they_are_done(vector):
     env = vector
     observation, _ = env.reset(seed=3)
@@ -250,7 +250,7 @@ def test_gymnasium_starts_copies_anew_when_they_are_done(vector):
     np.testing.assert_array_equal(again["x"], starts)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
     vector.reset(seed=0)
     places = jnp.array([[1.0], [jnp.nan], [0.0], [0.0]])

@@ -187,7 +187,7 @@ def swap(models, row):
 FEW = {row[1] + row[-1]: row for row in ROWS if "material" not in row[-1]}
 FEW = {row[0] + target_kind(row[-1]): row for row in FEW.values()}.values()
 of_rows = pytest.mark.parametrize(
-    "row", [r if r in FEW else pytest.param(r, marks=pytest.mark.full) for r in ROWS], ids="-".join
+    "row", [r if r in FEW else pytest.param(r, marks=pytest.mark.night) for r in ROWS], ids="-".join
 )
 
 

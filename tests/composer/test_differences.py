@@ -530,7 +530,7 @@ def test_connects_and_welds():
     assert np.abs(native - found).max() > 1e-3
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_geoms_that_touch():
     """MJX adds 1e-6 to the squared length of a capsule."""
     ball = '<geom type="{}" size="{}"/>'

@@ -11,7 +11,7 @@ ON_MJX = range(6, 10)
 test_mjx.py and test_composed_world.py, and the other blocks here."""
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=(pytest.mark.full, pytest.mark.slow))])
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.night)])
 def test_every_block_of_the_guide_runs(compiled):
     pytest.importorskip("gymnasium", reason="the vector environment: pip install 'sim2real[interop]'")
     blocks = re.findall(r"^```python\n(.*?)^```", GUIDE.read_text(), re.DOTALL | re.MULTILINE)

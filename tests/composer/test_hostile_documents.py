@@ -33,7 +33,7 @@ def test_what_takes_too_much_is_refused_at_once(tmp_path, name, door):
     assert time.perf_counter() - begun_s < 5.0
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_documents_that_include_each_other_or_are_no_text(tmp_path):
     (tmp_path / "a.xml").write_text('<mujoco><include file="b.xml"/></mujoco>')
     (tmp_path / "b.xml").write_text('<mujoco><include file="a.xml"/></mujoco>')

@@ -69,7 +69,7 @@ def said(theirs, mine):
     return found
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full) if n == "FruitFly" else n for n in ENTITIES])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.night) if n == "FruitFly" else n for n in ENTITIES])
 def test_entities_are_the_same(oracle, ours, name):
     file, options = ENTITIES[name]
     models = [getattr(module(package, file), name)(**options).mjcf_model for package in PACKAGES]

@@ -153,7 +153,7 @@ class Bounce(composer.NullTask):
         physics.bind(mjcf.get_frame_freejoint(self.ball)).qvel = np.array([0.5, 0, 0, 0, 0, 0])
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_three_hundred_steps_with_contacts_agree(double):
     environment = composer.MjxEnvironment(Bounce())
     _, states = rollout(environment, jnp.zeros((300, 0)))
@@ -167,7 +167,7 @@ def test_three_hundred_steps_with_contacts_agree(double):
     assert contacts == 1
 
 
-@pytest.mark.full  # `make test` varies numbers in test_random_tasks.py
+@pytest.mark.night  # `make test` varies numbers in test_random_tasks.py
 def test_numeric_variations_differ_from_copy_to_copy():
     environment = composer.MjxEnvironment(Swing(vary=True))
     states = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(0), 5))
@@ -257,7 +257,7 @@ class Placed(Bounce):
         self.placer(physics, random_state)
 
 
-@pytest.mark.full  # `make test` places props with C in test_prop_placer.py
+@pytest.mark.night  # `make test` places props with C in test_prop_placer.py
 def test_props_are_placed_apart_in_every_copy():
     environment = composer.MjxEnvironment(Placed(0.4))
     states = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(1), 64))
@@ -274,7 +274,7 @@ def test_props_cannot_settle_in_a_compiled_program():
         composer.MjxEnvironment(task)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_giving_up_is_a_flag():
     class Never(Bounce):
         def initialize_episode(self, physics, random_state):
@@ -297,7 +297,7 @@ def test_fields_and_elements_that_are_not_there_are_named():
         composer.MjxEnvironment(task)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_elliptic_cones_are_no_matter_where_nothing_can_touch():
     """MJX 3.17 raises a TypeError there: a joint limit, no contact, and the cones that arenas have."""
     arena = composer.Arena()

@@ -27,7 +27,7 @@ def programs():
     return make
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_cost_grows_with_the_length_of_a_chain(programs):
     if jax.default_backend() != "cpu":
         pytest.skip("elsewhere XLA itself weighs what it computes again")

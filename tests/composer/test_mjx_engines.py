@@ -106,7 +106,7 @@ def played(double, actions):
     return jax.jit(play)(jax.random.key(0), actions)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_streams_are_those_of_the_c_engine(played, actions):
     """One task that writes in every hook; in `make test`, test_random_tasks.py compares tasks with hooks of all kinds,
     and the tests below what is derived from what a hook writes.
@@ -145,7 +145,7 @@ BODIES = """
 UNUSED = {"dof_length", "geom_aabb", "actuator_length0"}  # by MJX
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_derived_constants_are_those_of_mj_set_const(double):
     model = mujoco.MjModel.from_xml_string(BODIES)
     varied, random = copy.copy(model), np.random.RandomState(0)
@@ -169,7 +169,7 @@ def test_derived_constants_are_those_of_mj_set_const(double):
         np.testing.assert_allclose(np.reshape(value, expected.shape), expected, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(
     "text",
     [
@@ -187,7 +187,7 @@ def test_which_constants_are_derived_is_known_before(text):
     assert constants.derived(model, given) == set(jax.eval_shape(lambda m: constants.derive(model, m), given))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_mjx_is_traced_once_for_all_programs_that_a_model_is_in(monkeypatch):
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><worldbody><body><joint type="slide"/><joint type="slide" axis="1 0 0"/><geom size=".1"/>
@@ -208,7 +208,7 @@ def test_mjx_is_traced_once_for_all_programs_that_a_model_is_in(monkeypatch):
     assert len(traced) == 1
 
 
-@pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.full)])
+@pytest.mark.parametrize("integrator", ["Euler", pytest.param("RK4", marks=pytest.mark.night)])
 def test_a_step_is_that_of_mj_step_with_all_sensors(double, integrator):
     """``mjx.step`` leaves accelerometers at 0 where nothing is constrained, and RK4's sensors in its last stage."""
     model = mujoco.MjModel.from_xml_string(CHAIN)
@@ -247,7 +247,7 @@ def test_an_episode_ends_where_mujoco_warns():
     assert [unstable(v) for v in (1e9, -1e11, np.inf, np.nan)] == [False, True, True, True]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_an_episode_ends_though_a_hook_hides_that_it_diverged():
     class Thrown(composer.NullTask):
         def after_step(self, physics, random_state):

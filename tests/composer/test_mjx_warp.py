@@ -17,7 +17,7 @@ from sim2real.graph import Base, BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
 
-pytestmark = pytest.mark.full  # compiles kernels; starting without them is tested in test_warp_start.py
+pytestmark = pytest.mark.night  # compiles kernels; starting without them is tested in test_warp_start.py
 STEPS, SUBSTEPS = 50, 2
 MISSING = 'Warp is not installed: pip install "sim2real[warp]"'
 
@@ -114,7 +114,6 @@ def worst(states, env, actions):
     return found, touching
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("legacy", [True, False])
 def test_a_hundred_steps_without_contacts_are_those_of_c(installed, actions, legacy):
     environment = composer.MjxEnvironment(Throw(floor=False), legacy_step=legacy, impl="warp")
@@ -124,14 +123,12 @@ def test_a_hundred_steps_without_contacts_are_those_of_c(installed, actions, leg
     assert max(found.values()) < 1e-5, found
 
 
-@pytest.mark.slow
 def test_a_hundred_steps_with_contacts_are_those_of_c(played, actions):
     found, touching = worst(played[1], composer.Environment(Throw()), actions)
     assert touching > 5
     assert max(found.values()) < 1e-4, found
 
 
-@pytest.mark.slow
 def test_observations_and_rewards_are_those_of_the_jax_implementation(played, actions):
     other = rollout(composer.MjxEnvironment(Throw(), impl="jax"), actions)
     for mine, theirs in zip(played, other, strict=True):
@@ -162,7 +159,6 @@ class Sensing(Throw):
         arm.sensor.add("subtreelinvel", body=arm.worldbody.body[0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
 def test_sensors_of_every_stage_are_those_of_c(installed, actions, integrator):
     _, states = rollout(composer.MjxEnvironment(Sensing(integrator), impl="warp"), actions)
@@ -188,7 +184,6 @@ class Varied(Throw):
         physics.model.opt.density = 100.0 * random_state.uniform(1.0, 2.0)
 
 
-@pytest.mark.slow
 def test_masses_sizes_and_options_differ_from_copy_to_copy_as_on_jax(installed, actions):
     keys = jax.random.split(jax.random.key(1), 3)
 
@@ -207,7 +202,6 @@ def test_masses_sizes_and_options_differ_from_copy_to_copy_as_on_jax(installed, 
     assert np.ptp(np.asarray(mine.data.qpos)[:, -1, 4]) > 0.01  # balls that lie are as high as they are large
 
 
-@pytest.mark.slow
 def test_environments_of_brax_and_gymnasium_run_on_it(installed):
     environment = composer.MjxEnvironment(Throw(), time_limit=3 * SUBSTEPS * 0.004, impl="warp", nconmax=4)
     wrappers = pytest.importorskip("brax.envs.wrappers.training")
@@ -234,7 +228,6 @@ class Again(Throw):
         physics.fail(physics.bind(self.arm.mjcf_model.find("site", "wrist")).xpos[2] < 1.05)
 
 
-@pytest.mark.slow
 def test_copies_start_differ_and_are_selected_one_by_one(installed, actions):
     environment = composer.MjxEnvironment(Again(vary=True), max_reset_attempts=30, impl="warp", nconmax=16)
     reset, step = jax.jit(jax.vmap(environment.reset)), jax.jit(jax.vmap(environment.step))
@@ -260,7 +253,6 @@ def test_copies_start_differ_and_are_selected_one_by_one(installed, actions):
     np.testing.assert_allclose(after.data.qpos[1], fresh.data.qpos[1], atol=1e-6)
 
 
-@pytest.mark.slow
 def test_copies_share_the_room_for_contacts_and_all_end_when_it_is_too_small(installed):
     task = Throw()
     box = task.ball.mjcf_model.find_all("geom")[0]
@@ -278,7 +270,6 @@ def test_copies_share_the_room_for_contacts_and_all_end_when_it_is_too_small(ins
             assert state.data.qvel[0, 4] > state.data.qvel[1, 4]  # the floor holds it
 
 
-@pytest.mark.slow
 def test_a_copy_ends_when_there_is_no_room_for_its_constraints(installed, actions):
     environment = composer.MjxEnvironment(Throw(), impl="warp", njmax=1)
     _, states = rollout(environment, actions)
@@ -321,7 +312,6 @@ def in_a_graph(impl):
     return np.asarray(jax.jit(jax.vmap(play))(damping, jnp.arange(2)))
 
 
-@pytest.mark.slow
 def test_the_same_graph_runs_on_both(installed):
     mine, theirs = in_a_graph("warp"), in_a_graph("jax")
     np.testing.assert_allclose(mine, theirs, atol=1e-5)

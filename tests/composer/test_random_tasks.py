@@ -14,12 +14,12 @@ def double():
         yield
 
 
-@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.full) for seed in range(4, 60))])
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.night) for seed in range(4, 60))])
 def test_a_random_task_is_that_of_dm_control(oracle, seed):
     assert compare(seed, "all" if seed % 2 else None)[0] < 1e-12
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_random_tasks_are_the_same_on_mjx():
     """Ten tasks whose models differ in their numbers, as copies in one program: compiling more is for ``fuzz``."""
     mine = play_variants_on_mjx(ON_MJX, VARIANTS)

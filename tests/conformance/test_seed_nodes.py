@@ -171,7 +171,7 @@ def test_compiled_it_rolls_out_as_recorded(tutorial, log):
         np.testing.assert_allclose(got, episode.outputs[name][field][: len(got)], atol=tolerance, rtol=0)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_sensor_and_actuator_delay_are_identified_from_the_record(tutorial, open_loop):
     """Recorded actions go in, recorded measurements are compared in the sensor: only the sum of the delays matters."""
     episode = open_loop
@@ -221,7 +221,7 @@ def test_a_policy_of_ours_acts_in_the_agent(tutorial):
     np.testing.assert_allclose(gs.state["agent"].history_act[0], expected, rtol=1e-5)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_brax_world_runs(tutorial):
     """The second world of the tutorial; in `make test` all other tests here run the first one."""
     nodes = robot(tutorial, world="BraxWorld", sensor="SimSensor", actuator="SimActuator")

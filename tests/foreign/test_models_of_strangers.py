@@ -304,7 +304,7 @@ def test_millimetres_of_a_slide_are_not_taken_for_degrees(tmp_path):
         import_logs_stage.proposed(open_foreign(tmp_path / "run.npz"), asked)
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(("to", "share"), [(0.3, None), (1.0, "47%")])
 def test_recorded_positions_at_which_a_loop_cannot_close_are_reported(tmp_path, to, share):
     """A rocker of 0.04 m stops the crank of 0.1 m at 0.44 rad; the gap is 5 mm at 0.48 rad."""

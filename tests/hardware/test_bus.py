@@ -20,7 +20,7 @@ from sim2real.hardware.dynamixel.protocol import PROTOCOL
 from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 PWM = OperatingMode.PWM
 

@@ -34,7 +34,7 @@ from sim2real.robots.roles import ROLES
 from sim2real.robots.walking.drive import BodySensor
 from sim2real.runtime.asynchronous import AsyncGraph
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 N, DAMPING = 2, 3.0
 COLUMNS = (

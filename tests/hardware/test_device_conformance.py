@@ -13,7 +13,7 @@ from sim2real.hardware.testing import DeviceConformance
 PLANTS = Path(__file__).parent / "plants.py"
 
 
-@pytest.mark.realtime
+@pytest.mark.process
 class TestOneServoByVoltage(DeviceConformance):
     emulation = EmulatorConfig
     plant = f"{PLANTS}:FirstOrder"
@@ -23,7 +23,7 @@ class TestOneServoByVoltage(DeviceConformance):
         return DynamixelServos(BusConfig(port, max_silence_s=0.5, silence_s=0.6), [1], VoltageDrive(5.0))
 
 
-@pytest.mark.realtime
+@pytest.mark.process
 class TestThreeServosByAngle(DeviceConformance):
     emulation = EmulatorConfig
     plant = f"{PLANTS}:Joints"

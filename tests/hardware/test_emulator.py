@@ -24,7 +24,7 @@ from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.hardware.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.hardware.plant import load_plant
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 PLANTS = Path(__file__).parent / "plants.py"
 OK = 0

@@ -20,7 +20,7 @@ from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety import guardian, guardian_process
 from sim2real.runtime import clock
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 IDS = (1, 2, 3)
 XL330 = 1200

@@ -14,7 +14,7 @@ from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 SPEED_RAD_S = 40.0
 

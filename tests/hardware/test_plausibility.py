@@ -15,7 +15,7 @@ from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.plausibility import Plausibility
 from sim2real.hardware.safety.rig import Rig
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 PERIOD_S = 0.02
 CONFIG = GateConfig(max_speed_rad_s=(10.0, 2.0), joints=("pan", "tilt"))

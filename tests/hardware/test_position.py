@@ -20,7 +20,7 @@ from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 IDS = (1, 2, 3)
 START_RAD = np.array([0.5, -0.8, 0.3])

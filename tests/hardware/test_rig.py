@@ -21,7 +21,7 @@ from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 SUPPLY_V = 5.0
 TIMEOUT_S = 0.1

@@ -46,20 +46,20 @@ def asynchronous_log(rng):
     return Episode(steps=log, messages={}, outputs=outputs)
 
 
-@pytest.fixture(scope="module", params=[pytest.param("free", marks=pytest.mark.full), "rest"])
-def fitted(request, repetitions):
+NIGHT = [pytest.param((start, 400), marks=pytest.mark.night, id=f"{start}-400") for start in ("free", "rest")]
+
+
+@pytest.fixture(scope="module", params=[pytest.param(("rest", 80), id="rest"), *NIGHT])
+def fitted(request):
     """Problem, and at each noise's estimate ``(N, P)`` the linearisation: starts unknown, or known and at rest."""
+    start, count = request.param
     model = load_pipeline("pendulum").load().identifiable(MAX_DELAY_S)
     episode = asynchronous_log(np.random.default_rng(1))
     spans = [Span(0, 1.0 + i * SEGMENT_S) for i in range(SEGMENTS)]
-    config = FitConfig(max_delay_s=MAX_DELAY_S, loss="squared", initial_state=request.param)
+    config = FitConfig(max_delay_s=MAX_DELAY_S, loss="squared", initial_state=start)
     problem = Problem(model, [episode], spans, SEGMENT_S, config)
-    known = request.param == "rest"
-    noisy = (
-        released_at_rest(problem, repetitions(80, 400))
-        if known
-        else moving_on(problem, episode, spans, config, repetitions(80, 400))
-    )
+    known = start == "rest"
+    noisy = released_at_rest(problem, count) if known else moving_on(problem, episode, spans, config, count)
     z_true = jnp.asarray(problem.table.encode(TRUTH), jnp.float32)
 
     def estimate(noisy):
@@ -146,7 +146,7 @@ def spreads(fitted):
         yield problem.table.unscale(x), uncertainty.from_linearised(problem, at), at
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
     problem = fitted[0]
     names = list(problem.table.names)
@@ -170,7 +170,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
     assert np.max(np.abs(off)) < 1e-3
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_what_cannot_be_told_is_named_in_all(fitted):
     problem = fitted[0]
     for _, spread, at in spreads(fitted):

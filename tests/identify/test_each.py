@@ -9,11 +9,11 @@ from sim2real.identify.uncertainty import per_recording
 from sim2real.identify.uncertainty.per_recording import identify_each
 
 
-def test_each_recording_says_what_it_says_alone(repetitions):
+def test_each_recording_says_what_it_says_alone():
     episodes = [lag_log(1), lag_log(2, 2 * BIAS)]
     whole = fit(Model(), episodes, [*spans(0), *spans(1)], LENGTH_S, CONFIG)
     each = list(zip(episodes, identify_each(whole), strict=True))
-    for episode, (values, spread) in each[-repetitions(1, 2) :]:
+    for episode, (values, spread) in each[-1:]:
         alone = fit(Model(), [episode], spans(0), LENGTH_S, CONFIG)
         errors = alone.uncertainty().standard_error
         for name, error in zip(whole.problem.table.names, errors, strict=True):

@@ -96,7 +96,7 @@ class Limited(Model):
     )
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_limit_that_no_motion_reaches_is_the_data_sheets_and_draws_are_above_what_was_reached():
     found = Findings.of(fit(Limited(), [lag_log(0)], spans(0), LENGTH_S, CONFIG))
     names = found.fit.problem.table.names

@@ -276,8 +276,8 @@ def test_value_and_jacobian_are_those_of_the_residuals(episode, outside):
     assert at.loss == pytest.approx(loss, rel=1e-5)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("count", [9, pytest.param(11, marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("count", [9, pytest.param(11, marks=pytest.mark.night)])
 def test_what_is_padded_changes_nothing(episode, count):
     """Segments, fitted ones and measurements are each rounded up: the loss is that of the segments one by one."""
     spans = [Span(0, 0.4 + 0.5 * i, fitted=i not in (3, 5)) for i in range(count + 2)]

@@ -164,8 +164,9 @@ def one():
     return SimpleNamespace(episode=episode, fit=whole, parts=parts, rows=rows)
 
 
-def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one, repetitions):
-    for part, row in list(zip(one.parts, one.rows, strict=True))[: repetitions(1, 3)]:
+@pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.night)])
+def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one, count):
+    for part, row in list(zip(one.parts, one.rows, strict=True))[:count]:
         rest = [s for s, gone in zip(spans(0), part.touches(spans(0), LENGTH_S), strict=True) if not gone]
         assert 4 <= len(rest) < len(spans(0))
         alone = fit(Model(), [one.episode], rest, LENGTH_S, CONFIG).values
@@ -248,7 +249,7 @@ def three():
     return whole, [trial.rows[k] for k, trial in enumerate(found.by_part)]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
     whole, rows = three
     assert [r.name for r in rows] == ["recording 1", "recording 2", "recording 3"]

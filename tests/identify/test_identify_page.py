@@ -20,7 +20,7 @@ def code_of(docstring):
     return textwrap.dedent("\n".join(lines[:end]))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_ten_calls_lead_from_a_log_to_a_verdict(monkeypatch, capsys):
     code = code_of(sys.modules["sim2real.identify"].__doc__)
     assert [f"# {i}" in code for i in range(1, 11)] == [True] * 10

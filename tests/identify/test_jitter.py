@@ -99,8 +99,8 @@ def jitter(log):
     return deviation(seen, np.full(len(seen.stamps), delay_s), own.deviation[0], own.noise, late)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("late_s", [1e-3, pytest.param(3e-3, marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("late_s", [1e-3, pytest.param(3e-3, marks=pytest.mark.night)])
 def test_the_deviation_of_commands_is_found(late_s):
     found = jitter(log(10.0, 1, late_s))
     assert found.low95 <= late_s <= found.high95
@@ -136,7 +136,7 @@ def test_without_commands_that_act_nothing_is_known():
     assert deviation(seen, np.full(len(seen.stamps), 0.006), 1e-3, np.ones(1), [none]).value is None
 
 
-@pytest.mark.full  # `make test` finds it in the logs above, and links of the same problem in test_links.py
+@pytest.mark.night  # `make test` finds it in the logs above, and links of the same problem in test_links.py
 def test_a_problem_knows_the_jitter_of_its_commands(fitted, late_problem):
     (link,) = links(late_problem, fitted.found.z)
     assert link.jitter.low95 <= 0.004 <= link.jitter.high95

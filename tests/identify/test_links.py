@@ -101,19 +101,19 @@ def test_a_link_is_found_with_the_dynamics(kind):
     assert link.share.sum() == pytest.approx(1.0)
 
 
-def test_intervals_hold_the_truth(repetitions):
+@pytest.mark.parametrize(("count", "least"), [(12, 9), pytest.param(24, 20, marks=pytest.mark.night)])
+def test_intervals_hold_the_truth(count, least):
     held = {"mean": 0, "p95": 0, "deviation": 0}
     truth = lag("gamma", 200_000, np.random.default_rng(0))[0]
     mean, p95 = truth.mean() + COMMAND_DELAY_S, np.quantile(truth, 0.95) + COMMAND_DELAY_S
     truth = {"mean": mean, "p95": p95, "deviation": truth.std()}
-    count = repetitions(12, 24)
     for seed in range(count):
         link, _ = identify(log("gamma", 3.0, seed))
         for name in held:
             own = getattr(link, name)
             held[name] += own.low95 <= truth[name] <= own.high95
     # 24 intervals of 95 % hold fewer than 20 once in 200 times, and 12 fewer than 9 once in 400 times.
-    assert min(held.values()) >= repetitions(9, 20), held
+    assert min(held.values()) >= least, held
 
 
 def test_a_constant_delay_has_no_jitter():
@@ -157,7 +157,7 @@ def test_without_losses_a_burst_has_no_length():
     assert found.burst.value is None
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_problem_knows_its_links(fitted):
     (link,) = links(fitted.problem, fitted.found.z)
     delay_s = fitted.truth["sensor_delay"] + fitted.truth["actuator_delay"]

@@ -33,7 +33,7 @@ def test_two_logs_of_a_length_have_one_program(name):
     assert lowered(problem_of(0), name) == lowered(problem_of(1), name)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_two_logs_with_timing_of_their_own_have_one_program(fitted, late_problem):
     """Stamps of measurements and commands differ from log to log, and how many of them a segment holds."""
     assert (
@@ -43,14 +43,14 @@ def test_two_logs_with_timing_of_their_own_have_one_program(fitted, late_problem
     assert lowered(fitted.problem, "losses") == lowered(late_problem, "losses")
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_counts_that_round_up_alike_have_one_program():
     nine, ten = (problem_of(0, [Span(0, 0.4 + 0.7 * i) for i in range(n)]) for n in (9, 10))
     assert (nine.segments, ten.segments) == (9, 10)
     assert lowered(nine, "linearised") == lowered(ten, "linearised")
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_other_segments_of_the_same_recordings_share_all_programs():
     problem = problem_of(0)
     other = problem.recut(spans(0.3), LENGTH_S)
@@ -78,7 +78,7 @@ def test_leaving_parts_out_and_fewer_parameters_compile_nothing():
     assert len(set(losses)) >= 3
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_longer_segments_are_another_program():
     problem = problem_of(0)
     z = problem.table.start()

@@ -78,7 +78,7 @@ def test_when_nothing_can_be_simulated():
 
 @pytest.mark.parametrize(
     "strategy",
-    [s if s in (*USUAL, *INCOMPLETE, "LM_MA_ES") else pytest.param(s, marks=pytest.mark.full) for s in strategies()],
+    [s if s in (*USUAL, *INCOMPLETE, "LM_MA_ES") else pytest.param(s, marks=pytest.mark.night) for s in strategies()],
 )
 def test_every_strategy_runs_or_says_why_not(strategy):
     config = FitConfig(strategy=strategy, population=8, generations=10, std=0.7)
@@ -122,7 +122,7 @@ def funnels(candidates, around, data, pick):
     return jnp.minimum(right, left) + far
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_restarts_find_the_deeper_funnel():
     populations = []
 
@@ -168,7 +168,7 @@ def test_a_generation_sees_one_batch_and_the_end_sees_all():
     assert len({tuple(sorted(p.tolist())) for p in batches}) > 5
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.full) for s in (1, 2))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.night) for s in (1, 2))])
 def test_a_search_goes_on_after_a_lucky_early_candidate(seed):
     """Its best loss is that of the first generation; the median falls, and that counts."""
     config, asked = replace(CONFIG, std=0.3, seed=seed), []
@@ -215,8 +215,8 @@ def on_host(candidates, around, pick, fresh):
     return np.asarray(bowl(jnp.asarray(candidates, jnp.float32)), np.float64)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("strategy", ["CMA_ES", pytest.param("SNES", marks=pytest.mark.full), "DifferentialEvolution"])
+@pytest.mark.night
+@pytest.mark.parametrize("strategy", ["CMA_ES", pytest.param("SNES", marks=pytest.mark.night), "DifferentialEvolution"])
 def test_losses_outside_of_programs_are_searched_alike(strategy):
     config = replace(CONFIG, strategy=strategy, generations=30)
     alone = lambda z: float(bowl(z[None])[0])  # noqa: E731
@@ -262,8 +262,7 @@ assert found[1].record.evaluations == found[0].record.evaluations
 """
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_two_devices_find_what_one_finds_and_each_simulates_half():
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
     here = Path(__file__).parent

@@ -50,7 +50,7 @@ def workplace(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_model_and_a_log_give_parameters_that_hold_on_a_later_log(workplace, capsys):
     assert cli.main(["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--folds", "0", "--free-run-s", "0"]) == 0
     assert "verdict: accepted" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from sim2real.policy.bundle import sealed
 from sim2real.stages.pipeline.open_parameters import open_identification
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_logs_that_are_too_short(fails, tmp_path, log):
     assert "segments" in said
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_truncated_log_works_with_a_warning(tmp_path, log, capsys):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(log.read_bytes()[: log.stat().st_size * 4 // 5])

@@ -15,7 +15,7 @@ from shared_run import copied
 from sim2real import cli
 from sim2real.commands import command_kinds, run_commands
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def report_of(path):
     return report, {row["name"]: row["value"] for row in report["rows"]}
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_demo(commands, tmp_path):
     path = tmp_path / "report.json"
     assert bench.main(["demo", "--quick", "--json", str(path)]) == 0
@@ -51,7 +51,7 @@ def test_demo(commands, tmp_path):
     assert len(rows["demo/upright/identified"]) == len(report["seeds"][0]["deployments"]) == 1
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_demo_beside_the_nominal_model(commands, tmp_path):
     path = tmp_path / "report.json"
     keep = tmp_path / "runs"
@@ -62,8 +62,8 @@ def test_demo_beside_the_nominal_model(commands, tmp_path):
     assert (keep / "seed4" / "nominal").is_dir()
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("name", ["arm", pytest.param("so101", marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("name", ["arm", pytest.param("so101", marks=pytest.mark.night)])
 def test_arm(name, commands, tmp_path, monkeypatch):
     # The run at hand is the pendulum's: it has a success where the arm has a distance.
     monkeypatch.setattr(arm.stages, "deployed", lambda folder, quantity: [0.01, 0.03])
@@ -76,7 +76,7 @@ def test_arm(name, commands, tmp_path, monkeypatch):
     assert rows[f"{name}/distance/identified"] == [20.0]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_arms_training_alone(commands, finished_run_dir, tmp_path):
     path = tmp_path / "report.json"
     flags = ["--ppo.num-envs", "1024"]
@@ -91,7 +91,7 @@ def test_the_arms_training_alone(commands, finished_run_dir, tmp_path):
     assert {"arm/train/compile_s", "arm/train/time_to_0.95_s", "arm/train/env_steps_per_s"} <= set(rows)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_legs(tmp_path):
     assert bench.main(["legs", "--quick", "--json", str(tmp_path / "report.json")]) == 0
     _, rows = report_of(tmp_path / "report.json")

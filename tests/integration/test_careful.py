@@ -1,6 +1,5 @@
 """A deployment that measures the delay first, is stopped softly, or meets a fault while the policy moves the robot."""
 
-import json
 import os
 import re
 import signal
@@ -20,10 +19,9 @@ from sim2real.policy import PolicyContract, save_bundle
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-import bench
 from benches import faults
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +63,7 @@ def assert_steps_are_a_log(folder):
     assert np.all(farthest > 0.05), "each step is answered, in its direction"
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, resting):
     code, folder = deploy("pendulum", resting, tmp_path)
     assert code == errors.OK
@@ -75,7 +73,7 @@ def test_the_delay_is_measured_before_the_policy_moves_the_robot(tmp_path, resti
     assert_torque_ends_off(read_truth(folder / "truth.bin"))
 
 
-@pytest.mark.full  # `make test` refuses a delay in test_admission.py, and measures one in the test above
+@pytest.mark.night  # `make test` refuses a delay in test_admission.py, and measures one in the test above
 def test_15_ms_more_of_delay_are_refused(make_pipeline, tmp_path, resting, capsys):
     latency = load_pipeline("pendulum").load().drive.embedded.emulator.actuation_latency_s + 0.015
     name = make_pipeline("late_pendulum", f"\n    embedded = faulty_emulator(actuation_latency_s={latency})\n")
@@ -118,7 +116,6 @@ def test_ctrl_c_brings_the_motor_to_rest_before_the_torque_goes_off(tmp_path):
     assert read_log(log).complete
 
 
-@pytest.mark.slow
 def test_a_robot_that_would_fall_is_held_until_it_is_let_go(tmp_path, start_cli):
     robot = load_pipeline("arm").load()
     size, low, high = robot.agent.observation_size, *np.array([(a.low, a.high) for a in robot.agent.action]).T
@@ -171,29 +168,3 @@ def test_the_motors_of_a_voltage_drive_hold_nothing(tmp_path, resting, capsys):
     assert code == errors.USAGE
     assert "hold no position" in capsys.readouterr().err
     assert manifest_of(folder)["status"] == "failed"
-
-
-QUICK = ("wild", "unplugged")
-"""Faults that `make test` does not have in test_faults.py, test_kill.py and test_guardian.py."""
-
-
-@pytest.fixture(scope="module")
-def runs(repetitions):
-    """How often each fault happens."""
-    return repetitions(1, 3)
-
-
-@pytest.fixture(scope="module")
-def report(tmp_path_factory, runs, repetitions):
-    """What the bench says of runs of each fault, two at a time; patient, for the machine may be busy."""
-    path = tmp_path_factory.mktemp("faults") / "report.json"
-    flags = ["--runs", str(runs), "--jobs", "2", "--servo-watchdog-s", "0.15", "--json", str(path)]
-    assert bench.main(["faults", *flags, "--faults", *repetitions(QUICK, faults.FAULTS)]) == 0
-    return json.loads(path.read_text())
-
-
-@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.full) for n in faults.FAULTS])
-def test_a_fault_leaves_the_motor_safe_and_its_reason_said(report, runs, name):
-    rows = {row["name"].removeprefix(f"faults/{name}/"): row["value"] for row in report["rows"]}
-    assert (rows["code_and_reason"], rows["log_readable"]) == (runs, runs), report["wrong"]
-    assert rows["safe_s"][1] < 2 * faults.SAFE_S, report["wrong"]

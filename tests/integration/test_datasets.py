@@ -32,7 +32,7 @@ def test_the_log_is_complete(name):
     assert abs(episode.duration_s - MANIFEST[name]["duration_s"]) < 0.1
 
 
-@pytest.mark.full  # `make test` finds true parameters in test_any_robot.py, and those of real logs in test_disk.py
+@pytest.mark.night  # `make test` finds true parameters in test_any_robot.py, and those of real logs in test_disk.py
 @pytest.mark.parametrize("name", MANIFEST)
 def test_identification_finds_the_true_parameters(name):
     entry = MANIFEST[name]

@@ -25,7 +25,7 @@ from sim2real.log.reader import read_log, read_session
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 GUIDES = Path(__file__).parents[2] / "docs" / "guides"
 PATIENT = ["--gate.servo-watchdog-s", "0.6"]  # a busy machine is not what is tested
@@ -216,7 +216,7 @@ def steady(robot, folder):
     return save_bundle(folder, weights, contract, np.zeros((1, size)))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_session_without_a_rig_of_a_device_is_refused(make_pipeline, tmp_path):
     name = make_pipeline(
         "no_dry_run",

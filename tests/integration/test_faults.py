@@ -12,7 +12,7 @@ from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.plant import OperatingMode
 from sim2real.log.reader import read_log
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture

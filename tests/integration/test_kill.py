@@ -15,7 +15,7 @@ from sim2real.hardware.emulation.truth import Kind, read_truth
 from sim2real.hardware.plant import OperatingMode
 from sim2real.log.reader import TruncatedLogWarning, read_log
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 def check_death(log, killed_ns, truth):
@@ -48,7 +48,7 @@ def assert_off_soon(truth, since_ns):
     assert np.all(modes[off[0] :] == OperatingMode.OFF)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_recording_that_is_stopped_and_wakes_again_ends_in_order(tmp_path, lone_robot, start_cli):
     port, end_robot = lone_robot
     process = start_cli("record", "pendulum", "--port", port, "--duration-s", 20, "--runs", tmp_path)

@@ -8,7 +8,7 @@ from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.manifest import read_manifest
 from sim2real.artifacts.run.stage_status import STAGES
 
-pytestmark = [pytest.mark.realtime, pytest.mark.full]
+pytestmark = [pytest.mark.process, pytest.mark.night]
 RECORD = ["--record.duration-s", 12, "--record.gate.servo-watchdog-s", 0.4]
 IDENTIFY = ["--identify.generations", 5, "--identify.population", 8, "--identify.refine", 1, "--identify.folds", 0]
 TRAIN = ["--train.ppo.total-steps", 512, "--train.ppo.num-envs", 16, "--train.ppo.minibatches", 2, "--train.force"]

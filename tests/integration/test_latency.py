@@ -9,7 +9,7 @@ from sim2real.stages.identify.true_values import true_values
 from sim2real.stages.latency.result import Latency
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def tested(tmp_path):
     return run
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_steps_tell_what_the_device_takes(tested, capsys):
     folder = tested("--duration-s", "10", "--identify.generations", "0", "--identify.refine", "1")
     found = Latency.load(folder)
@@ -38,7 +38,7 @@ def test_steps_tell_what_the_device_takes(tested, capsys):
     assert manifest_of(folder)["status"] == "finished"
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_dry_one_moves_nothing_and_knows_the_host_and_the_bus(tested, capsys):
     folder = tested("--duration-s", "2", "--dry-run")
     found = Latency.load(folder)

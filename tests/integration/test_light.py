@@ -19,7 +19,7 @@ from sim2real.log.reader import read_log
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 WITHOUT_JAX = (sys.executable, str(Path(__file__).with_name("without_jax.py")))
 """A command line that refuses what only the distribution sim2real brings."""
@@ -33,7 +33,7 @@ def call(command, folder, *arguments):
     return done.returncode, done.stdout + done.stderr
 
 
-@pytest.fixture(scope="module", params=["pendulum", pytest.param("so101", marks=pytest.mark.full)])
+@pytest.fixture(scope="module", params=["pendulum", pytest.param("so101", marks=pytest.mark.night)])
 def resting(request, tmp_path_factory):
     """A robot, and a bundle whose policy rests; the aim of the SO-101 is drawn."""
     robot = load_pipeline(request.param).load()
@@ -100,7 +100,7 @@ def test_a_motion_from_a_table_is_played(tmp_path):
     assert "which parameters this motion determines is not checked" in said
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_motion_by_hand_is_recorded_and_seen_and_check_refuses_it(tmp_path):
     hand = ["--excitation", "hand", "--duration-s", "1", "--view", "live.rrd", *PATIENT]
     code, said = call(WITHOUT_JAX, tmp_path, "record", "so101", *hand)
@@ -127,8 +127,8 @@ def test_check_prints_a_recording_as_json_and_the_reason_why_it_ends_there(tmp_p
     assert "hint: copy it to a computer with sim2real" in done.stderr
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("robot", ["arm", pytest.param("so101", marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("robot", ["arm", pytest.param("so101", marks=pytest.mark.night)])
 def test_check_determines_the_same_parameters_with_and_without_jax(tmp_path, robot):
     seconds = ["--duration-s", "12", *PATIENT]
     code, said = call(WITHOUT_JAX, tmp_path, "record", robot, *seconds)
@@ -193,8 +193,7 @@ def test_a_robot_whose_module_imports_jax_is_named(tmp_path):
     assert "from sim2real.later import jax, jnp" in said
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_the_distribution_is_small_and_works(tmp_path_factory, tmp_path, resting):
     folder = tmp_path_factory.mktemp("light")
     command = [bench.installed(folder), "-P", "-m", "sim2real.cli"]

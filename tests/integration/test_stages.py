@@ -19,7 +19,7 @@ from sim2real.artifacts.run.run_folder import STAGES, finished, newest
 from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "guides" / "notebook.md"
 
@@ -57,7 +57,7 @@ def test_a_resumed_run_is_complete(finished_run_dir):
     assert log == {"path": "record/session.mcap", "sha256": recorded["sha256"]}
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_resuming_a_finished_run_does_nothing(run_copy, capsys):
     before = {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
     root = run_copy.parent.parent
@@ -66,7 +66,7 @@ def test_resuming_a_finished_run_does_nothing(run_copy, capsys):
     assert before == {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
 
 
-@pytest.mark.full  # `make test` numbers attempts in test_an_interrupted_stage_is_run_again
+@pytest.mark.night  # `make test` numbers attempts in test_an_interrupted_stage_is_run_again
 def test_deploying_again_keeps_the_first_deployment(finished_run_dir, tmp_path):
     run_dir = tmp_path / "runs" / "pendulum" / "copy"
     copied(finished_run_dir, run_dir)
@@ -81,7 +81,7 @@ def test_deploying_again_keeps_the_first_deployment(finished_run_dir, tmp_path):
     assert len(strict_json(again / "result.json")["episodes"]) == 2
 
 
-@pytest.mark.full  # `make test` moves a run folder in test_run_folder.py
+@pytest.mark.night  # `make test` moves a run folder in test_run_folder.py
 def test_a_run_that_was_copied_goes_on_without_its_origin(finished_run_dir, tmp_path, monkeypatch):
     """Neither the log nor anything outside of the run folder is needed to train, deploy, report and look at it."""
     run_dir = tmp_path / "elsewhere" / "pendulum" / "copy"
@@ -128,7 +128,7 @@ def test_training_on_what_is_not_accepted_must_be_asked_for(finished_run_dir, tm
     assert not (run_dir / "train.2").exists()
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkeypatch):
     """Each stage is a function of a robot and of the artifact of another one, opened from Python."""
     text = "\n".join(re.findall(r"^```python\n(.*?)^```", NOTEBOOK.read_text(), re.DOTALL | re.MULTILINE))
@@ -160,7 +160,7 @@ def test_what_the_page_for_notebooks_has_runs(finished_run_dir, tmp_path, monkey
         sim2real.train(had["robot"], found, replace(config, world="moon"))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
     run = sim2real.run("pendulum", run_copy.parent.parent, resume=str(run_copy))
     assert run.folder == run_copy
@@ -183,7 +183,7 @@ def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
     assert "identified from" in forced.fitted[0]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_new_recording_is_what_identify_takes_next(finished_run_dir, tmp_path):
     copied(finished_run_dir, tmp_path / "pendulum" / finished_run_dir.name)
     assert cli.main(["record", "pendulum", "--duration-s", "1", "--runs", str(tmp_path), *PATIENT]) == 0
@@ -198,7 +198,7 @@ def test_a_new_recording_is_what_identify_takes_next(finished_run_dir, tmp_path)
     assert (tmp_path / "pendulum" / finished_run_dir.name / "identify.2").is_dir()
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_an_interrupted_stage_is_run_again(finished_run_dir, tmp_path, capsys):
     run_dir = tmp_path / "pendulum" / "copy"
     copied(finished_run_dir, run_dir)

@@ -11,8 +11,6 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
-pytestmark = pytest.mark.slow
-
 
 def call(*command, cwd, env=None):
     done = subprocess.run([str(c) for c in command], cwd=cwd, env=env, capture_output=True, text=True, timeout=240)
@@ -49,7 +47,7 @@ def outside(tmp_path):
     return {"cwd": tmp_path, "env": {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_"))}}
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_wheel_carries_the_pipelines_inside_the_package(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert "sim2real/_pipelines/pendulum/__init__.py" in names
@@ -58,7 +56,7 @@ def test_wheel_carries_the_pipelines_inside_the_package(wheel):
     assert {name for name in top if not name.endswith(".dist-info")} == {"sim2real"}
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_command_runs_from_the_wheel(environment, outside):
     command = environment / "bin" / "sim2real"
     assert "exit codes" in call(command, "--help", **outside)
@@ -66,7 +64,7 @@ def test_command_runs_from_the_wheel(environment, outside):
     assert "--duration-s" in call(command, "record", "pendulum", "--help", **outside)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_imports_come_from_the_wheel(environment, outside):
     code = (
         "import sim2real, sim2real.stages.pipeline.pipeline as p; print(sim2real.__file__, p.load_pipeline('pendulum'))"

@@ -30,7 +30,7 @@ def played(pendulum):
     return env, np.asarray(first), jax.tree.map(np.asarray, rows)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_its_sizes_and_its_period(played):
     env, first, _ = played
     assert (env.observation_size, env.action_size, env.dt, env.max_episode_length) == (19, 1, 0.02, 24)
@@ -77,7 +77,7 @@ def test_past_the_time_limit_there_is_no_reward_to_learn_from(pendulum):
     assert not done.any()
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_braxs_own_ppo_trains_on_it(pendulum, monkeypatch):
     from brax.training.agents.ppo import train as ppo
 

@@ -10,8 +10,7 @@ GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "interop.md"
 SMALLER = {"1_000_000": "64", "num_envs=64": "num_envs=2", "num_envs=128": "num_envs=2", "n_steps=64": "n_steps=32"}
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_every_block_of_the_guide_runs(monkeypatch):
     monkeypatch.setattr(jax, "device_put_replicated", None, raising=False)  # the guide defines it, for all of JAX
     pytest.importorskip("gymnasium", reason="pip install 'sim2real[interop]'")

@@ -30,7 +30,7 @@ def quietly(call, *arguments):
         return call(*arguments)
 
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 def read_quietly(path):

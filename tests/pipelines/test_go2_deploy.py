@@ -23,8 +23,8 @@ pytest.importorskip("cyclonedds")
 GUIDE = Path(__file__).parents[2] / "docs/guides/walk.md"
 
 
-@pytest.mark.realtime
-@pytest.mark.full  # `make test` drives the device in test_unitree_device.py, and walks in test_rough_ground.py
+@pytest.mark.process
+@pytest.mark.night  # `make test` drives the device in test_unitree_device.py, and walks in test_rough_ground.py
 def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
     (command,) = re.findall(r"^    sim2real (deploy .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
@@ -78,8 +78,8 @@ def test_a_robot_that_does_not_walk_refuses_a_velocity(tmp_path, capsys):
     assert "follows no velocity" in capsys.readouterr().err
 
 
-@pytest.mark.full  # `make test` records a deployment of it, above
-@pytest.mark.realtime
+@pytest.mark.night  # `make test` records a deployment of it, above
+@pytest.mark.process
 def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
     command, *_ = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
@@ -96,8 +96,8 @@ def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
     assert ROBOT.drive.embedded.plant_args["place"] == "floor"
 
 
-@pytest.mark.full
-@pytest.mark.realtime
+@pytest.mark.night
+@pytest.mark.process
 def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsys):
     """The smaller tests are those of the model in a stand, of the run's stages, and of the deployment above."""
     (command,) = re.findall(r"^    sim2real (run go2.*)$", GUIDE.read_text(), re.MULTILINE)
@@ -119,8 +119,8 @@ def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsy
     assert "does not test the model" in advice.reasons[-1]
 
 
-@pytest.mark.full  # test_weighing.py has the load from a log of the emulator's clock
-@pytest.mark.realtime
+@pytest.mark.night  # test_weighing.py has the load from a log of the emulator's clock
+@pytest.mark.process
 def test_the_load_of_a_robot_on_its_feet_over_dds(tmp_path, capsys):
     logs = []
     for number, excitation in enumerate(("multisine", "standing")):

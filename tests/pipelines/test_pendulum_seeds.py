@@ -13,7 +13,7 @@ from sim2real.stages.pipeline.pipeline import load_pipeline
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "chirp.mcap"
 SEEDS = range(5)
 
-pytestmark = pytest.mark.full  # five whole identifications, with five refits each
+pytestmark = pytest.mark.night  # five whole identifications, with five refits each
 
 
 def test_estimates_and_intervals_do_not_depend_on_the_seed():

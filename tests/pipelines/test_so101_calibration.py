@@ -13,7 +13,7 @@ from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 SO101 = load_pipeline("so101")
 GUIDE, PERSON = SO101.load("guide"), SO101.load("person")
 PLANT = f"{Path(__file__).with_name('wrong_arms.py')}:WrongArm"
@@ -82,7 +82,7 @@ test_so101_hand_motion.py, where it takes no time."""
 IN_FULL = WHOLE_MOTION - {"servos exchanged"}
 
 
-@pytest.mark.parametrize("fault", [pytest.param(f, marks=pytest.mark.full) if f in IN_FULL else f for f in FAULTS])
+@pytest.mark.parametrize("fault", [pytest.param(f, marks=pytest.mark.night) if f in IN_FULL else f for f in FAULTS])
 def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
     plant, changes, emulation, message = FAULTS[fault]
     wrong = arm(changes, emulation, **plant)
@@ -92,8 +92,7 @@ def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
     assert not (tmp_path / "calibration.json").exists()
 
 
-@pytest.mark.slow
-@pytest.mark.full  # `make test` plays the motion to HandMotion in test_so101_hand_motion.py
+@pytest.mark.night  # `make test` plays the motion to HandMotion in test_so101_hand_motion.py
 def test_a_right_calibration_is_accepted(arm, tmp_path):
     right = arm()
     calibrate(right.port, GUIDE, tmp_path / "calibration.json")
@@ -101,8 +100,7 @@ def test_a_right_calibration_is_accepted(arm, tmp_path):
     assert modes(right) <= {OperatingMode.OFF}
 
 
-@pytest.mark.slow
-@pytest.mark.full  # as above
+@pytest.mark.night  # as above
 def test_without_a_calibration_the_motion_makes_one(arm, tmp_path, monkeypatch):
     """Its zeros are those of the arm. Before, the encoders' seam was inside of the joints' travel."""
     new = arm(emulation={"homing_offset": 1900})

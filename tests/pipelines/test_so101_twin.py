@@ -33,8 +33,8 @@ def new(arm, folder, answer):
     return done.returncode, done.stderr
 
 
-@pytest.mark.full  # `make test` calibrates by hand in test_so101_calibration.py, without the minute of waiting
-@pytest.mark.realtime
+@pytest.mark.night  # `make test` calibrates by hand in test_so101_calibration.py, without the minute of waiting
+@pytest.mark.process
 def test_without_an_answer_nothing_moves_and_the_pipeline_is_there(arm, tmp_path):
     code, told = new(arm, tmp_path, "")
     assert (code, told.count(QUESTION)) == (2, 1), told
@@ -52,8 +52,8 @@ def test_without_an_answer_nothing_moves_and_the_pipeline_is_there(arm, tmp_path
     assert set(arm.truth().of(Kind.EFFECT)["values"][:, 0].tolist()) <= {OperatingMode.OFF}
 
 
-@pytest.mark.full
-@pytest.mark.realtime
+@pytest.mark.night
+@pytest.mark.process
 def test_an_answer_gives_an_accepted_twin(arm, tmp_path):
     code, told = new(arm, tmp_path, "\n")
     assert (code, told.count(QUESTION)) == (0, 1), told

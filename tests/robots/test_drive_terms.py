@@ -190,7 +190,7 @@ def played(program, terms):
     return np.asarray(program({n: jnp.asarray(v) for n, v in values.items()}))
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize("one", [*MECHANICAL, "all"])
 def test_both_engines_say_the_same(engines, one):
     own = ON if one == "all" else OFF | {what: ON[what] for what in OPTIONAL[one]}
@@ -199,7 +199,7 @@ def test_both_engines_say_the_same(engines, one):
     assert np.abs(found - played(engines.c, OFF)).max() > 1e-3
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_friction_acts_on_the_compiled_engine_although_the_file_has_none(engines):
     """MJX leaves friction out for good where a model is compiled without any."""
     with_it, without = (played(engines.compiled, OFF | {"frictionloss": v}) for v in (0.3, 0.0))
@@ -228,14 +228,14 @@ def by_hands_log(tmp_path_factory):
 PLAY = {"play": 0.03, "tilt_y": 0.15}
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_play_and_tilt_are_found_in_a_recording_made_by_hand(by_hands_log):
     """In `make test` each term moves a joint as by hand, and what refinement sees of a delay is known, below."""
     found = by_hands_log.table.decode(refine(by_hands_log, by_hands_log.table.start()[None]).z)
     assert {n: float(found[n]) for n in PLAY} == pytest.approx(PLAY, rel=0.1)
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize("share", [1e-4, 1e-6, 1e-9])
 def test_what_a_delay_of_nothing_would_change_is_known(by_hands_log, share):
     """At a bound the search's own unknown changes nothing, and the delay does: 10 ms of it would be seen."""

@@ -16,7 +16,7 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 
-pytestmark = pytest.mark.full  # `make test` compares the engines in test_drive_terms.py
+pytestmark = pytest.mark.night  # `make test` compares the engines in test_drive_terms.py
 MAX_DELAY_S, SEGMENT_S = 0.03, 0.4
 LIMITS = {"gain": (2.0, 8.0), "damping": (0.05, 0.4), "armature": (0.003, 0.03), "friction_left": (0.01, 0.1)}
 LIMITS |= {"stribeck": (0.05, 2.0)}

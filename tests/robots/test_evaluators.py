@@ -15,7 +15,7 @@ from sim2real.identify.fit import run_search
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 
-pytestmark = pytest.mark.full  # MJX compiles for two minutes
+pytestmark = pytest.mark.night  # MJX compiles for two minutes
 
 TRUTH = {**VALUES, "stribeck": 0.5, "sensor_delay": 0.006, "actuator_delay": 0.011}
 SHIFT = (0.02, -0.01, 0.1, -0.2)

@@ -58,8 +58,8 @@ def recorded(tmp_path_factory):
     return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("kept", [pytest.param(5, marks=pytest.mark.full), 3])
+@pytest.mark.night
+@pytest.mark.parametrize("kept", [pytest.param(5, marks=pytest.mark.night), 3])
 def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch, kept):
     """Sets of terms are compared on fewer segments where all would take long: a part has as many errors as ever."""
     robot, episode = recorded
@@ -87,7 +87,7 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch
     assert errors["gravcomp",] < 0.1 * errors[()]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_fit_that_would_take_long_takes_the_segments_with_most_motion(recorded, monkeypatch):
     """As many of each recording; all are predicted, and the parts that are held out are as many as ever."""
     robot, episode = recorded

@@ -20,7 +20,7 @@ from sim2real.stages.on_robot.episode import run_episode
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 # A busy machine is not what is tested: the watchdog is patient.
 GATE = GateLimits(limit=1.5, slew_per_s=6.0, command_timeout_s=0.2, max_speed_rad_s=20.0, servo_watchdog_s=0.6)

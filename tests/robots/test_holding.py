@@ -224,7 +224,7 @@ FOUR_BAR = """<mujoco><default><geom type="capsule" size=".01"/><joint axis="0 1
 <equality><connect body1="coupler" body2="rocker" anchor=".2 0 0"/></equality></mujoco>"""
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_loop_is_closed_at_the_start(tmp_path):
     """Of a parallelogram the rocker turns with the crank, and the coupler stays level, also beyond half a turn."""
     path = tmp_path / "bar.xml"
@@ -268,10 +268,10 @@ SUM = '<joint joint="crank" coef="1"/><joint joint="rocker" coef="-2"/>'
     ("inner", "outer", "rest", "rocker"),
     [
         (COUPLER.format('<joint name="p" type="ball"/>'), "", f"<equality>{PIN}</equality>", 1.0),
-        pytest.param("", FREED, f"<equality>{PIN}{PINNED}</equality>", 1.0, marks=pytest.mark.full),
+        pytest.param("", FREED, f"<equality>{PIN}{PINNED}</equality>", 1.0, marks=pytest.mark.night),
         pytest.param(
             "", "", f'<tendon><fixed name="t">{SUM}</fixed></tendon><equality><tendon tendon1="t"/></equality>', 0.5,
-            marks=pytest.mark.full,
+            marks=pytest.mark.night,
         ),
         ("", "", '<equality><joint joint1="rocker" joint2="crank" polycoef="0 0 1 0 0"/></equality>', 0.4),
     ],

@@ -64,13 +64,13 @@ def fitted(robot, episode, terms):
 BOTH = "torque_limit,speed_limit"
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(
     ("offered", "limits", "chosen", "name", "truth"),
     [
         ("torque_limit", {"torque": TORQUE}, "torque_limit", "torque", TORQUE),
-        pytest.param(BOTH, {"torque": TORQUE}, "torque_limit", "torque", TORQUE, marks=pytest.mark.full),
-        pytest.param(BOTH, {}, None, "", 0.0, marks=pytest.mark.full),
+        pytest.param(BOTH, {"torque": TORQUE}, "torque_limit", "torque", TORQUE, marks=pytest.mark.night),
+        pytest.param(BOTH, {}, None, "", 0.0, marks=pytest.mark.night),
     ],
 )
 def test_auto_finds_a_limit_that_was_reached(tmp_path, offered, limits, chosen, name, truth):
@@ -88,7 +88,7 @@ def test_auto_finds_a_limit_that_was_reached(tmp_path, offered, limits, chosen, 
         assert errors[chosen,] < 0.5 * errors[()]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_limit_that_is_named_and_was_not_reached_has_no_number(tmp_path):
     robot, episode = recorded(tmp_path)
     findings = Findings.of(fitted(robot, episode, "torque_limit"))

@@ -95,7 +95,7 @@ def check(folder, figures):
     assert float(largest[1]) < 1.0
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_pendulum_of_a_real_recording(tmp_path):
     values = {"gain": 21.08, "gravity": 112.7, "damping": 0.748, "friction": 8.458, "sensor_delay": 0.0223,
               "actuator_delay": 0.0223}  # fmt: skip
@@ -104,7 +104,7 @@ def test_the_pendulum_of_a_real_recording(tmp_path):
     check(card_of(robot, found, tmp_path / "card"), 15)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_so101_whose_friction_wears_off_with_speed(tmp_path):
     """A log of the model at other parameters than those of the card, read in counts."""
     pipeline = load_pipeline("so101")
@@ -152,12 +152,12 @@ def two_links(folder, own, commands):
     return robot, Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(
     ("own", "commands"),
     [
         (PLAIN, ("goal",)),
-        pytest.param(PLAIN | TERMS, ("goal", "kp", "enabled", "torque", "goal_velocity"), marks=pytest.mark.full),
+        pytest.param(PLAIN | TERMS, ("goal", "kp", "enabled", "torque", "goal_velocity"), marks=pytest.mark.night),
     ],
     ids=["plain", "every term"],
 )
@@ -167,7 +167,7 @@ def test_a_robot_that_only_its_file_describes(own, commands, tmp_path):
     check(card_of(robot, found, tmp_path / "card"), 20)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_go2_of_the_public_recording(tmp_path):
     """The robot and its estimates: twelve joints that follow chirps in the air."""
     if not (DATA / "go2" / "chirp_fit.npz").is_file():
@@ -185,7 +185,7 @@ def test_the_go2_of_the_public_recording(tmp_path):
     check(card_of(robot, found, tmp_path / "card"), 80)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_wrong_delay_or_a_wrong_model_is_seen(tmp_path):
     """The script is no copy of the card's figures: with another delay, or a joint without friction, it fails."""
     robot, episode = two_links(tmp_path, PLAIN, ("goal",))
@@ -222,7 +222,7 @@ def test_the_card_of_a_run(finished_run_dir, tmp_path, monkeypatch, capsys):
     assert "holds no model card" in capsys.readouterr().err
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_distribution_of_a_link_s_delay_is_on_the_card(tmp_path):
     """As ``--links`` estimates it; the script computes mean and percentile from the shares."""
     robot, episode = two_links(tmp_path, PLAIN, ("goal",))
@@ -265,7 +265,7 @@ def test_facts_about_the_hardware_come_from_the_log():
     }
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_card_without_a_simulation_has_the_reason(tmp_path):
     """A world that MuJoCo has not, and an identification without commands: no script computes their errors."""
     robot, episode = two_links(tmp_path, PLAIN, ("goal",))

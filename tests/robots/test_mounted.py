@@ -78,7 +78,7 @@ def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
     assert one.truth() == pytest.approx({n: v * factors[n.split("_")[0]] for n, v in pair.nominal().items()}, rel=1e-5)
 
 
-@pytest.mark.realtime
+@pytest.mark.process
 def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
     """The servos turn up to twice as far, some of them the other way; the true joints go where they are told."""
     robot = arm.load()
@@ -102,8 +102,8 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
         assert sent == pytest.approx(joint.encoder(goal[i]), abs=0.001)
 
 
-@pytest.mark.realtime
-@pytest.mark.full  # test_mounting.py has each reading and command, the test below goals and limits
+@pytest.mark.process
+@pytest.mark.night  # test_mounting.py has each reading and command, the test below goals and limits
 def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path):
     """The log of a pendulum whose motor turns twice the other way gives the parameters of the pendulum's plant."""
     pipeline = load_pipeline("pendulum")

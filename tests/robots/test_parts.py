@@ -80,7 +80,7 @@ def test_torque_grows_with_the_error_and_ends_at_the_stall_torque():
         assert env.physics.bind(task.robot.actuators).force == pytest.approx(torque)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_c_and_mjx_play_the_same_goals_alike(pair, played):
     _, positions, speeds, rewards = play_on_c(pair, played.params, played.goals)
     assert np.ptp(positions, axis=0).min() > 0.5
@@ -89,8 +89,7 @@ def test_c_and_mjx_play_the_same_goals_alike(pair, played):
     np.testing.assert_allclose(played.rewards, rewards, atol=5e-5)
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_the_arm_moves_alike_on_c_and_on_mjx(arm):
     """It rubs, and its solver takes a single step. `make test` does so with the pair, in the test before."""
     robot = arm.load()

@@ -52,8 +52,8 @@ def robot(tmp_path, commands=COMMANDS, **changes) -> MjcfRobot:
     return MjcfRobot(RobotConfig(**{**vars(config), **changes}))
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("engine", ["c", pytest.param("compiled", marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("engine", ["c", pytest.param("compiled", marks=pytest.mark.night)])
 def test_logs_with_different_payloads_give_the_drive_of_all(tmp_path, engine):
     model = robot(tmp_path).identifiable(0.02)
     spans = [Span(r, begin) for r in (0, 1) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]

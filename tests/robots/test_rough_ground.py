@@ -68,7 +68,7 @@ def test_feet_touch_the_ground_that_is_below_them():
     assert model.body(robot).name
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_training_without_roughness_has_a_flat_floor():
     values = ROBOT.nominal()
     kinds = []

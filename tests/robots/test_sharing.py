@@ -67,7 +67,7 @@ def recorded(tmp_path_factory):
     return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_joint_with_another_stiffness_gets_a_factor(recorded):
     robot, episode = recorded
     robot = held_out_parts.offering(robot, "kp_by_joint")

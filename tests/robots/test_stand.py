@@ -37,7 +37,7 @@ def log(tmp_path_factory):
     return Recording.load(path).episode, header["truth"] | delays
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_with_the_true_parameters_the_model_predicts_the_log_to_its_noise(log):
     episode, truth = log
     model = ROBOT.identifiable(0.06)

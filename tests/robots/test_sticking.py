@@ -88,7 +88,7 @@ def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
     assert fastest() > 1e-2, "few iterations do suffice: training may have them, too"
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize("task", [Reach, arm_task.Reach])
 def test_in_single_precision_too(task):
     """On MJX, as beside a deployment; at an impedance of 0.999 single precision does not find the holding force."""

@@ -20,8 +20,8 @@ XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
   <inertial pos="0 0 -0.2" mass="1" diaginertia="1e-3 1e-3 1e-3"/></body></worldbody></mujoco>"""
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("share", [1.0, pytest.param(0.0, marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("share", [1.0, pytest.param(0.0, marks=pytest.mark.night)])
 def test_the_share_that_follows_the_voltage_is_found(tmp_path, share):
     path = tmp_path / "arm.xml"
     path.write_text(XML)

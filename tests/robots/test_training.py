@@ -56,7 +56,7 @@ def drawn(trained):
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(trained.task.params))(keys))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_push_gives_the_joints_other_velocities(trained):
     before, after, moving = trained.blow
     np.testing.assert_array_equal(before, moving)

@@ -19,7 +19,7 @@ print(json.dumps([name for name in sys.modules if name.startswith("sim2real.hard
 """
 
 
-@pytest.mark.parametrize("name", ["pendulum", *(pytest.param(n, marks=pytest.mark.full) for n in ("arm", "so101"))])
+@pytest.mark.parametrize("name", ["pendulum", *(pytest.param(n, marks=pytest.mark.night) for n in ("arm", "so101"))])
 def test_training_imports_no_driver_and_no_pyserial(name):
     done = subprocess.run([sys.executable, "-c", SCRIPT, name], capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr

@@ -12,7 +12,7 @@ from sim2real.log.reader import read_log
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.record import stage as record_stage
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.md"
 
@@ -50,7 +50,7 @@ def test_the_twin_is_recorded_and_differs_from_the_model(head, tmp_path):
     assert {n: found[n] / nominal[n] for n in found} == pytest.approx(factors, rel=1e-6)
 
 
-@pytest.mark.full  # `make test` records and runs its twin, and other devices pass the suite in tests/hardware
+@pytest.mark.night  # `make test` records and runs its twin, and other devices pass the suite in tests/hardware
 def test_it_passes_the_test_that_the_page_has(head, tmp_path):
     names: dict = {}
     exec(blocks()[2], names)

@@ -171,7 +171,7 @@ def test_play_into_a_file_of_the_viewer(tmp_path):
         PlayConfig("go2", window=True, view="web")
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_commands_of_the_guide_run(tmp_path, monkeypatch):
     text = (ROOT / "docs/guides/walk.md").read_text()
     commands = re.findall(r"^    sim2real (play .*)$", text, re.MULTILINE)
@@ -183,7 +183,7 @@ def test_the_commands_of_the_guide_run(tmp_path, monkeypatch):
     assert (tmp_path / "walk.gif").is_file()
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_training_of_the_guide_is_on_rough_ground(tmp_path, monkeypatch, capsys):
     text = (ROOT / "docs/guides/walk.md").read_text()
     command, *_ = re.findall(r"^    sim2real (train .*roughness.*)$", text, re.MULTILINE)

@@ -60,7 +60,7 @@ def test_true_parameters_give_the_true_load(standing):
     assert weighing.balances_of(ROBOT, episode, values).load(ROBOT, stronger) - found == pytest.approx(0.48, abs=0.06)
 
 
-@pytest.mark.full  # the quick test has one of these robots
+@pytest.mark.night  # the quick test has one of these robots
 @pytest.mark.parametrize("seed", [0, 2, 6])
 def test_loads_of_other_robots(tmp_path, seed):
     episode, values, load = logged(tmp_path, seed, standing=True)

@@ -20,7 +20,7 @@ from sim2real.runtime.wall_clock.node_thread import NodeThread
 from sim2real.runtime.wall_clock.wall_clock import WallClockRun
 from sim2real.runtime.wall_clock.watchdog import step_limits
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(60)]
+pytestmark = [pytest.mark.process, pytest.mark.timeout(60)]
 KEY = jax.random.key(0)
 WHOLE = (["startup", "stop"], [])
 """What a node may have seen of an episode that was stopped while it started: all of it, or nothing."""

@@ -19,7 +19,7 @@ from sim2real.graph.schedule import rederive
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import MonotonicClock, realtime
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(60)]
+pytestmark = [pytest.mark.process, pytest.mark.timeout(60)]
 KEY = jax.random.key(0)
 
 

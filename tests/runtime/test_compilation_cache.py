@@ -46,7 +46,7 @@ def run(environment):
     return folder, int(hits), int(misses)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_second_process_finds_the_programs_of_the_first(tmp_path):
     environment = {"XDG_CACHE_HOME": str(tmp_path)}
     folder, hits, misses = run(environment)

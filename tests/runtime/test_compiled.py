@@ -41,7 +41,7 @@ def compiled():
 
 def others_in_full(topologies_, *few):
     """Return rows of a parametrisation: `make test` takes a few, and the dearer ones of the same claim are `full`."""
-    return [pytest.param(t, marks=() if t in few else pytest.mark.full, id=t.__name__) for t in topologies_]
+    return [pytest.param(t, marks=() if t in few else pytest.mark.night, id=t.__name__) for t in topologies_]
 
 
 DEAR = (topologies.open_loop, topologies.random_one, topologies.two_in_five, topologies.slow_world)
@@ -105,7 +105,7 @@ def test_a_pattern_of_ticks_and_steps_equals_rows(topology, compiled):
     check_pattern(graph)
 
 
-@pytest.mark.full  # `make test` takes the pattern of a topology, above
+@pytest.mark.night  # `make test` takes the pattern of a topology, above
 @pytest.mark.parametrize("seed", PATTERNS)
 def test_a_random_pattern_equals_rows(seed):
     nodes, supervisor = topologies.random_pattern(seed, jax_hash_node)
@@ -259,7 +259,7 @@ def observes(graph, gs):
 @pytest.mark.parametrize(
     ("way", "topology"),
     [(w, topologies.robot) for w in (rolls, rolls_in_parts, runs_a_row, steps, observes)]
-    + [pytest.param(rolls, topologies.three_in_ten, marks=pytest.mark.full)],
+    + [pytest.param(rolls, topologies.three_in_ten, marks=pytest.mark.night)],
     ids=lambda x: x.__name__,
 )
 def test_an_episode_that_does_not_exist_has_no_steps(way, topology, compiled):

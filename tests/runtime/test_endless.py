@@ -20,7 +20,7 @@ from sim2real.runtime.init import OUTPUTS
 KEY = jax.random.key(0)
 
 
-@pytest.mark.parametrize("seed", [60, *(pytest.param(seed, marks=pytest.mark.full) for seed in (61, 62, 63))])
+@pytest.mark.parametrize("seed", [60, *(pytest.param(seed, marks=pytest.mark.night) for seed in (61, 62, 63))])
 @pytest.mark.parametrize("trainable", [False, True])
 def test_an_episode_goes_on_by_the_same_rules(seed, trainable, monkeypatch):
     """In pieces, over several ends of what was drawn."""

@@ -20,7 +20,7 @@ def names():
     return found
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_page_says_what_is_so(names):
     nodes = names["nodes"]
     assert (nodes["agent"].phase, nodes["actuator"].phase) == pytest.approx((0.003, 0.007))
@@ -33,7 +33,7 @@ def test_the_page_says_what_is_so(names):
     assert len(names["log"].outputs["sensor"]["th"]) > 60
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_loss_of_ones_own_finds_the_mass_of_the_recorded_world(names):
     """The recorded episode was made with the world's own mass, and sensors that saw it 5 ms later."""
     assert float(names["estimate"].parameters["mass"]) == pytest.approx(0.0509, rel=0.1)

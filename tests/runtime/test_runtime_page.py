@@ -19,13 +19,13 @@ def names():
     return namespace
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_wall_clock_runs_at_the_nodes_rates(names):
     assert 10 <= int(names["measured"].seq["agent"]) <= 26
     assert float(names["measured"].state["world"].x) < 1.0
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_simulated_clock_and_the_compiled_program_give_the_same_numbers(names):
     assert float(names["simulated"]) == pytest.approx(float(names["of_first_episode"]), rel=1e-6)
     assert 0.0 < float(names["simulated"]) < 1.0

@@ -73,7 +73,7 @@ def test_random_graphs(seed, which):
     compare(nodes, supervisor, timeline, eps=1)
 
 
-@pytest.mark.full
+@pytest.mark.night
 @settings(max_examples=30)
 @given(st.integers(0, 10**6))
 def test_random_graphs_whose_rates_do_not_divide(seed):

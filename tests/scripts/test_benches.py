@@ -75,14 +75,14 @@ def names(report):
     return {row["name"] for row in report["rows"]}
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_graph(run, traced):
     found = names(run("graph", "--name", "h200"))
     assert {"graph/h200/hiccups/2/over_hand", "graph/h200/mjx_arm/2/over_bare", "graph/bytes_per_copy"} <= found
     assert "graph/build/10_episodes_wire_s" in found
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_train(run):
     report = run("train", "--seeds", 2)
     name = f"train/{jax.default_backend()}/pendulum/2_seeds"
@@ -93,7 +93,7 @@ def test_train(run):
     assert report["machine"]["devices"]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_scaling(run):
     name = f"scaling/{jax.default_backend()}"
     found = names(run("scaling"))
@@ -101,7 +101,7 @@ def test_scaling(run):
     assert {f"{name}/identify/1_devices/{n}" for n in ("candidates_per_s", "compile_s")} <= found
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_randomise(run):
     report = run("randomise", "--ways", "all", "--record-s", 12)  # a length whose programs other tests compile, too
     found = {row["name"]: row["value"] for row in report["rows"]}
@@ -112,8 +112,7 @@ def test_randomise(run):
     assert robot["identified"]["gain"] == pytest.approx(robot["truth"]["gain"], rel=0.3)
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_drift(run):
     report = run("drift", "--changes", "friction")
     (robot,) = report["robots"]
@@ -125,7 +124,7 @@ def test_drift(run):
     assert {c["name"] for c in tested["changes"]} >= {"friction", "payload", "round_trip_delay"}
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_view(run):
     pytest.importorskip("rerun")
     found = names(run("view"))
@@ -135,8 +134,7 @@ def test_view(run):
     )}  # fmt: skip
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_excitation(run):
     assert "excitation/teleoperated/friction_error" in names(run("excitation"))
 
@@ -145,12 +143,12 @@ def test_async(run):
     assert {"graph/simulated/steps_per_s", "async/100_hz/agent/lateness_ms", "async/100_hz/cpu"} <= names(run("async"))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_compose(run):
     assert "compose/step_ms" in names(run("compose", "--parts", "step"))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_compose_on_warp(run):
     pytest.importorskip("warp", reason='Warp is not installed: pip install "sim2real[warp]"')
     name = f"compose/{jax.default_backend()}/warp/2"
@@ -163,7 +161,7 @@ def test_compose_without_warp_leaves_its_rows_out(monkeypatch, capsys):
     assert "MuJoCo Warp is not installed, its rows are missing" in capsys.readouterr().err
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_runner(run):
     found = {row["name"]: row["value"] for row in run("runner")["rows"]}
     assert 0.0 < found["runner/numpy/32-64-64-8/p50_us"] < found["runner/numpy/32-64-64-8/p99_us"]
@@ -178,17 +176,17 @@ def test_log(run):
     assert {"log/loop_200hz/p99_ms", "log/range_read_ms"} <= set(rows)
 
 
-@pytest.mark.full  # `make test` reads the outcome of such a run, below
+@pytest.mark.night  # `make test` reads the outcome of such a run, below
 def test_suite(run):
     report = run("suite")
     rows = {r["name"].removeprefix("suite/"): r["value"] for r in report["rows"]}
     assert (rows["passed"], rows["skipped"], rows["failed"], report["failed"]) == (3, 0, 0, [])
     assert rows["processor_over_cold"] == pytest.approx(rows["processor_s"], abs=0.1), "the yardstick is set to 1 s"
     assert 0.1 < rows["processor_s"] < 60.0, "Python and pytest start in a few tenths of a second"
-    assert list(report["rooms"]) == ["test_repetitions"]
+    assert list(report["rooms"]) == ["test_plain_pytree"]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_identify_time(run):
     """The second log of the same length finds all programs of the first: so says tests/identify/test_programs.py."""
     rows = {r["name"].removeprefix("identify-time/"): r["value"] for r in run("identify-time")["rows"]}
@@ -207,7 +205,7 @@ def test_the_outcome_of_tests_is_read_from_pytests_report(tmp_path):
     assert found.rooms == {"log": 3.0, "view": 3.0}
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_tests_that_cannot_run_are_an_error_with_a_hint(capsys):
     assert bench.main(["suite", "--quick", "--paths", "tests/no_such_room"]) == 1
     told = capsys.readouterr().err
@@ -229,7 +227,7 @@ def disk(tmp_path_factory):
     return path
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_identify(run, disk):
     """Ours beside MuJoCo's sysid, as the league compares them in ``test_league``."""
     pytest.importorskip("mujoco.sysid")
@@ -256,7 +254,7 @@ def servo(tmp_path_factory):
     return folder.parent
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_league(run, servo, tmp_path):
     pytest.importorskip("mujoco.sysid")
     kept = tmp_path / "kept.jsonl"
@@ -325,7 +323,7 @@ def test_scripts_stay_short(module):
             assert node.end_lineno - node.lineno < 60, node.name
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_carried(run):
     rows = {row["name"].removeprefix("carried/"): row["value"] for row in run("carried")["rows"]}
     assert set(rows) == {"seconds", "terms", "gravcomp", "stiffness_error", "verdict"}
@@ -333,7 +331,7 @@ def test_carried(run):
     assert 0.0 < rows["gravcomp"] <= 1.5
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_legs_identify(run):
     report = run("legs-identify")
     (twin,) = report["twins"]
@@ -351,7 +349,7 @@ def test_a_training_on_warp_is_refused_without_a_gpu(capsys, flags):
     assert "needs a GPU, and JAX has none here\n\nhint: " in capsys.readouterr().err
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_walk_delays(run):
     """The policy that the pipeline ships, which needs no training, on one twin."""
     rows = {r["name"].removeprefix("walk_delays/shipped/10_ms/"): r["value"] for r in run("walk-delays")["rows"]}

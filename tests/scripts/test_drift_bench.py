@@ -40,7 +40,7 @@ def test_15_ms_more_delay_are_seen_in_the_small_steps(kind, tmp_path):
     assert np.mean(answered[1]) - np.mean(answered[0]) == pytest.approx(0.015, abs=0.004)
 
 
-@pytest.mark.full
+@pytest.mark.night
 @KINDS
 def test_a_payload_weighs_and_friction_brakes(kind, tmp_path):
     def off(change):

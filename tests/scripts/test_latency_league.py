@@ -43,7 +43,7 @@ def test_a_lost_measurement_repeats_the_one_before():
     assert (log.position[at] == log.position[at - 1]).all()
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_ours_finds_a_distribution_and_a_correlation_measures_the_lag_of_the_servo_too():
     log, true = links.log("gaussian", 6.0, 1), links.truth("gaussian", 6.0)
     ours, peak = methods.ours(log, 0), methods.correlation(log, 0)
@@ -52,14 +52,14 @@ def test_ours_finds_a_distribution_and_a_correlation_measures_the_lag_of_the_ser
     assert peak.mean > true.mean + 0.02
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(("kind", "seed"), [("tail", 101), ("steps", 200), ("usb", 107)])
 def test_ours_finds_the_mean_from_a_start_far_from_it(kind, seed):
     """From one start the first ended 4 ms away and the third 2.5, and the first estimate of the second diverged."""
     assert methods.ours(links.log(kind, 8.0, seed), 0).mean == pytest.approx(links.truth(kind, 8.0).mean, abs=1.5e-3)
 
 
-@pytest.mark.full  # `make test` runs the other methods
+@pytest.mark.night  # `make test` runs the other methods
 def test_sysid_finds_a_constant_delay_and_paces_is_a_multiple_of_its_step(monkeypatch):
     log, true = links.log("fixed", 3.0, 1), links.truth("fixed", 3.0)
     monkeypatch.setattr(methods, "PACE_S", 2.0)

@@ -269,7 +269,7 @@ def recorded():
     return record
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_ours_identifies_an_arm_from_logs_and_sees_of_the_test_its_start_alone(recorded, quick_to_compile, monkeypatch):
     monkeypatch.setattr(league_ours, "CHOOSES", ())  # two logs of 2 s are too few to choose terms
     fold = Fold("a gain", (recorded(5.0, 4.0), recorded(10.0, 7.0)), (recorded(7.0, 5.0, (0.2, -1.0)),))

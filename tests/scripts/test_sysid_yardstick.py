@@ -40,7 +40,7 @@ def test_a_recording_that_ends_without_torque_is_simulated_through():
     assert np.abs(np.diff(angle)).max() < 0.1  # without a jump where the parts meet
 
 
-@pytest.mark.full  # `make test` finds a delay in test_latency_league.py
+@pytest.mark.night  # `make test` finds a delay in test_latency_league.py
 @pytest.mark.skipif(not (DATA / "unbalanced_disk" / "disk_fit.npz").is_file(), reason=f"no recordings in {DATA}")
 def test_the_delay_of_the_disk_is_found_in_a_short_recording():
     with np.load(DATA / "unbalanced_disk" / "disk_fit.npz") as file:

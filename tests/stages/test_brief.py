@@ -45,8 +45,8 @@ def test_no_two_seconds_are_silent(capsys):
     assert capsys.readouterr().err.count(".") >= 2
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("verbose", [False, pytest.param(True, marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("verbose", [False, pytest.param(True, marks=pytest.mark.night)])
 def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys, run_copy):
     """The stages' artifacts are those of a finished run; each stage prints 100 lines of details."""
     from sim2real.artifacts.run.run_folder import finished

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches.hidden import randomise
 from benches.hidden import robots as hidden
 
-pytestmark = [pytest.mark.slow, pytest.mark.full]
+pytestmark = pytest.mark.night
 MORE_S = 0.030
 
 

@@ -82,7 +82,7 @@ def test_a_teacher_is_never_deployed(root, capsys):
     assert not list(root.glob("*/*/deploy"))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_student_is_trained_and_names_its_teacher(root, tmp_path):
     teacher = next((root / "pendulum").glob("*/train"))
     assert cli.main([*TINY, "--runs", str(tmp_path), "--distil", str(teacher)]) == 0

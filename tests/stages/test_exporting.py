@@ -65,7 +65,7 @@ def test_mjcf_has_what_was_identified(arm, here, capsys):
     np.testing.assert_allclose(limit / limit[0], gain / gain[0], rtol=1e-3)  # it goes with the gain
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_run_folder_is_found_by_its_pipeline(arm, here, capsys):
     with run_folder.open_stage(here / "runs", "arm", "identify", {}) as stage:
         for name, path in arm.save(stage.folder).items():

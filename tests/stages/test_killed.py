@@ -113,9 +113,9 @@ def ran(run_dir):
     return done, [(r.number, r.verdict, r.then, len(r.stages)) for r in Iterations.load(run_dir).rows]
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(
-    "verdicts", [("re-identify", "fine"), pytest.param(("re-train", "fine"), marks=pytest.mark.full)]
+    "verdicts", [("re-identify", "fine"), pytest.param(("re-train", "fine"), marks=pytest.mark.night)]
 )
 def test_a_run_that_is_killed_at_any_stage_ends_as_if_it_had_not_been(tmp_path, verdicts):
     whole = Stages(tmp_path / "whole", verdicts)

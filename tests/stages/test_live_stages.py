@@ -31,7 +31,7 @@ def tiny(stage):
     return [f"--{flag.removeprefix(f'--{stage}.')}" for flag in TINY if flag.startswith(f"--{stage}.")]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_search_streams_its_loss_and_its_best_fit(run_copy, tmp_path):
     file = tmp_path / "identify.rrd"
     home = ["--run", str(run_copy), "--runs", str(run_copy.parent.parent)]
@@ -47,7 +47,7 @@ def test_a_search_streams_its_loss_and_its_best_fit(run_copy, tmp_path):
     assert (run_copy / "identify.2" / "best_fit.npz").is_file()
 
 
-@pytest.mark.full  # `make test` streams a search, above
+@pytest.mark.night  # `make test` streams a search, above
 def test_a_training_streams_its_curves_and_a_viewer_joins_it(run_copy, tmp_path):
     file = tmp_path / "train.rrd"
     home = ["--run", str(run_copy), "--runs", str(run_copy.parent.parent)]
@@ -58,7 +58,7 @@ def test_a_training_streams_its_curves_and_a_viewer_joins_it(run_copy, tmp_path)
     assert (run_copy / "train.2" / "progress.jsonl").is_file(), "a viewer joins a training that has none"
 
 
-@pytest.mark.parametrize("follow", [True, pytest.param(False, marks=pytest.mark.full)])
+@pytest.mark.parametrize("follow", [True, pytest.param(False, marks=pytest.mark.night)])
 def test_a_run_is_served_to_browsers_until_ctrl_c(run_copy, follow):
     command = [sys.executable, "-m", "sim2real.cli", "view", str(run_copy), "--web", *(["--follow"] if follow else [])]
     environment = {**os.environ, "RERUN_ANALYTICS_ENABLED": "0"}

@@ -17,7 +17,7 @@ from sim2real.errors import UsageError
 from sim2real.log.reader import read_log
 from sim2real.stages.live.config import check_view
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 def record(root, view, *, duration_s=2.0, pipeline="pendulum"):
@@ -63,8 +63,8 @@ def when_recording(root, action, told):
     return thread
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("pipeline", ["pendulum", pytest.param("so101", marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("pipeline", ["pendulum", pytest.param("so101", marks=pytest.mark.night)])
 def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline):
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
@@ -89,7 +89,7 @@ def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline)
 @pytest.mark.parametrize(
     ("number", "problem"),
     [
-        pytest.param(signal.SIGKILL, "its process ended early", marks=pytest.mark.full),
+        pytest.param(signal.SIGKILL, "its process ended early", marks=pytest.mark.night),
         (signal.SIGSTOP, "its process hangs"),
     ],
 )
@@ -103,7 +103,7 @@ def test_a_viewer_that_dies_or_hangs_costs_no_row(tmp_path, capsys, number, prob
     assert viewers() == []
 
 
-@pytest.mark.full  # `make test` stops a viewer's process, above
+@pytest.mark.night  # `make test` stops a viewer's process, above
 def test_a_viewer_that_reads_nothing_costs_no_row(tmp_path, capsys):
     with socket.socket() as deaf:
         deaf.bind(("127.0.0.1", 0))
@@ -113,7 +113,7 @@ def test_a_viewer_that_reads_nothing_costs_no_row(tmp_path, capsys):
     assert "the viewer did not take" in capsys.readouterr().err
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_without_a_screen_the_recording_goes_on_and_names_another_viewer(tmp_path, capsys, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

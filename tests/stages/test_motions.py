@@ -18,7 +18,7 @@ from sim2real.robots.servo.drive import ServoDrive
 from sim2real.stages.excitation.played import played
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 ARM = load_pipeline("so101")
 SERVOS = ARM.load().drive.servos
@@ -135,7 +135,7 @@ def test_files_without_a_motion_are_refused(tmp_path):
         replace(ARM.record, excitation="wobble")
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsys):
     t_s = np.arange(0.0, 3.0, 0.02)
     volts = 1.2 * np.sin(2 * np.pi * 0.7 * t_s)
@@ -200,7 +200,7 @@ def test_no_stage_identifies_from_it_and_the_message_names_what_to_do(by_hand, c
     assert "a recording by hand determines no parameter" in capsys.readouterr().err
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_its_log_is_a_motion_that_the_arm_reaches_slowly(by_hand, tmp_path):
     recording, _ = by_hand
     rows = goals(recording.path)

@@ -176,7 +176,7 @@ def identified(t: np.ndarray, goal: np.ndarray, q: np.ndarray) -> tuple[Path, di
     return folder, json.loads((folder / "parameters.json").read_text())
 
 
-@pytest.mark.full  # `make test` finds the worst second in test_worst_second.py, and rejects models in test_verdict.py
+@pytest.mark.night  # `make test` finds the worst second in test_worst_second.py, and rejects models in test_verdict.py
 @pytest.mark.parametrize("name", FAULTS)
 def test_the_first_figure_shows_the_fault(name, tmp_path, monkeypatch, capsys):
     log, joints, end_s = FAULTS[name]
@@ -210,7 +210,7 @@ def test_the_first_figure_shows_the_fault(name, tmp_path, monkeypatch, capsys):
     assert worst["begin_s"] == pytest.approx(first_s)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_fault_in_the_fitted_part_is_named_though_the_verdict_does_not_see_it(tmp_path, monkeypatch, capsys):
     t, goal, q = simulated()
     frozen(q, np.flatnonzero((t >= 4.0) & (t < 5.5)))

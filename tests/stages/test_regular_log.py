@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 from benches.drift.arms import ReachingArm
 
 
-@pytest.mark.full  # the unit test of where segments begin is in test_long_segments.py
+@pytest.mark.night  # the unit test of where segments begin is in test_long_segments.py
 def test_its_held_out_end_is_predicted_as_well_as_the_fitted_part(tmp_path):
     # 18 of 24 s would begin between two steps of the arm's world: goals acted 3 ms earlier there, at 3 times the error.
     ReachingArm.draw(700).record(log := tmp_path / "session.mcap", 24.0, 0)

@@ -43,7 +43,7 @@ def folder(root, name="train"):
     return next((root / "pendulum").glob(f"*/{name}"))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_path, capsys):
     root = tmp_path / "runs"
     shutil.copytree(runs, root)
@@ -63,7 +63,7 @@ def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_pa
     np.testing.assert_allclose(sum(terms), found.history.returns, rtol=1e-4)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_stage_folder_and_a_run_name_it_too(runs):
     own = folder(runs)
     for target in (own, own.parent):
@@ -80,7 +80,7 @@ def settings(own, target, **changes):
     return flags.parse(config, words, "", "")
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -94,7 +94,7 @@ def test_other_settings_are_refused(runs, change, message):
         resume.find_interrupted("pendulum", settings(own, own, **change), runs)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
     own, whole = folder(runs), folder(runs / "whole")
     with pytest.raises(UsageError, match="is a training of pendulum, not of arm"):
@@ -113,7 +113,7 @@ def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
         resume.check_same_parameters(found, other)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_sweep_names_what_it_tried_and_no_checkpoint_is_written_where_that_is_said(tmp_path, capsys, monkeypatch):
     report, left = learn_policy.show_progress, []
     monkeypatch.setattr(

@@ -85,7 +85,7 @@ def judged():
     return sensitivity(robot, env, policy, moves, models, seed=0)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_parameter_that_breaks_it_is_found_and_no_other(judged):
     assert judged.success == 1.0
     assert judged.parameters[0].name == "gain"
@@ -94,7 +94,7 @@ def test_the_parameter_that_breaks_it_is_found_and_no_other(judged):
     assert judged.advice.startswith("Measure 'gain' better: 4 half-widths of its 95 % interval ")
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_it_breaks_where_the_angle_is_too_far_off(judged):
     gain = judged.parameters[0]
     angle = np.arcsin(np.minimum(gain.values * VOLTS / VALUES["gravity"], 1.0))

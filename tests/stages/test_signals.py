@@ -12,7 +12,7 @@ import pytest
 
 from sim2real.stages.terminal.interruption import SignalHandling, interruptible, patiently
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 FINALISER = """
 import gc, sys, time

@@ -56,7 +56,7 @@ def learnt():
     return train(Bandit(), config, jax.random.key(0))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_module_of_flax_is_trained(learnt):
     assert learnt.history["success"][-1, 0] > 0.6
     assert learnt.best.spec == NetworkSpec(f"{__name__}:Normalised")
@@ -115,7 +115,7 @@ BLOCKS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.full)])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.night)])
 def test_what_is_exported_acts_as_in_jax(seed):
     """Each block after another one, drawn at random; the export compares with JAX on 64 observations."""
     pytest.importorskip("onnxruntime")
@@ -133,7 +133,7 @@ def test_what_is_exported_acts_as_in_jax(seed):
     assert export_graph(drawn(Module, seed, squash=seed == 1)) is not None
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_what_remembers_is_exported_with_what_it_begins_with(tmp_path):
     pytest.importorskip("onnxruntime")
     policy = drawn(Remembering, inputs=2)

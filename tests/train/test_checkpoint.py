@@ -40,7 +40,7 @@ def saved(tmp_path_factory):
     return path
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_what_is_resumed_ends_as_if_it_had_never_been_interrupted(whole, saved, tmp_path):
     seen = []
     found = train(Bandit(), CONFIG, KEY, seen.append, checkpoint=tmp_path / "next", resume=saved)

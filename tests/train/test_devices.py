@@ -68,8 +68,7 @@ def found():
     return json.loads(done.stdout)
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_eight_devices_learn_what_one_learns(found):
     assert len(found["1"]) > 10
     assert found["mesh"] == {"seeds": 4, "copies": 2}, "two seeds, each with two settings"
@@ -77,8 +76,7 @@ def test_eight_devices_learn_what_one_learns(found):
         np.testing.assert_allclose(eight, one, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_each_device_computes_its_part_of_a_minibatch(found):
     whole = 48 // 4 * 5
     assert whole // 2 in found["rows"]

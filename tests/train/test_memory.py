@@ -32,14 +32,14 @@ def learnt():
     return train(Sign(), dataclasses.replace(CONFIG, network="gru"), jax.random.key(0))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_it_learns_what_a_perceptron_cannot(learnt):
     blind = train(Sign(), CONFIG, jax.random.key(0))
     assert learnt.history["success"][-1, 0] > 0.9
     assert blind.history["success"][-1, 0] < 0.6, "half of the signs can be guessed"
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize("backend", ["numpy", "onnx"])
 def test_the_bundle_remembers_until_it_is_reset(learnt, backend, tmp_path):
     if backend == "onnx":
@@ -57,7 +57,7 @@ def test_the_bundle_remembers_until_it_is_reset(learnt, backend, tmp_path):
     assert forgetful[1] != pytest.approx(found[1], abs=1e-3)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_weights_make_the_same_policy(learnt):
     policy = learnt.best
     again = Policy.from_weights(policy.to_weights(), policy.spec)
@@ -65,13 +65,13 @@ def test_weights_make_the_same_policy(learnt):
     assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(policy), strict=True))
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_an_observation_alone_tells_no_action(learnt):
     with pytest.raises(UsageError, match=r"network 'gru' remembers[\s\S]*hint: call step"):
         learnt.best.get_action(jnp.zeros(2))
 
 
-@pytest.mark.full  # `make test` resumes a training without memory: test_checkpoint.py
+@pytest.mark.night  # `make test` resumes a training without memory: test_checkpoint.py
 def test_it_is_resumed_in_the_middle_of_episodes(tmp_path):
     config = dataclasses.replace(CONFIG, total_steps=2 * 16 * 64, evaluations=2, hidden=(4,), epochs=1)
     file, whole = tmp_path / "checkpoint", train(Sign(), config, jax.random.key(2))

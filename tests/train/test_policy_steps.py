@@ -55,13 +55,13 @@ def played(uneven):
     return SimpleNamespace(env=env, turns=turns, rows=as_numpy(rows), steps=as_numpy(steps), first=first, state=state)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_some_rows_have_no_step_of_the_policy(played):
     assert 0.5 < played.turns.mean() < 1.0
     assert played.rows.valid.tolist() == played.turns[:-1].tolist()
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_every_step_is_one_of_the_policy(played):
     assert int(played.state.step_state.seq) == 0
     assert played.steps.valid.all()

@@ -58,7 +58,7 @@ def test_the_best_policy_is_one_that_was_evaluated(bandit):
     assert best.max() == returns[success == success.max()].max()
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_seed_does_not_depend_on_its_neighbours(bandit):
     result, _, config = bandit
     alone = train(Bandit(), dataclasses.replace(config, num_seeds=1), jax.random.key(0))
@@ -67,8 +67,8 @@ def test_a_seed_does_not_depend_on_its_neighbours(bandit):
     assert not np.allclose(result.history["entropy"][-1, 0], result.history["entropy"][-1, 1])
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("rollout_steps", [2, pytest.param(8, marks=pytest.mark.full)])
+@pytest.mark.night
+@pytest.mark.parametrize("rollout_steps", [2, pytest.param(8, marks=pytest.mark.night)])
 def test_a_test_within_training_plays_one_whole_episode_per_copy(rollout_steps):
     """Also where it takes several rollouts, and where episodes for training are cut before."""
     config = dataclasses.replace(TINY, rollout_steps=rollout_steps, eval_steps=5, evaluations=2)
@@ -99,9 +99,9 @@ def blind_value(length, window, gamma):
     [
         pytest.param(Constant(ends="truncated"), 10.0, id="truncation goes on for ever"),
         pytest.param(
-            Constant(ends="truncated", rows_per_step=2), 10.0, id="rows without a policy step", marks=pytest.mark.full
+            Constant(ends="truncated", rows_per_step=2), 10.0, id="rows without a policy step", marks=pytest.mark.night
         ),
-        pytest.param(Constant(ends="terminated"), blind_value(8, 16, 0.9), id="termination", marks=pytest.mark.full),
+        pytest.param(Constant(ends="terminated"), blind_value(8, 16, 0.9), id="termination", marks=pytest.mark.night),
     ],
 )
 def test_value_of_a_constant_reward(env, value):
@@ -115,7 +115,7 @@ def test_value_of_a_constant_reward(env, value):
     ("wrong", "message"),
     [
         ("observation", r"entries \[0\] of the observation are not finite \(seed 0"),
-        pytest.param("reward", "the reward is not finite", marks=pytest.mark.full),
+        pytest.param("reward", "the reward is not finite", marks=pytest.mark.night),
     ],
 )
 def test_what_is_no_number_is_named(wrong, message):
@@ -187,7 +187,7 @@ def test_step_is_public():
     assert Step._fields == ("state", "observation", "reward", "terminated", "truncated", "valid", "metrics")
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_pendulum_with_delays_swings_up():
     """Half a million steps; in `make test` the bandit's tests say that training finds the best action."""
     config = PPOConfig(total_steps=500_000, evaluations=5)
@@ -209,7 +209,7 @@ def test_training_ends_at_the_first_evaluation_behind_its_time():
     assert len(found.env_steps) == 1
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_evaluations_of_few_copies_judge_the_same_policies(bandit):
     full, _, config = bandit
     found = train(Bandit(), dataclasses.replace(config, eval_envs=16), jax.random.key(0))
@@ -237,7 +237,7 @@ def test_a_target_without_a_success_is_refused():
         train(Constant(), dataclasses.replace(TINY, target=0.5), jax.random.key(0))
 
 
-@pytest.mark.full  # `make test` says in test_optimiser.py how the rate moves
+@pytest.mark.night  # `make test` says in test_optimiser.py how the rate moves
 def test_an_adaptive_step_size_keeps_the_policy_near_its_target():
     config = dataclasses.replace(SMALL, schedule="adaptive", target_kl=0.02, learning_rate=1e-5, epochs=8)
     result = train(Bandit(), config, jax.random.key(0))

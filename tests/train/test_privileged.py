@@ -50,7 +50,7 @@ class Infinite(Coin):
         return jnp.stack([state["coin"], jnp.inf])
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_what_is_no_number_is_named():
     config = dataclasses.replace(CONFIG, privileged=True, total_steps=1, num_envs=8, epochs=1)
     with pytest.raises(Sim2RealError, match=r"entries \[1\] of the privileged observation[\s\S]*privileged"):

@@ -100,7 +100,7 @@ def told(tmp_path_factory):
     return [json.loads((folder / f"{i}.json").read_text()) for i in (0, 1)]
 
 
-@pytest.mark.full  # `make test` divides a training among devices: test_devices.py
+@pytest.mark.night  # `make test` divides a training among devices: test_devices.py
 def test_two_processes_learn_what_one_learns_and_go_on_where_they_were_interrupted(told):
     one = train(Bandit(), CONFIG, jax.random.key(3))
     expected = [*jax.tree.leaves(jax.device_get(one.policies)), *one.history.values()]
@@ -110,18 +110,18 @@ def test_two_processes_learn_what_one_learns_and_go_on_where_they_were_interrupt
             np.testing.assert_allclose(found, np.ravel(own), rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_first_process_alone_leads_and_writes(told):
     assert [(t["leads"], t["wrote"]) for t in told] == [(True, True), (False, False)]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_processes_that_were_started_differently_say_in_what(told):
     for process in told:
         assert "the processes were not started alike: clip = 0.1 in process 0 and 0.2 in process 1" in process["differ"]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_who_loses_another_process_says_so(told):
     assert told[0]["lost"].startswith("process 0 of 2 lost another one of this training: ")
     assert "--resume newest" in told[0]["lost"]
@@ -149,8 +149,7 @@ except Sim2RealError as error:
 """
 
 
-@pytest.mark.full
-@pytest.mark.slow
+@pytest.mark.night
 def test_who_is_ended_by_jax_ends_in_words_and_the_coordinator_listens_where_it_was_told():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -193,9 +192,8 @@ def test_each_process_says_who_can_join_and_where_the_coordinator_is_not_reached
     assert "warning" not in str(replace(own, coordinator="first:52700", process=1))
 
 
-@pytest.mark.full
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", [pytest.param("slurm", marks=pytest.mark.full), "open_mpi"])
+@pytest.mark.night
+@pytest.mark.parametrize("launcher", [pytest.param("slurm", marks=pytest.mark.night), "open_mpi"])
 def test_processes_of_a_launcher_find_each_other(launcher):
     text = "import os, signal; signal.signal(signal.SIGTERM, lambda *_: print('ended', flush=True)); "
     text += "from sim2real.train.scale.processes import *; join(HostsConfig(found=True, timeout_s=20)); "

@@ -206,7 +206,7 @@ class Following(Growing):
         return made._replace(metrics={**made.metrics, "success": (state["width"] < 0.5).astype(jnp.float32)})
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_differences_that_follow_success_grow_while_it_is_high(tmp_path):
     """In a quarter of the updates from the first to the last share at most: by 1/3 of 0.5 each, and then they stay."""
     config = replace(CONFIG, total_steps=12 * 32, evaluations=12, num_envs=8)

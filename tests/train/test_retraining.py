@@ -22,7 +22,7 @@ def played(env):
     return jax.tree.map(np.asarray, rows)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_all_numbers_of_a_recording_are_in_the_data():
     first, second = environment(0), environment(1)
     exchanged, own = played(first.with_data(second.data)), played(second)
@@ -31,7 +31,7 @@ def test_all_numbers_of_a_recording_are_in_the_data():
     assert any((a != b).any() for a, b in zip(jax.tree.leaves(played(first)), jax.tree.leaves(own), strict=True))
 
 
-@pytest.mark.full  # `make test` checks the reason: the test above
+@pytest.mark.night  # `make test` checks the reason: the test above
 def test_a_second_recording_compiles_nothing(tmp_path):
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     command = [sys.executable, str(Path(__file__).with_name("retraining.py")), "0", "1"]

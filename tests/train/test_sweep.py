@@ -27,7 +27,7 @@ def swept():
     return train(Bandit(), CONFIG, KEY, sweep=Sweep(values | {"learning_rate": (1e-3, 5e-3)}))
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(("own", "rate"), [(slice(0, 2), 1e-3), (slice(2, 4), 5e-3)])
 def test_each_is_as_if_it_were_alone(swept, own, rate):
     alone = train(Bandit(), dataclasses.replace(CONFIG, learning_rate=rate), KEY)
@@ -36,7 +36,7 @@ def test_each_is_as_if_it_were_alone(swept, own, rate):
     assert [member["learning_rate"] for member in swept.members[own]] == [rate, rate]
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_best_is_of_all(swept):
     assert swept.history["return"].shape == (2, 4)
     assert not np.allclose(swept.history["entropy"][-1, :2], swept.history["entropy"][-1, 2:])

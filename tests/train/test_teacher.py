@@ -37,7 +37,7 @@ def test_a_teacher_sees_what_the_policy_cannot(teacher):
     assert teacher.best.mean.shape == (3,)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_student_learns_from_it_what_a_robot_shows(student):
     assert student.history["success"][-1, 0] > 0.9
     assert student.history["imitation_error"][-1, 0] < 0.25
@@ -45,7 +45,7 @@ def test_a_student_learns_from_it_what_a_robot_shows(student):
     assert student.best.mean.shape == (2,)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_its_noise_becomes_what_it_cannot_tell(student):
     error = student.history["imitation_error"][-1, 0]
     assert float(jnp.exp(student.best.log_std[0])) == pytest.approx(error, rel=0.5)

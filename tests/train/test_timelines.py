@@ -100,7 +100,7 @@ def test_messages_are_as_late_as_they_were_and_phases_stay(loop):
     assert ("actuator", "agent") not in times.transport, "nothing is known of it"
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_computer_that_pauses_all_the_time_is_refused(loop):
     times = recorded(40, 0.2)
     with pytest.raises(Sim2RealError, match="nearly every timeline"):

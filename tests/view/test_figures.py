@@ -113,7 +113,7 @@ def test_a_figure_is_one_well_formed_element_with_a_label(picture):
     assert "<metadata" not in picture
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_every_figure_has_a_label_and_no_pixels(calls, drawn):
     for name, (draw, *arguments) in calls.items():
         with sketched():

@@ -34,7 +34,7 @@ class Cells(HTMLParser):
             self.cells[-1] += data
 
 
-@pytest.mark.full
+@pytest.mark.night
 @given(TEXT, TEXT, st.floats())
 @example("<script>alert(1)</script>", "</td><img src=x onerror=alert(2)>", math.nan)
 @example("\ud800", '"><svg onload=alert(1)>&amp;', -math.inf)

@@ -210,7 +210,7 @@ def test_the_viewer_draws_the_curves(saved, tmp_path):
 @needs_rerun
 @needs_vulkan
 @pytest.mark.usefixtures("software_vulkan")
-@pytest.mark.full  # `make test` finds drawings in the test above
+@pytest.mark.night  # `make test` finds drawings in the test above
 def test_an_error_screen_is_no_drawing(tmp_path):
     (tmp_path / "damaged.rrd").write_bytes(b"nothing")
     assert drawn_roles(tmp_path / "damaged.rrd", tmp_path / "error.png", 2.0) == set()

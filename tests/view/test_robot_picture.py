@@ -60,8 +60,8 @@ def test_a_driver_that_fails_leaves_a_reason(tmp_path, monkeypatch):
     assert "no such driver" in drawing.reason
 
 
-@pytest.mark.full
-@pytest.mark.parametrize("joint", [pytest.param("th", marks=pytest.mark.full), "arm/lower/th/joint"])
+@pytest.mark.night
+@pytest.mark.parametrize("joint", [pytest.param("th", marks=pytest.mark.night), "arm/lower/th/joint"])
 def test_a_picture_is_drawn_or_its_driver_is_named(joint, tmp_path, monkeypatch):
     """CI may have no driver."""
     (tmp_path / "robot.xml").write_text(MODEL.replace('"th"', f'"{joint}"'))
@@ -76,7 +76,7 @@ def test_a_picture_is_drawn_or_its_driver_is_named(joint, tmp_path, monkeypatch)
     assert drawing.placed == ("th",)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_model_without_shapes_gets_balls_and_its_one_joint_the_measured_angle(tmp_path, monkeypatch):
     """The export of the pendulum has masses only: without balls the picture is an empty sky."""
     (tmp_path / "robot.xml").write_text(

@@ -49,7 +49,7 @@ def test_a_push_changes_velocities_and_nothing_else():
     np.testing.assert_array_equal(pushed.qpos, state.qpos)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_a_rollout_is_that_of_c_mujoco_under_the_same_commands():
     model = arm()
     world = MjxWorld("world", 100.0, model)
@@ -86,7 +86,7 @@ def test_what_mjx_would_do_otherwise_is_refused(model, rate, match):
         MjxWorld("world", rate, model)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_the_same_graph_runs_on_warp():
     """Started in one program and run in another, which gives every copy a model of its own."""
     pytest.importorskip("warp", reason='Warp is not installed: pip install "sim2real[warp]"')

@@ -20,7 +20,7 @@ from benches.processor_time import yardstick
 from benches.provenance import ROOT
 from sim2real.errors import Sim2RealError
 
-QUICK = {"paths": ["tests/test_repetitions.py"], "workers": 0, "cold_s": 1.0}
+QUICK = {"paths": ["tests/test_plain_pytree.py"], "workers": 0, "cold_s": 1.0}
 SOME_FAILED = 1
 """Exit code of pytest when tests failed; larger ones mean that pytest itself could not run."""
 

@@ -9,7 +9,7 @@ from sim2real.hardware.dynamixel.emulation import EmulatedBus, EmulatorConfig
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import OperatingMode
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 def answer_twice(robot, servo_id, place, join):

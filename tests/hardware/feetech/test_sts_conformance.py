@@ -12,7 +12,7 @@ from sim2real.hardware.testing import DeviceConformance
 PLANTS = Path(__file__).parents[1] / "plants.py"
 
 
-@pytest.mark.realtime
+@pytest.mark.process
 class TestStsServos(DeviceConformance):
     emulation = StsEmulation
     plant = f"{PLANTS}:Joints"

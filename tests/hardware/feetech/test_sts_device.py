@@ -20,7 +20,7 @@ from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.registry import load_device
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 def test_it_moves_and_measures(serve, connect):

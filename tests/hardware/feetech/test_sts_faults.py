@@ -23,7 +23,7 @@ from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 
 def drive(device, for_s=0.15):

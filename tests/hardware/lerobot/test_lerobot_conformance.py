@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = [pytest.mark.full, pytest.mark.slow, pytest.mark.realtime]
+pytestmark = [pytest.mark.night, pytest.mark.process]
 
 ROOT = Path(__file__).resolve().parents[3]
 SUITE = Path(__file__).with_name("lerobot_suite.py")

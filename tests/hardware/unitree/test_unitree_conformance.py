@@ -6,8 +6,8 @@ pytest.importorskip("cyclonedds")
 from sim2real.hardware.testing import DeviceConformance
 
 
-@pytest.mark.full
-@pytest.mark.realtime
+@pytest.mark.night
+@pytest.mark.process
 class TestUnitreeLegs(DeviceConformance):
     patience_s = 2.0
     no_address = "no-such-interface:0"

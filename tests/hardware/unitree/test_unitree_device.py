@@ -20,7 +20,7 @@ from sim2real.hardware.unitree.dds import Address, DdsLink
 from sim2real.hardware.unitree.device import UnitreeLegs
 from sim2real.hardware.unitree.legs import LegDrive
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 MIXED = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
 
 
@@ -64,7 +64,7 @@ def run(device, command, seconds, each=lambda: None):
         device.measure()
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize("robot", ["stand"], indirect=True)
 def test_joints_in_another_order_move_and_are_measured(robot, device):
     device.open()
@@ -105,7 +105,7 @@ def test_a_command_beyond_the_reach_is_not_sent(column, value, words):
         device.command(values)
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_torque_that_was_taken_off_stays_off(device):
     device.open()
     device.enable()

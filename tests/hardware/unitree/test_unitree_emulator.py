@@ -15,7 +15,7 @@ pytest.importorskip("cyclonedds")
 from sim2real.hardware.unitree.dds import Address, DdsLink
 from sim2real.hardware.unitree.emulation import UnitreeEmulation
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).resolve().parents[3]
 BODY = "pipelines.go2.plant:Go2Body"
@@ -32,7 +32,7 @@ def unitree_sdk():
     return folder
 
 
-@pytest.mark.full
+@pytest.mark.night
 def test_unitrees_own_client_lets_the_emulated_robot_stand_up(unitree_sdk):
     client = Path(__file__).with_name("unitree_client.py")
     with EmbeddedRobot(BODY, UnitreeEmulation(0.004, 0.006, 0.0005)) as robot:

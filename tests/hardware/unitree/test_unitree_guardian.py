@@ -17,7 +17,7 @@ from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.safety.guardian_process import BEAT, REST, Guard
 from sim2real.log.reader import read_log
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.process
 
 HOST = """
 import sys, jax, numpy as np
@@ -66,13 +66,13 @@ with Rig(device, gate) as rig:
 """
 
 
-@pytest.mark.full
+@pytest.mark.night
 @pytest.mark.parametrize(
     "number",
     [
         pytest.param(signal.SIGKILL, id="killed"),
         # `make test` stops the control process of a servo in test_guardian.py.
-        pytest.param(signal.SIGSTOP, id="stopped", marks=pytest.mark.full),
+        pytest.param(signal.SIGSTOP, id="stopped", marks=pytest.mark.night),
     ],
 )
 def test_a_robot_that_stands_sinks_before_its_motors_switch_off(tmp_path, number):
