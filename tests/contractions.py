@@ -2,10 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+from oracles.hash_nodes import Value
 
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode, BaseWorld
-from sim2real.graph.testing import Value
 from sim2real.types import PyTree
 
 

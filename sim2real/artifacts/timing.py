@@ -24,9 +24,8 @@ from sim2real.artifacts.files import (
 )
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError
-from sim2real.graph.delays import DelayDistribution
+from sim2real.graph.delays import DelayDistribution, EmpiricalDist
 from sim2real.graph.episode import TICKS_PER_S, Episode
-from sim2real.graph.fitting import resample
 from sim2real.log.ages import input_ages
 from sim2real.types import Json
 
@@ -182,7 +181,7 @@ class Timing(Shown):
                     f"only {usual.size} of {took.size} steps of node {name!r} took less than {1e3 * longest_s:g} ms",
                     hint="record on a less busy machine, or lower the rates of the pipeline",
                 )
-            delays[name] = resample(usual)
+            delays[name] = EmpiricalDist.fit(usual)
             if usual.size < took.size:
                 dropped[name] = int(took.size - usual.size)
         return delays, dropped

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
-from sim2real.errors import Sim2RealError, UsageError
+from sim2real.errors import UsageError
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Episode, Messages
 from sim2real.graph.node import BaseNode, Connection, to_ticks
 from sim2real.graph.rules import at_delay
 from sim2real.graph.times import NEVER, Edge, Vertex
-from sim2real.types import PyTree
 
 _FORMAT = 2
 
@@ -119,46 +115,6 @@ class Timeline:
             for k in first.edges
         }
         return Timeline(vertices, edges)
-
-    def save(self, path: Path) -> None:
-        """Write the timeline to an ``.npz`` file."""
-        names = {"vertices": list(self.vertices), "edges": [[*key, e.sender] for key, e in self.edges.items()]}
-        arrays: dict[str, PyTree] = {"format": np.array(_FORMAT), "names": np.array(json.dumps(names))}
-        for n, v in enumerate(self.vertices.values()):
-            arrays |= {f"vertex_{n}_start": v.start, f"vertex_{n}_end": v.end, f"vertex_{n}_count": v.count}
-        for n, e in enumerate(self.edges.values()):
-            arrays |= {f"edge_{n}_received": e.received, f"edge_{n}_seq_in": e.seq_in}
-        np.savez_compressed(path, **arrays)
-
-    @staticmethod
-    def load(path: Path) -> Timeline:
-        """Read a timeline from an ``.npz`` file.
-
-        Raises:
-            Sim2RealError: The file is missing or holds no timeline of this format.
-        """
-        hint = "pass a file made by Timeline.save"
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = dict(data)
-            if int(arrays["format"]) != _FORMAT:
-                raise Sim2RealError(f"{path} is a timeline of format {arrays['format']}, not {_FORMAT}", hint=hint)
-            # Rebuild vertices and edges from the numbered arrays.
-            names = json.loads(str(arrays["names"]))
-            return Timeline(
-                {
-                    name: Vertex(*(arrays[f"vertex_{n}_{field}"] for field in ("start", "end", "count")))
-                    for n, name in enumerate(names["vertices"])
-                },
-                {
-                    (node, name): Edge(arrays[f"edge_{n}_received"], arrays[f"edge_{n}_seq_in"], sender)
-                    for n, (node, name, sender) in enumerate(names["edges"])
-                },
-            )
-        except Sim2RealError:
-            raise
-        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
-            raise Sim2RealError(f"{path} is no timeline: {type(error).__name__}: {error}", hint=hint) from None
 
     def cut(
         self, begins: Sequence[int], length: int, lead: Mapping[str, int] | None = None

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from contractions import contracting_node
+from oracles.conformance import NodeConformance
+from oracles.hash_nodes import HashInJax, HashInPython, Value
 
 from sim2real.graph import BaseNode
-from sim2real.graph.testing import HashInJax, HashInPython, NodeConformance, Value
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 

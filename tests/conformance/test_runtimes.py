@@ -2,10 +2,11 @@
 
 import jax
 import numpy as np
-from table_interpreter import interpret_hashes
+from oracles.conformance import Played, RuntimeConformance
+from oracles.hash_nodes import jax_hash_node
+from oracles.table_interpreter import interpret_hashes
 
 from sim2real.graph.episode import MemoryRecorder
-from sim2real.graph.testing import Played, RuntimeConformance, jax_hash_node
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.compilation.compiled import CompiledGraph

@@ -3,13 +3,12 @@
 from functools import partial
 
 import pytest
+from oracles.hash_nodes import HashInPython, random_graph
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling, TrainableDist
 from sim2real.graph.rebuilding import rebuild
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing import HashInPython
-from sim2real.graph.testing.nodes import random_graph
 
 
 class Replay(BaseNode):

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles.hash_nodes import random_graph
+from oracles.reference import Reference
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling, Timeline, TrainableDist
 from sim2real.graph.rules import eligible, quota, slot
 from sim2real.graph.schedule import derive, draw
-from sim2real.graph.testing import Reference, random_graph
 from sim2real.graph.times import NEVER, Vertex
 
 MS = 1000

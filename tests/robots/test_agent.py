@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from oracles.conformance import NodeConformance
 
 from sim2real.graph import BaseNode
 from sim2real.graph.base import GraphState, InputState, StepState
-from sim2real.graph.testing import NodeConformance
 from sim2real.robots.control_loop.messages import Goals, JointReading
 from sim2real.robots.servo.agent import AgentParams, DirectAgent, GoalAgent
 

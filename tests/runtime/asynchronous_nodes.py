@@ -4,9 +4,9 @@ import threading
 import time
 
 import numpy as np
+from oracles.hash_nodes import Value
 
 from sim2real.graph import BaseNode, EmpiricalDist, Jitter, Scheduling
-from sim2real.graph.testing import Value
 
 
 class Plain(BaseNode):

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from asynchronous_nodes import Jitted, Plain
+from oracles.hash_nodes import HashInJax, HashInPython
 
 from sim2real.errors import UsageError
 from sim2real.graph import TrainableDist
-from sim2real.graph.testing import HashInJax, HashInPython
 from sim2real.runtime.init import OUTPUTS, collect, default_output, init_graph_state
 
 KEY = jax.random.key(3)

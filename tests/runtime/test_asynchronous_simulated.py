@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from asynchronous_nodes import Jitted, Plain, jittery, random_graph
+from oracles.hash_nodes import HashInJax, HashInPython, Value, mix
+from oracles.reference import Reference
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, Scheduling, Timeline, TrainableDist
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing import HashInJax, HashInPython, Reference, Value
-from sim2real.graph.testing.nodes import mix
 from sim2real.log.ages import input_ages
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock

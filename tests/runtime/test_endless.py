@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from oracles.hash_nodes import Value, as_message, mix, random_graph
+from oracles.reference import Reference
 
 from sim2real.errors import UsageError
 from sim2real.graph import Base, BaseNode, BaseWorld, Timeline, TrainableDist, growing
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import rederive
-from sim2real.graph.testing import Value
-from sim2real.graph.testing.nodes import as_message, mix, random_graph
-from sim2real.graph.testing.reference import Reference
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.init import OUTPUTS

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from oracles.hash_nodes import Value
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing import Value
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.compilation.compiled import CompiledGraph

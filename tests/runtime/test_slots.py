@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles.hash_nodes import hash_node, jax_hash_node, random_graph
 
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing import hash_node, jax_hash_node, random_graph
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.runtime.compilation.wiring import wire
 

@@ -3,15 +3,15 @@
 import jax
 import numpy as np
 import pytest
-import topologies
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from table_interpreter import interpret_hashes
+from oracles import topologies
+from oracles.hash_nodes import random_graph
+from oracles.table_interpreter import interpret_hashes
 
 from sim2real.graph import Timeline
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import draw, rederive
-from sim2real.graph.testing import random_graph
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.compilation.wiring import wire, wire_pattern

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from oracles.conformance import NodeConformance
+from oracles.hash_nodes import Value
 from scipy.integrate import solve_ivp
 
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing import NodeConformance, Value
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 

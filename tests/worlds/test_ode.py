@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from oracles.conformance import NodeConformance
+from oracles.hash_nodes import Value
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, StepState
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing import NodeConformance, Value
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.worlds.ode import OdeWorld
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from oracles.hash_nodes import Value
 
 from sim2real.graph.base import Base, GraphState
-from sim2real.graph.testing import Value
 from sim2real.worlds.encoder import Encoder
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 from sim2real.worlds.recorded import CommandDelay, RecordedSensor

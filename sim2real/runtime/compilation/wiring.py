@@ -2,7 +2,7 @@
 
 A row is a fixed sequence of **slots**, in which steps of the nodes are computed, followed by n world ticks. In a
 pattern (``pattern.py``) the slots stand between the ticks. ``placement.py`` decides which step is computed where. Pure
-numpy, before anything is compiled; ``tests/table_interpreter.py`` interprets the tables.
+numpy, before anything is compiled; ``tests/oracles/table_interpreter.py`` interprets the tables.
 """
 
 from collections.abc import Mapping

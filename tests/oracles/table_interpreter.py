@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from oracles.hash_nodes import hash_step
 
 from sim2real.graph.node import BaseNode
-from sim2real.graph.testing.nodes import hash_step
 from sim2real.runtime.compilation.wiring import InputTable, SlotTable, Wiring
 
 Windows = dict[str, tuple[list[int], list[int]]]
@@ -101,7 +101,7 @@ def interpret_hashes(
     """Play one episode of hash nodes.
 
     Args:
-        nodes: Hash nodes (``sim2real.graph.testing``) without trainable delays, by name.
+        nodes: Hash nodes (``oracles.hash_nodes``) without trainable delays, by name.
         outputs: Default outputs, numbers.
 
     Returns:

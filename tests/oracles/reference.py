@@ -5,9 +5,10 @@ from collections.abc import Mapping
 from fractions import Fraction
 from functools import cached_property
 
+from oracles.hash_nodes import as_message, hash_step, mix
+
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, Connection, Jitter, Scheduling
-from sim2real.graph.testing.nodes import as_message, hash_step, mix
 from sim2real.graph.timeline import Timeline
 
 

@@ -1,9 +1,9 @@
 """A dozen small graphs, one for each thing that a compiled graph must get right."""
 
 import numpy as np
+from oracles.hash_nodes import hash_node, random_graph
 
 from sim2real.graph import BaseNode, EmpiricalDist, Jitter, Scheduling
-from sim2real.graph.testing import hash_node, random_graph
 
 
 def by_name(*nodes: BaseNode):

@@ -209,7 +209,7 @@ def _make_trainable(rng: np.random.Generator, reader: BaseNode) -> None:
         free = not connection.blocking and connection.jitter is Jitter.LATEST
         if not free or not isinstance(sender, HashInPython) or rng.random() < 0.2:
             continue
-        kinds = ["zoh"] if sender.dtype.startswith("float") else ["zoh", "linear", "linear_real_only"]
+        kinds = ["zoh"] if sender.dtype.startswith("float") else ["zoh", "linear"]
         low = int(rng.integers(0, 5))
         high = low + int(rng.integers(1, 40))
         delay = int(rng.integers(low, high + 1))

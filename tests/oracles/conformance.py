@@ -8,12 +8,12 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from oracles.hash_nodes import MakeNode, hash_node, random_graph
+from oracles.reference import Reference
 
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.graph.testing.nodes import MakeNode, hash_node, random_graph
-from sim2real.graph.testing.reference import Reference
 from sim2real.graph.timeline import Timeline
 from sim2real.types import PyTree
 
