@@ -7,8 +7,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 
 from sim2real.errors import UsageError
-from sim2real.graph.collection import by_name
-from sim2real.graph.node import BaseNode, BaseWorld
+from sim2real.graph.node import BaseNode, BaseWorld, by_name
 from sim2real.types import PyTree
 
 _TIMING = ("rate", "delay", "delay_dist", "advance", "scheduling")

@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.delays import DelayDistribution
 from sim2real.graph.episode import Episode
-from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, phase_ticks, to_ticks
+from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, by_name, check_senders, phase_ticks, to_ticks
 from sim2real.graph.rules import consumer, next_drift, quota, slot, start, waits_for_schedule
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import NEVER, Edge, Vertex
@@ -50,7 +49,7 @@ def draw(
     fixed = recorded or Timeline({}, {})
     episodes = fixed.episodes if recorded else episodes
     delays = {
-        name: computation_delays(node, duration_s, episodes, rng)
+        name: _computation_delays(node, duration_s, episodes, rng)
         for name, node in nodes.items()
         if name not in fixed.vertices
     }
@@ -60,7 +59,7 @@ def draw(
             if (node.name, c.name) not in fixed.edges:
                 sender = fixed.vertices.get(c.output_node.name)
                 count = sender.start.shape[1] if sender else delays[c.output_node.name].shape[1]
-                transfers[node.name, c.name] = transport_delays(c, (episodes, count), rng)
+                transfers[node.name, c.name] = _sampled(c.delay_dist, rng, (episodes, count), repr(c))
     return derive(nodes, delays, transfers, to_ticks(duration_s), fixed)
 
 
@@ -123,14 +122,8 @@ def rederive(episode: Episode, nodes: Mapping[str, BaseNode]) -> Timeline:
     return Timeline(vertices, derived.edges)
 
 
-def computation_delays(
-    node: BaseNode, duration_s: float, episodes: int, rng: np.random.Generator, earlier: np.ndarray | None = None
-) -> np.ndarray:
-    """Draw a node's computation delays [ticks], shape ``(E, N)``: one for each slot within the duration.
-
-    Args:
-        earlier: Delays that were drawn for a shorter duration; they stay at the front.
-    """
+def _computation_delays(node: BaseNode, duration_s: float, episodes: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw a node's computation delays [ticks], shape ``(E, N)``: one for each slot within the duration."""
     last = to_ticks(duration_s) - 1 - phase_ticks(node)
     count = int(np.floor(last * (node.rate / TICKS_PER_S))) + 2 if last >= 0 else 0
     count = int((slot(node, np.arange(count)) <= last + phase_ticks(node)).sum())
@@ -139,28 +132,7 @@ def computation_delays(
             f"node {node.name!r} makes no step within {duration_s} s: its first is due after {node.phase} s",
             hint="draw longer timelines",
         )
-    return _extend(node.delay_dist, rng, (episodes, count), f"node {node.name!r}", earlier)
-
-
-def transport_delays(
-    connection: Connection, shape: tuple[int, int], rng: np.random.Generator, earlier: np.ndarray | None = None
-) -> np.ndarray:
-    """Draw a connection's communication delays [ticks].
-
-    Args:
-        earlier: Delays that were drawn for fewer messages; they stay at the front.
-    """
-    return _extend(connection.delay_dist, rng, shape, repr(connection), earlier)
-
-
-def _extend(
-    dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, int], where: str, earlier: np.ndarray | None
-) -> np.ndarray:
-    if earlier is None:
-        return _sampled(dist, rng, shape, where)
-    if shape[1] <= earlier.shape[1]:
-        return earlier
-    return np.concatenate([earlier, _sampled(dist, rng, (shape[0], shape[1] - earlier.shape[1]), where)], axis=1)
+    return _sampled(node.delay_dist, rng, (episodes, count), f"node {node.name!r}")
 
 
 def _sampled(dist: DelayDistribution, rng: np.random.Generator, shape: tuple[int, ...], where: str) -> np.ndarray:

@@ -74,3 +74,23 @@ def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
                 hint="drop these episodes (sim2real.graph.windows.bursty_episodes finds them), or lengthen the "
                 "window: TrainableDist.create(..., burst=2)",
             )
+
+
+def make_room(nodes: Mapping[str, BaseNode], timeline: Timeline) -> dict[tuple[str, str], int]:
+    """Lengthen, in place, the windows with a trainable delay that are too short for the bursts of a timeline.
+
+    Otherwise ``check_bursts`` refuses such a timeline.
+
+    Returns:
+        (node, input) -> number of messages that were added to the window, for the windows that were too short.
+    """
+    grown: dict[tuple[str, str], int] = {}
+    for key, edge in timeline.edges.items():
+        connection = nodes[key[0]].inputs[key[1]]
+        reader, sender = timeline.vertices[key[0]], timeline.vertices[edge.sender]
+        while isinstance(dist := connection.delay_dist, TrainableDist) and np.any(
+            overfull(connection, edge, reader, sender)
+        ):
+            connection.delay_dist = dist.replace(burst=dist.burst + 1)
+            grown[key] = grown.get(key, 0) + 1
+    return grown

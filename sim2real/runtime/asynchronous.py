@@ -12,7 +12,6 @@ import numpy as np
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.episode import Recorder
-from sim2real.graph.growing import Growing
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
@@ -49,8 +48,7 @@ class AsyncGraph:
         nodes: The nodes, by name or as a list.
         supervisor: The node at whose steps ``reset``, ``step`` and ``run`` return, usually the policy.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit. Simulated clock only.
-        duration_s: Length of drawn timelines [s]; default: no end, further delays are drawn when they are needed.
-            Simulated clock only.
+        duration_s: Length of drawn timelines [s]; the simulated clock needs this or ``timeline``.
         timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
         timeout_s: Longest wait of a call for the next step, and of the supervisor for its caller [s].
         spin_s: Time before each step in which a thread polls the clock instead of sleeping [s]. Wall clock only.
@@ -227,8 +225,8 @@ class AsyncGraph:
         # Options of one clock only, and their ranges.
         simulated = self.clock is Clock.SIMULATED
         if simulated:
-            if self._duration_s is not None and self._timeline is not None:
-                raise UsageError("the simulated clock takes a duration_s or a timeline, not both")
+            if (self._duration_s is None) == (self._timeline is None):
+                raise UsageError("the simulated clock takes a duration_s or a timeline, one of them")
             if self._spin_s or self._step_timeout_s is not None:
                 raise UsageError("spin_s and step_timeout_s are for the wall clock")
         elif self._factor or self._duration_s is not None or self._timeline is not None:
@@ -280,10 +278,7 @@ class AsyncGraph:
         data = self._prepare(graph_state)
         common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, autonomous)
         if self.clock is Clock.SIMULATED:
-            endless = self._duration_s is None and self._timeline is None
-            growing = Growing(self.nodes, self._seed(graph_state), check_bursts) if endless else None
-            timeline, episode = (growing.timeline, 0) if growing else self._timeline_of(graph_state)
-            run = SimulatedRun(*common, timeline, episode, self._factor, growing)
+            run = SimulatedRun(*common, *self._timeline_of(graph_state), self._factor)
         else:
             run = WallClockRun(*common, self._spin_s, self._timeout_s, self._step_timeout_s)
 
@@ -313,12 +308,10 @@ class AsyncGraph:
                 raise UsageError(f"there is no episode {eps}: the timeline has {self._timeline.episodes}")
             check_bursts(self.nodes, self._timeline[[eps]])
             return self._timeline, eps
-        timeline = draw(self.nodes, self._duration_s or 0.0, 1, self._seed(graph_state))
+        seed = [int(graph_state.eps), *key_numbers(graph_state.rng[self.supervisor.name])]
+        timeline = draw(self.nodes, self._duration_s or 0.0, 1, np.random.default_rng(seed))
         check_bursts(self.nodes, timeline)
         return timeline, 0
-
-    def _seed(self, graph_state: GraphState) -> np.random.Generator:
-        return np.random.default_rng([int(graph_state.eps), *key_numbers(graph_state.rng[self.supervisor.name])])
 
     def _running(self) -> WallClockRun | SimulatedRun:
         if self._run is None:

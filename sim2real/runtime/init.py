@@ -11,9 +11,8 @@ import numpy as np
 from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
-from sim2real.graph.collection import by_name, check_senders
 from sim2real.graph.delays import TrainableDist
-from sim2real.graph.node import BaseNode, phase_ticks
+from sim2real.graph.node import BaseNode, by_name, check_senders, phase_ticks
 from sim2real.graph.rules import waits_for_schedule
 from sim2real.installation import has_jax
 from sim2real.later import jax, jnp

@@ -12,7 +12,6 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord
-from sim2real.graph.growing import Growing
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.rules import at_delay, next_drift, slot
 from sim2real.graph.schedule import topological
@@ -36,10 +35,6 @@ class _Link:
 
     def __init__(self, edge: Edge, recorded: Edge, episode: int, steps: int) -> None:
         self.waiting: dict[int, list[np.ndarray]] = {}
-        self.plan(edge, recorded, episode, steps)
-
-    def plan(self, edge: Edge, recorded: Edge, episode: int, steps: int) -> None:
-        """Take a timeline, which may be a longer one than before."""
         self.sender = edge.sender
         self.recorded_received: list[int] = recorded.received[episode].tolist()
         self.recorded_seq_in: list[int] = recorded.seq_in[episode].tolist()
@@ -58,9 +53,9 @@ class _Link:
         """Return the messages that step ``k`` consumes in the log, oldest first."""
         return self._recorded[self._recorded_bounds[k] : self._recorded_bounds[k + 1]].tolist()
 
-    def put(self, m: int, leaves: list[np.ndarray], always: bool) -> None:
-        """Store message ``m`` if a step will consume it; ``always``: a step of a longer timeline may."""
-        if always or self.seq_in[m] >= 0:
+    def put(self, m: int, leaves: list[np.ndarray]) -> None:
+        """Store message ``m`` if a step will consume it."""
+        if self.seq_in[m] >= 0:
             self.waiting[m] = leaves
 
 
@@ -69,28 +64,20 @@ class _Player:
 
     def __init__(self, stepper: Stepper, data: NodeData, timeline: Timeline, episode: int) -> None:
         self.stepper, self.data = stepper, data
-        self.links: dict[str, _Link] = {}
-        self.plan(timeline, episode)
-        self.outputs: list[_Link] = []
-        self.k = 0
-        self.drift = 0
-        # With a trainable delay the step itself picks the message; the timeline does not say which.
-        self.log = StepLog(n for n, c in stepper.node.inputs.items() if not c.trainable)
-
-    def plan(self, timeline: Timeline, episode: int) -> None:
-        """Take a timeline, which may be longer than the one so far and begins as that one does."""
-        node, data = self.stepper.node, self.data
-        vertex = timeline.vertices[node.name]
+        node, vertex = stepper.node, timeline.vertices[stepper.node.name]
         steps = int(vertex.count[episode])
         self.begins: list[int] = [*vertex.start[episode, :steps].tolist(), _NEVER]
         self.ends: list[int] = vertex.end[episode, :steps].tolist()
         self.slots: list[int] = slot(node, np.arange(steps + 1)).tolist()
-        for i in node.inputs:
-            arguments = (timeline.edges[node.name, i], _recorded_edge(data, i, timeline), episode, steps)
-            if i in self.links:
-                self.links[i].plan(*arguments)
-            else:
-                self.links[i] = _Link(*arguments)
+        self.links = {
+            i: _Link(timeline.edges[node.name, i], _recorded_edge(data, i, timeline), episode, steps)
+            for i in node.inputs
+        }
+        self.outputs: list[_Link] = []
+        self.k = 0
+        self.drift = 0
+        # With a trainable delay the step itself picks the message; the timeline does not say which.
+        self.log = StepLog(n for n, c in node.inputs.items() if not c.trainable)
 
     def blocked(self, k: int) -> int:
         """Return the last arrival among the messages that step ``k`` waited for [ticks]; 0 if there are none."""
@@ -122,7 +109,6 @@ class SimulatedRun:
     Args:
         recorder: Receives all steps and messages, or None.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit.
-        growing: Draws longer timelines that begin with ``timeline``; None: the episode ends with ``timeline``.
     """
 
     def __init__(
@@ -137,9 +123,7 @@ class SimulatedRun:
         timeline: Timeline,
         episode: int,
         real_time_factor: float,
-        growing: Growing | None = None,
     ) -> None:
-        self._growing = growing
         self._nodes, self._supervisor, self._data = nodes, supervisor, data
         self._graph_state, self._recorder, self._autonomous, self._factor = (
             graph_state,
@@ -189,8 +173,7 @@ class SimulatedRun:
         deadline = time.monotonic() + timeout_s
         player = self._players[self._supervisor]
         while self._pending is None:
-            self._grow()
-            if player.begins[player.k] == _NEVER and self._growing is None:
+            if player.begins[player.k] == _NEVER:
                 raise UsageError(
                     f"the timeline ends after step {player.k - 1} of the supervisor {self._supervisor!r}",
                     hint="reset the graph, or give AsyncGraph a longer duration_s or timeline",
@@ -257,7 +240,7 @@ class SimulatedRun:
         try:
             if self._pending is not None:
                 self.reply(Reply())
-            while not self.ended and self._next() < limit:
+            while not self.ended and min(p.begins[p.k] for p in self._players.values()) < limit:
                 if deadline is not None and time.monotonic() > deadline:
                     return False
                 self._event()
@@ -265,19 +248,6 @@ class SimulatedRun:
             self._autonomous = autonomous
         self._now = max(self._now, limit) if limit < _NEVER - 1 else self._now
         return True
-
-    def _next(self) -> int:
-        """Return the start of the next step [ticks], after drawing a longer timeline if it needs one."""
-        self._grow()
-        return min(p.begins[p.k] for p in self._players.values())
-
-    def _grow(self) -> None:
-        """Take a longer timeline if the next step may lie behind the end of this one."""
-        growing = self._growing
-        while growing and min(p.begins[p.k] for p in self._players.values()) >= growing.ticks:
-            growing.grow()
-            for player in self._players.values():
-                player.plan(growing.timeline, 0)
 
     def _event(self) -> None:
         """Make the step that comes next in time, or offer it to the caller; do nothing in a stopped graph."""
@@ -327,7 +297,7 @@ class SimulatedRun:
         # Send the output, then update the drift, the statistics and the log.
         player.k += 1
         for link in player.outputs:
-            link.put(k, result.leaves, self._growing is not None)
+            link.put(k, result.leaves)
         player.data.keep(result.changed)
         before = player.ends[k - 1] if k else 0
         later = int(next_drift(node.scheduling, player.slots[k], player.drift, before))

@@ -12,8 +12,7 @@ from matplotlib.colors import is_color_like
 from matplotlib.figure import Figure
 
 from sim2real.errors import UsageError
-from sim2real.graph.collection import by_name
-from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection
+from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, by_name
 from sim2real.graph.schedule import topological
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Edge

@@ -5,7 +5,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, DelayDistribution
-from sim2real.graph.collection import by_name, check_senders
+from sim2real.graph.node import by_name, check_senders
 from sim2real.graph.schedule import draw
 
 

@@ -9,7 +9,7 @@ from sim2real.graph import BaseNode, EmpiricalDist, Scheduling, TrainableDist
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseWorld
 from sim2real.graph.schedule import derive, draw
-from sim2real.graph.windows import bursty_episodes, newest_message
+from sim2real.graph.windows import bursty_episodes, make_room, newest_message
 from sim2real.identify.parameters import ParameterTable
 from sim2real.robots.control_loop.loop import (
     BURST,
@@ -25,7 +25,6 @@ from sim2real.robots.control_loop.loop import (
     recorded_loop,
     simulated_loop,
 )
-from sim2real.runtime.compilation.bursts import make_room
 
 TICK_S, SPREAD_S, LEAD_S = 0.01, 0.002, 0.00125
 VALUES = {"gain": 2.0, "damping": 0.3, "friction": 0.1, "sensor_delay": 0.013, "actuator_delay": 0.001}

@@ -16,7 +16,7 @@ from sim2real.errors import UsageError
 from sim2real.graph import BaseWorld, Timeline, TrainableDist
 from sim2real.graph.node import TICKS_PER_S, Jitter, Scheduling
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.bursts import make_room
+from sim2real.graph.windows import make_room
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph
 

@@ -17,6 +17,7 @@ from sim2real import pytree
 from sim2real.errors import NotInstalled, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.schedule import draw
+from sim2real.graph.windows import make_room
 from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
@@ -29,7 +30,6 @@ from sim2real.identify.problem.segments import Data, Retimed, Span, cut, data_of
 from sim2real.identify.problem.sizes import padded, rounded
 from sim2real.installation import has_jax
 from sim2real.later import jnp
-from sim2real.runtime.compilation.bursts import make_room
 from sim2real.types import Array, PyTree
 
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from sim2real import pytree
 from sim2real.errors import UsageError
-from sim2real.graph.collection import by_name, check_senders
-from sim2real.graph.node import BaseNode
+from sim2real.graph.node import BaseNode, by_name, check_senders
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import NEVER
 from sim2real.types import PyTree

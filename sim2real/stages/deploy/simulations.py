@@ -14,9 +14,9 @@ from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import TICKS_PER_S
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
+from sim2real.graph.windows import make_room
 from sim2real.robots.contract import Robot
 from sim2real.robots.score_columns import as_columns, as_sent
-from sim2real.runtime.compilation.bursts import make_room
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.terminal.console import note
 from sim2real.train.environment.draws import draw_robots
