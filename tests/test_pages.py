@@ -228,7 +228,7 @@ def unknown_flags(line: str) -> list[str]:
     words = shlex.split(line.split("&&")[0], comments=True)
     flags = [word for word in words if word.startswith("--")]
     names = [*itertools.takewhile(lambda word: not word.startswith("-"), words[1:])]
-    kinds = [name for name in names[1:2] if name in PIPELINES | {"identified", "policy", "recover"}]
+    kinds = [name for name in names[1:2] if name in PIPELINES | {"identified", "policy"}]
     text = help_of(names[0], *kinds, *(["--mjcf", "robot.xml"] if "--mjcf" in flags else []))
     return [flag for flag in flags if flag not in ("--help", "--mjcf") and not re.search(rf"{flag}(?![\w-])", text)]
 

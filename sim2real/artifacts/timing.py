@@ -26,7 +26,7 @@ from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError
 from sim2real.graph.delays import DelayDistribution, EmpiricalDist
 from sim2real.graph.episode import TICKS_PER_S, Episode
-from sim2real.log.ages import input_ages
+from sim2real.log.session import input_ages
 from sim2real.types import Json
 
 FORMAT = 2

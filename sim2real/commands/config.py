@@ -1,4 +1,4 @@
-"""The commands ``new``, ``log recover``, ``export``, ``play``; each field is a flag. No JAX, for ``--help``."""
+"""The commands ``new``, ``export``, ``play``; each field is a flag. No JAX, for ``--help``."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,23 +33,6 @@ class NewConfig:
     """Folder of pipelines."""
     runs: Path = Path("runs")
     """Folder of all runs, for --like."""
-
-
-@dataclass(frozen=True)
-class RecoverConfig:
-    """Copy the readable part of a damaged MCAP file into a new file."""
-
-    log: Annotated[Positional[Path | None], arg(metavar="FILE")] = None
-    """The damaged file; it is left as it is."""
-    out: Annotated[Path | None, arg(metavar="FILE")] = None
-    """The new file; default: beside the damaged one, as NAME.recovered.mcap."""
-
-    @property
-    def source(self) -> Path:
-        """The damaged file."""
-        if self.log is None:
-            raise UsageError("log recover needs a file", hint="sim2real log recover FILE")
-        return self.log
 
 
 @dataclass(frozen=True)

@@ -65,14 +65,5 @@ COMMANDS: dict[str, Command] = {
             ),
         },
     ),
-    "log": CommandGroup(
-        "copy the readable part of a damaged log into a new one",
-        {
-            "recover": ConfigCommand(
-                "FILE", "commands.recover_log", "commands.config.RecoverConfig",
-                examples=("log recover session.mcap", "log recover session.mcap --out saved.mcap"),
-            ),
-        },
-    ),
 }
 # fmt: on

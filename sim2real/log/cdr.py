@@ -46,12 +46,14 @@ class CdrField:
         dtype: Type of its elements.
         shape: ``()`` for a scalar.
         code: The element type's code in the module ``struct``.
+        python_type: The Python type that ``struct`` encodes without a loss, apart from its range.
     """
 
     name: str
     dtype: np.dtype[np.generic]
     shape: tuple[int, ...] = ()
     code: str = field(init=False)
+    python_type: type | None = field(init=False)
 
     def __post_init__(self) -> None:
         dtype = np.dtype(self.dtype)
@@ -64,6 +66,7 @@ class CdrField:
             )
         object.__setattr__(self, "dtype", dtype.newbyteorder("<"))
         object.__setattr__(self, "code", code)
+        object.__setattr__(self, "python_type", {"i": int, "u": int, "f": float, "b": bool}[dtype.kind])
 
     @property
     def size(self) -> int:
@@ -151,30 +154,50 @@ class Layout:
             )
         arguments: list[object] = list(self._template)
         for slot, part, value in zip(self._slots, self.fields, values, strict=True):
-            arguments[slot] = _array_bytes(part, value) if part.shape else value
+            # A Python number of the field's own kind needs no array.
+            plain = not part.shape and type(value) is part.python_type
+            arguments[slot] = value if plain else _encoded(part, value)
         try:
             return self._struct.pack(*arguments)
-        except (struct.error, TypeError, ValueError) as error:
-            raise Sim2RealError(f"{self._culprit(values)}: {error}") from error
-
-    def _culprit(self, values: Sequence[npt.ArrayLike]) -> str:
-        """Return a description of the scalar that could not be encoded."""
-        for part, value in zip(self.fields, values, strict=True):
-            if not part.shape:
-                try:
-                    struct.pack(f"<{part.code}", value)
-                except (struct.error, TypeError, ValueError):
-                    shape = getattr(value, "shape", ())
-                    return f"field {part.name!r} is {part.dtype.name}, got {value!r} of shape {shape}"
-        return "a message cannot be encoded"
+        except (struct.error, OverflowError):
+            for part, value in zip(self.fields, values, strict=True):
+                _encoded(part, value)  # raises the error that names the field
+            raise
 
 
-def _array_bytes(part: CdrField, value: npt.ArrayLike) -> bytes:
-    array = np.asarray(value)
+def _encoded(part: CdrField, value: npt.ArrayLike) -> object:
+    """Return a value as `struct` takes it: the bytes of an array, or a scalar."""
+    try:
+        array = np.asarray(value)
+    except (ValueError, OverflowError) as error:
+        raise Sim2RealError(f"field {part.name!r} is {part.dtype.name}, got {value!r}") from error
     if array.shape != part.shape:
         raise Sim2RealError(f"field {part.name!r} has shape {array.shape}, expected {part.shape}")
     if array.dtype != part.dtype:
-        if not np.can_cast(array.dtype, part.dtype, "same_kind"):
-            raise Sim2RealError(f"field {part.name!r} is {part.dtype.name}, got {array.dtype.name}")
-        array = array.astype(part.dtype)
-    return array.tobytes()
+        array = _converted(part, array)
+    return array.tobytes() if part.shape else array.item()
+
+
+def _converted(part: CdrField, array: np.ndarray) -> np.ndarray:
+    """Return an array in a field's type; only floats are rounded."""
+    from_kind, to_kind = array.dtype.kind, part.dtype.kind
+    if from_kind not in ("biuf" if to_kind == "f" else "biu"):
+        raise Sim2RealError(f"field {part.name!r} is {part.dtype.name}, got {array.dtype.name}")
+    with np.errstate(over="ignore"):
+        result = array.astype(part.dtype)
+    if from_kind == "f":
+        lost = np.isinf(result) & ~np.isinf(array)
+    elif to_kind == "f":
+        exact = 1 << (53 if part.code == "d" else 24)  # all integers up to here are exact
+        lost = (array > exact) | (array < -exact) if from_kind != "b" else np.zeros(array.shape, bool)
+        if lost.any():
+            lost = np.reshape([int(r) != int(a) for r, a in zip(result.flat, array.flat, strict=True)], array.shape)
+    else:
+        lost = result != array
+    if lost.any():
+        value = array[lost].flat[0] if array.shape else array[()]
+        raise Sim2RealError(
+            f"field {part.name!r} is {part.dtype.name}, which cannot hold {value!s}",
+            hint="give the node's init_output the dtype of its outputs",
+        )
+    return result

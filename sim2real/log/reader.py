@@ -1,25 +1,222 @@
-"""Reads logs, whole or damaged, as episodes with the original names and shapes."""
+"""Reads logs, whole, cut or damaged, as episodes with the original names and shapes; also while they are written."""
+
+from __future__ import annotations
 
 import json
+import mmap
+import re
+import struct
 import warnings
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Header, Metadata
+from mcap.writer import MCAP0_MAGIC
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode, Messages, Steps
-from sim2real.log.cdr import read_text
-from sim2real.log.file_contents import Contents, Range, readable_errors, walk
+from sim2real.log.cdr import Layout, read_text
 from sim2real.log.schema import MESSAGE_LAYOUT, STEP_LAYOUT, layout_of_fields, units_of_fields
+from sim2real.log.session import SESSION, SESSION_END, decode
+from sim2real.log.writer import LIBRARY
 from sim2real.types import Json
 
+_PREFIX = struct.Struct("<BQ")
+# Sizes in a message record: opcode and length; then channel, sequence and two times.
+_MESSAGE_AT, _DATA_AT = 9, 31
+# Plain integers compare faster than enum members, and every record is compared.
+_CHUNK, _MESSAGE, _MESSAGE_INDEX, _DATA_END = (
+    int(o) for o in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.DATA_END)
+)
+# After damage, reading resumes at a chunk or at the session's end. The search looks for the name of the chunk's
+# compression, which comes after the prefix, two times, a size and a checksum, or for the name of the session's end.
+_LANDMARK = re.compile(rb"(?P<chunk>\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)|\x0b\x00\x00\x00session_end")
+_CHUNK_NAME_AT, _METADATA_NAME_AT = 37, 9
+# A chunk that claims to hold more is damaged: ours hold 64 KiB, or one message.
+_MAX_CHUNK_BYTES = 1 << 28
+# Records that overlap could repeat without end: reading stops after this multiple of the file's size.
+_MAX_READ_RATIO = 4
+# Number of unreadable places with a description; a file can have millions.
+_MAX_DESCRIBED = 100
+# Exceptions of parsing damaged bytes.
+_BROKEN = (
+    *(McapError, struct.error, zlib.error, ValueError, LookupError, TypeError),
+    *(AttributeError, ArithmeticError, MemoryError, RecursionError),
+)
+# Role of a channel -> required keys of its metadata; joint states repeat the outputs and are not decoded.
+_ROLES = {"step": {"node"}, "output": {"node", "fields"}, "input": {"node", "input"}, "events": set[str]()}
+_ROLES["joint_states"] = set()
 # Positions of an event's level, and of its name before alignment [bytes].
 _LEVEL_AT, _NAME_AT = 12, 13
 
 
 class TruncatedLogWarning(UserWarning):
     """The log is incomplete: its session crashed, or a part of the file is unreadable. The rest is read."""
+
+
+class _Record(NamedTuple):
+    """A record's opcode, and start and end of its content in the file."""
+
+    opcode: int
+    start: int
+    end: int
+
+
+@dataclass
+class _Contents:
+    """The content of a log file.
+
+    Attributes:
+        library: The library that wrote the file, according to its header.
+        session: The session's metadata; None if damaged.
+        end: The metadata written at the session's end; None after a crash.
+        attachments: File name -> content.
+        epoch_ns: Wall clock at the episode's time 0 [ns]; 0 if the episode never started.
+        channels: Channel number -> channel.
+        messages: Channel number -> message records, in the order of the file; empty if no chunk was opened.
+        indexed: Channel number -> number of messages, according to the chunks' indices.
+        last_log_time: Latest log time of all chunks [ns].
+        skipped: Descriptions of the unreadable places.
+    """
+
+    library: str = ""
+    session: dict[str, Json] | None = None
+    end: dict[str, Json] | None = None
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    epoch_ns: int = 0
+    channels: dict[int, Channel] = field(default_factory=dict)
+    messages: dict[int, list[bytes]] = field(default_factory=dict)
+    indexed: dict[int, int] = field(default_factory=dict)
+    chunks: int = 0
+    last_log_time: int = 0
+    skipped: list[str] = field(default_factory=list)
+
+    def skip(self, description: str) -> None:
+        """Add the description of an unreadable place."""
+        if len(self.skipped) < _MAX_DESCRIBED:
+            self.skipped.append(description)
+        elif len(self.skipped) == _MAX_DESCRIBED:
+            self.skipped.append("more places")
+
+    def with_role(self, role: str) -> dict[int, Channel]:
+        """Return the channels with a role: ``step``, ``output``, ``input`` or ``events``."""
+        return {number: c for number, c in self.channels.items() if c.metadata["role"] == role}
+
+    def log_times(self, span: tuple[float | None, float | None]) -> tuple[int, int]:
+        """Return start and exclusive end of a time range [s from the episode's start] in log time [ns]."""
+        start_s, end_s = span
+        begin = 0 if start_s is None else max(0, self.epoch_ns + round(start_s * 1e6) * 1000)
+        end = 2**63 if end_s is None else max(0, self.epoch_ns + round(end_s * 1e6) * 1000)
+        return begin, end
+
+    def columns(self, channel: int, layout: Layout, span: tuple[float | None, float | None]) -> np.ndarray:
+        """Decode the messages of a channel, whose type has a fixed size.
+
+        Returns:
+            A structured array, shape ``(N,)``, ordered by sequence: ``sequence``, ``log_time`` and ``publish_time``
+            [ns], and ``data`` with the fields of the message.
+        """
+        # Decode all messages at once: record header and data have a fixed size.
+        dtype = np.dtype(
+            {
+                "names": ["sequence", "log_time", "publish_time", "data"],
+                "formats": ["<u4", "<u8", "<u8", layout.dtype],
+                "offsets": [11, 15, 23, _DATA_AT],
+                "itemsize": _DATA_AT + layout.size,
+            }
+        )
+        messages = self.messages[channel]
+        if any(len(m) != dtype.itemsize for m in messages):
+            raise Sim2RealError(f"topic {self.channels[channel].topic} holds messages that do not fit its own fields")
+        rows = np.frombuffer(b"".join(messages), dtype)
+        # Select the range, and sort by sequence, as threads can write out of order.
+        begin, end = self.log_times(span)
+        rows = rows[(rows["log_time"] >= begin) & (rows["log_time"] < end)]
+        return rows[np.argsort(rows["sequence"], kind="stable")]
+
+    def take(self, data: mmap.mmap | bytes, record: _Record, span: tuple[float | None, float | None] | None) -> None:
+        """Add a record; of a chunk in the range its messages, and of none if the range is None."""
+        opcode, start, end = record
+        if opcode == _CHUNK:
+            self._take_chunk(data, record, span)
+        elif opcode == _MESSAGE_INDEX:
+            channel = data[start] | data[start + 1] << 8
+            self.indexed[channel] = self.indexed.get(channel, 0) + (end - start - 6) // 16
+        elif opcode == _MESSAGE and span is not None:  # some tools write messages outside of chunks
+            self._take_message(data[start - _MESSAGE_AT : end])
+        elif opcode == Opcode.CHANNEL:
+            self._take_channel(self._parsed(Channel, data, record))
+        elif opcode == Opcode.HEADER and (header := self._parsed(Header, data, record)) is not None:
+            self.library = header.library
+        elif opcode == Opcode.ATTACHMENT and (attachment := self._parsed(Attachment, data, record)) is not None:
+            self.attachments[attachment.name] = attachment.data
+        elif opcode == Opcode.METADATA and (entry := self._parsed(Metadata, data, record)) is not None:
+            if entry.name == SESSION:
+                self.session = decode(entry.metadata)
+            elif entry.name == SESSION_END:
+                self.end = decode(entry.metadata)
+
+    def _take_chunk(
+        self, data: mmap.mmap | bytes, record: _Record, span: tuple[float | None, float | None] | None
+    ) -> None:
+        self.chunks += 1
+        first, last = struct.unpack_from("<QQ", data, record.start)
+        self.last_log_time = max(self.last_log_time, last)
+        if span is None:
+            return
+        begin, end = self.log_times(span)
+        # Open the first chunk always: it repeats the channels' definitions with a checksum.
+        if self.chunks > 1 and self.channels and (last < begin or first >= end):
+            return
+        try:
+            content = _decompressed(Chunk.read(_stream(data, record)))
+        except Exception as error:  # decompressors have their own exceptions
+            self.skip(f"a chunk of {record.end - record.start} bytes at {record.start} ({error})")
+            return
+        position, size = 0, len(content)
+        while position < size:
+            start = position + _PREFIX.size
+            opcode, length = _PREFIX.unpack_from(content, position) if start <= size else (0, size)
+            if start + length > size:
+                raise ValueError("the records in a chunk do not fill it")
+            if opcode == _MESSAGE:
+                self._take_message(content[position : start + length])
+            elif opcode == Opcode.CHANNEL:
+                self._take_channel(self._parsed(Channel, content, _Record(opcode, start, start + length)))
+            position = start + length
+
+    def _take_message(self, record: bytes) -> None:
+        waiting = self.messages.get(record[_MESSAGE_AT] | record[_MESSAGE_AT + 1] << 8)
+        if waiting is not None:
+            waiting.append(record)
+
+    def _take_channel(self, channel: Channel | None) -> None:
+        metadata = {} if channel is None else channel.metadata
+        needed, epoch_ns = _ROLES.get(metadata.get("role", "")), metadata.get("epoch_ns", "")
+        if channel is None or needed is None or not needed <= set(metadata):
+            return
+        if re.fullmatch(r"[0-9]{1,19}", epoch_ns):
+            self.channels[channel.id] = channel
+            self.epoch_ns = int(epoch_ns)
+            if metadata["role"] != "joint_states":
+                self.messages.setdefault(channel.id, [])
+
+    def _parsed(self, kind: Any, data: mmap.mmap | bytes, record: _Record) -> Any:
+        """Return a record parsed by a class of ``mcap.records``; None if it is damaged."""
+        try:
+            return kind.read(_stream(data, record))
+        except _BROKEN as error:
+            self.skip(f"a {kind.__name__.lower()} record at {record.start} ({error})")
+            return None
 
 
 def read_log(path: str | Path, start_s: float | None = None, end_s: float | None = None) -> Episode:
@@ -48,12 +245,12 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
     """
     if start_s is not None and end_s is not None and not start_s <= end_s:
         raise UsageError(f"the range begins at {start_s} s, after its end at {end_s} s")
-    span = Range(start_s, end_s)
-    contents = walk(path, span)
-    with readable_errors(path):
-        steps, outputs, sequences = steps_and_outputs(contents, span)
+    span = (start_s, end_s)
+    contents = _walk(path, span)
+    with _readable_errors(path):
+        steps, outputs, sequences = _steps_and_outputs(contents, span)
         messages, events = _connections(contents, span, sequences), _events(contents, span)
-        units = output_units(contents)
+        units = _output_units(contents)
     # Steps before the first one count as lost, unless the range starts later.
     firsts = {node: int(s[0]) for node, s in sequences.items() if len(s)}
     missing = {
@@ -68,7 +265,7 @@ def read_log(path: str | Path, start_s: float | None = None, end_s: float | None
         "events": events,
         "first_seq": firsts,
         "missing_steps": missing,
-        "skipped": contents.damage.skipped,
+        "skipped": contents.skipped,
     }
     return Episode(
         steps=steps,
@@ -86,7 +283,7 @@ def read_session(path: str | Path) -> dict[str, Json]:
     Raises:
         Sim2RealError: As ``read_log``, and when the metadata is damaged.
     """
-    session = walk(path).session
+    session = _walk(path).session
     if session is None:
         raise Sim2RealError(f"the session metadata of {path} is damaged", hint="read_log still reads the data")
     return session
@@ -98,7 +295,7 @@ def read_attachment(path: str | Path, name: str) -> bytes:
     Raises:
         Sim2RealError: As ``read_log``, and when there is no such attachment.
     """
-    attachments = walk(path).attachments
+    attachments = _walk(path).attachments
     if name not in attachments:
         raise Sim2RealError(f"the log {path} has no attachment {name!r}. Available: {', '.join(attachments) or 'none'}")
     return attachments[name]
@@ -115,7 +312,7 @@ def summary(path: str | Path) -> dict[str, Json]:
     Raises:
         Sim2RealError: As ``read_log``.
     """
-    contents = walk(path)
+    contents = _walk(path)
     return {
         "bytes": Path(path).stat().st_size,
         "chunks": contents.chunks,
@@ -126,19 +323,151 @@ def summary(path: str | Path) -> dict[str, Json]:
         "session_end": contents.end,
         "attachments": {name: len(content) for name, content in contents.attachments.items()},
         "topics": {c.topic: contents.indexed.get(number, 0) for number, c in contents.channels.items()},
-        "skipped": contents.damage.skipped,
+        "skipped": contents.skipped,
     }
 
 
-def output_units(contents: Contents) -> dict[str, dict[str, str]]:
+class LogTail:
+    """The growing end of a log.
+
+    It only reads the file, so the process that writes the log is not aware of it.
+
+    Args:
+        path: The log, which exists and may be empty.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._position = 0
+        self._contents = _Contents()
+
+    @property
+    def ended(self) -> bool:
+        """Whether the session has ended in order."""
+        return self._contents.end is not None
+
+    @property
+    def epoch_ns(self) -> int:
+        """Wall clock at the episode's time 0 [ns]."""
+        return self._contents.epoch_ns
+
+    def read(self) -> Episode | None:
+        """Return the new steps, without messages; None if there is none.
+
+        Raises:
+            Sim2RealError: The file is damaged, or is no log of sim2real.
+        """
+        contents, position, span = self._contents, 0, (None, None)
+        with open(self.path, "rb") as stream:
+            stream.seek(self._position)
+            data = stream.read()
+        if self._position == 0:
+            if len(data) < len(MCAP0_MAGIC):
+                return None
+            if not data.startswith(MCAP0_MAGIC):
+                raise Sim2RealError(f"{self.path} is no MCAP file")
+            position = len(MCAP0_MAGIC)
+        # Take the records that are whole; the next call reads the rest again.
+        with _readable_errors(self.path):
+            while position + _PREFIX.size <= len(data):
+                opcode, length = _PREFIX.unpack_from(data, position)
+                start, end = position + _PREFIX.size, position + _PREFIX.size + length
+                if end > len(data) or opcode == _DATA_END:
+                    break
+                contents.take(data, _Record(opcode, start, end), span)
+                position = end
+            self._position += position
+            steps = contents.with_role("step")
+            if not any(map(contents.messages.get, steps)):
+                return None
+            parts, outputs, _ = _steps_and_outputs(contents, span)
+            episode = Episode(parts, {}, outputs, contents.session or {}, complete=False, units=_output_units(contents))
+        # Keep the outputs whose step records are in the next chunk: the writer writes an output before its step.
+        counts = {c.metadata["node"]: len(contents.messages[n]) for n, c in steps.items()}
+        for number, channel in contents.channels.items():
+            waiting = contents.messages.get(number, [])
+            whole = counts.get(channel.metadata.get("node", ""), 0) if channel.metadata["role"] == "output" else None
+            contents.messages[number] = [] if whole is None else waiting[whole:]
+        return episode
+
+
+def _walk(path: str | Path, span: tuple[float | None, float | None] | None = None) -> _Contents:
+    """Read a log file once.
+
+    Args:
+        span: Chunks in this range are opened for their messages; None: no chunk is opened.
+
+    Raises:
+        Sim2RealError: When the file is missing, not an MCAP file, not a log of sim2real, or cut off before the end of
+            its session metadata.
+    """
+    contents = _Contents()
+    with _readable_errors(path), _opened(path) as data:
+        for record in _records(data, contents):
+            contents.take(data, record, span)
+    # Without the session's metadata, find the reason.
+    if contents.session is None:
+        if contents.library not in ("", LIBRARY):
+            raise Sim2RealError(
+                f"{path} is an MCAP file of {contents.library!r}, not a log of sim2real",
+                hint="convert it with `sim2real import FILE`",
+            )
+        if not contents.chunks:
+            raise _cut_before_session(path)
+        contents.skip("the session's metadata")
+    return contents
+
+
+@contextmanager
+def _readable_errors(path: str | Path) -> Iterator[None]:
+    """Convert the exceptions that damaged bytes cause in the block into an error about the file."""
+    try:
+        yield
+    except Sim2RealError:
+        raise
+    except _BROKEN as error:
+        raise Sim2RealError(
+            f"the log {path} is damaged: {type(error).__name__}: {error}",
+            hint="record again; `mcap recover` of MCAP's own command-line tool may save the readable part",
+        ) from error
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[mmap.mmap]:
+    """Map an MCAP file into memory."""
+    path = Path(path)
+    if not path.is_file():
+        names = sorted(p.name for p in path.parent.glob("*.mcap"))
+        raise Sim2RealError(
+            f"there is no log {path}", hint=f"logs in that folder: {', '.join(names)}" if names else "check the path"
+        )
+    with open(path, "rb") as stream:
+        # An MCAP file starts with its magic bytes.
+        magic = stream.read(len(MCAP0_MAGIC))
+        if len(magic) < len(MCAP0_MAGIC) and MCAP0_MAGIC.startswith(magic):
+            raise _cut_before_session(path)
+        if magic != MCAP0_MAGIC:
+            raise Sim2RealError(f"{path} is no MCAP file", hint="logs are recorded with `sim2real record`")
+        with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            yield data
+
+
+def _cut_before_session(path: str | Path) -> Sim2RealError:
+    return Sim2RealError(
+        f"the log {path} was cut before the end of its session metadata: it holds no data",
+        hint="the recording stopped while it was set up; record again",
+    )
+
+
+def _output_units(contents: _Contents) -> dict[str, dict[str, str]]:
     """Return node -> field -> unit, for the nodes whose channels have units."""
     channels = contents.with_role("output").values()
     by_node = {c.metadata["node"]: units_of_fields(json.loads(c.metadata["fields"])) for c in channels}
     return {node: units for node, units in by_node.items() if units}
 
 
-def steps_and_outputs(
-    contents: Contents, span: Range
+def _steps_and_outputs(
+    contents: _Contents, span: tuple[float | None, float | None]
 ) -> tuple[dict[str, Steps], dict[str, dict[str, np.ndarray]], dict[str, np.ndarray]]:
     """Return steps, outputs, and the number of each step, by node."""
     output_channels = {c.metadata["node"]: (n, c) for n, c in contents.with_role("output").items()}
@@ -168,7 +497,7 @@ def steps_and_outputs(
 
 
 def _connections(
-    contents: Contents, span: Range, sequences: Mapping[str, np.ndarray]
+    contents: _Contents, span: tuple[float | None, float | None], sequences: Mapping[str, np.ndarray]
 ) -> dict[tuple[str, str], Messages]:
     """Return the messages of each connection, by (node, input name)."""
     connections = {}
@@ -188,26 +517,140 @@ def _connections(
     return connections
 
 
-def _events(contents: Contents, span: Range) -> list[dict[str, Json]]:
+def _events(contents: _Contents, span: tuple[float | None, float | None]) -> list[dict[str, Json]]:
     events = []
+    begin, end = contents.log_times(span)
     for number in contents.with_role("events"):
-        for log_time, payload in contents.payloads(number, span):
-            kind, position = read_text(payload, _NAME_AT)
-            text, _ = read_text(payload, position)
-            time_s = (log_time - contents.epoch_ns) / 1e9
-            events.append({"time_s": time_s, "level": payload[_LEVEL_AT], "kind": kind, "text": text})
+        for record in contents.messages[number]:
+            log_time, payload = int.from_bytes(record[15:23], "little"), record[_DATA_AT:]
+            if begin <= log_time < end:
+                kind, position = read_text(payload, _NAME_AT)
+                text, _ = read_text(payload, position)
+                time_s = (log_time - contents.epoch_ns) / 1e9
+                events.append({"time_s": time_s, "level": payload[_LEVEL_AT], "kind": kind, "text": text})
     return events
 
 
-def _warn(path: str | Path, contents: Contents, missing: Mapping[str, int]) -> None:
+def _warn(path: str | Path, contents: _Contents, missing: Mapping[str, int]) -> None:
     """Warn of missing parts of the log; the warning points to the caller of ``read_log``."""
     problems = []
     if contents.end is None:
         problems.append("its session has no end: the process that recorded it crashed or still runs")
-    if contents.damage.skipped:
-        problems.append(f"unreadable: {'; '.join(contents.damage.skipped)}")
+    if contents.skipped:
+        problems.append(f"unreadable: {'; '.join(contents.skipped)}")
     lost = [f"{count} of node {node!r}" for node, count in missing.items() if count]
     if lost:
         problems.append(f"steps are missing: {', '.join(lost)}")
     if problems:
         warnings.warn(f"the log {path} is not whole: {'. '.join(problems)}", TruncatedLogWarning, stacklevel=3)
+
+
+def _records(data: mmap.mmap, contents: _Contents) -> Iterator[_Record]:
+    """Yield the records of the data section without reading their content.
+
+    The length of each record leads to the next one. If a length is damaged, reading resumes at the next bytes that look
+    like a chunk or the session's end.
+
+    Raises:
+        Sim2RealError: When records overlap.
+    """
+    position = trusted = len(MCAP0_MAGIC)
+    read = 0
+    while position < len(data):
+        record = _record(data, position)
+        if record is not None:
+            read += record.end - position
+            if read > _MAX_READ_RATIO * len(data):
+                raise Sim2RealError("the records of the file overlap, which no recorder writes")
+            yield record
+            position = record.end
+            if record.opcode in (_CHUNK, _MESSAGE_INDEX):
+                trusted = position
+            elif record.opcode == _DATA_END:
+                return
+            continue
+        # A damaged length can lead past good chunks: search from the end of the last record that is surely whole.
+        resume = _next_landmark(data, trusted)
+        if resume is None:
+            break
+        contents.skip(f"{resume - trusted} bytes at {trusted}")
+        position, trusted = resume, resume + 1
+
+
+def _record(data: mmap.mmap, position: int) -> _Record | None:
+    """Return the record at a position; None if there is no complete and plausible one."""
+    start = position + _PREFIX.size
+    if start > len(data):
+        return None
+    opcode, length = _PREFIX.unpack_from(data, position)
+    end = start + length
+    if end > len(data) or not opcode:
+        return None
+    # Check the lengths inside of chunks and message indices, which are most of a file; check the opcode of the others.
+    if opcode == _MESSAGE_INDEX:
+        plausible = length >= 6 and length == 6 + int.from_bytes(data[start + 2 : start + 6], "little")
+    elif opcode == _CHUNK:
+        plausible = _is_chunk(data, start, length)
+    elif opcode > _DATA_END:
+        # Accept a private record (from 0x80 on) or one of a later format, but no chunk with a damaged opcode.
+        plausible = _begins_record(data, end) and not _is_chunk(data, start, length)
+    else:
+        plausible = opcode != _DATA_END or length == 4
+    return _Record(opcode, start, end) if plausible else None
+
+
+def _begins_record(data: mmap.mmap, position: int) -> bool:
+    """Return whether a record can begin at a position, or the file ends there."""
+    if position + _PREFIX.size > len(data):
+        return position == len(data)
+    opcode, length = _PREFIX.unpack_from(data, position)
+    return opcode > 0 and position + _PREFIX.size + length <= len(data)
+
+
+def _is_chunk(data: mmap.mmap, start: int, length: int) -> bool:
+    """Return whether the lengths inside a record's content are those of a chunk."""
+    if length < 40:
+        return False
+    name = int.from_bytes(data[start + 28 : start + 32], "little")
+    if 40 + name > length:
+        return False
+    return length == 40 + name + int.from_bytes(data[start + 32 + name : start + 40 + name], "little")
+
+
+def _next_landmark(data: mmap.mmap, position: int) -> int | None:
+    """Return the position of the next plausible chunk or session's end at or after a position; None without any."""
+    for match in _LANDMARK.finditer(data, position):
+        begin = match.start() - (_CHUNK_NAME_AT if match["chunk"] else _METADATA_NAME_AT)
+        kind = Opcode.CHUNK if match["chunk"] else Opcode.METADATA
+        if begin >= position and (record := _record(data, begin)) is not None and record.opcode == kind:
+            return begin
+    return None
+
+
+def _decompressed(chunk: Chunk) -> bytes:
+    """Return a chunk's content, of its claimed size at most; check size and checksum."""
+    size = chunk.uncompressed_size
+    if size > _MAX_CHUNK_BYTES:
+        raise ValueError(f"it claims to hold {size} bytes")
+    if chunk.compression == "lz4":
+        import lz4.frame
+
+        content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    elif chunk.compression == "zstd":
+        import zstandard
+
+        content = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(size + 1)
+    elif chunk.compression == "":
+        content = chunk.data
+    else:
+        raise ValueError(f"its compression {chunk.compression!r} is unknown")
+    if len(content) != size:
+        raise ValueError(f"it holds other than the {size} bytes that it claims")
+    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
+        raise ValueError("its checksum differs")
+    return content
+
+
+def _stream(data: mmap.mmap | bytes, record: _Record) -> ReadDataStream:
+    """Return a record's content as the stream that classes of ``mcap.records`` read."""
+    return ReadDataStream(BytesIO(data[record.start : record.end]))

@@ -1,33 +1,324 @@
-"""The recorder that writes a log: control threads put records into a queue, and a writer thread writes them."""
+"""Writes a log: control threads put records into a queue, and one thread writes them to the file.
+
+The file's order keeps a crashed session readable: metadata and attachments are on the disk before the first data.
+"""
+
+from __future__ import annotations
 
 import atexit
 import contextlib
+import itertools
+import mimetypes
+import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel, Schema
+from mcap.writer import CompressionType, Writer
 
 from sim2real.errors import ERROR, OK, Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord, named_leaves
-from sim2real.log.backlog import RECORD_BYTES, Backlog, max_queue_bytes
-from sim2real.log.session_file import SessionFile
+from sim2real.log.cdr import CdrField, Layout, text
+from sim2real.log.schema import (
+    EVENTS_SCHEMA,
+    EVENTS_TEXT,
+    EVENTS_TOPIC,
+    JointSource,
+    Topic,
+    input_topic,
+    joint_source,
+    output_topic,
+    step_topic,
+    unique_names,
+)
+from sim2real.log.session import SESSION, SESSION_END, encode
 from sim2real.types import Json, PyTree
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
 
 # A crash costs at most 0.25 s of data; 0.15 s of it is the margin for a writer thread that wakes late: with 0.05 s, two
 # busy cores lost 0.26 s once. A flush each 0.1 s makes the log 8 % larger than one each 0.2 s.
 FLUSH_PERIOD_S = 0.1
 SYNC_PERIOD_S = 1.0
-# `close` checks the writer's progress, and reports it, with these periods.
-CHECK_PERIOD_S, REPORT_PERIOD_S = 0.2, 5.0
-# The queue's memory is checked once in this many records.
+# `close` waits for the writer in steps of WAIT_S, reports its progress after every so many of them, and gives up if the
+# writer writes nothing for STUCK_S.
+WAIT_S, REPORT_WAITS, STUCK_S = 0.2, 25, 60.0
+# Limit of the queue's memory [bytes], and memory of a queued record without its arrays.
+MAX_QUEUE_BYTES, RECORD_BYTES = 1 << 30, 500
+# The queue's memory is checked once in this many records, as the check takes longer than a put.
 RECORDS_PER_CHECK = 256
 # The warning level of rcl_interfaces/msg/Log.
 WARN = 30
+
+
+LIBRARY = "sim2real"
+# Small, so that reading a range decompresses little, and a damaged byte costs little data.
+CHUNK_BYTES = 64 * 1024
+
+
+@dataclass
+class _Node:
+    """The topics of one node.
+
+    Attributes:
+        filled: Indices of the output's leaves with elements; empty leaves are not written.
+        joints: Source of its joint states, or None.
+    """
+
+    step: Topic
+    output: Topic
+    filled: list[int]
+    leaves: int
+    joints: JointSource | None
+
+
+class SessionFile:
+    """A log that is being written.
+
+    The constructor writes the session's metadata and attachments, and waits until they are on the disk.
+
+    Args:
+        path: The file; it must not exist.
+        outputs: Node -> an example of its output.
+        joint_states: Node -> joint -> quantity -> field of the node's output; see ``McapRecorder``.
+        units: Node -> field, or entry of one -> unit.
+
+    Attributes:
+        counts: Topic -> number of messages written.
+
+    Raises:
+        Sim2RealError: As ``McapRecorder``.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        metadata: Mapping[str, Json],
+        attachments: Mapping[str, bytes],
+        outputs: Mapping[str, PyTree],
+        inputs: Iterable[tuple[str, str]],
+        joint_states: Mapping[str, Mapping[str, Mapping[str, str]]],
+        units: Mapping[str, Mapping[str, str]] | None = None,
+    ) -> None:
+        self.counts: dict[str, int] = {}
+        self._nodes = _nodes(outputs, joint_states, units or {})
+        self._inputs = _inputs(inputs, self._nodes)
+        self._topics = self._all_topics()
+        self._channels: dict[str, int] = {}
+        self._epoch_ns = 0
+        self._start_monotonic_ns = 0
+        self._early_events: list[tuple[int, int | None, int, str, str]] = []
+        # Encode the metadata before the file exists, so that an error leaves no file.
+        session = encode(SESSION, metadata)
+        try:
+            self._stream = open(path, "xb")  # noqa: SIM115 - finish and abandon close it
+        except FileExistsError as error:
+            raise Sim2RealError(
+                f"the log {path} exists already", hint="logs are never overwritten: choose another name"
+            ) from error
+        except OSError as error:
+            raise Sim2RealError(f"the log {path} cannot be created: {error.strerror}") from error
+        # Write metadata and attachments first: a log without them cannot be read.
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4, enable_crcs=True)
+        try:
+            self._writer.start(profile="ros2", library=LIBRARY)
+            self._writer.add_metadata(SESSION, session)
+            now = time.time_ns()
+            for name, data in attachments.items():
+                media_type = mimetypes.guess_type(name)[0] or "application/octet-stream"
+                self._writer.add_attachment(now, now, name, media_type, data)
+            self.flush()
+            self.sync()
+        except OSError as error:
+            self.abandon()
+            raise Sim2RealError(
+                f"the log {path} cannot be written: {error.strerror}", hint="check the disk's free space"
+            ) from error
+
+    def start(self, epoch_ns: int, monotonic_ns: int) -> None:
+        """Write the channels, whose metadata have the episode's time 0.
+
+        Args:
+            epoch_ns: Time 0 on the wall clock [ns].
+            monotonic_ns: Time 0 on the monotonic clock [ns].
+        """
+        self._epoch_ns, self._start_monotonic_ns = epoch_ns, monotonic_ns
+        loose = RecordBuilder()
+        schemas: dict[str, int] = {}
+        for topic in self._topics:
+            schema = schemas.get(topic.schema)
+            if schema is None:
+                data = topic.schema_text.encode()
+                schema = schemas[topic.schema] = self._writer.register_schema(topic.schema, "ros2msg", data)
+                Schema(id=schema, name=topic.schema, encoding="ros2msg", data=data).write(loose)
+            metadata = {**topic.metadata, "epoch_ns": str(epoch_ns), "monotonic_ns": str(monotonic_ns)}
+            channel = self._writer.register_channel(topic.name, "cdr", schema, metadata)
+            Channel(channel, topic.name, "cdr", metadata, schema).write(loose)
+            self._channels[topic.name] = channel
+        # Write the definitions also before the first chunk, so that the loss of that chunk does not lose the others.
+        self._stream.write(loose.end())
+        for event in self._early_events:
+            self.event(*event)
+
+    def step(self, record: StepRecord, leaves: Sequence[npt.ArrayLike]) -> None:
+        """Write a step, its output and its joint states."""
+        # Refuse a node or an output that the session did not announce.
+        node = self._nodes.get(record.node)
+        if node is None:
+            raise Sim2RealError(f"node {record.node!r} is not in this log. Available: {', '.join(self._nodes)}")
+        if len(leaves) != node.leaves:
+            raise Sim2RealError(
+                f"the output of node {record.node!r} has {len(leaves)} leaves, its init_output had {node.leaves}"
+            )
+        # Write output, step record and joint states with the step's number.
+        seq, sent = record.seq, self._epoch_ns + 1000 * record.end
+        if node.filled:
+            values = _to_host([leaves[i] for i in node.filled])
+            try:
+                payload = node.output.layout.pack(values)
+            except Sim2RealError as error:
+                raise Sim2RealError(f"step {seq} of node {record.node!r}, unlike its init_output: {error}") from error
+            self._add(node.output, payload, seq, sent, sent)
+        self._add(node.step, node.step.layout.pack(record[1:]), seq, sent, self._epoch_ns + 1000 * record.start)
+        if node.joints is not None:
+            payload = _joint_state(node.joints, leaves, sent)
+            self._add(node.joints.topic, payload, seq, sent, sent)
+
+    def message(self, record: MessageRecord) -> None:
+        """Write the record of a message."""
+        topic = self._inputs.get((record.node, record.input))
+        if topic is None:
+            available = ", ".join(f"{node}/{name}" for node, name in self._inputs)
+            raise Sim2RealError(f"input {record.node}/{record.input} is not in this log. Available: {available}")
+        payload = topic.layout.pack((record.seq_out, record.seq_in))
+        sent, received = (self._epoch_ns + 1000 * ticks for ticks in (record.sent, record.received))
+        self._add(topic, payload, record.seq_out, received, sent)
+
+    def event(self, monotonic_ns: int, ticks: int | None, level: int, kind: str, message: str) -> None:
+        """Write an event.
+
+        Args:
+            monotonic_ns: Time of the event on the monotonic clock [ns].
+            ticks: Time on a simulated clock [us from the episode's start]; None: use ``monotonic_ns``.
+            level: Level as in ROS: 20 information, 30 warning, 40 error, 50 fatal.
+        """
+        topic = self._topics[-1]
+        if not self._channels:
+            self._early_events.append((monotonic_ns, ticks, level, kind, message))
+            return
+        # Times before the episode's start are negative, which the wall clock allows.
+        passed_ns = monotonic_ns - self._start_monotonic_ns if ticks is None else 1000 * ticks
+        time_ns = self._epoch_ns + passed_ns
+        stamp = [
+            CdrField("sec", np.dtype("<i4")),
+            CdrField("nanosec", np.dtype("<u4")),
+            CdrField("level", np.dtype("u1")),
+        ]
+        texts = [text(kind), text(message), text(""), text("")]
+        layout = Layout([*stamp, *texts, CdrField("line", np.dtype("<u4"))])
+        payload = layout.pack((time_ns // 1_000_000_000, time_ns % 1_000_000_000, level, 0))
+        self._add(topic, payload, self.counts.get(topic.name, 0), time_ns, time_ns)
+
+    def flush(self) -> None:
+        """Pass the written records to the operating system, so that they survive the end of this process."""
+        self._writer.flush()
+
+    def sync(self) -> None:
+        """Wait until the flushed records are on the disk, so that they survive a loss of power."""
+        os.fsync(self._stream.fileno())
+
+    def finish(self, end: Mapping[str, Json]) -> None:
+        """Write ``session_end`` and the index, and close."""
+        self._writer.flush()
+        self._writer.add_metadata(SESSION_END, encode(SESSION_END, end))
+        self._writer.finish()
+        self._stream.flush()
+        self.sync()
+        self._stream.close()
+
+    def abandon(self) -> None:
+        """Close the file without its end."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+    def _all_topics(self) -> list[Topic]:
+        """Return the topics of all channels; the topic of events is the last one."""
+        topics = [t for node in self._nodes.values() for t in (node.step, node.output) if t.layout.fields]
+        topics += self._inputs.values()
+        topics += [node.joints.topic for node in self._nodes.values() if node.joints is not None][:1]
+        events = Topic(EVENTS_TOPIC, EVENTS_SCHEMA, EVENTS_TEXT, Layout(()), {"role": "events"})
+        return [*topics, events]
+
+    def _add(self, topic: Topic, payload: bytes, sequence: int, log_time: int, publish_time: int) -> None:
+        channel = self._channels.get(topic.name)
+        if channel is None:
+            raise Sim2RealError("the log got data before the episode's start", hint="call start() first")
+        self._writer.add_message(channel, log_time, payload, publish_time, sequence)
+        self.counts[topic.name] = self.counts.get(topic.name, 0) + 1
+
+
+def _nodes(
+    outputs: Mapping[str, PyTree],
+    joint_states: Mapping[str, Mapping[str, Mapping[str, str]]],
+    units: Mapping[str, Mapping[str, str]],
+) -> dict[str, _Node]:
+    unique_names(outputs, "the graph", "node")
+    nodes, types = {}, {}
+    # Derive the topics of each node from the example of its output.
+    for name, example in outputs.items():
+        leaves = list(named_leaves(example).values())
+        node_units = units.get(name, {})
+        joints = joint_source(name, example, joint_states[name], node_units) if name in joint_states else None
+        filled = [i for i, leaf in enumerate(leaves) if np.size(leaf)]
+        node = _Node(step_topic(name), output_topic(name, example, node_units), filled, len(leaves), joints)
+        other = types.setdefault(node.output.schema, name)
+        if other != name:
+            raise Sim2RealError(
+                f"nodes {other!r} and {name!r} both get the message type {node.output.schema}",
+                hint="underscores do not count in ROS type names: rename one of them",
+            )
+        nodes[name] = node
+    if unknown := set(joint_states) - set(nodes):
+        raise Sim2RealError(f"joint states of unknown node {sorted(unknown)[0]!r}. Available: {', '.join(nodes)}")
+    return nodes
+
+
+def _inputs(inputs: Iterable[tuple[str, str]], nodes: Mapping[str, _Node]) -> dict[tuple[str, str], Topic]:
+    topics = {}
+    for node, name in inputs:
+        if node not in nodes:
+            raise Sim2RealError(f"input {name!r} of unknown node {node!r}. Available: {', '.join(nodes)}")
+        topics[node, name] = input_topic(node, name)
+    for node in nodes:
+        unique_names((name for n, name in topics if n == node), f"node {node!r}", "input")
+    return topics
+
+
+def _to_host(leaves: list[PyTree]) -> list[PyTree]:
+    """Return the leaves as NumPy arrays or numbers; all transfers start before the first wait."""
+    for leaf in leaves:
+        if hasattr(leaf, "copy_to_host_async"):
+            leaf.copy_to_host_async()
+    return [np.asarray(leaf) if hasattr(leaf, "__array__") else leaf for leaf in leaves]
+
+
+def _joint_state(source: JointSource, leaves: Sequence[npt.ArrayLike], time_ns: int) -> bytes:
+    values: list[int | list[float]] = [time_ns // 1_000_000_000, time_ns % 1_000_000_000]
+    values += [
+        [float("nan") if i < 0 else float(np.ravel(leaves[i])[element]) for i, element in picks]
+        for picks in source.picks
+        if picks
+    ]
+    return source.topic.layout.pack(values)
 
 
 class McapRecorder:
@@ -37,8 +328,8 @@ class McapRecorder:
     from any thread. The next call raises an error of the writer. As a context manager, it writes an exception that
     leaves the block as the status of the session. If the process ends without ``close``, the status is ``aborted``.
 
-    A writer that falls behind loses no record: ``backlog`` returns its delay, and ``close`` waits while it makes
-    progress. The queue's memory has a limit: beyond it every call raises an error, and the queued records are written.
+    A writer that falls behind loses no record, and ``close`` waits for it. The queue's memory has a limit: beyond it
+    every call raises an error, and the queued records are written.
 
     Args:
         path: The file; it must not exist.
@@ -70,32 +361,33 @@ class McapRecorder:
         self.path = Path(path)
         self._names = {node: dict.fromkeys(named_leaves(example)) for node, example in outputs.items()}
         self._file = SessionFile(self.path, metadata, attachments, outputs, inputs, joint_states or {}, units)
-        # The queue between the control loops and the writer's thread.
+        # The queue between the control loops and the writer's thread: time of the put, method, arguments.
         self._queue: queue.SimpleQueue[tuple[float, Callable[..., None], tuple[Any, ...]] | None]
         self._queue = queue.SimpleQueue()
-        self._longest_queue = 0
-        self._longest_behind_s = 0.0
-        self._max_bytes = max_queue_bytes()
-        # Memory of the arrays in each node's outputs, which have the shapes of the example.
+        # Memory of the arrays in each node's outputs, and the steps of each node, which one thread counts.
         self._sizes = {
             node: sum(np.asarray(leaf).nbytes for leaf in named_leaves(example).values())
             for node, example in outputs.items()
         }
-        self._queued = dict.fromkeys(outputs, 0)  # steps of each node, which one thread counts
+        self._queued = dict.fromkeys(outputs, 0)
         self._written = dict.fromkeys(outputs, 0)
-        self._puts = 0
-        self._at_s = self._began_s = 0.0  # when the present record was queued, and when its write began
-        self._busy = False
+        self._puts = self._done = 0
+        self._max_bytes = _max_queue_bytes()
+        self._at_s: float | None = None  # when the record that is being written was queued
         self._error: BaseException | None = None
         self._failed: Sim2RealError | None = None
-        self._overflow: Sim2RealError | None = None
-        self._started = False
-        self._closed = False
+        self._started = self._closed = False
         self._lock = threading.Lock()
         # Start the thread; at exit it writes the rest of the queue.
         self._thread = threading.Thread(target=self._run, name="log-writer", daemon=True)
         self._thread.start()
         atexit.register(self._close_at_exit)
+
+    @property
+    def behind_s(self) -> float:
+        """Age of the record that is being written [s]; 0 if none is."""
+        at_s = self._at_s
+        return 0.0 if at_s is None else time.monotonic() - at_s
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
         """Queue the episode's start.
@@ -129,14 +421,6 @@ class McapRecorder:
         """
         self._put(self._file.event, time.monotonic_ns(), ticks, level, kind, text)
 
-    def backlog(self) -> Backlog:
-        """Return the records that are not written yet; callable from any thread."""
-        records = self._queue.qsize() + self._busy
-        arrays = sum(self._sizes[n] * max(0, self._queued[n] - self._written[n]) for n in self._sizes)
-        now_s = time.monotonic()
-        behind_s, idle_s = (now_s - self._at_s, now_s - self._began_s) if self._busy else (0.0, 0.0)
-        return Backlog(records, RECORD_BYTES * records + arrays, behind_s, idle_s)
-
     def close(
         self,
         status: str = "finished",
@@ -145,8 +429,6 @@ class McapRecorder:
         report: Callable[[str], None] | None = None,
     ) -> None:
         """Write all queued records and ``session_end``, and close the file. Later calls do nothing.
-
-        It waits while the writer makes progress.
 
         Args:
             status: End of the session, in a word or a sentence.
@@ -164,19 +446,11 @@ class McapRecorder:
         atexit.unregister(self._close_at_exit)
         # Wait for the queue, then write the end of the session.
         self._queue.put(None)
-        self._drain(report)
+        self._wait(report)
         if self._error is None:
+            end = {**(summary or {}), "status": status, "exit_code": exit_code, "messages": self._file.counts}
             try:
-                self._file.finish(
-                    {
-                        **(summary or {}),
-                        "status": status,
-                        "exit_code": exit_code,
-                        "messages": self._file.counts,
-                        "longest_queue": self._longest_queue,
-                        "longest_behind_s": round(self._longest_behind_s, 3),
-                    }
-                )
+                self._file.finish(end)
             except (OSError, Sim2RealError) as error:
                 self._error = error
         if self._error is not None:
@@ -205,34 +479,39 @@ class McapRecorder:
             raise self._failure() from self._error
         if self._closed:
             raise Sim2RealError(f"the log {self.path} is closed")
-        if self._overflow is not None:
-            raise self._overflow
+        if self._failed is not None:
+            raise self._failed
         self._queue.put((time.monotonic(), write, arguments))
         self._puts += 1
-        # Check the queue's memory once in many records, as the check takes longer than a put.
-        if self._puts % RECORDS_PER_CHECK == 0 and (left := self.backlog()).bytes > self._max_bytes:
-            self._overflow = Sim2RealError(
-                f"{left}: more than {self._max_bytes / 1e6:.0f} MB of the log {self.path} would wait in memory",
+        if self._puts % RECORDS_PER_CHECK == 0 and self._queue_bytes() > self._max_bytes:
+            self._failed = Sim2RealError(
+                f"{self._queue.qsize():,} records wait in memory, as the disk is too slow: more than "
+                f"{self._max_bytes / 1e6:.0f} MB for the log {self.path}",
                 hint="the log holds every record until now; record fewer or smaller outputs, at a lower rate, close "
                 "other programs on this machine, or write to a faster, local disk",
             )
 
-    def _drain(self, report: Callable[[str], None] | None) -> None:
-        """Wait until the writer has written the queue."""
-        report_s = time.monotonic() + REPORT_PERIOD_S
-        while self._thread.is_alive():
-            self._thread.join(CHECK_PERIOD_S)
-            # Wait as long as the disk takes data.
-            left = self.backlog()
-            if left.stuck and self._thread.is_alive():
+    def _queue_bytes(self) -> int:
+        arrays = sum(self._sizes[n] * max(0, self._queued[n] - self._written[n]) for n in self._sizes)
+        return RECORD_BYTES * self._queue.qsize() + arrays
+
+    def _wait(self, report: Callable[[str], None] | None) -> None:
+        """Wait until the writer has written the queue, as long as it makes progress."""
+        done, silent_s = self._done, 0.0
+        for waits in itertools.count(1):
+            self._thread.join(WAIT_S)
+            if not self._thread.is_alive():
+                return
+            silent_s = silent_s + WAIT_S if self._done == done else 0.0
+            done, left = self._done, self._queue.qsize()
+            if silent_s > STUCK_S:
                 raise Sim2RealError(
-                    f"the disk took no data for {left.idle_s:.0f} s: the log {self.path} has no end, "
-                    f"{left.records:,} records are lost",
+                    f"the disk took no data for {STUCK_S:.0f} s: the log {self.path} has no end, "
+                    f"{left:,} records are lost",
                     hint="the written part of the log can be read; write logs to a local disk",
                 )
-            if report is not None and left.records and time.monotonic() >= report_s:
-                report(f"writing the log: {left}")
-                report_s += REPORT_PERIOD_S
+            if report is not None and left and waits % REPORT_WAITS == 0:
+                report(f"writing the log: {left:,} records wait, the oldest for {self.behind_s:.0f} s")
 
     def _failure(self) -> Sim2RealError:
         """Return the error that all later calls raise; it is one object, so that it is reported once."""
@@ -246,44 +525,53 @@ class McapRecorder:
     def _run(self) -> None:
         """Write the records of the queue until None comes."""
         try:
-            # Write queued records until the queue holds None.
             flush_at = time.monotonic() + FLUSH_PERIOD_S
             sync_at = time.monotonic() + SYNC_PERIOD_S
             while True:
                 with contextlib.suppress(queue.Empty):
                     item = self._queue.get(timeout=max(0.0, flush_at - time.monotonic()))
                     if item is None:
+                        self._at_s = None
                         return
                     self._write(*item)
                 # Flush after each period, so that a crash costs little data; sync less often, as it takes longer.
                 if (now := time.monotonic()) < flush_at:
                     continue
-                left = self.backlog()
-                self._longest_queue = max(self._longest_queue, left.records)
-                self._longest_behind_s = max(self._longest_behind_s, left.behind_s)
-                self._at_s, self._began_s, self._busy = self._at_s if left.records else now, now, True
+                self._at_s = self._at_s or now
                 self._file.flush()
                 flush_at = now + FLUSH_PERIOD_S
                 if now >= sync_at:
-                    self._began_s = time.monotonic()
                     self._file.sync()
                     sync_at = now + SYNC_PERIOD_S
-                self._busy = not self._queue.empty()
+                self._rest()
         except BaseException as error:
             self._error = error
 
     def _write(self, at_s: float, write: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        """Write one record."""
-        self._at_s, self._began_s, self._busy = at_s, time.monotonic(), True
+        self._at_s = at_s
         write(*arguments)
         if write == self._file.step:
             self._written[arguments[0].node] += 1
-        self._busy = not self._queue.empty()
+        self._rest()
+
+    def _rest(self) -> None:
+        """Count a finished write; without further records the writer is not behind."""
+        self._done += 1
+        if self._queue.empty():
+            self._at_s = None
 
     def _close_at_exit(self) -> None:
         # The interpreter is exiting: a failure could not be reported.
         with contextlib.suppress(Sim2RealError):
             self.close("aborted", ERROR)
+
+
+def _max_queue_bytes() -> int:
+    """Return the limit of the queue's memory [bytes]: at most a quarter of the machine's memory."""
+    try:
+        return min(MAX_QUEUE_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 4)
+    except (AttributeError, ValueError, OSError):  # not on every platform
+        return MAX_QUEUE_BYTES
 
 
 def _snapshot(node: str, output: PyTree, expected: dict[str, None]) -> list[PyTree]:

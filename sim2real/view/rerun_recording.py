@@ -12,7 +12,7 @@ import numpy as np
 
 from sim2real.artifacts.run.run_folder import finished_stages, pipeline_of
 from sim2real.graph.episode import TICKS_PER_S, Episode
-from sim2real.log.ages import input_ages
+from sim2real.log.session import input_ages
 from sim2real.view.node_looks import color_of, in_order, slowest_period_s
 from sim2real.view.rerun_content import IDLE, Curve, Tab, readable, states_of, tabs_of
 from sim2real.view.rerun_viewer import open_viewer, rerun_module

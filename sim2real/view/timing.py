@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from sim2real.graph.episode import Episode, Steps
-from sim2real.log.ages import oldest_input
+from sim2real.log.session import oldest_input
 from sim2real.view import style
 from sim2real.view.node_looks import color_of, in_order, slowest_period_s
 from sim2real.view.style import BLUE, INK, MUTED, ORANGE, new_figure, styled, to_svg

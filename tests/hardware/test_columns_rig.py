@@ -24,8 +24,7 @@ from sim2real.hardware.device import (
 )
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
-from sim2real.log.file_contents import walk
-from sim2real.log.reader import output_units, read_log
+from sim2real.log.reader import read_log
 from sim2real.log.writer import McapRecorder
 from sim2real.robots.control_loop.hardware import Excitation, ServoActuator, ServoSensor
 from sim2real.robots.control_loop.loop import control_nodes
@@ -213,7 +212,7 @@ def test_the_log_has_every_part_and_every_column_with_its_unit(tmp_path):
         graph.stop()
         graph.recorder.close("finished", 0, {})
     outputs = read_log(log).outputs
-    found = output_units(walk(log))
+    found = read_log(log).units
     assert found[ROLES.sensor]["gyro"] == "rad/s"
     assert UNITS.items() <= found[ROLES.actuator].items()
     np.testing.assert_allclose(outputs[ROLES.sensor]["gyro"][-1], [0.1, 0.2, 0.3], rtol=1e-6)

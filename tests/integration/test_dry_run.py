@@ -21,7 +21,7 @@ from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.log.reader import read_log, read_session
+from sim2real.log.reader import read_log
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -141,14 +141,6 @@ def test_no_later_stage_takes_it_for_a_recording(recorded):
     code, _, err = call("run", "pendulum", "--record.dry-run", "--runs", recorded.runs)
     assert (code, "a run cannot identify from it" in err) == (2, True)
     assert len(list(recorded.runs.glob("pendulum/*"))) == 1
-
-
-def test_a_recovered_log_still_says_so(recorded, tmp_path):
-    log = recorded.folder / "session.mcap"
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(log.read_bytes()[: log.stat().st_size // 2])
-    assert call("log", "recover", cut)[0] == 0
-    assert read_session(tmp_path / "cut.recovered.mcap")["dry_run"] is True
 
 
 def test_whoever_looks_at_the_run_is_told(recorded):

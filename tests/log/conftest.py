@@ -5,7 +5,7 @@ from pathlib import Path
 import fake_sessions
 import pytest
 
-from sim2real.log.session_file import SessionFile
+from sim2real.log.writer import SessionFile
 
 
 @pytest.fixture(scope="session")

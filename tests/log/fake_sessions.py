@@ -9,8 +9,7 @@ from flax import struct
 
 from sim2real.graph.base import Base, Empty
 from sim2real.graph.episode import MessageRecord, StepRecord
-from sim2real.log.session_file import SessionFile
-from sim2real.log.writer import _snapshot
+from sim2real.log.writer import SessionFile, _snapshot
 
 EPOCH_NS = 1_790_000_000_123_456_789
 RATE_HZ = 200

@@ -95,6 +95,9 @@ def test_many_messages_decode_at_once():
         ([300, np.zeros(2)], "field 'n' is int8"),
         ([1, np.zeros(3)], r"field 'q' has shape \(3,\), expected \(2,\)"),
         ([1, np.zeros(2, complex)], "field 'q' is float32, got complex128"),
+        ([1.0, np.zeros(2)], "field 'n' is int8"),
+        ([1, np.full(2, 1e40)], "field 'q' is float32"),
+        ([1, np.full(2, 2**24 + 1)], "field 'q' is float32"),
         ([1], "1 fields, expected 2: n, q"),
     ],
 )
@@ -102,6 +105,32 @@ def test_what_does_not_fit_is_named(value, message):
     layout = Layout([CdrField("n", np.dtype("i1")), CdrField("q", np.dtype("f4"), (2,))])
     with pytest.raises(Sim2RealError, match=message):
         layout.pack(value)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "value"),
+    [
+        ("f4", 1e40), ("f4", 10**40), ("f4", 2**24 + 1), ("f4", np.float64(-1e40)), ("f8", 2**53 + 1), ("f8", 10**400),
+        ("f8", np.uint64(2**64 - 1)), ("i4", np.int64(2**40)), ("i8", np.uint64(2**63)), ("u8", -1), ("u1", 256),
+        ("i4", 1.0), ("b1", 0.3), ("b1", 2), ("b1", np.nan), ("f8", "1"), ("f8", None), ("f8", 1j),
+    ],
+)  # fmt: skip
+def test_a_value_that_its_field_cannot_hold_is_an_error(dtype, value):
+    """A scalar and each entry of an array alike."""
+    for shape in ((), (2,)):
+        layout = Layout([CdrField("x", np.dtype(dtype), shape)])
+        with pytest.raises(Sim2RealError, match="'x' is"):
+            layout.pack([[value, value] if shape else value])
+
+
+@pytest.mark.parametrize(
+    ("dtype", "value"),
+    [("f4", 0.1), ("f4", np.inf), ("f8", np.nan), ("f8", 2**60), ("f8", True), ("b1", 1), ("i1", np.int64(-5))],
+)
+def test_what_a_field_can_hold_is_kept(dtype, value):
+    layout = Layout([CdrField("x", np.dtype(dtype))])
+    (read,) = np.frombuffer(layout.pack([value]), layout.dtype)["x"]
+    np.testing.assert_array_equal(read, np.asarray(value).astype(dtype))
 
 
 def test_a_dtype_that_ros_lacks_is_an_error():

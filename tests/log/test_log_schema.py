@@ -7,7 +7,7 @@ import pytest
 
 from sim2real.errors import Sim2RealError
 from sim2real.log.schema import joint_source, output_topic, snake
-from sim2real.log.session_file import SessionFile
+from sim2real.log.writer import SessionFile
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from sim2real.log import metadata
+from sim2real.log import session as metadata
 
 TEXT = st.text(st.characters(codec=None, exclude_categories=()), max_size=20)
 VALUES = st.recursive(

@@ -6,7 +6,7 @@ import pytest
 
 from sim2real.errors import Sim2RealError
 from sim2real.log import McapRecorder, read_log
-from sim2real.log.tail import LogTail
+from sim2real.log.reader import LogTail
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, Scheduling, Timeline, TrainableDist
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import draw
-from sim2real.log.ages import input_ages
+from sim2real.log.session import input_ages
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.runtime.init import OUTPUTS

@@ -172,7 +172,7 @@ def test_runner(run):
 def test_log(run):
     report = run("log")
     rows = {row["name"]: row["value"] for row in report["rows"]}
-    assert rows["log/truncations/recovered"] == 3
+    assert rows["log/truncations/opened"] == 3
     assert {"log/loop_200hz/p99_ms", "log/range_read_ms"} <= set(rows)
 
 

@@ -14,7 +14,7 @@ from sim2real.log.importing import plausibility
 from sim2real.log.importing.files.foreign import ForeignFile, open_foreign
 from sim2real.log.importing.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, load_mapping, positive
 from sim2real.log.importing.sample_selection import align_turns, plausible_samples, selected_samples
-from sim2real.log.session_file import SessionFile
+from sim2real.log.writer import SessionFile
 from sim2real.types import Json
 
 RECORDED, GENERATED = "recorded", "generated"

@@ -17,7 +17,7 @@ from sim2real.graph.node import TICKS_PER_S
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import newest_message
 from sim2real.installation import has_jax
-from sim2real.log.ages import input_ages
+from sim2real.log.session import input_ages
 from sim2real.robots.contract import Robot
 from sim2real.robots.score_columns import as_columns, as_sent
 from sim2real.stages.deploy.trajectories import courses, lost_s

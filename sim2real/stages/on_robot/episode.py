@@ -30,6 +30,8 @@ from sim2real.stages.terminal.interruption import interruptible
 LATE_SHARE = 0.01
 """Share of late steps above which ``--strict-timing`` ends with code 5."""
 _POLL_S = 0.25
+WARN_BEHIND_S = 1.0
+"""Age of the record that is being written above which a warning names the slow disk [s]."""
 _INTERRUPTED = 130
 
 
@@ -149,17 +151,17 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
 
 
 def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str, recorder: McapRecorder) -> None:
-    """Run the graph; print a warning where the log's writer falls behind, and again when it is twice as far behind."""
+    """Run the graph; print one warning if the log's writer falls behind."""
     graph.start(state)
     with progress(round(duration_s, 1), label) as bar:
-        begin, warn_s = time.monotonic(), 0.0
+        begin, warned = time.monotonic(), False
         while (left := duration_s - (time.monotonic() - begin)) > 0:
             graph.run_for(min(_POLL_S, left))
             bar.n = round(min(duration_s, time.monotonic() - begin), 1)
             bar.refresh()
-            if (left := recorder.backlog()).late and left.behind_s > warn_s:
-                note(f"warning: {left}")
-                warn_s = 2.0 * left.behind_s
+            if recorder.behind_s > WARN_BEHIND_S and not warned:
+                note(f"warning: the disk is slow: the log is {recorder.behind_s:.0f} s behind, kept in memory")
+                warned = True
 
 
 def _recorder(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.graph.episode import TICKS_PER_S, Episode, Steps
-from sim2real.log.tail import LogTail
+from sim2real.log.reader import LogTail
 from sim2real.view.rerun_content import Curve, Tab, episode_tab, with_goals
 from sim2real.view.signals import outputs_of
 

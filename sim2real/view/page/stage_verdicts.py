@@ -10,7 +10,7 @@ _DEPLOYED: dict[str, Tone] = {"fine": "good", "look at this joint": "bad"}
 
 
 def record_banner(log: Signals) -> Banner:
-    """Return the verdict on a recording: whether it is complete, and its measurements are plausible and in time."""
+    """Return the verdict on a recording: whether it is complete, and what its session judged of the measurements."""
     if log.dry:
         return DRY
     end = log.episode.metadata.get("log", {}).get("session_end") or {}
@@ -21,7 +21,8 @@ def record_banner(log: Signals) -> Banner:
     if faults:
         return Banner("doubt", "Incomplete" if log.warnings else "Suspicious measurements", faults)
     lost = f"; {number(end['lost_replies'])} lost answers were requested again" if "lost_replies" in end else ""
-    return Banner("good", "Complete", [f"{log.episode.duration_s:.1f} s, no suspicious measurement{lost}."])
+    judged = ", no suspicious measurement" if "suspects" in end else ""
+    return Banner("good", "Complete", [f"{log.episode.duration_s:.1f} s{judged}{lost}."])
 
 
 def train_banner(success: float) -> Banner:

@@ -7,14 +7,16 @@ import numpy as np
 
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode
-from sim2real.log.ages import oldest_input
+from sim2real.log.session import is_imported, oldest_input
 from sim2real.types import Json
 from sim2real.view import timing
 from sim2real.view.blocks import MISSING, Block, FigureBlock, TableBlock, Tile, fixed, number
 
 
 def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
-    """Yield the worst lateness, the oldest input and the overruns of some episodes."""
+    """Yield the worst lateness, the oldest input and the overruns of some episodes; nothing of an imported log."""
+    if any(map(is_imported, episodes)):
+        return
     late = {n: np.concatenate([timing.times(e.steps[n]).lateness for e in episodes]) for n in episodes[0].steps}
     p99 = {n: float(np.quantile(values, 0.99)) for n, values in late.items() if len(values)}
     worst = max(p99, key=lambda n: p99[n])
@@ -33,7 +35,9 @@ def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
 
 
 def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = False) -> list[Block]:
-    """Return figures and table about an episode's timing."""
+    """Return figures and table about an episode's timing; nothing of an imported log, whose steps have stamps alone."""
+    if is_imported(episode):
+        return []
     end: Mapping[str, Json] = episode.metadata.get("log", {}).get("session_end") or {}
     rows, measured = [], Timing.of(episode)
     # Make a row for each node: quantiles of period, lateness, computation, bus and age.

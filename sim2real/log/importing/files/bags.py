@@ -16,9 +16,18 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.log.importing.files.bag_columns import Columns
 from sim2real.log.importing.files.budget import MAX_BYTES, MAX_TEXT_BYTES, require_memory, require_signals
 from sim2real.log.importing.files.raw_file import RawSignals
+from sim2real.log.importing.files.records import (
+    BROKEN,
+    Damage,
+    Record,
+    chunk_content,
+    chunk_records,
+    opened,
+    parsed,
+    records,
+)
 from sim2real.log.importing.files.ros_messages import Decode, UndecodableError, decoder
-from sim2real.log.metadata import SESSION
-from sim2real.log.records import BROKEN, Damage, Record, chunk_content, chunk_records, opened, parsed, records
+from sim2real.log.session import SESSION
 
 _MESSAGE = struct.Struct("<HIQQ")
 _MAX_MESSAGE_BYTES = 64 * 1024

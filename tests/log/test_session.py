@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord
-from sim2real.log.ages import input_ages, oldest_input
+from sim2real.log.session import input_ages, oldest_input
 
 STEPS = {"sensor": [0, 10, 20, 30], "agent": [2, 12, 22, 32, 42]}
 READ = [(0, 0), (1, 2), (2, 2), (3, -1)]
