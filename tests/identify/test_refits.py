@@ -41,6 +41,14 @@ def test_a_refit_is_used_again_from_the_file(tmp_path):
     assert again.source == tmp_path / REFITS
 
 
+def test_a_thread_that_still_computes_writes_no_file_of_a_closed_stage(tmp_path):
+    refits = filled(tmp_path / REFITS)
+    before = (tmp_path / REFITS).read_bytes()
+    refits.close()
+    refits.store(TERMS, "another part", END)
+    assert (tmp_path / REFITS).read_bytes() == before
+
+
 def test_other_inputs_have_no_refits(tmp_path):
     filled(tmp_path / REFITS)
     other = Refits(None, "another", [tmp_path / REFITS])
@@ -81,12 +89,13 @@ def test_the_digest_covers_logs_bounds_terms_and_settings_but_no_start(pendulum)
     config = replace(pipeline.identify, log=(str(log.path),))
     digest = prepare(pipeline, config, [log], []).digest
     assert prepare(pipeline, config, [log], [], {"gain": 20.0}).digest == digest
-    assert prepare(pipeline, replace(config, reveal=False, log=()), [log], []).digest == digest
+    assert prepare(pipeline, config, [log], [other]).digest == digest
+    for unrelated in ({"reveal": False}, {"log": ()}, {"view": "web"}, {"generations": 160}, {"refine_steps": 50}):
+        assert prepare(pipeline, replace(config, **unrelated), [log], []).digest == digest
     low, high = 5.0, 60.0
     changed = (
         prepare(pipeline, config, [other], []),
         prepare(pipeline, config, [log, other], []),
-        prepare(pipeline, config, [log], [other]),
         prepare(pipeline, replace(config, bounds={"gain": (low, high)}), [log], []),
         prepare(pipeline, replace(config, fix={"gain": 20.0}), [log], []),
         prepare(pipeline, replace(config, terms="none"), [log], []),

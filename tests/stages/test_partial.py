@@ -1,20 +1,24 @@
 """A search that is ended by a signal leaves its best so far."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import Identification, Judgement
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run.manifest import sha256
 from sim2real.artifacts.run.run_folder import attempts
 from sim2real.errors import Sim2RealError
 from sim2real.stages.identify import fitting
 from sim2real.stages.identify import stage as identify_stage
-from sim2real.stages.identify.interrupted import Best
+from sim2real.stages.identify.interrupted import Best, left_behind
 from sim2real.stages.pipeline.open_parameters import open_identification
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -68,6 +72,53 @@ def test_nothing_is_left_where_nothing_was_found_or_something_else_went_wrong(pe
     stage = interrupted(pendulum, tmp_path / "error", monkeypatch, ValueError("broken"))
     assert stage.manifest["status"] == "failed"
     assert not (stage.folder / "partial.json").exists()
+
+
+def fitted(monkeypatch, before_judging, judged):
+    """Replace the fit and its judgement; the fit ends with gain 21."""
+
+    def fit(inputs, best):
+        best.restart(inputs.table.for_recordings(1))
+        z = best.table.encode({p.name: 21.0 if p.name == "gain" else p.high / 2 for p in best.table})
+        best.begin(None)
+        before_judging()
+        return SimpleNamespace(estimate=SimpleNamespace(z=z, loss=1.0))
+
+    monkeypatch.setattr(identify_stage, "fit_model", fit)
+    monkeypatch.setattr(identify_stage, "judge", judged)
+
+
+def test_an_error_in_the_judgement_leaves_the_fit(pendulum, tmp_path, monkeypatch, capsys):
+    fitted(monkeypatch, lambda: None, lambda *inputs: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        identify_stage.run(pendulum, replace(pendulum.identify, log=(str(LOG),)), tmp_path, None)
+    (run,) = (tmp_path / "pendulum").iterdir()
+    stage = attempts(run, "identify")[0]
+    assert stage.manifest["status"] == "failed"
+    assert Identification.load(stage.output("partial")).values["gain"] == pytest.approx(21.0, rel=1e-4)
+    assert "--begin" in capsys.readouterr().err
+
+
+def test_a_log_that_is_moved_during_the_fit_keeps_its_hash(pendulum, tmp_path, monkeypatch):
+    log = Path(shutil.copy(LOG, tmp_path))
+    before = sha256(log)
+    document = Identification("pendulum", (), Judgement("accepted", ()), ())
+    fitted(monkeypatch, log.unlink, lambda *inputs: document)
+    found = identify_stage.identify(pendulum, log)
+    assert [(source.path, source.sha256) for source in found.logs] == [("chirp.mcap", before)]
+    unwritten = replace(Recording.load(LOG), path=tmp_path / "never_written.mcap")
+    fitted(monkeypatch, lambda: None, lambda *inputs: document)
+    assert identify_stage.identify(pendulum, unwritten).logs[0].sha256 == ""
+
+
+def test_a_thread_that_still_computes_ends_once_its_stage_has(tmp_path):
+    with (
+        pytest.raises(ZeroDivisionError),
+        left_behind(SimpleNamespace(folder=tmp_path), "pendulum", (), lambda path: "") as best,
+    ):
+        raise ZeroDivisionError
+    with pytest.raises(RuntimeError):
+        best.advance("search", 0.1, 1.0, np.zeros(1))
 
 
 def test_a_refinement_goes_on_from_the_searchs_best_and_counts_from_then_on():

@@ -40,7 +40,7 @@ _NAME = re.compile(r"\w[\w.-]*")
 
 @dataclass(frozen=True)
 class Source:
-    """A source file of an artifact: its path, relative to the run folder, and its SHA-256."""
+    """A source file of an artifact: its path, relative to the run folder, and its SHA-256; "" without a file."""
 
     path: str
     sha256: str

@@ -4,6 +4,7 @@ A refit is used again only for the same inputs: the file's digest covers logs, p
 must still give the loss that the fit of all parts had. Other data or another model gives another loss.
 """
 
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,6 +60,7 @@ class Refits:
         self._path, self._document, self.reused = path, StoredRefits(digest), 0
         self.source: Path | None = None
         self.stored = False
+        self._lock = threading.Lock()
         for file in earlier:
             try:
                 document = read_json(file, StoredRefits)
@@ -110,10 +112,16 @@ class Refits:
             return False
         return abs(problem.loss(z, data) - loss) <= _SAME * abs(loss)
 
+    def close(self) -> None:
+        """Stop writing: a thread that still computes must not change a file of a stage that has ended."""
+        with self._lock:
+            self._path = None
+
     def _write(self) -> None:
-        if self._path is not None:
-            self.stored = True
-            write_json(self._path, self._document)
+        with self._lock:
+            if self._path is not None:
+                self.stored = True
+                write_json(self._path, self._document)
 
 
 def _key(terms: Sequence[str]) -> str:

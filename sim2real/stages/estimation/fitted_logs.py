@@ -35,13 +35,13 @@ def require_new(
     # Collect the hashes and the measurements of the fitted logs.
     rows = identification.samples
     fitted = set(rows["recording"][~rows["held_out"]].tolist()) if rows else set(range(len(identification.logs)))
-    paths = {source.sha256: source.path for i, source in enumerate(identification.logs) if i in fitted}
+    paths = {s.sha256: s.path for i, s in enumerate(identification.logs) if i in fitted and s.sha256}
     pieces = list(_fitted_pieces(identification, model))
     # Compare each log with them.
     messages = []
     for log in logs:
         positions = _measured(log, model)
-        if (path := paths.get(_hash(log) or "")) is not None:
+        if (path := paths.get(hash_of(log))) is not None:
             messages.append(f"{log.path} is {path}, which these parameters were identified from")
         elif any(_contains(positions, piece) for piece in pieces):
             messages.append(f"{log.path} holds measurements that these parameters were identified from")
@@ -82,17 +82,17 @@ def require_apart(
     Raises:
         UsageError: A log is given twice, and ``force`` is False.
     """
-    hashes = [_hash(log) for log in fitted]
+    hashes = [hash_of(log) for log in fitted]
     messages = [
         f"{a.path} and {b.path} are the same log: fitted twice, it would count twice"
         for (a, ha), (b, hb) in combinations(zip(fitted, hashes, strict=True), 2)
-        if ha is not None and ha == hb
+        if ha and ha == hb
     ]
     positions = [_measured(log, model) for log in fitted]
     for log in held_out:
-        digest, pieces = _hash(log), list(_cut(_measured(log, model)))
+        digest, pieces = hash_of(log), list(_cut(_measured(log, model)))
         for other, other_digest, whole in zip(fitted, hashes, positions, strict=True):
-            if (digest is not None and digest == other_digest) or any(_contains(whole, p) for p in pieces):
+            if (digest and digest == other_digest) or any(_contains(whole, p) for p in pieces):
                 messages.append(f"{log.path} is to be held out, and {other.path}, with the same measurements, fitted")
     _refuse(messages, "name each log once, or --force: held-out errors of a fitted log are no test of the fit", force)
 
@@ -105,9 +105,9 @@ def _refuse(messages: list[str], hint: str, force: bool) -> list[str]:
     return messages
 
 
-def _hash(log: Recording) -> str | None:
-    """Return the SHA-256 of a log's file; None if there is no such file."""
-    return sha256(log.path) if log.path.is_file() else None
+def hash_of(log: Recording) -> str:
+    """Return the SHA-256 of a log's file; "" if there is no such file."""
+    return sha256(log.path) if log.path.is_file() else ""
 
 
 def _measured(log: Recording, model: IdentifiableModel) -> np.ndarray:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import sim2real
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.manifest import sha256
+from sim2real.artifacts.run.run_folder import Source, portable
 from sim2real.graph.episode import Episode
 from sim2real.identify.delays.links import measured
 from sim2real.identify.model import IdentifiableModel
@@ -20,14 +21,17 @@ from sim2real.identify.validation.refits import REFITS, Refits
 from sim2real.robots.contract import RecordedRobot, Robot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.fitted_logs import require_apart, require_standing, with_load
+from sim2real.stages.estimation.fitted_logs import hash_of, require_apart, require_standing, with_load
 from sim2real.stages.estimation.segment_split import spans, with_length
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.open_log import require_units
 from sim2real.stages.pipeline.pipeline import Pipeline
 
-_WITHOUT_EFFECT = ("log", "hold_out", "begin", "standing", "force", "each", "links", "reveal", "devices")
-"""Settings on which no refit depends; logs count by their content."""
+_WITHOUT_EFFECT = (
+    *("log", "hold_out", "begin", "standing", "force", "each", "links", "reveal", "view"),
+    *("devices", "strategy", "population", "generations", "restarts", "std", "batch", "refine", "refine_steps", "seed"),
+)
+"""Settings on which no refit depends: a refit starts from the fit, wherever that was found. Logs count by content."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,7 @@ class Inputs:
         robot: The robot, with the optional terms that the configuration names.
         table: The parameters, with the bounds and fixed values of the configuration.
         logs: The fitted recordings, then those that are held out whole.
+        hashes: SHA-256 of each log's file before the fit; "" for a recording without a file.
         windows: Segments to fit, and segments to predict.
         refits: Finished refits without parts of the recordings.
         standing: The recording of a robot on its feet; None: there is none.
@@ -49,6 +54,7 @@ class Inputs:
     model: IdentifiableModel
     table: ParameterTable
     logs: tuple[Recording, ...]
+    hashes: tuple[str, ...]
     fitted: int
     windows: list[Span]
     refits: Refits = field(default_factory=Refits)
@@ -65,25 +71,23 @@ class Inputs:
 
     @property
     def digest(self) -> str:
-        """Digest of all that the estimates depend on: logs, robot, parameters, settings and this version."""
+        """Digest of all that the refits depend on: fitted logs, robot, parameters, settings and this version."""
         config = {k: v for k, v in asdict(self.config).items() if k not in _WITHOUT_EFFECT}
         rows = [
             (replace(p, prior=None, begin=None), p.prior and [float(p.prior.log_prob(v)) for v in (p.low, p.high)])
             for p in self.table
         ]
-        logs = [sha256(log.path) for log in self.logs]
-        whole = (config, rows, logs, self.fitted, sorted(self.pipeline.texts().items()), sim2real.__version__)
+        whole = (config, rows, self.hashes[: self.fitted], sorted(self.pipeline.texts().items()), sim2real.__version__)
         return hashlib.sha256(repr(whole).encode()).hexdigest()
 
-    def storing_refits(self, folder: Path, root: Path) -> Inputs:
-        """Return the inputs with finished refits in a stage's folder, and those of earlier folders of the same inputs.
+    def sources(self, run_dir: Path | None = None) -> tuple[Source, ...]:
+        """Return the logs with their hashes from before the fit.
 
         Args:
-            root: Folder of all runs.
+            run_dir: Folder that paths are relative to; None: names alone.
         """
-        files = (root / self.pipeline.name).glob(f"*/identify*/{REFITS}")
-        earlier = sorted(files, key=lambda file: file.stat().st_mtime, reverse=True)
-        return replace(self, refits=Refits(folder / REFITS, self.digest, earlier))
+        paths = [log.path.name if run_dir is None else portable(log.path, run_dir) for log in self.logs]
+        return tuple(Source(*pair) for pair in zip(paths, self.hashes, strict=True))
 
     @property
     def episodes(self) -> list[Episode]:
@@ -131,7 +135,23 @@ def prepare(
     if standing:
         require_standing(robot, standing, model)
     windows = spans([log.episode for log in logs], len(fitted), config, config.settle_s + config.horizon_s)
-    return Inputs(pipeline, config, robot, model, table, logs, len(fitted), windows, standing=standing)
+    hashes = tuple(hash_of(log) for log in logs)
+    return Inputs(pipeline, config, robot, model, table, logs, hashes, len(fitted), windows, standing=standing)
+
+
+@contextmanager
+def storing_refits(inputs: Inputs, folder: Path, root: Path) -> Iterator[Inputs]:
+    """Yield the inputs with finished refits in a stage's folder, and those of earlier folders of the same inputs.
+
+    Args:
+        root: Folder of all runs.
+    """
+    files = (root / inputs.pipeline.name).glob(f"*/identify*/{REFITS}")
+    refits = Refits(folder / REFITS, inputs.digest, sorted(files, key=lambda f: f.stat().st_mtime, reverse=True))
+    try:
+        yield replace(inputs, refits=refits)
+    finally:
+        refits.close()
 
 
 def robot_of(pipeline: Pipeline, config: IdentifyConfig) -> RecordedRobot:

@@ -1,8 +1,8 @@
-"""The best values of a search that a signal ended, as a file."""
+"""The best values of a search that did not end with a verdict, as a file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,6 +30,7 @@ class Best:
         on_fit: Called after the fit, before it is judged.
         on_begin: Called with each problem, before its search.
         on_advance: Called after each advance.
+        ended: Whether the stage has ended; a thread that still computes records nothing.
     """
 
     table: ParameterTable | None = None
@@ -39,6 +40,7 @@ class Best:
     on_fit: Callable[[], object] | None = None
     on_begin: Callable[[Problem], object] | None = None
     on_advance: Callable[[Best], object] | None = None
+    ended: bool = False
 
     def restart(self, table: ParameterTable) -> None:
         """Begin a search of other parameters."""
@@ -51,7 +53,12 @@ class Best:
             stage: ``search`` or ``refine``.
             share: Share of the phase that was completed since the last call.
             z: Shape ``(P,)``.
+
+        Raises:
+            RuntimeError: The stage has ended; it ends the thread that still computes.
         """
+        if self.ended:
+            raise RuntimeError("the stage has ended")
         if loss < self.loss or (stage == "refine" and not self.done["refine"]):
             self.z, self.loss = np.array(z), loss
         self.done[stage] = min(1.0, self.done[stage] + share)
@@ -75,33 +82,40 @@ class Best:
 
 
 @contextmanager
-def left_behind(stage: OpenStage, pipeline: str, logs: Sequence[Path], again: Callable[[Path], str]) -> Iterator[Best]:
+def left_behind(
+    stage: OpenStage, pipeline: str, logs: tuple[Source, ...], again: Callable[[Path], str]
+) -> Iterator[Best]:
     """Yield the record of the best values, which is written to ``partial.json`` after the fit and on a signal.
 
-    The file is removed when the block ends without a signal.
+    The file is an output of the stage if a signal ends it, or an error after the fit. A judgement removes it.
 
     Args:
+        logs: The fitted logs, with their hashes from before the fit.
         again: Path of the file -> the command that continues from it.
     """
     best, path = Best(), stage.folder / PARTIAL
 
     def write() -> None:
-        _unfinished(pipeline, logs, stage.run_dir, best, again(path)).write(path)
+        _unfinished(pipeline, logs, best, again(path)).write(path)
 
     best.on_fit = write
     try:
         yield best
-    except (KeyboardInterrupt, SystemExit):
-        if best.z is not None and np.isfinite(best.loss):
+    except BaseException as error:
+        best.ended = True
+        signalled = isinstance(error, KeyboardInterrupt | SystemExit)
+        if best.z is not None and np.isfinite(best.loss) and (signalled or path.exists()):
             stage.output("partial", PARTIAL)
             write()
-            note(f"interrupted: the best values so far are in {shown(path)}, without intervals and verdict")
+            ended = "interrupted: the best values so far" if signalled else "the judgement failed: the fitted values"
+            note(f"{ended} are in {shown(path)}, without intervals and verdict")
             note(f"next: {again(path)}")
         raise
+    best.ended = True
     path.unlink(missing_ok=True)
 
 
-def _unfinished(pipeline: str, logs: Sequence[Path], run_dir: Path, best: Best, again: str) -> Identification:
+def _unfinished(pipeline: str, logs: tuple[Source, ...], best: Best, again: str) -> Identification:
     """Return the best values as an identification with the verdict ``interrupted``."""
     # The best values so far, without intervals.
     table = best.table or ParameterTable([])
@@ -125,7 +139,7 @@ def _unfinished(pipeline: str, logs: Sequence[Path], run_dir: Path, best: Best, 
     ]
     return Identification(
         pipeline=pipeline,
-        logs=tuple(Source.of(path, run_dir) for path in logs),
+        logs=logs,
         verdict=Judgement("interrupted", (reason,), again),
         parameters=tuple(rows),
         search=Search(loss=best.loss, done=best.done),

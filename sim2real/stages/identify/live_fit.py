@@ -1,7 +1,7 @@
 """Progress of a search for a viewer that joins it: the loss, and the best fit so far over the recording."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from sim2real.artifacts.progress import write_best_fit, write_progress
 from sim2real.artifacts.run.run_folder import OpenStage
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.validation.prediction import samples
-from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.identify.interrupted import Best, left_behind
 from sim2real.stages.live.viewer import live_view
 
@@ -20,17 +20,16 @@ _PERIOD_S = 5.0
 
 
 @contextmanager
-def searching(
-    stage: OpenStage, pipeline: str, config: IdentifyConfig, logs: Sequence[Path], again: Callable[[Path], str]
-) -> Iterator[Best]:
+def searching(stage: OpenStage, inputs: Inputs, again: Callable[[Path], str]) -> Iterator[Best]:
     """Yield the record of the best values, and write the progress, beside a viewer if one is configured.
 
     Args:
         again: See ``left_behind``.
     """
+    config = inputs.config
     live = LiveFit(stage.folder, config.view is not None, config.settle_s)
     view = live_view(config.view, stage.folder, f"identify {stage.run_dir.name}", dict)
-    with left_behind(stage, pipeline, logs, again) as best, view:
+    with left_behind(stage, inputs.pipeline.name, inputs.sources(stage.run_dir), again) as best, view:
         best.on_begin, best.on_advance = live.begin, live.advance
         yield best
 

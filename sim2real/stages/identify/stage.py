@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2real.artifacts.identification import PARAMETERS, Identification
-from sim2real.artifacts.run.manifest import sha256
-from sim2real.artifacts.run.run_folder import OpenStage, Source, StageFolder, newest, open_stage
+from sim2real.artifacts.run.run_folder import OpenStage, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
 from sim2real.identify.uncertainty.noise import noises
 from sim2real.identify.validation.refits import REFITS
@@ -18,7 +17,7 @@ from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.estimation import recording_advice
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
-from sim2real.stages.identify.inputs import Inputs, prepare, robot_of
+from sim2real.stages.identify.inputs import Inputs, prepare, robot_of, storing_refits
 from sim2real.stages.identify.judgement import judge
 from sim2real.stages.identify.live_fit import Best, searching
 from sim2real.stages.identify.show import show, summary
@@ -71,7 +70,7 @@ def _identify(inputs: Inputs, best: Best) -> Identification:
     identification = judge(inputs, fits, started_s)
     return replace(
         identification,
-        logs=tuple(Source(log.path.name, sha256(log.path)) for log in inputs.logs),
+        logs=inputs.sources(),
         units=inputs.units,
         world=inputs.config.world,
         noise=noises(identification.samples, inputs.units),
@@ -98,11 +97,9 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     files |= {"standing": standing} if standing else {}
     with (
         open_stage(root, pipeline.name, "identify", config, files, run_dir) as stage,
-        searching(
-            stage, pipeline.name, config, paths, lambda file: recording_advice.onward(pipeline, config, root, file)
-        ) as best,
+        storing_refits(inputs, stage.folder, root) as inputs,
+        searching(stage, inputs, lambda file: recording_advice.onward(pipeline, config, root, file)) as best,
     ):
-        inputs = inputs.storing_refits(stage.folder, root)
         identification = _identify(inputs, best)
         if inputs.refits.stored:
             stage.output("refits", REFITS)
@@ -111,8 +108,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         if identification.verdict.status == "not converged":
             again = recording_advice.onward(pipeline, config, root, stage.folder / PARAMETERS)
         verdict = replace(identification.verdict, next=again)
-        sources = tuple(Source.of(path, stage.run_dir) for path in paths)
-        identification = replace(identification, logs=sources, verdict=verdict)
+        identification = replace(identification, logs=inputs.sources(stage.run_dir), verdict=verdict)
         _write(identification, stage, pipeline, robot)
         show(identification)
         stage.summary(summary(identification))

@@ -85,8 +85,8 @@ def patiently(work: Callable[[], Result], look: Callable[[], None] | None = None
     """Run a long computation in another thread, so that a signal is handled at once.
 
     Python handles signals between bytecode instructions of the main thread, and a single call into XLA may compile for
-    a minute. The signal does not stop the computation itself, which ends with the process; so it must not do anything
-    but compute.
+    a minute. The signal does not stop the computation itself, which ends with the process; so its callbacks must write
+    no file after the caller has left.
 
     Args:
         work: The computation; an exception in it is raised here.
