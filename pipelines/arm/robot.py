@@ -10,7 +10,6 @@ import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.later import jax, jnp
-from sim2real.random_numbers import uniform
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.hardware import Embedded
 from sim2real.robots.control_loop.messages import JointReading
@@ -21,7 +20,7 @@ from sim2real.robots.servo.model import ComposedModel
 from sim2real.robots.servo.observation import ServoAgent
 from sim2real.robots.servo.payload import Hand
 from sim2real.robots.servo.servos import Servos
-from sim2real.robots.servo.task import Aim, AimTask
+from sim2real.robots.servo.task import Aim, AimTask, uniform
 from sim2real.types import Array, Key
 
 from .parts import JOINTS, LINK_M, SHEET, Arm
@@ -45,7 +44,7 @@ def embedded() -> Embedded:
     return Embedded(f"{Path(__file__).with_name('plant.py')}:ArmPlant", emulator)
 
 
-def draw_target(key: Key) -> Array:
+def draw_target(key: Key | int) -> Array:
     """Return a target ``(3,)`` [m]."""
     angles = uniform(key, LOW, HIGH)
     return tip_of(namespace(angles), angles)

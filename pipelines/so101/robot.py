@@ -16,7 +16,6 @@ from sim2real.arrays import namespace
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter
 from sim2real.later import jax, jnp
-from sim2real.random_numbers import uniform
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.hardware import Embedded
 from sim2real.robots.control_loop.messages import JointReading
@@ -27,7 +26,7 @@ from sim2real.robots.servo.model import ComposedModel
 from sim2real.robots.servo.observation import ServoAgent
 from sim2real.robots.servo.payload import Hand
 from sim2real.robots.servo.servos import Servos
-from sim2real.robots.servo.task import Aim, AimTask
+from sim2real.robots.servo.task import Aim, AimTask, uniform
 from sim2real.types import Array, Key
 
 from .parts import JOINTS, SHEET, TIP_M, TRAVEL_RAD, Arm
@@ -123,7 +122,7 @@ def dynamics() -> list[Parameter]:
     return [*of_servos, *limits, HAND.parameter()]
 
 
-def draw_target(key: Key) -> Array:
+def draw_target(key: Key | int) -> Array:
     """Return a target [m] and an opening [rad], ``(4,)``."""
     angles = uniform(key, LOW, HIGH)
     xp = namespace(angles)

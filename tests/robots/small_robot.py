@@ -16,7 +16,7 @@ from sim2real.robots.servo.model import ComposedModel
 from sim2real.robots.servo.observation import ServoAgent
 from sim2real.robots.servo.parts import GoalTask, Servo, ServoDriven
 from sim2real.robots.servo.servos import Servos
-from sim2real.robots.servo.task import Aim, AimTask
+from sim2real.robots.servo.task import Aim, AimTask, uniform
 
 SHEET = DataSheet(stall=1.4, damping=0.2, armature=0.01, friction=0.02, p_gain=1200, profile_rad_s=2.0)
 
@@ -52,7 +52,7 @@ class PairTask(GoalTask):
 
 
 SERVOS = Servos(("left", "right"), (1, 2), (-1.0, -0.5), (0.8, 1.2), SHEET, speed=2.0)
-ANGLE = Aim((("angle", "rad"),), lambda key: jax.random.uniform(key, (1,), minval=-0.4, maxval=0.8))
+ANGLE = Aim((("angle", "rad"),), lambda key: uniform(key, [-0.4], [0.8]))
 
 
 class PairRobot(Robot):

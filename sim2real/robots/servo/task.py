@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim2real.later import jax, jnp
-from sim2real.random_numbers import key_of
 from sim2real.robots.contract import RobotTask
 from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
@@ -23,15 +22,27 @@ class Aim:
 
     Attributes:
         entries: Name and unit of each of the k entries.
-        draw: Returns the aim of an episode ``(k,)``; with ``random_numbers.uniform`` also without JAX.
+        draw: Returns the aim of an episode ``(k,)``: of training for a key of JAX, of a trial for its number; see
+            ``uniform``.
         elements: Returns the parts of the composed task that an aim sets: name -> (elements, attribute).
         place: Returns the arrays of ``elements`` for an aim ``(k,)``.
     """
 
     entries: tuple[tuple[str, str], ...]
-    draw: Callable[[Key], Array]
+    draw: Callable[[Key | int], Array]
     elements: Callable[[PyTree], Mapping[str, tuple[PyTree, str]]] = lambda task: {}
     place: Callable[[Array], dict[str, Array]] = lambda aim: {}
+
+
+def uniform(key: Key | int, low: PyTree, high: PyTree) -> Array:
+    """Return one number between each pair of bounds ``(n,)``, float32; one key always gives the same ones.
+
+    Args:
+        key: A key of JAX, also in a traced function; or a seed of numpy, which needs no JAX.
+    """
+    if isinstance(key, int | np.integer):
+        return np.random.default_rng(key).uniform(low, high).astype(np.float32)
+    return jax.random.uniform(key, np.shape(low), minval=np.asarray(low), maxval=np.asarray(high))
 
 
 NO_AIM = Aim((), lambda key: np.zeros(0, np.float32))
@@ -70,7 +81,7 @@ class AimTask(RobotTask):
     def at_rest(self, trial: int) -> EpisodeStart:
         """Return the start at rest with the aim of a trial."""
         rest = self._servos.at_rest
-        return EpisodeStart(rest, np.zeros_like(rest), self.aim.draw(key_of(trial)))
+        return EpisodeStart(rest, np.zeros_like(rest), self.aim.draw(trial))
 
     def moved(self, start: EpisodeStart, position: Array, velocity: Array) -> EpisodeStart:
         """Return a start with an offset, within the goals' bounds."""
