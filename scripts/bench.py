@@ -3,39 +3,69 @@
     python scripts/bench.py demo --seeds 0 1 2 3 4 --json reports/demo.json
     python scripts/bench.py graph --help
     python scripts/bench.py train --quick
-    python scripts/bench.py all --list
 
-prints a table and, with --json, writes a report: rows (``{"name", "value", "unit", "yardstick", "goal"}``), flags,
-machine, versions, and the state of the code that was measured. ``all`` measures every report of ``reports/`` that this
-machine can.
+prints a table and, with --json, writes a report: rows (``{"name", "value", "unit", "yardstick", "goal"}``) with
+command, commit, date, machine, versions and seeds. A report ages: it stays a statement about its commit.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
 import importlib
-import json
 import os
 import platform
+import shlex
+import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from benches.catalogue import BENCHES, measures
-from benches.provenance import ROOT, state
+from benches.rows import ROOT, missed, text_of
+
+BENCHES = {
+    "arm": ("runs.arm", "the arm's whole run, or its training alone"),
+    "async": ("graph.asynchronous", "the simulated clock's speed, and the wall clock's lateness"),
+    "carried": ("identify.carried", "an arm whose controller carries its weight, from two logs to a verdict"),
+    "compose": ("compose.bench", "control steps against dm_control, tasks on Warp against bare steps"),
+    "demo": ("runs.demo", "the pendulum's whole run for several seeds"),
+    "drift": ("drift", "how often the drift test detects and names a change of a hidden SO-101"),
+    "faults": ("faults", "faults while a policy runs: time until the motor is safe, the log, exit code and message"),
+    "graph": ("graph.bench", "the compiled graph against a robot written by hand"),
+    "identify": ("identify.bench", "recordings of real motors, fitted on one part and judged on another"),
+    "latency-league": ("latency.bench", "six emulated links, whose delays four methods estimate"),
+    "league": ("league.bench", "every recording, held out in parts, against mujoco.sysid, PACE and BAM"),
+    "legs-identify": ("legs_identify", "hidden Go2s: the errors of identified parameters and delays"),
+    "light": ("light", "sim2real-robot in a new environment: its size, and record's processor time"),
+    "log": ("log", "the cost of recording for a control loop, cut files, and reading a range"),
+    "randomise": ("hidden.randomise", "success on hidden robots by what the training was given"),
+    "runner": ("runner", "a step of a policy in numpy, and the loop of twelve joints at 500 Hz"),
+    "scaling": ("scaling", "training and identification on all devices of a host against one"),
+    "so101": ("runs.arm", "the SO-101's whole run, or its training alone"),
+    "train": ("train", "PPO on the pendulum with its delays"),
+    "walk": ("walk", "a walking policy on hidden twins in C MuJoCo: falls and errors"),
+    "walk-delays": ("walking.delays", "falls over the true delay, by the delays that the policy was trained with"),
+    "walk-rival": ("walking.rival", "learnt steps a second of our PPO and of MuJoCo Playground's on one GPU"),
+    "walk-train": ("walking.train", "a walking policy on one GPU: time to a policy that stays up"),
+}  # fmt: skip
+"""Name -> module in ``benches/`` with ``add_flags``, ``run``, ``table`` and ``QUICK`` (flags of --quick); summary."""
+
+
+def module_of(bench: str) -> Any:
+    """Return the module of a bench."""
+    return importlib.import_module(f"benches.{BENCHES[bench][0]}")
 
 
 def machine() -> dict[str, object]:
     """Return processor, cores, system and devices, on which the figures depend."""
-    model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        model = names[0] if names else model
-    description = {"cpu": model, "cores": os.cpu_count(), "system": platform.platform()}
+    names = [line.partition(":")[2].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line] \
+        if cpuinfo.is_file() else []  # fmt: skip
+    model = names[0] if names else platform.processor() or platform.machine()
+    description: dict[str, object] = {"cpu": model, "cores": os.cpu_count(), "system": platform.platform()}
     if "jax" in sys.modules:
         import jax
 
@@ -43,28 +73,21 @@ def machine() -> dict[str, object]:
     return description
 
 
-def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
+def parse(arguments: Sequence[str]) -> tuple[Any, argparse.Namespace]:
     """Return the bench's module, and its flags."""
-    wide = max(map(len, BENCHES)) + 1
-    listed = "\n".join(f"  {name:{wide}}{about.summary}" for name, about in BENCHES.items())
-    raw = argparse.RawDescriptionHelpFormatter
-    every = argparse.ArgumentParser(
-        prog="bench.py", description=__doc__, epilog=f"benches:\n{listed}", formatter_class=raw
-    )
+    wide, raw = max(map(len, BENCHES)) + 1, argparse.RawDescriptionHelpFormatter
+    listed = "\n".join(f"  {name:{wide}}{summary}" for name, (_, summary) in BENCHES.items())
+    every = argparse.ArgumentParser("bench.py", description=__doc__, epilog=f"benches:\n{listed}", formatter_class=raw)
     every.add_argument("bench", choices=BENCHES, metavar="BENCH", help="a bench listed below")
-    every.add_argument(
-        "flags", nargs=argparse.REMAINDER, metavar="...", help="flags of the bench: BENCH --help lists them"
-    )
+    every.add_argument("flags", nargs=argparse.REMAINDER, metavar="...", help="its flags: BENCH --help lists them")
     chosen = every.parse_args(arguments)
-    module = importlib.import_module(f"benches.{BENCHES[chosen.bench].module}")
+    module = module_of(chosen.bench)
     parser = argparse.ArgumentParser(
-        prog=f"bench.py {chosen.bench}", description=module.__doc__, formatter_class=raw, allow_abbrev=False
+        f"bench.py {chosen.bench}", description=module.__doc__, formatter_class=raw, allow_abbrev=False
     )
     parser.set_defaults(bench=chosen.bench)
     module.add_flags(parser)
-    parser.add_argument(
-        "--quick", action="store_true", help="tiny sizes, in seconds: shows that it runs, measures nothing"
-    )
+    parser.add_argument("--quick", action="store_true", help="tiny sizes: shows that it runs, measures nothing")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write a report")
     parser.add_argument("--commit", help="the commit of this copy of the code, where the copy has no git history")
     if "--quick" in chosen.flags:
@@ -72,67 +95,52 @@ def parse(arguments: Sequence[str] | None) -> tuple[Any, argparse.Namespace]:
     return module, parser.parse_args(chosen.flags)
 
 
-def measure_all(arguments: Sequence[str]) -> int:
-    """Measure every report of a folder that this machine can, or list them."""
-    parser = argparse.ArgumentParser(prog="bench.py all", description=measure_all.__doc__, allow_abbrev=False)
-    parser.add_argument("--list", action="store_true", help="list the reports with machine, commit and state")
-    parser.add_argument("--only", nargs="+", metavar="REPORT", help="these reports; default: all")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the public recordings")
-    parser.add_argument("--reports", type=Path, default=ROOT / "reports", metavar="DIR", help="folder of the reports")
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: shows that the benches run")
-    options = parser.parse_args(arguments)
-    import jax
-    from benches.all_reports import listed, plans
-    from benches.all_reports import measure_all as measured
+def origin(arguments: Sequence[str], options: argparse.Namespace) -> dict[str, Any]:
+    """Return what a report says about itself: command, commit, date, machine, versions, seeds and all flags."""
+    from sim2real.artifacts.run.manifest import versions
 
-    from sim2real.stages.terminal.console import table
-
-    kinds = sorted({d.device_kind for d in jax.devices()})
-    module_of = lambda bench: importlib.import_module(f"benches.{BENCHES[bench].module}")  # noqa: E731
-    rows = [p for p in plans(options.reports, module_of, options.data, kinds)
-            if not options.only or p.report.stem in options.only]  # fmt: skip
-    if options.only and (unknown := sorted(set(options.only) - {p.report.stem for p in rows})):
-        parser.error(f"{options.reports} has no report {unknown[0]}")
-    if options.list:
-        print(table(listed(rows), ["report", "measured on", "commit", "state", "here"]))
-        return 0
-    return measured(rows, main, options.quick)
-
-
-def reported_flags(flags: Mapping[str, Any]) -> dict[str, Any]:
-    """Return flags as in a report: paths without their folders."""
-    return {name: value.name if isinstance(value, Path) else value for name, value in flags.items()}
+    git = lambda *words: subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True).stdout  # noqa: E731
+    # Reports name no folders of this machine.
+    short = lambda word: Path(word).name if Path(word).is_absolute() else word  # noqa: E731
+    hidden = ("bench", "quick", "json", "commit")
+    flags = {n: v.name if isinstance(v, Path) else v for n, v in vars(options).items() if n not in hidden}
+    seeds = {n: v for n, v in flags.items() if n in ("seed", "seeds", "first", "first_seed")}
+    changed = [line[3:] for line in git("status", "--porcelain").splitlines() if not line[3:].startswith("reports/")]
+    return {
+        "bench": options.bench,
+        "command": shlex.join(["python", "scripts/bench.py", *map(short, arguments)]),
+        "commit": git("rev-parse", "HEAD").strip() or options.commit,
+        "date": datetime.date.today().isoformat(),
+        "machine": machine(),
+        "versions": versions(),
+        "seeds": seeds or "fixed in the bench",
+        "flags": flags,
+        **({"changed since the commit": changed} if changed else {}),
+        **({"quick": True} if options.quick else {}),
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one bench, or all; return the exit code."""
+    """Run one bench; return the exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
-    if words[:1] == ["all"]:
-        return measure_all(words[1:])
-    module, options = parse(arguments)
-    from sim2real.artifacts.run.manifest import plain, versions
+    module, options = parse(words)
+    from sim2real.artifacts.run.manifest import plain
     from sim2real.errors import Sim2RealError
     from sim2real.stages.terminal.console import table
 
-    flags = {n: v for n, v in vars(options).items() if n not in ("bench", "quick", "json", "commit")}
-    about = {"bench": options.bench, "quick": options.quick, "flags": flags}
-    # Take the state of the code before the run, as files may be edited during a long one.
-    about |= state(measures(options.bench, flags), ROOT, options.commit)
     try:
         result = module.run(options)
     except Sim2RealError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     headers = ["name", "value", "unit", "yardstick", "goal"]
-    print(table([[row.get(h) for h in headers] for row in result["rows"]], headers))
+    cells = [[r.get(h) for h in headers[:-1]] + [f"{r['goal']}{', missed' * missed(r)}"] for r in result["rows"]]
+    print(table(cells, headers))
     if options.quick:
         print("quick: tiny sizes, these figures measure nothing", file=sys.stderr)
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        document = plain(
-            {**about, "flags": reported_flags(flags), "machine": machine(), "versions": versions(), **result}
-        )
-        options.json.write_text(json.dumps(document, indent=1) + "\n")
+        options.json.write_text(text_of(plain({**origin(words, options), **result})))
         print(f"wrote {options.json}", file=sys.stderr)
     return 0
 

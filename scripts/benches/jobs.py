@@ -1,4 +1,4 @@
-"""Several fits or robots at once, each in its own process on one processor: as fair as one after the other."""
+"""Several fits or robots at once, each in a process of its own on one processor: as fair as one after the other."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ import multiprocessing
 import os
 import signal
 import sys
-import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from functools import partial
 from itertools import cycle, islice
-from queue import SimpleQueue
 from typing import Any
 
 ONE_THREAD = {
@@ -26,130 +22,64 @@ ONE_THREAD = {
 }
 """Environment of a process that computes in one thread; other flags in XLA_FLAGS stay."""
 _PR_SET_PDEATHSIG = 1
-OVER = "not done when the bench's time was up"
-"""Message of the error that ends a robot after the time limit."""
+Work = Callable[..., dict[str, Any]]
 
 
-def each(
-    work: Callable[..., dict[str, Any]],
-    tasks: Sequence[Sequence[Any]],
-    options: argparse.Namespace,
-    lost: Callable[[Sequence[Any]], dict[str, Any]] | None = None,
-) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Call ``work(*task, options)`` for each task, and yield its number and its result in the order of their ends.
+def each(work: Work, tasks: Sequence[Sequence[Any]], options: argparse.Namespace) -> Iterator[tuple[int, Any]]:
+    """Call ``work(*task, options)`` for each task; yield its number and its result in the order of their ends.
 
     Args:
         options: The bench's flags; ``jobs`` tasks run at once, in this process if that is 1.
-        lost: Returns the result of a task whose process was killed; without it, that is an error.
     """
     if options.jobs == 1:
-        for i, task in enumerate(tasks):
-            yield i, work(*task, options)
+        yield from ((i, work(*task, options)) for i, task in enumerate(tasks))
         return
-    context, free = multiprocessing.get_context("spawn"), SimpleQueue()
-    for number in islice(cycle(_processors()), options.jobs):
-        free.put(number)
-
-    def alone(task: Sequence[Any]) -> dict[str, Any]:
-        number = free.get()
-        try:
-            # One process for each task: no task profits from programs that another has compiled.
-            with ProcessPoolExecutor(1, context, _hold, (number,)) as pool:
-                return pool.submit(work, *task, options).result()
-        except BrokenProcessPool:
-            if lost is None:
-                raise
-            return lost(task)
-        finally:
-            free.put(number)
-
-    with _environment(), ThreadPoolExecutor(options.jobs) as threads:
-        numbers = {threads.submit(alone, task): i for i, task in enumerate(tasks)}
-        try:
-            for done in as_completed(numbers):
-                yield numbers[done], done.result()
-        finally:
-            threads.shutdown(cancel_futures=True)
+    before = dict(os.environ)  # libraries read it when a new process loads them
+    os.environ.update(ONE_THREAD | {"XLA_FLAGS": f"{before.get('XLA_FLAGS', '')} {ONE_THREAD['XLA_FLAGS']}".strip()})
+    processors = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    free, waiting, running = list(islice(cycle(processors), options.jobs)), list(enumerate(tasks)), {}
+    # One process a task: no task profits from programs that another has compiled.
+    pool = ProcessPoolExecutor(
+        options.jobs, multiprocessing.get_context("spawn"), _end_with_parent, max_tasks_per_child=1
+    )
+    try:
+        while waiting or running:
+            while waiting and free:
+                (i, task), processor = waiting.pop(0), free.pop()
+                running[pool.submit(_pinned, processor, work, task, options)] = i, processor
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                i, processor = running.pop(future)
+                free.append(processor)
+                yield i, future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+        os.environ.clear()
+        os.environ.update(before)
 
 
-def robots(
-    one: Callable[[int, Any], dict[str, Any]], numbers: Sequence[int], options: argparse.Namespace
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Call ``one(number, options)`` for every robot; the failure of one does not end the others.
-
-    Args:
-        options: The bench's flags: ``jobs`` as for :func:`each`; ``within_s``, if there is one, is the time after which
-            robots that are not done count as failed [s].
-
-    Returns:
-        The results, and number and error of the robots that failed, in order.
-    """
-    within_s = getattr(options, "within_s", None)
-    until = None if within_s is None else time.time() + within_s
-    tasks = [(number,) for number in numbers]
-    lost = lambda task: {"number": task[0], "failed": "its process was killed"}  # noqa: E731
-    outcomes = [outcome for _, outcome in each(partial(_outcome, one, until), tasks, options, lost)]
+def robots(one: Work, numbers: Sequence[int], options: argparse.Namespace) -> tuple[list[Any], list[Any]]:
+    """Call ``one(number, options)`` for every robot; return the results, and number and error of those that failed."""
+    outcomes = [outcome for _, outcome in each(partial(_outcome, one), [(number,) for number in numbers], options)]
     outcomes.sort(key=lambda outcome: outcome["number"])
     return [o for o in outcomes if "failed" not in o], [o for o in outcomes if "failed" in o]
 
 
-def _outcome(
-    one: Callable[[int, Any], dict[str, Any]], until: float | None, number: int, options: Any
-) -> dict[str, Any]:
+def _outcome(one: Work, number: int, options: argparse.Namespace) -> dict[str, Any]:
     try:
-        with _until(until):
-            return one(number, options)
+        return one(number, options)
     except Exception as error:  # the results of the other robots must not be lost
         print(f"robot {number} failed:\n{traceback.format_exc()}", file=sys.stderr, flush=True)
         return {"number": number, "failed": f"{type(error).__name__}: {error}"}
 
 
-@contextmanager
-def _until(until: float | None) -> Iterator[None]:
-    """Raise TimeoutError in the block at a time; a call into C ends first."""
-    if until is None:
-        yield
-        return
-
-    def ring(*_: Any) -> None:
-        raise TimeoutError(OVER)
-
-    before = signal.signal(signal.SIGALRM, ring)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, max(until - time.time(), 1e-3))
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-
-
-def _hold(number: int) -> None:
-    """Hold this process on one processor, and let the kernel end it with the bench, also with a killed one.
-
-    C engines start one thread for each processor that they may use.
-    """
+def _end_with_parent() -> None:
+    """Let the kernel end this process with the bench, also with a killed one."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+
+def _pinned(processor: int, work: Work, task: Sequence[Any], options: argparse.Namespace) -> dict[str, Any]:
+    """Work on one processor: C engines start a thread for each processor that they may use."""
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {number})
-
-
-def _processors() -> list[int]:
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
-
-
-@contextmanager
-def _environment() -> Iterator[None]:
-    """Set the environment of new processes to one thread, which libraries read when they are loaded."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD | {"XLA_FLAGS": f"{before['XLA_FLAGS'] or ''} {ONE_THREAD['XLA_FLAGS']}".strip()})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        os.sched_setaffinity(0, {processor})
+    return work(*task, options)

@@ -24,7 +24,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
-from benches.figures import Report, Row, medians, row
+from benches.rows import Report, Row, medians, row
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import MessageRecord, StepRecord
 from sim2real.log.reader import TruncatedLogWarning, read_log

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benches.figures import Report, Row, row
+from benches.rows import Report, Row, markdown, missed, row
 from pipelines.go2.plant import LYING
 from sim2real.graph.base import Base
 from sim2real.graph.node import BaseNode
@@ -182,3 +182,20 @@ def run(options: argparse.Namespace) -> Report:
         rows.append(a_cycle(rig.device, options.steps // 10))
         rows += loop(f"runner/go2_{options.rate:g}_hz", rig, nodes_of(rig, options.rate, _damped), *flags)
     return {"rows": rows}
+
+
+def table(report: Report) -> str:
+    """Return the time of a policy's step, and the lateness of the loops, beside their goals."""
+    of = {r["name"].removeprefix("runner/"): r for r in report["rows"]}
+    rate = report["flags"]["rate"]
+    lines = [("a step of the policy in numpy, median", "numpy/32-64-64-8/p50_us", "us")]
+    lines += [("the Go2's `measure` and `command`, processor time", "go2/measure_and_command_us", "us")]
+    for base, what in ((f"{JOINTS}_joints_{rate:g}_hz", "twelve servos"), (f"go2_{rate:g}_hz", "the Go2")):
+        nodes = ("sensor", "agent", "actuator")
+        lines += [(f"{what} at {rate:g} Hz: lateness of {n}, p99", f"{base}/{n}/lateness_ms", "ms") for n in nodes]
+        lines.append((f"{what} at {rate:g} Hz: wait for a reading, p99", f"{base}/reading_ms", "ms"))
+    cells = []
+    for about, name, unit in lines:
+        value = of[name]["value"][1] if isinstance(of[name]["value"], list) else of[name]["value"]
+        cells.append((about, f"{value:g} {unit}", of[name]["goal"] + ", missed" * missed(of[name])))
+    return markdown(("", "measured", "goal"), cells)

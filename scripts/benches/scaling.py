@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from benches.figures import Report, row
+from benches.rows import Report, row, values
 from benches.train import environment
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> Report:
             ]
         if several > 1:
             ratio = round(speeds[several] / speeds[1], 2)
-            goal = f"at least {GOAL * several:g}" if part == "train" else ""
+            goal = f">= {GOAL * several:g}" if part == "train" else ""
             rows.append(row(f"{name}/{part}/{several}_over_1", ratio, "times the speed", "one device", goal))
     return {"rows": rows}
 
@@ -139,3 +139,14 @@ def identify_on(options: argparse.Namespace) -> Measure:
 def speed(result: TrainResult) -> float:
     """Return training rows a second, with the time of evaluations, without the first stretch."""
     return float(np.median(np.diff(result.env_steps) / np.diff(result.elapsed_s)))
+
+
+def table(report: Report) -> str:
+    """Return the speed of a training on all devices of a host against one."""
+    v = {name.rpartition("train/")[2]: value for name, value in values(report).items()}
+    count = next(name.removesuffix("_over_1") for name in v if name.endswith("_over_1"))
+    cards = f"{count} {report['flags']['name'].upper()}s"
+    return (
+        f"{cards} of one host make {v[f'{count}_over_1']:.2f} times the steps of one, "
+        f"{v[f'{count}_devices/env_steps_per_s'] / 1e6:.1f} million policy steps per second\nof a single policy.\n"
+    )

@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from benches.figures import Report, Row, four_digits, row
+from benches.rows import Report, Row, four_digits, markdown, missed, row
 
 EVERY_S = 2.5
 """How long a command lasts [s]."""
 QUICK = {"twins": 1, "seconds": 0.2, "push": 0.1, "rough_m": 0.01}
-ERRORS = (("error_m_s", "m/s", "0.08"), ("error_rad_s", "rad/s", "0.1"))
+ERRORS = (("error_m_s", "m/s", "<= 0.08"), ("error_rad_s", "rad/s", "<= 0.1"))
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> Report:
     return {"rows": judged(trials, options.twins, "walk")}
 
 
-def judged(trials: Mapping[str, Trial], twins: int, prefix: str) -> list[Row]:
+def judged(trials: Mapping[str, Trial], twins: int, prefix: str, goals: bool = True) -> list[Row]:
     """Return falls, errors and the judge's time for each trial, by its name behind the prefix."""
     workers = min(os.cpu_count() or 1, twins)
     rows: list[Row] = []
@@ -55,11 +55,11 @@ def judged(trials: Mapping[str, Trial], twins: int, prefix: str) -> list[Row]:
             played = pool.map(partial(one, trial), range(twins))
             fell, *errors = (np.array(column) for column in zip(*played, strict=True))
             about = f"{twins} twins, {trial.seconds:g} s{trial.about}"
-            goal = "2" if trial.rough_m else "0"
+            goal = ("<= 2" if trial.rough_m else "<= 0") * goals
             rows.append(row(f"{prefix}/{name}/falls", int(fell.sum()), f"of {twins}", about, goal))
             for (figure, unit, goal), values in zip(ERRORS, errors, strict=True):
                 worst = f"worst twin {values.max():.3f}"
-                rows.append(row(f"{prefix}/{name}/{figure}", four_digits(values.mean()), unit, worst, goal))
+                rows.append(row(f"{prefix}/{name}/{figure}", four_digits(values.mean()), unit, worst, goal * goals))
             took_s = round(time.perf_counter() - begin, 1)
             rows.append(row(f"{prefix}/{name}/judge_s", took_s, "s", f"{workers} processes"))
     return rows
@@ -111,3 +111,16 @@ def one(trial: Trial, seed: int) -> tuple[bool, float, float]:
     runner = load_bundle(trial.bundle or found.folder / "walk")
     walked = walk(twin, runner, lambda t_s: commands[int(t_s / EVERY_S + 1e-6)], trial.seconds, trial.push_m_s)
     return walked.fell_s is not None, walked.error_m_s, walked.error_rad_s
+
+
+def table(report: Report) -> str:
+    """Return the falls and errors of a walking policy, a line for each set of twins."""
+    of = {r["name"].removeprefix("walk/"): r for r in report["rows"]}
+    lines = []
+    for case in [name.partition("/")[0] for name in of if name.endswith("/falls")]:
+        falls, *errors = (of[f"{case}/{what}"] for what in ("falls", *(name for name, *_ in ERRORS)))
+        delay = f", delay {case.split('_')[1]} ms" if case.endswith("_ms") else ""
+        cells = [f"{r['value']:.3f} {r['unit']}" + f" (goal {r['goal']}, missed)" * missed(r) for r in errors]
+        count = f"{falls['value']} {falls['unit']}" + f" (goal {falls['goal']}, missed)" * missed(falls)
+        lines.append((falls["yardstick"] + delay, count, *cells))
+    return markdown(("twins", "falls", "error", "error"), lines)

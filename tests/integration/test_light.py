@@ -12,7 +12,7 @@ import pytest
 from live_robots import PATIENT, manifest_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-from benches.processor_time import light as bench
+from benches import light as bench
 
 from sim2real import errors
 from sim2real.log.reader import read_log

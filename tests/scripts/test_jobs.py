@@ -1,5 +1,7 @@
-"""Processes of a bench end with it."""
+"""Tasks of a bench: a process each, on one processor, that ends with the bench."""
 
+import argparse
+import importlib
 import os
 import signal
 import subprocess
@@ -10,6 +12,19 @@ from pathlib import Path
 import pytest
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+sys.path.insert(0, str(SCRIPTS))
+from benches import jobs  # noqa: E402
+
+pytestmark = pytest.mark.process
+TASK = """
+import os, time
+
+def where(name, options):
+    if name == "bad":
+        raise ValueError(name)
+    threads = os.environ["OPENBLAS_NUM_THREADS"]
+    return {"name": name, "process": os.getpid(), "processors": os.sched_getaffinity(0), "threads": threads}
+"""
 BENCH = """
 import argparse, os, pathlib, sys, time
 from benches import jobs
@@ -17,40 +32,62 @@ from benches import jobs
 def work(number, options):
     pathlib.Path(sys.argv[1], str(os.getpid())).touch()
     time.sleep(120)
-    return {}
 
 if __name__ == "__main__":
     list(jobs.each(work, [(0,), (1,)], argparse.Namespace(jobs=2)))
 """
 
 
-def alive(pid):
-    """Whether a process runs; one that ended and was not waited for does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
+@pytest.fixture
+def where(tmp_path, monkeypatch):
+    (tmp_path / "a_task.py").write_text(TASK)
+    monkeypatch.syspath_prepend(tmp_path)
+    sys.modules.pop("a_task", None)
+    return importlib.import_module("a_task").where
 
 
-def until(holds, seconds=60.0):
-    """Wait until something holds."""
-    end = time.monotonic() + seconds
-    while not holds() and time.monotonic() < end:
-        time.sleep(0.05)
-    return holds()
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux holds a process on a processor")
+def test_tasks_are_processes_of_one_thread_on_one_processor(where):
+    before = dict(os.environ)
+    done = dict(jobs.each(where, [("a",), ("b",), ("c",)], argparse.Namespace(jobs=2)))
+    assert os.environ == before
+    assert [done[i]["name"] for i in range(3)] == ["a", "b", "c"]
+    assert len({task["process"] for task in done.values()} | {os.getpid()}) == 4
+    assert all(task["threads"] == "1" and len(task["processors"]) == 1 for task in done.values())
+
+
+def test_a_task_that_fails_ends_the_bench_but_a_robot_loses_no_other(where):
+    before = dict(os.environ)
+    with pytest.raises(ValueError, match="bad"):
+        list(jobs.each(where, [("bad",)], argparse.Namespace(jobs=2)))
+    assert os.environ == before
+    one = lambda number, options: {"number": number, "share": 1 / number}  # noqa: E731
+    done, failed = jobs.robots(one, range(3), argparse.Namespace(jobs=1))
+    assert [robot["number"] for robot in done] == [1, 2]
+    assert [robot["number"] for robot in failed] == [0]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
-def test_a_bench_that_is_killed_leaves_nothing_that_computes(tmp_path):
-    script, seen = tmp_path / "bench.py", tmp_path / "seen"
-    script.write_text(BENCH)
-    seen.mkdir()
-    path = os.pathsep.join([str(SCRIPTS), os.environ.get("PYTHONPATH", "")])
-    bench = subprocess.Popen([sys.executable, str(script), str(seen)], env={**os.environ, "PYTHONPATH": path})
+def test_a_killed_bench_leaves_no_process(tmp_path):
+    def until(holds):
+        end = time.monotonic() + 60.0
+        while not holds() and time.monotonic() < end:
+            time.sleep(0.05)
+        return holds()
+
+    def alive(pid):
+        try:
+            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        except FileNotFoundError:
+            return False
+
+    (tmp_path / "bench.py").write_text(BENCH)
+    (tmp_path / "seen").mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(SCRIPTS)}
+    bench = subprocess.Popen([sys.executable, tmp_path / "bench.py", tmp_path / "seen"], env=environment)
     try:
-        assert until(lambda: len(list(seen.iterdir())) == 2)
-        pids = [int(file.name) for file in seen.iterdir()]
-        assert all(map(alive, pids))
+        assert until(lambda: len(list((tmp_path / "seen").iterdir())) == 2)
+        pids = [int(file.name) for file in (tmp_path / "seen").iterdir()]
     finally:
         bench.send_signal(signal.SIGKILL)
         bench.wait()

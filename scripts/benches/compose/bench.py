@@ -9,7 +9,7 @@ import argparse
 
 from benches.compose.step import step
 from benches.compose.warp import warp
-from benches.figures import Report
+from benches.rows import Report
 
 PARTS = ("step", "warp")
 QUICK = {"repeats": 1, "control_steps": 2, "warp_copies": [2], "warp_steps": 2}

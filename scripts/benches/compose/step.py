@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from benches.figures import Row, medians, row
+from benches.rows import Row, medians, row
 
 LINKS = 6
 SIZE = 48, 64

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from benches.figures import Row, medians, row
+from benches.rows import Report, Row, markdown, medians, row, values
 from sim2real.types import Array, Key, PyTree
 
 LEGS = {"fl": (1, 1), "fr": (1, -1), "hl": (-1, 1), "hr": (-1, -1)}
@@ -212,3 +212,25 @@ def compared(copies: int, repeats: int, length: int) -> list[Row]:
         compile_about = f"and a first rollout; {compile_s['bare']:.1f} bare"
         lines.append(row(f"{name}/{key}_compile_s", round(compile_s[key], 1), "s", compile_about))
     return [*lines, row(f"{name}/first_reset_s", round(first_s, 1), "s", "environment, graph, first reset")]
+
+
+def table(report: Report) -> str:
+    """Return the times of tasks on MuJoCo Warp over those of bare steps."""
+    v = values(report, "compose/gpu/warp/")
+    copies = dict.fromkeys(int(name.partition("/")[0]) for name in v)
+    head = (
+        *("copies", "physics steps per second, `mjx.step` alone", "time of the task with late observables"),
+        "time of the task in a graph with delays",
+    )
+    lines = [
+        (
+            *(f"{n:,}", f"{v[f'{n}/bare_steps_per_s'] / 1e6:.1f} million"),
+            *(f"{v[f'{n}/env_over_bare']:.3f} times as long", f"{v[f'{n}/graph_over_bare']:.3f} times"),
+        )
+        for n in copies
+    ]
+    compiled = [v[f"{n}/{kind}_compile_s"] for n in copies for kind in ("env", "graph")]
+    return markdown(head, lines, "rrrr") + (
+        f"\nA program takes {min(compiled):.0f} to {max(compiled):.0f} s to compile; building Warp's kernels takes "
+        f"{max(v[f'{n}/first_reset_s'] for n in copies):.0f} s more, once for a machine.\n"
+    )

@@ -7,7 +7,7 @@ import time
 
 import jax
 
-from benches.figures import Report, Row, row
+from benches.rows import Report, Row, row
 from sim2real.graph.node import BaseNode
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.runtime.asynchronous import AsyncGraph

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benches.figures import Report, Row, compare, row
 from benches.graph.shared import EPISODES, MODEL, unroll_of
+from benches.rows import Report, Row, compare, row, values
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import StaticDist
 from sim2real.graph.node import BaseNode
@@ -309,3 +309,19 @@ def run(options: argparse.Namespace) -> Report:
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes))
     rows.append(row("graph/bytes_per_copy", bytes_per_copy(graph), "B", goal="< 2000"))
     return {"rows": [*rows, *building(options.build)]}
+
+
+def table(report: Report) -> str:
+    """Return how long the compiled pendulum takes against a simulation written by hand."""
+
+    def between(what: str, uneven: bool) -> str:
+        rows = values(report).items()
+        several = [v for n, v in rows if n.endswith(f"/{what}") and ("30_over_100_hz" in n) == uneven]
+        return f"{min(several):.2f} to {max(several):.2f}"
+
+    return (
+        f"The compiled pendulum takes {between('over_hand', False)} times as long on an "
+        f"{report['flags']['name'].upper()} as a simulation written by hand,\n"
+        f"{between('over_hand_unrolled', False)} times as long if that simulation has an unrolled loop too, and\n"
+        f"{between('over_hand', True)} times as long if rates do not divide.\n"
+    )

@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benches.figures import Row, compare, row
 from benches.graph.shared import EPISODES, MODEL, unroll_of
+from benches.rows import Row, compare, row
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw

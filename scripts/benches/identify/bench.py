@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from benches import figures
-from benches.figures import Report, Row, mean_absolute, rmse
+from benches import rows as figures
 from benches.identify import recordings
-from benches.identify.recordings import PAST, SPECS
+from benches.identify.recordings import ITERATIONS, PAST, SPECS
+from benches.rows import Report, Row, markdown, mean_absolute, rmse, values
 from sim2real.graph.episode import Episode
 from sim2real.identify.fit import Fit, fit, refit
 from sim2real.identify.problem.problem import Problem
@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> Report:
     # mujoco.sysid fits the same split afterwards: its rows hold the ratio of ours to its own.
     ours = {str(r["name"]).removeprefix("identify/"): r["value"] for r in rows}
     rows += [row(*columns) for columns in sysid_rows.rows(case.name, fitted, test, ours)]
-    return {"rows": rows, "fit": list(fitted), "test": list(test), "values": [f.values for f in fits]}
+    return {"rows": rows, "values": [f.values for f in fits]}
 
 
 def fit_and_judge(
@@ -223,3 +223,35 @@ def _so101_rows(case: Case, columns: Columns, undelayed: Columns, test: Mapping[
                 rows.append(row(f"{base}_no_delay_mrad", 1e3 * rmse(without[:, j]), "mrad", "no delay"))
                 ratios.append(rmse(ours[:, j]) / off)
     return [*rows, row("so101/worst_over_goal", max(ratios), "1", "distance from the goal", "<= 0.5")]
+
+
+def table(*reports: Report) -> str:
+    """Return the errors on recordings of real motors, and the time of each fit: of the disk, the XL330, the SO-101."""
+    v = {name: value for report in reports for name, value in values(report, "identify/").items()}
+    joints = [
+        n.removesuffix("_sysid_rmse_mrad") for n in v if n.startswith("so101/") and n.endswith("_sysid_rmse_mrad")
+    ]
+    kinds = ("_rmse_mrad", "_sysid_rmse_mrad", "_no_delay_mrad")
+    arm, worst = ([of([v[j + kind] for j in joints]) for kind in kinds] for of in (np.mean, np.max))
+    disk = [1e3 * v[f"disk/{n}free_run_rmse_rad"] for n in ("", "sysid_", "no_delay_")]
+    servo = [v[f"xl330/{n}test_mae_mrad"] for n in ("", "sysid_", "no_delay_")]
+    expected = {kind: [v[n] for n in v if n.startswith(f"{kind}/promised/")] for kind in ("disk", "xl330")}
+    moved = [v[n] for j in joints if (n := f"so101/promised/{j.rpartition('/')[2]}_mrad") in v]
+    fits = {kind: [x for n, x in v.items() if n.startswith(f"{kind}/fit_s")] for kind in ("disk", "xl330", "so101_log")}
+    lines = [
+        [about, f"{errors[0]:.{digits}f}", f"{bound:.{digits}f}", *(f"{x:.{digits}f}" for x in errors[1:])]
+        for about, errors, bound, digits in (
+            ("motor with eccentric mass, 125 s free run, RMSE", disk, np.mean(expected["disk"]), 0),
+            ("DYNAMIXEL XL330, a gain that was not fitted, MAE", servo, np.mean(expected["xl330"]), 0),
+            ("SO-101 arm, joints that move, mean RMSE", arm, np.mean(moved), 1),
+            ("SO-101 arm, worst joint of a motion, RMSE", worst, np.max(moved), 0),
+        )
+    ]
+    held_out, bound = "held-out data, whole recordings [mrad]", "95 % bound, RMSE"
+    head = [held_out, "sim2real", bound, "mujoco.sysid", "sim2real without delay"]
+    took = ", ".join(f"{np.median(seconds):.0f} s" for seconds in fits.values())
+    iterations = ", ".join(map(str, ITERATIONS.values()))
+    return markdown(head, lines) + (
+        f"\nsim2real fits until it converges: {took} of wall clock for motor, XL330 and SO-101. mujoco.sysid has one "
+        f"start and at most {iterations} iterations: {v['disk/sysid_s']:.0f} s for the motor.\n"
+    )

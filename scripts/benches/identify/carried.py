@@ -16,7 +16,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from benches.figures import Report, four_digits, row
+from benches.rows import Report, four_digits, row, values
 from sim2real.artifacts.identification import Identification
 
 QUICK = {"seconds": 6.0, "joints": 2, "terms": "gravcomp"}
@@ -49,18 +49,17 @@ def run(options: argparse.Namespace) -> Report:
         ended = subprocess.run([*command, "--log", "log1.npz", "--log", "log2.npz"], cwd=place, check=False)
         wall_s = time.monotonic() - begun
         document = Identification.load(next(place.glob("runs/arm/*/identify")))
-    values = {p.name: p.estimate for p in document.parameters}
-    stiffness = [_of(values, "kp", i) / (kp * share) - 1.0 for i, (kp, share) in enumerate(_firsts(joints, KP, SHARES))]
+    found = {p.name: p.estimate for p in document.parameters}
+    stiffness = [_of(found, "kp", i) / (kp * share) - 1.0 for i, (kp, share) in enumerate(_firsts(joints, KP, SHARES))]
     off = float(np.abs(stiffness).max())
     return {
         "rows": [
             row("carried/seconds", round(wall_s), "s", f"exit code {ended.returncode}"),
             row("carried/terms", ", ".join(document.terms or ()), "", "the controller carries all of the weight"),
-            row("carried/gravcomp", four_digits(values.get("gravcomp", 0.0)), "1", "1"),
+            row("carried/gravcomp", four_digits(found.get("gravcomp", 0.0)), "1", "1"),
             row("carried/stiffness_error", round(100 * off, 2), "%", "largest of the joints; of the model 11"),
             row("carried/verdict", document.verdict.status, ""),
-        ],
-        "values": values,
+        ]
     }
 
 
@@ -114,3 +113,15 @@ def _of(values: dict[str, float], quantity: str, joint: int) -> float:
     ends = f"joint{joint + 1}"
     group = next((v for n, v in values.items() if n.startswith(f"{quantity}_joint") and ends in n.split("_")), None)
     return (values[quantity] if group is None else group) * values.get(f"{quantity}_of_{ends}_alone", 1.0)
+
+
+def table(report: Report) -> str:
+    """Return the result for an arm that carries its own weight."""
+    v, truth = values(report, "carried/"), {r["name"]: r["yardstick"] for r in report["rows"]}
+    model = truth["carried/stiffness_error"].rpartition(" ")[2]
+    return (
+        f"`auto` chooses the terms `{v['terms']}`. The controller carries {v['gravcomp']:.2f} of the weight (true: "
+        f"{truth['carried/gravcomp']}).\nStiffnesses are {v['stiffness_error']:.1f} % off, the maker's {model}. "
+        f"Verdict: {v['verdict']}, after {v['seconds'] / 60:.0f} min on "
+        f"{report['machine']['cores']} cores.\n"
+    )

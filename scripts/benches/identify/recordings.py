@@ -21,6 +21,8 @@ SPECS = {
     "so101_log": "chirp_sweep[0:0.9] multisine prbs_excitation single_joint_*[0:0.5]",
     "so101_log_test": "step_response single_joint_*[0.5:1]",
 }  # fmt: skip
+ITERATIONS = {"disk": 40, "xl330": 25, "so101": 8}
+"""Largest number of iterations of mujoco.sysid."""
 PAST = 20
 """Number of samples before a test part of the disk from which its initial state is estimated."""
 

@@ -27,12 +27,13 @@ import mujoco
 import numpy as np
 from mujoco import sysid
 
+from benches.identify.recordings import ITERATIONS
+
 PHYSICS_S = {"disk": 0.005, "xl330": 0.002, "so101": 0.005}
 DELAY_S = (0.0, 0.06)
 DISK_SAMPLES = 6000
 SO101_SPAN_S = 60.0
 SO101_JOINTS = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
-ITERATIONS = {"disk": 40, "xl330": 25, "so101": 8}
 SENSOR, JOINT, DRIVE = "position", "hinge", "drive"
 PWM_LIMIT, PULSES_PER_RAD = 885.0, 4096 / (2 * np.pi)
 

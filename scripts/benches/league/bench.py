@@ -5,8 +5,7 @@
 
 Each entrant fits the same parts of the same recordings within the same processor time, compilation included, and
 predicts the held-out part. The settings of its pipeline determine the time of ours, which is reported. The rows are
-mean and worst over the folds of a set, and the worst joint. A fit gets no test part: the structure of our model, its
-parameters, bounds and terms, is hashed before the test part is passed on, and each fold's hash is in the report. A
+mean and worst over the folds of a set, and the worst joint. A fit gets no test part. A
 folder in --data with a league.toml (benches/league/sets.py) is a set, too. --jobs runs several fits at once, each in
 its own process on one processor.
 --results gets a line for each fold and entrant at once: an interrupted run continues from there.
@@ -15,7 +14,6 @@ its own process on one processor.
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
 import time
@@ -25,26 +23,27 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import stdtrit
 
-from benches import figures, jobs
-from benches.figures import Report, Row
+from benches import jobs
+from benches import rows as figures
 from benches.identify.sysid import Recording
 from benches.league import bam as league_bam
 from benches.league import mujoco_joints as league_mujoco
 from benches.league import ours as league_ours
 from benches.league import published, textbook
 from benches.league.sets import FORCES, Fold, LeagueSet, available
+from benches.rows import Report, Row, markdown, values
 from sim2real.errors import UsageError
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
 
 
 class Fitted(NamedTuple):
-    """A predictor, a line on the fit, and the structure of the model as text; "": it has one structure only."""
+    """A predictor, and a line on the fit."""
 
     predict: Predict
     summary: str
-    structure: str = ""
 
 
 ENTRANTS = {
@@ -88,7 +87,8 @@ def run(options: argparse.Namespace) -> Report:
         results[keys[i]] = {**dict(zip(_KEY, keys[i], strict=True)), **result}
         _add(options.results, results[keys[i]])
     measured = [results[key] for key in tasks]
-    return {"rows": rows(measured), "folds": measured}
+    kept = ("set", "fold", "entrant", "value", "worst_joint", "unit", "seconds")
+    return {"rows": rows(measured), "folds": [{key: fold[key] for key in kept} for fold in measured]}
 
 
 _KEY = ("set", "fold", "entrant", "budget_s", "seed")
@@ -112,17 +112,15 @@ def judge(league_set: LeagueSet, fold: Fold, entrant: str, options: argparse.Nam
     fitted, test = (_short(part, options.samples) for part in (fold.fitted, fold.test))
     begin, unit = time.process_time(), "mm" if test[0].constants.get("sliding") else "mrad"
     try:
-        predict, summary, structure = fit(league_set.name, replace(fold, fitted=fitted, test=()), entrant, options)
+        predict, summary = fit(league_set.name, replace(fold, fitted=fitted, test=()), entrant, options)
     except NoFormError as reason:
         return {"value": None, "worst_joint": None, "unit": unit, "seconds": None, "summary": str(reason)}
     seconds = time.process_time() - begin
-    # The structure is hashed here: the fit has seen no test part.
-    frozen = {"structure": structure, "sha256": hashlib.sha256(structure.encode()).hexdigest()} if structure else {}
     each = [league_set.score(p, r) for p, r in zip(predict(test), test, strict=True)]
     errors = np.concatenate(each)
     finite = len(errors) > 0 and bool(np.isfinite(errors).all())
     value, worst = (float(errors.mean()), float(errors.max())) if finite else (None, None)
-    return {"value": value, "worst_joint": worst, "unit": unit, "seconds": seconds, "summary": summary, **frozen}
+    return {"value": value, "worst_joint": worst, "unit": unit, "seconds": seconds, "summary": summary}
 
 
 def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fitted:
@@ -143,7 +141,7 @@ def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fit
         load = league_bam.DISK_LOAD if name == "disk" else league_bam.ARM_LOAD if name == "so101" else {}
         loaded = replace(fold, fitted=tuple(_loaded(r, load) for r in fold.fitted))
         single = lambda rs, s: Fitted(*league_bam.fit(kind, rs, s, seed))  # noqa: E731
-        predict, summary, _ = _joint_by_joint(loaded, single, budget_s)
+        predict, summary = _joint_by_joint(loaded, single, budget_s)
         return Fitted(lambda recordings: predict([_loaded(r, load) for r in recordings]), summary)
     if "mjcf" in constants:
         rig = (league_mujoco.legs if name == "go2" else league_mujoco.described)(fold.fitted[0])
@@ -169,7 +167,7 @@ def _joint_by_joint(fold: Fold, single: Callable[[list[Recording], float], Fitte
         fits.append(single(moved or [fold.fitted[0].joint(j)], budget_s / joints))
 
     def predict(recordings: Sequence[Recording]) -> list[np.ndarray]:
-        columns = [p([r.joint(j) for r in recordings]) for j, (p, _, _) in enumerate(fits)]
+        columns = [p([r.joint(j) for r in recordings]) for j, (p, _) in enumerate(fits)]
         return [np.hstack(joint_columns) for joint_columns in zip(*columns, strict=True)]
 
     return Fitted(predict, "; ".join(dict.fromkeys(f.summary for f in fits)))
@@ -225,3 +223,192 @@ def _add(results: Path | None, measured: dict[str, Any]) -> None:
     if results is not None:
         with results.open("a") as file:
             file.write(json.dumps(measured) + "\n")
+
+
+LABELS = {
+    "disk": "motor with eccentric mass, RMSE",
+    "xl330": "DYNAMIXEL XL330, MAE",
+    "so101": "SO-101 arm, joints that move, RMSE",
+    "go2": "Unitree Go2 in the air, RMSE",
+    "sts3250": "Feetech STS3250, MAE",
+    "emps": "EMPS linear axis, RMSE",
+}
+"""Sets with these names; others have their folder's name."""
+NAMES = {
+    "sysid": "mujoco.sysid",
+    "sysid_delay": "mujoco.sysid with a delay",
+    "pace": "PACE (re-implemented)",
+    "bam_m1": "BAM M1 (re-implemented)",
+    "bam_m6": "BAM M6 (re-implemented)",
+    "textbook": "textbook servo",
+    "published": "best published set",
+}
+LEAST_PARTS, PRIOR_DEVIATION, PRIOR_PARTS, SHARE = 2, 0.3, 4.0, 0.95
+
+
+def bound(errors: Sequence[float]) -> float:
+    """Return the error below which a further part stays with 95 % probability.
+
+    Errors are taken as log-normal: the upper end of a one-sided prediction interval (Student), whose deviation is
+    pooled with a prior of four parts, as few parts may be alike, or differ, by chance.
+    """
+    logs, freedom = np.log(errors), PRIOR_PARTS + len(errors) - 1
+    squares = PRIOR_PARTS * PRIOR_DEVIATION**2 + float(np.sum((logs - logs.mean()) ** 2))
+    width = stdtrit(freedom, SHARE) * np.sqrt(squares / freedom * (1.0 + 1.0 / len(errors)))
+    return float(np.exp(logs.mean() + width))
+
+
+class Part(NamedTuple):
+    """Our error on a held-out part, the bound that follows from our errors on the other parts of the set, and these."""
+
+    name: str
+    error: float
+    bound: float | None
+    others: list[float]
+
+
+def parts(report: Report, name: str) -> list[Part]:
+    """Return our parts of a set, the largest error first."""
+    folds = [f for f in report["folds"] if (f["set"], f["entrant"]) == (name, "ours") and f["value"] is not None]
+    found = []
+    for fold in folds:
+        others = [f["value"] for f in folds if f is not fold]
+        found.append(Part(fold["fold"], fold["value"], bound(others) if len(others) >= LEAST_PARTS else None, others))
+    return sorted(found, key=lambda part: -part.error)
+
+
+def sets_of(report: Report) -> list[str]:
+    """Return the sets of a report, those of the list first."""
+    there = dict.fromkeys(f["set"] for f in report["folds"])
+    return [*(n for n in LABELS if n in there), *(n for n in there if n not in LABELS)]
+
+
+def errors_of(report: Report, name: str, what: str) -> dict[str, float]:
+    """Return entrant -> error on a set [mrad, mm]; the published sets are one entrant, with the least."""
+    errors: dict[str, float] = {}
+    for entrant, value in ((n.split("/"), v) for n, v in values(report, f"league/{name}/").items()):
+        if entrant[1] == what and value is not None:
+            label = "published" if entrant[0].startswith("published") else entrant[0]
+            errors[label] = min(value, errors.get(label, value))
+    return errors
+
+
+def seconds_of(report: Report, name: str, entrant: str) -> str:
+    """Return the median processor time of a fit; none for published sets, which are not fitted."""
+    folds = [f for f in report["folds"] if f["set"] == name and f["entrant"] == entrant]
+    took = [f["seconds"] for f in folds if f["seconds"] is not None]
+    return f"{np.median(took):.0f} s" if took and entrant != "published" else "no fit"
+
+
+def unit_of(report: Report, name: str) -> str:
+    """Return the unit of a set's errors."""
+    return next(f["unit"] for f in report["folds"] if f["set"] == name)
+
+
+def short(value: float | None) -> str:
+    """Return an error with three digits; "-" if there is none."""
+    return "-" if value is None else f"{value:.1f}" if value < 100 else f"{value:.0f}"
+
+
+def with_bound(part: Part) -> str:
+    """Return an error, and its bound in brackets."""
+    return short(part.error) + (f" ({short(part.bound)})" if part.bound else "")
+
+
+def about_budget(report: Report) -> str:
+    """Return the sentence on what each tool was given."""
+    ours = [seconds_of(report, name, "ours") for name in sets_of(report)]
+    longest = max(ours, key=lambda text: float(text.split()[0]))
+    shortest = min(ours, key=lambda text: float(text.split()[0]))
+    return (
+        f"The others have {report['flags']['budget_s']:g} s of processor time for a fit. "
+        f"sim2real fits until it converges: {shortest} to {longest}, medians of the sets.\nPACE and BAM are our "
+        "re-implementations of their published forms.\n"
+    )
+
+
+def about_broken(report: Report) -> str:
+    """Return a sentence for each error above its bound."""
+    text = ""
+    for name in sets_of(report):
+        for part in (p for p in parts(report, name) if p.bound and p.error > p.bound):
+            unit, (low, high) = unit_of(report, name), (min(part.others), max(part.others))
+            text += (
+                f"\nA bound is broken on {LABELS.get(name, name)}: {short(part.error)} {unit} on `{part.name}`, "
+                f"{part.error / part.bound:.1f} times the {short(part.bound)} {unit} that followed from\nthe other "
+                f"{len(part.others)} parts ({short(low)} to {short(high)} {unit}). So few parts, each of another "
+                f"motion, do not say how far off a new motion is.\n"
+            )
+    return text
+
+
+def table(report: Report) -> str:
+    """Return the errors of all entrants, a line for each set, what each was given, and the sets that another wins."""
+    lines, lost = [], ""
+    for name in sets_of(report):
+        means, joint, unit = (
+            errors_of(report, name, "mean"),
+            errors_of(report, name, "worst_joint"),
+            unit_of(report, name),
+        )
+        count = len({f["fold"] for f in report["folds"] if f["set"] == name})
+        about = f"{LABELS.get(name, name)}, {count} fold{'s' * (count > 1)} [{unit}]"
+        ours = short(means.get("ours")), with_bound(parts(report, name)[0]), short(joint.get("ours"))
+        others = [short(means.get(entrant)) for entrant in NAMES]
+        lines.append((about, *ours, seconds_of(report, name, "ours"), *others))
+        better = [e for e in sorted(means, key=lambda e: means[e]) if means[e] < means["ours"]]
+        if better:
+            listed = ", ".join(f"{NAMES[e]} ({short(means[e])} {unit})" for e in better)
+            lost += f"\nBetter than sim2real on the set {LABELS.get(name, name)}: {listed}.\n"
+    head = ("held out, mean", "sim2real", "worst fold (95 % bound)", "worst joint", "processor time", *NAMES.values())
+    return markdown(head, lines) + f"\n{about_budget(report)}{about_broken(report)}{lost}"
+
+
+def bounds(report: Report) -> str:
+    """Return each error of sim2real beside its bound, the largest ratio first."""
+    rows = [(LABELS.get(n, n), unit_of(report, n), p) for n in sets_of(report) for p in parts(report, n) if p.bound]
+    rows.sort(key=lambda line: -line[2].error / line[2].bound)
+    lines = [
+        (label, p.name, f"{short(p.bound)} {unit}", f"{short(p.error)} {unit}", f"{p.error / p.bound:.2f}")
+        for label, unit, p in rows
+    ]
+    below = sum(p.error <= p.bound for _, _, p in rows)
+    head = ("held out", "part", "95 % bound", "error", "ratio")
+    return markdown(head, lines, "llrrr") + f"\n{below} of {len(rows)} errors are below their bounds.\n"
+
+
+def worst_joint(report: Report) -> str:
+    """Return the range over all entrants of the worst joint of the SO-101."""
+    rows = values(report, "league/so101/").items()
+    joints = [value for name, value in rows if name.endswith("/worst_joint") and value is not None]
+    return f"The worst joint of the SO-101 is off by {min(joints):.0f} to {max(joints):.0f} mrad with every tool.\n"
+
+
+def evidence(ideal: Report, report: Report) -> str:
+    """Return README's table: what sim2real reaches beside the best of the others, then the sets that it loses.
+
+    Args:
+        ideal: The report of hidden robots that are nearly ideal.
+        report: The league's.
+    """
+    share, flags = values(ideal, "randomise/"), ideal["flags"]
+    success = (
+        f"success on {flags['robots']} nearly ideal robots with hidden parameters and delays, {flags['trials']} "
+        "deployments each"
+    )
+    data_sheet = f"{100 * share['data_sheet/success']:.0f} % trained on the data sheet"
+    lines, lost = [(success, f"{100 * share['all/success']:.0f} %", "", data_sheet)], ""
+    for name in sets_of(report):
+        errors, unit = errors_of(report, name, "mean"), unit_of(report, name)
+        best = min((e for e in errors if e != "ours"), key=lambda e: errors[e])
+        what = f"{LABELS.get(name, name)}, mean over held-out parts"
+        ours = f"{errors['ours']:.1f} {unit} in {seconds_of(report, name, 'ours')}"
+        other = f"{errors[best]:.1f} {unit} by {NAMES[best]} in {seconds_of(report, name, best)}"
+        if errors["ours"] < errors[best]:
+            lines.append((what, ours, with_bound(parts(report, name)[0]), other))
+        else:
+            lost += f"\nsim2real loses on {what}: {ours} against {other}.\n"
+    return markdown(("measured on", "sim2real", "worst part (95 % bound)", "compared with"), lines) + (
+        f"\n{about_budget(report)}In brackets: the bound that follows from the errors on the other parts, 95 % of "
+        f"errors are below it.\n{about_broken(report)}{lost}"
+    )

@@ -30,8 +30,8 @@ from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
-Fit = tuple[Predict, str, str]
-"""Predictor, summary, and the structure of the fitted model."""
+Fit = tuple[Predict, str]
+"""Predictor and summary."""
 SETS = {"disk": "disk", "xl330": "xl330", "so101": "so101_log"}
 """Sets with a pipeline of ours, and its name."""
 CHOOSES = ("sts3250",)
@@ -81,14 +81,7 @@ def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> Fit:
         return [_at(case, columns, r, one) for r, one in enumerate(test_recordings)]
 
     tried = identified.search.record.evaluations if identified.search else 0
-    return predict, f"{tried} candidates, then refined", structure(identified.problem)
-
-
-def structure(problem: Problem) -> str:
-    """Return the fitted model's terms, and name, scale and bounds of each parameter, a line each."""
-    lines = [f"terms {' '.join(problem.table.terms)}"]
-    lines += [f"{p.name} {p.transform} {p.low:.6g} {p.high:.6g}{'' if p.free else ' held'}" for p in problem.table]
-    return "\n".join(lines)
+    return predict, f"{tried} candidates, then refined"
 
 
 def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
@@ -116,7 +109,7 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
 
     about = f"{len(identified.problem.table)} parameters of --mjcf, refined from the model's"
     about += f"; terms {', '.join(identified.problem.table.terms) or 'none'}"
-    return predict, f"{about}; engine {identified.problem.engine.name}", structure(identified.problem)
+    return predict, f"{about}; engine {identified.problem.engine.name}"
 
 
 def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:

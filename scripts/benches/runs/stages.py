@@ -5,15 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benches.figures import Row, row
+from benches.rows import Report, Row, row
 
 from sim2real.artifacts.estimation.promise import promises_table
 from sim2real.artifacts.identification import Identification
@@ -103,3 +104,26 @@ def rows(name: str, seeds: list[Row], goals: dict[str, str]) -> list[Row]:
         values = [round(100 * s["errors"][parameter], 2) for s in seeds]
         lines.append(row(f"{name}/{parameter}_error", values, "%", "true parameter", goals.get("error", "")))
     return lines
+
+
+def about_held_out(runs: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Return the table's line on errors on held-out data beside the errors that were expected before."""
+    lines = [line for run in runs for line in run["promises"]]
+    below, worst = sum(line["kept"] == "yes" for line in lines), max(float(line["ratio"]) for line in lines)
+    text = f"{below} of {len(lines)} below the expected error; the worst is {worst:.2f} times as large"
+    return [("errors on held-out data", text)]
+
+
+def times(runs: Sequence[dict[str, Any]]) -> str:
+    """Return the median time of each stage [s] as text."""
+    return ", ".join(f"{stage} {statistics.median(run[f'{stage}_s'] for run in runs):.0f}" for stage in STAGES)
+
+
+def sentence(report: Report, subject: str) -> str:
+    """Return the sentence on the time of a run: the median over its seeds, and that of each stage."""
+    total, *each = (statistics.median(r[f"{name}_s"] for r in report["runs"]) for name in ("total", *STAGES))
+    record, identify, train, deploy = (f"{stage:.0f} s" for stage in each)
+    return (
+        f"On two CPU cores {subject} takes {total:.0f} s: {record} to record, {identify} to\n"
+        f"identify, {train} to train and {deploy} to deploy.\n"
+    )

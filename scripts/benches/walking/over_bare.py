@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from benches.figures import Row, medians, row
+from benches.rows import Row, medians, row
 from benches.walking.training import PIPELINE
 from sim2real.types import Array, PyTree
 

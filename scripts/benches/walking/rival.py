@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from benches.figures import Report, Row, row
+from benches.rows import Report, Row, row, values
 from benches.walk import Trial, judged
 from benches.walking.over_bare import first_step
 from benches.walking.train import KERNELS, alone, shown
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> Report:
             ]
         )
         calm = Trial(PIPELINE, done.folder / "bundle", options.seconds)
-        rows += shown(judged({"calm": calm}, options.twins, "walk_rival/ours"))
+        rows += shown(judged({"calm": calm}, options.twins, "walk_rival/ours", goals=False))
     return {"rows": rows, "playground": played}
 
 
@@ -169,3 +169,18 @@ def walked(env: Any, policy: Any, copies: int, steps: int) -> dict[str, Any]:
     mean = lambda values: float(jnp.sum(values.mean(0) * stayed) / jnp.maximum(stayed.sum(), 1))  # noqa: E731
     fell = int(copies - stayed.sum())
     return {"fell": fell, "of": copies, "error_m_s": mean(off), "error_rad_s": mean(turned)}
+
+
+def table(report: Report) -> str:
+    """Return a paragraph about MuJoCo Playground's training beside ours."""
+    v, last, flags = values(report, "walk_rival/"), report["playground"][-1], report["flags"]
+    return (
+        f"MuJoCo Playground trains its Go1 with brax's PPO, in the same run and with its own settings, at "
+        f"{v['playground/learnt_steps_per_s'] / 1e6:.2f} M learnt steps a second; ours learnt "
+        f"{v['ours/learnt_steps_per_s'] / 1e6:.2f} M. After {last['steps'] / 1e6:.0f} M steps and "
+        f"{last['wall_s']:.0f} s its error was {last['error_m_s']:.3f} m/s, and {last['fell']} of {last['of']} "
+        f"copies fell in {flags['seconds']:g} s. After {flags['steps'] / 1e6:.0f} M steps and "
+        f"{v['ours/command_s']:.0f} s ours was {v['ours/calm/error_m_s']:.3f} m/s, and {v['ours/calm/falls']} of "
+        f"{flags['twins']} twins fell. Each error is of the policy's own simulation: the robots, commands and "
+        "noise differ, and Playground's robot has no delay.\n"
+    )

@@ -15,8 +15,7 @@ import tempfile
 import tty
 from pathlib import Path
 
-from benches.figures import Report, row
-from benches.provenance import ROOT
+from benches.rows import ROOT, Report, row, values
 
 QUICK = {"repeats": 1, "robots": ["pendulum"], "no_install": True}
 _PATIENCE_S = 60.0
@@ -80,3 +79,13 @@ def addressed_s(python: str, robot: str, folder: Path) -> float:
             os.close(wire)
             os.close(end)
     return sum(int(ticks) for ticks in fields[11:15]) / os.sysconf("SC_CLK_TCK")
+
+
+def table(report: Report) -> str:
+    """Return the size of sim2real-robot, and the processor time of record there."""
+    v = values(report, "light/")
+    return (
+        f"Its packages take {v['packages']:.0f} MB. `record` uses {v['pendulum/addressed']:.2f} s of processor time "
+        f"until it addresses the pendulum,\nand {v['so101/addressed']:.2f} s for the SO-101 "
+        f"(`python scripts/bench.py light`).\n"
+    )

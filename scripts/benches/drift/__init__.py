@@ -1,1 +1,0 @@
-"""Robots that change, and the tests that notice it."""

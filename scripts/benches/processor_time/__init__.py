@@ -1,1 +1,0 @@
-"""Processor time of the tests and of an identification."""
