@@ -9,7 +9,7 @@ WARP_READY := .venv/.ready-warp
 EXTRAS := --all-extras --no-extra lerobot
 SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never UV_COMPILE_BYTECODE=1 VIRTUAL_ENV= $(BIN)/uv sync --locked --inexact --quiet
 
-.PHONY: demo test night bench docs format wheel
+.PHONY: demo test night bench figures docs format wheel
 
 demo: $(READY)
 	$(BIN)/sim2real demo
@@ -34,8 +34,13 @@ night: $(WARP_READY)
 	$(PYTEST) -m "night and process"; process=$$?; \
 	[ $$tests = 0 ] && [ $$process = 0 ]
 
+# Short benches beside the committed reports, 10 to 15 minutes; DATA=DIR adds the recordings of real motors.
 bench: $(READY)
-	for bench in graph train async log demo; do $(BIN)/python scripts/bench.py $$bench || exit 1; done
+	$(BIN)/python scripts/canary.py $(if $(DATA),--data $(DATA))
+
+# The tables of README.md and docs/, and README's figures, from reports/.
+figures: $(READY)
+	$(BIN)/python scripts/figures.py
 
 docs: $(DOCS_READY)
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going -q -b html docs docs/_build/html

@@ -21,7 +21,7 @@ import bench
 from benches.rows import ROOT, missed
 
 Tolerances = Mapping[str, tuple[str, float]]
-"""Pattern of rows -> ``within`` or ``less by`` a difference from the committed value, or ``times`` that value at most."""
+"""Pattern of rows -> ``within`` or ``less by`` a difference from the committed value, or ``times`` as large at most."""
 RUN: Tolerances = {"*/total_s": ("times", 2.0), "*/round_trip_error_ms": ("within", 1.5), "*_error": ("within", 3.0)}
 CASES: tuple[tuple[str, str, Tolerances], ...] = (
     (
@@ -92,9 +92,10 @@ def main() -> int:
                 continue
             old = json.loads((ROOT / "reports" / f"{name}.json").read_text())["rows"] if name else []
             committed = {row["name"]: row for row in old}
-            for row in json.loads(new.read_text())["rows"]:
-                if why := why_red(row, committed.get(row["name"]), tolerances):
-                    red.append((row["name"], row["value"], why))
+            reasons = [
+                (r, why_red(r, committed.get(r["name"]), tolerances)) for r in json.loads(new.read_text())["rows"]
+            ]
+            red += [(row["name"], row["value"], why) for row, why in reasons if why]
     for row in red:
         print("red:", *row)
     print(f"{len(red)} red rows", file=sys.stderr)
