@@ -1,8 +1,12 @@
-"""PPO on the pendulum with its delays inside one program: steps a second, and time until success."""
+"""PPO on the pendulum with its delays inside one program: steps a second, and time until success.
+
+``scaling`` is the speed on all devices of a host over that on one, with the same work on each.
+"""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -18,18 +22,26 @@ from sim2real.train.ppo.trainer import TrainResult, train
 
 SPREAD, SPREAD_S, DRAWS = 0.02, 0.002, 1024
 """Standard deviation of each parameter as a share, largest deviation of the delay [s], number of draws."""
+EVALUATIONS, GOAL = 6, 0.9
+"""Of ``scaling``: evaluations, the speed is the median over the stretches between them, without the first; share of the
+ideal speed, which is proportional to the number of devices."""
 QUICK = {"steps": 256, "envs": 8, "timelines": 2, "episode_s": 0.5, "evaluations": 2, "minibatches": 2}
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     parser.add_argument("--seeds", type=int, default=1, help="policies in parallel")
-    parser.add_argument("--envs", type=int, default=256, help="copies for each")
-    parser.add_argument("--steps", type=int, default=1_000_000, help="policy steps for each")
-    parser.add_argument("--evaluations", type=int, default=20, help="evaluations, spread over the steps")
+    parser.add_argument("--envs", type=int, default=256, help="copies for each, or on each device")
+    parser.add_argument(
+        "--steps", type=int, default=1_000_000, help="policy steps for each; of scaling, on each device"
+    )
+    parser.add_argument("--evaluations", type=int, default=20, help="evaluations, spread over the steps; scaling has 6")
     parser.add_argument("--minibatches", type=int, default=PPOConfig.minibatches, help="they must divide --envs")
     parser.add_argument("--timelines", type=int, default=32, help="timelines that episodes are drawn from")
     parser.add_argument("--episode-s", type=float, default=5.0, help="length of an episode [s]")
+    parser.add_argument(
+        "--devices", type=int, help="of scaling: devices to compare with one; default: all of this host"
+    )
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
 
 
@@ -50,18 +62,39 @@ def environment(timelines: int, episode_s: float) -> GraphEnvironment:
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Train on the device that JAX finds."""
+    """Train on the device that JAX finds, or on one and on several."""
+    name = options.name or jax.default_backend()
+    if options.bench == "scaling":
+        return {"rows": scaling_rows(options, f"scaling/{name}/train")}
+    result = trained(options, PPOConfig(num_seeds=options.seeds, evaluations=options.evaluations))
+    return {"rows": rows(result, f"train/{name}/pendulum/{options.seeds}_seeds")}
+
+
+def trained(options: argparse.Namespace, config: PPOConfig, devices: int = 1) -> TrainResult:
+    """Train with the flags' sizes on each device."""
     env = environment(options.timelines, options.episode_s)
-    config = PPOConfig(
-        num_seeds=options.seeds,
-        num_envs=options.envs,
-        total_steps=options.steps,
-        minibatches=options.minibatches,
-        evaluations=options.evaluations,
-        eval_steps=env.length + 1,
-    )
-    result = train(env, config, jax.random.key(0))
-    return {"rows": rows(result, f"train/{options.name or jax.default_backend()}/pendulum/{options.seeds}_seeds")}
+    sizes = {"num_envs": devices * options.envs, "total_steps": devices * options.steps}
+    config = replace(config, **sizes, minibatches=options.minibatches, eval_steps=env.length + 1)
+    return train(env, config, jax.random.key(0))
+
+
+def scaling_rows(options: argparse.Namespace, base: str) -> list[Row]:
+    """Return the speed of PPO on one device, then on several."""
+    several = options.devices or jax.local_device_count()
+    lines, speeds = [], {}
+    for devices in sorted({1, several}):
+        result = trained(options, PPOConfig(evaluations=EVALUATIONS, devices=devices), devices)
+        speeds[devices] = float(np.median(np.diff(result.env_steps) / np.diff(result.elapsed_s)))
+        lines += [
+            row(f"{base}/{devices}_devices/size", devices * options.envs, "copies"),
+            row(f"{base}/{devices}_devices/env_steps_per_s", round(speeds[devices]), "1/s"),
+            row(f"{base}/{devices}_devices/compile_s", round(result.compile_s, 1), "s"),
+        ]
+    if several > 1:
+        ratio = round(speeds[several] / speeds[1], 2)
+        goal = f">= {GOAL * several:g}"
+        lines.append(row(f"{base}/{several}_over_1", ratio, "times the speed", "one device", goal))
+    return lines
 
 
 def rows(result: TrainResult, name: str) -> list[Row]:
@@ -89,4 +122,15 @@ def table(report: Report) -> str:
         f"{report['flags']['seeds']} seeds of the pendulum, trained side by side on one "
         f"{report['machine']['devices'][0]}, are all above 85 % after\n"
         f"{v[f'{base}/time_to_0.85_all_s']:.1f} s, {v[f'{base}/compile_s']:.1f} s of them compilation.\n"
+    )
+
+
+def scaling(report: Report) -> str:
+    """Return the speed of a training on all devices of a host against one."""
+    v = {name.rpartition("train/")[2]: value for name, value in values(report).items()}
+    count = next(name.removesuffix("_over_1") for name in v if name.endswith("_over_1"))
+    cards = f"{count} {report['flags']['name'].upper()}s"
+    return (
+        f"{cards} of one host make {v[f'{count}_over_1']:.2f} times the steps of one, "
+        f"{v[f'{count}_devices/env_steps_per_s'] / 1e6:.1f} million policy steps per second\nof a single policy.\n"
     )

@@ -10,27 +10,28 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 pytest.importorskip("mujoco.sysid")
-from benches.identify import sysid
-from benches.identify.sysid import Recording
-from benches.league import bam, published, textbook
+from benches.recorded import bam, published, rigs, textbook
+from benches.recorded.sets import Recording
 
 
 def test_commands_are_held_not_interpolated():
     t, command = np.array([0.0, 0.025, 0.05]), np.array([[1.0], [2.0], [3.0]])
     still = np.zeros((3, 1))
-    spec = sysid._disk_problem(delay=False)[0]
-    control = sysid._Run(sysid.Recording(t, command, still, np.zeros((1, 2))), spec).control
+    spec = rigs.hinge(0.005, 0.1, 0.041, 1e-4)
+    control = rigs.Run(Recording(t, command, still, np.zeros((1, 2))), spec).control
     assert control.data[:-1, 0].tolist() == [1.0] * 5 + [2.0] * 5 + [3.0]
 
 
 def test_a_recording_that_ends_without_torque_is_simulated_through():
     t = np.arange(400) * 0.005
     enabled = t < 1.0
-    constants = {"kp": 800, "mass": 0.49, "length": 0.1, "torque_enable": enabled}
+    duty_per_rad = 800 / 256 * rigs.PULSES_PER_RAD / rigs.PWM_LIMIT
+    constants = {"duty_per_rad": duty_per_rad, "mass": 0.49, "length": 0.1, "torque_enable": enabled}
     goal = np.full((400, 1), 0.5)
-    recording = sysid.Recording(t, goal, np.where(enabled, 0.4, 0.0)[:, None], np.zeros((1, 2)), constants)
-    rows = {"torque": (0.5, 0.1, 2.0, sysid._torque), "damping": (0.05, 0.0, 0.5, sysid._damping)}
-    angle = sysid._free_run(sysid._parameters(rows, delay=False)[0], sysid._xl330_runs(recording))[:, 0]
+    recording = Recording(t, goal, np.where(enabled, 0.4, 0.0)[:, None], np.zeros((1, 2)), constants)
+    rows = {"torque": (0.5, 0.1, 2.0, rigs.put_torque), "damping": (0.05, 0.0, 0.5, rigs.put_damping)}
+    rig = rigs.Rig(rigs.servo_runs, rows, {}, rows)
+    angle = rigs.Fit(rig, rigs._parameters(rows, delay=False)[0], 0).predict([recording])[0][:, 0]
     assert angle.shape == t.shape
     assert angle[195] > 0.3  # held up against gravity
     assert abs(angle[-1]) < 0.05  # dropped

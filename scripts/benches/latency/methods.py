@@ -13,10 +13,9 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from benches.identify import sysid as rigs
-from benches.identify.sysid import Recording
 from benches.latency.links import NOISE_RAD, Log, motion
-from benches.league import mujoco_joints
+from benches.recorded import rigs
+from benches.recorded.sets import Recording
 from sim2real.identify.delays.likelihood import DelayEvidence
 from sim2real.identify.delays.links import describe, find
 
@@ -73,36 +72,35 @@ def ours(log: Log, seed: int) -> Estimate:
     return Estimate(float(link.mean.value or 0.0), float(link.p95.value or 0.0), float(link.lost.value or 0.0), *ends)
 
 
-def _friction(spec: mujoco.MjSpec, value: float) -> None:
-    rigs._friction(spec, value)
+def _put_friction(spec: mujoco.MjSpec, value: float) -> None:
+    rigs.put_friction(spec, value)
     joint = spec.joint(rigs.JOINT)
     joint.solref_friction, joint.solimp_friction[:2] = [2 * spec.option.timestep, 1.0], 0.999
 
 
-def _problem(log: Log, step_s: float) -> tuple[mujoco.MjSpec, dict[str, mujoco_joints.Row], Recording]:
-    """Return the servo, its parameters, and the recording for the toolbox."""
-    puts = {"kp": rigs._kp, "damping": rigs._damping, "friction": _friction, "armature": rigs._armature}
+def _problem(log: Log, step_s: float) -> tuple[rigs.Rig, Recording]:
+    """Return the servo as a rig, and the recording for the toolbox."""
+    puts = {"kp": rigs.put_kp, "damping": rigs.put_damping, "friction": _put_friction, "armature": rigs.put_armature}
     rows = {name: (guess, guess / 5, guess * 5, puts[name]) for name, guess in GUESS.items()}
-    start = np.array([[log.position[0], 0.0]])
-    return rigs._spec(step_s, 1e-9, 0.1, 0.01), rows, Recording(log.t, log.goal[:, None], log.position[:, None], start)
+    spec, start = rigs.hinge(step_s, 1e-9, 0.1, 0.01), np.array([[log.position[0], 0.0]])
+    recording = Recording(log.t, log.goal[:, None], log.position[:, None], start)
+    return rigs.Rig(lambda r: [rigs.Run(r, spec)], rows, {}, rows), recording
 
 
 def sysid(log: Log, seed: int) -> Estimate:
     """Fit the servo and mujoco.sysid's delay of the sensor, with its simulated linearised interval."""
     del seed
-    spec, rows, recording = _problem(log, STEP_S)
-    _, result = rigs._fit([rigs._Run(recording, spec)], *rigs._parameters(rows, True), iterations=25)
+    rig, recording = _problem(log, STEP_S)
+    fit = rigs.fit_once(rig, [recording], delay=True, iterations=25)
     # The toolbox stamps a reading at the end of the step at whose begin it was taken.
-    delay, (low, high) = result.values["delay"], result.interval95["delay"]
-    return _constant(delay + 0.5 * STEP_S, (low + 0.5 * STEP_S, high + 0.5 * STEP_S))
+    low, high = fit.interval95["delay"]
+    return _constant(fit.value("delay") + 0.5 * STEP_S, (low + 0.5 * STEP_S, high + 0.5 * STEP_S))
 
 
 def pace(log: Log, seed: int) -> Estimate:
     """Fit the servo, an encoder's bias and a delay in whole steps by CMA-ES, as PACE does; it gives no interval."""
-    spec, rows, recording = _problem(log, PACE_STEP_S)
-    rig = mujoco_joints.Rig(lambda r: [rigs._Run(r, spec)], {}, {}, rows, mujoco_joints._feed_back)
-    parameters, _ = mujoco_joints.pace_parameters(rig, [recording], PACE_S, seed)
-    return _constant(float(parameters["delay"].value[0]) + 0.5 * PACE_STEP_S)
+    rig, recording = _problem(log, PACE_STEP_S)
+    return _constant(rigs.fit_pace(rig, [recording], PACE_S, seed).value("delay") + 0.5 * PACE_STEP_S)
 
 
 def correlation(log: Log, seed: int) -> Estimate:

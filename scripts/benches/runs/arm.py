@@ -1,16 +1,11 @@
 """Whole runs of an arm that reaches for targets, ``arm`` or ``so101``, for several seeds.
 
-Beside each stands the same training on the nominal model without delays. On an accelerator, the training alone, in a
-run folder that holds a recording and an identification:
-
-    python scripts/bench.py arm --train RUN -- --ppo.num-envs 1024
+Beside each stands the same training on the nominal model without delays.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +22,11 @@ QUICK = demo.QUICK
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this bench."""
     stages.add_flags(parser, seeds=[0])
-    parser.add_argument("--train", type=Path, metavar="RUN", help="only train, on an accelerator, in this run folder")
-    parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run`, with --train of `train`")
+    parser.add_argument("flags", nargs="*", help="behind --: flags of `sim2real run`")
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Run the arm once a seed, or train it; return the rows and a record of every seed."""
-    if options.train:
-        return {"rows": train_rows(options.bench, options.train.resolve(), options.flags)}
+    """Run the arm once a seed; return the rows and a record of every seed."""
     runs = stages.run_seeds(options, run_seed)
     return {"rows": rows(options.bench, runs), "runs": runs}
 
@@ -58,29 +50,6 @@ def held_out_mae_mrad(predictions: Path) -> float:
     joints = [n.removesuffix("_measured") for n in samples.files if n.endswith("_measured") and "velocity" not in n]
     errors = [np.abs(samples[f"{j}_identified"] - samples[f"{j}_measured"])[ahead].mean() for j in joints]
     return 1e3 * float(np.mean(errors))
-
-
-def train_rows(arm: str, run_dir: Path, flags: list[str]) -> list[Row]:
-    """Train an arm in a run folder that holds a recording and an identification; return times and success."""
-    import jax
-
-    begin = time.monotonic()
-    stages.sim2real("train", arm, "--run", str(run_dir), "--runs", str(run_dir.parent.parent), *flags)
-    total_s = time.monotonic() - begin
-    history = json.loads(stages.done(run_dir, "train").output("history").read_text())
-    success = np.max(history["success"], axis=1)
-    good = np.flatnonzero(success >= 0.95)
-    first_s = history["seconds"][int(good[0])] if good.size else None
-    figures = [
-        ("compile_s", history["compile_s"], "s", ""),
-        ("train_s", history["train_s"], "s", ""),
-        ("time_to_0.95_s", first_s, "s", "< 180"),
-        ("total_s", total_s, "s", ""),
-        ("success", float(success.max()), "1", ""),
-        ("env_steps_per_s", history["env_steps_per_s"], "1/s", ""),
-    ]
-    how = f"{jax.devices()[0].device_kind} {' '.join(flags)}"
-    return [row(f"{arm}/train/{n}", v, unit, how, goal) for n, v, unit, goal in figures]
 
 
 def rows(arm: str, seeds: list[Row]) -> list[Row]:

@@ -22,7 +22,7 @@ from typing import Any
 from benches.jobs import each
 from benches.rows import Report, markdown, share
 from benches.walk import Trial, judged
-from benches.walking.training import PIPELINE, add_training_flags, require_gpu, train
+from benches.walking.train import PIPELINE, add_training_flags, require_gpu, train
 
 QUICK = {"policies": ["shipped"], "delays_ms": [10.0], "twins": 1, "seconds": 0.2, "push": 0.1}
 SHIPPED, IDENTIFIED = "shipped", "identified_"

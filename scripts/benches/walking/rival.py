@@ -20,9 +20,7 @@ from typing import Any
 
 from benches.rows import Report, Row, row, values
 from benches.walk import Trial, judged
-from benches.walking.over_bare import first_step
-from benches.walking.train import KERNELS, alone, shown
-from benches.walking.training import PIPELINE, add_training_flags, require_gpu, train
+from benches.walking.train import KERNELS, PIPELINE, add_training_flags, alone, first_step, require_gpu, shown, train
 from sim2real.errors import UsageError
 from sim2real.runtime.compilation_cache import VARIABLE
 

@@ -8,23 +8,29 @@ from __future__ import annotations
 import argparse
 import os
 import shlex
+import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from benches.rows import Report, Row, markdown, missed, row
+from benches.rows import Report, Row, markdown, medians, missed, row
 from benches.walk import Trial, judged
-from benches.walking.over_bare import first_step, over_bare
-from benches.walking.training import PIPELINE, add_training_flags, require_gpu, train
+from sim2real.errors import Sim2RealError, UsageError
 from sim2real.runtime.compilation_cache import OFF, VARIABLE
+from sim2real.types import PyTree
 
 QUICK = {"copies": 64, "steps": [4000], "rollout": 2, "repeats": 1, "twins": 1, "seconds": 0.2}
 KERNELS = "WARP_CACHE_PATH"
+PIPELINE = "go2"
+_OWN_MEMORY = "XLA_PYTHON_CLIENT_PREALLOCATE"
+ROOMS = (16, 96)
+"""Contacts and rows of constraints that Warp has room for in a copy, as in training."""
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -108,3 +114,165 @@ def table(report: Report) -> str:
         unit = f" {of[name]['unit']}".removesuffix(" 1")
         lines.append((label, f"{of[name]['value']:,}{unit}", of[name]["goal"] + ", missed" * missed(of[name])))
     return markdown(("", "measured", "goal"), lines)
+
+
+def first_step() -> float:
+    """Return the time until a copy's graph makes its first step in a new process: import, trace, compile, build [s]."""
+    begin = time.perf_counter()
+    import jax
+
+    env, keys = _environment(), jax.random.split(jax.random.key(0), 8)
+    state, _ = jax.jit(jax.vmap(env.reset))(keys)
+    jax.block_until_ready(jax.jit(jax.vmap(env.step))(state, _stand(8), keys))
+    return time.perf_counter() - begin
+
+
+def over_bare(copies: int, repeats: int, steps: int) -> list[Row]:
+    """Return the time of policy steps in the graph over that of bare physics steps of a robot that stands.
+
+    Args:
+        steps: Policy steps of a rollout.
+    """
+    import jax
+
+    programs, ticks = _programs(copies, steps)
+    calls, compile_s = {}, {}
+    for name, (program, starts) in programs.items():
+        begin = time.perf_counter()
+        compiled = jax.jit(program).lower(starts).compile()
+        compile_s[name] = time.perf_counter() - begin
+        calls[name] = lambda compiled=compiled, starts=starts: jax.block_until_ready(compiled(starts))
+    seconds = medians(calls, repeats)
+    rate = {name: copies * ticks * steps / s for name, s in seconds.items()}
+    name = f"walk_train/{copies}"
+    about = f"bare mjx.step of Warp, standing too; median of {repeats} rollouts of {steps} policy steps"
+    return [
+        row(f"{name}/graph_over_bare", round(seconds["graph"] / seconds["bare"], 3), "1", about, "<= 1.1"),
+        row(f"{name}/graph_steps_per_s", round(rate["graph"]), "1/s", f"physics steps; {rate['bare']:.4g} bare"),
+        row(f"{name}/graph_compile_s", round(compile_s["graph"], 1), "s", f"{compile_s['bare']:.1f} bare"),
+    ]
+
+
+def _environment() -> Any:
+    """Return the environment of ``sim2real train go2`` without pushes: the robot stands as the bare one does."""
+    from dataclasses import replace
+
+    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.train.training_setup import prepare
+
+    pipeline = load_pipeline(PIPELINE)
+    config = replace(pipeline.train, vary=replace(pipeline.train.vary, push=0.0))
+    return prepare(pipeline, config).env
+
+
+def _stand(copies: int) -> PyTree:
+    import jax.numpy as jnp
+
+    return jnp.zeros((copies, 12))
+
+
+def _programs(copies: int, steps: int) -> tuple[dict[str, tuple[Any, PyTree]], int]:
+    """Return name -> (program of all copies, their starts), and the physics steps of a policy step."""
+    import jax
+    import jax.numpy as jnp
+    from mujoco import mjx
+
+    env = _environment()
+    world = env.graph.nodes["world"]
+    keys = jax.random.split(jax.random.key(0), copies)
+    states, _ = jax.jit(jax.vmap(env.reset))(keys)
+    data = states.graph.state["world"].data
+    world_model, ticks, (contacts, rows) = world.environment.mjx_model, env.graph.wiring.ticks, ROOMS
+    blank = mjx.make_data(world.environment.model, impl="warp", naconmax=copies * contacts, njmax=rows)
+
+    def bare(starts: PyTree) -> Any:
+        def one(start: PyTree) -> Any:
+            moved = blank.replace(qpos=start[0], qvel=start[1], ctrl=start[2])
+            return jax.lax.scan(lambda d, _: (mjx.step(world_model, d), None), moved, length=ticks * steps)[0].qpos
+
+        return jax.vmap(one)(starts)
+
+    def graph(starts: PyTree) -> Any:
+        def one(state: PyTree, key: Any) -> Any:
+            def policy_step(now: PyTree, _: None) -> Any:
+                state, total = now
+                step = env.step(state, jnp.zeros(12), key)
+                return (step.state, total + step.reward + step.observation.sum()), None
+
+            (state, total), _ = jax.lax.scan(policy_step, (state, jnp.float32(0.0)), length=steps)
+            return state.graph.state["world"].data.qpos, total
+
+        return jax.vmap(one)(*starts)
+
+    return {"bare": (bare, (data.qpos, data.qvel, data.ctrl)), "graph": (graph, (states, keys))}, ticks
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A finished training.
+
+    Attributes:
+        folder: Folder of the stage, with the bundle.
+        command_s: Time from the start of the command to its end [s].
+    """
+
+    folder: Path
+    command_s: float
+    compile_s: float
+    train_s: float
+    steps: int
+    learnt_steps_per_s: float
+
+
+def require_gpu(bench: str) -> str:
+    """Return the name of the GPU; raise a ``UsageError`` without one.
+
+    JAX takes little of its memory in this process: the trainings have processes of their own.
+    """
+    os.environ.setdefault(_OWN_MEMORY, "false")
+    import jax
+
+    if jax.default_backend() != "gpu":
+        raise UsageError(
+            f"{bench} trains on MuJoCo Warp, which needs a GPU, and JAX has none here",
+            hint="`bench.py walk` judges a policy without a GPU",
+        )
+    return jax.devices()[0].device_kind
+
+
+def add_training_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of a bench that trains and judges policies."""
+    # Updates after 12 rows: with 24, 60 M steps ended at an error of 0.42 m/s; with 12 at 0.09 m/s, in the same time.
+    usual = "--ppo.num-envs=8192 --ppo.rollout-steps=12 --ppo.minibatches=8 --ppo.evaluations=1"
+    parser.add_argument("--flags", default=usual, help="flags of `sim2real train go2`, in one word")
+    parser.add_argument("--twins", type=int, default=50, help="hidden twins that judge a policy")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length of an episode of a twin [s]")
+    parser.add_argument("--push", type=float, default=0.5, help="size of a push every 5 s [m/s]")
+
+
+def train(steps: int, flags: Sequence[str], runs: Path, environment: Mapping[str, str]) -> Trained:
+    """Run ``sim2real train go2`` with flags; return its bundle and its times.
+
+    Args:
+        steps: Steps in all copies together.
+        runs: A new folder of runs.
+        environment: Variables of the process beside those of this one.
+    """
+    from sim2real.artifacts.bundle import Bundle
+
+    inherited = {name: value for name, value in os.environ.items() if name != _OWN_MEMORY}
+    command = [sys.executable, "-m", "sim2real.cli", "train", PIPELINE, "--runs", str(runs)]
+    command += [f"--ppo.total-steps={steps}", *flags]
+    begin = time.perf_counter()
+    done = subprocess.run(command, env={**inherited, **environment}, capture_output=True, text=True)
+    took_s = time.perf_counter() - begin
+    if done.returncode:
+        text = done.stderr[-3000:]
+        raise Sim2RealError(f"`sim2real train {PIPELINE}` ended with exit code {done.returncode}:\n{text}")
+    (folder,) = runs.glob(f"{PIPELINE}/*/train")
+    history = Bundle.load(folder).history
+    assert history is not None
+    times = history.compile_s, history.train_s, history.env_steps_per_s
+    compile_s, train_s, steps_per_s = (float(t or 0.0) for t in times)
+    steps_done = int(history.steps[-1])
+    return Trained(folder, took_s, compile_s, train_s, steps_done, steps_per_s)

@@ -6,7 +6,7 @@
 Each entrant fits the same parts of the same recordings within the same processor time, compilation included, and
 predicts the held-out part. The settings of its pipeline determine the time of ours, which is reported. The rows are
 mean and worst over the folds of a set, and the worst joint. A fit gets no test part. A
-folder in --data with a league.toml (benches/league/sets.py) is a set, too. --jobs runs several fits at once, each in
+folder in --data with a league.toml (benches/recorded/sets.py) is a set, too. --jobs runs several fits at once, each in
 its own process on one processor.
 --results gets a line for each fold and entrant at once: an interrupted run continues from there.
 """
@@ -27,12 +27,8 @@ from scipy.special import stdtrit
 
 from benches import jobs
 from benches import rows as figures
-from benches.identify.sysid import Recording
-from benches.league import bam as league_bam
-from benches.league import mujoco_joints as league_mujoco
-from benches.league import ours as league_ours
-from benches.league import published, textbook
-from benches.league.sets import FORCES, Fold, LeagueSet, available
+from benches.recorded import bam, ours, published, textbook
+from benches.recorded.sets import FORCES, Fold, LeagueSet, Recording, available
 from benches.rows import Report, Row, markdown, values
 from sim2real.errors import UsageError
 
@@ -127,7 +123,7 @@ def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fit
     """Fit one entrant; raise NoFormError if it has no form for such a rig."""
     budget_s, seed, constants = options.budget_s, options.seed, fold.fitted[0].constants
     if entrant == "ours":
-        return Fitted(*league_ours.fit(name, fold, options.data, seed))
+        return Fitted(*ours.fit(name, fold, options.data, seed))
     if entrant in published.SETS:
         return Fitted(lambda recordings: published.predict(entrant, recordings), "not fitted")
     if entrant == "textbook":
@@ -138,24 +134,26 @@ def fit(name: str, fold: Fold, entrant: str, options: argparse.Namespace) -> Fit
         if "mjcf" in constants:
             raise NoFormError("BAM's form is a bench with one joint and a given load; a robot's load is not one number")
         kind = entrant.removeprefix("bam_").upper()
-        load = league_bam.DISK_LOAD if name == "disk" else league_bam.ARM_LOAD if name == "so101" else {}
+        load = bam.DISK_LOAD if name == "disk" else bam.ARM_LOAD if name == "so101" else {}
         loaded = replace(fold, fitted=tuple(_loaded(r, load) for r in fold.fitted))
-        single = lambda rs, s: Fitted(*league_bam.fit(kind, rs, s, seed))  # noqa: E731
-        predict, summary = _joint_by_joint(loaded, single, budget_s)
+        predict, summary = _joint_by_joint(loaded, lambda rs, s: Fitted(*bam.fit(kind, rs, s, seed)), budget_s)
         return Fitted(lambda recordings: predict([_loaded(r, load) for r in recordings]), summary)
-    if "mjcf" in constants:
-        rig = (league_mujoco.legs if name == "go2" else league_mujoco.described)(fold.fitted[0])
-        if rig is None:
-            raise NoFormError("the model has other joints than those that were recorded")
-        return _mujoco(entrant, rig, fold.fitted, budget_s, seed)
-    rig = league_mujoco.one_joint(name)
-    return _joint_by_joint(fold, lambda rs, s: _mujoco(entrant, rig, rs, s, seed), budget_s)
+    from benches.recorded import rigs
 
+    def mujoco(rig: rigs.Rig, fitted: Sequence[Recording], seconds: float) -> Fitted:
+        if entrant == "pace":
+            found = rigs.fit_pace(rig, fitted, seconds, seed)
+            return Fitted(found.predict, f"{found.evaluations} evaluations")
+        found = rigs.fit_sysid(rig, fitted, entrant == "sysid_delay", seconds, seed)
+        return Fitted(found.predict, f"{found.evaluations} evaluations, {found.starts} starts")
 
-def _mujoco(entrant: str, rig: Any, fitted: Sequence[Recording], budget_s: float, seed: int) -> Fitted:
-    if entrant == "pace":
-        return Fitted(*league_mujoco.fit_pace(rig, fitted, budget_s, seed))
-    return Fitted(*league_mujoco.fit_sysid(rig, fitted, entrant == "sysid_delay", budget_s, seed))
+    if "mjcf" not in constants:
+        rig = rigs.one_joint(name)
+        return _joint_by_joint(fold, lambda rs, s: mujoco(rig, rs, s), budget_s)
+    rig = (rigs.legs if name == "go2" else rigs.described)(fold.fitted[0])
+    if rig is None:
+        raise NoFormError("the model has other joints than those that were recorded")
+    return mujoco(rig, fold.fitted, budget_s)
 
 
 def _joint_by_joint(fold: Fold, single: Callable[[list[Recording], float], Fitted], budget_s: float) -> Fitted:

@@ -1,33 +1,53 @@
-"""Our entry in the league: `sim2real identify` with the settings of a robot, for one fold."""
+"""Our identification of recordings: with the settings of a pipeline, or of ``--mjcf`` for a robot from a model."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benches.identify import bench as identify
-from benches.identify import recordings
-from benches.identify.sysid import Recording
-from benches.league.sets import DISK_BLOCK, DISK_BLOCKS, Fold
+from benches.recorded.sets import BEFORE, DISK_BLOCK, DISK_BLOCKS, Fold, Recording, load
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
+from sim2real.identify.fit import Fit as ModelFit
 from sim2real.identify.fit import as_numbers
 from sim2real.identify.fit import fit as fit_model
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation import prediction
+from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.estimation import held_out_parts, segment_split
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
+
+SETTLE_S = 0.3
+"""Length of the samples from which the initial state of the disk's free run is estimated [s]."""
+Columns = Mapping[str, np.ndarray]
+"""Samples of free runs: ``recording``, ``ahead`` [s], and of each field the measured and the predicted values."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot that is judged, with the settings of its identification."""
+
+    name: str
+    config: IdentifyConfig
+    robot: Any
+    model: Any
+
+    @property
+    def fields(self) -> list[str]:
+        """The columns of positions."""
+        return [c.position if c.index is None else f"{c.position}[{c.index}]" for c in self.model.channels]
+
 
 Predict = Callable[[Sequence[Recording]], list[np.ndarray]]
 Fit = tuple[Predict, str]
@@ -54,6 +74,50 @@ ARM = """<mujoco>
 """The model that docs/guides/any_robot.md gives for a servo with a mass on an arm."""
 
 
+def make_case(name: str, budget: Mapping[str, Any]) -> Case:
+    """Return the case of a pipeline, with its settings, but for those of the budget."""
+    pipeline = load_pipeline(name)
+    robot: Any = pipeline.load()
+    config = replace(pipeline.identify, **budget)
+    return Case(name, config, robot, robot.identifiable(config.max_delay_s))
+
+
+def identify(case: Case, fitted: Mapping[str, Episode]) -> ModelFit:
+    """Fit with the settings of the case."""
+    c, episodes = case.config, list(fitted.values())
+    longer = windows(episodes, c.long_s, 0.0, c.initial_state == "free") if c.long_s else []
+    length = c.settle_s + c.horizon_s
+    spans = windows(episodes, length, c.spacing_s, c.initial_state == "free")
+    return fit_model(case.model, episodes, spans, length, c, None, longer)
+
+
+def windows(episodes: Sequence[Episode], length_s: float, spacing_s: float, estimated: bool) -> list[Span]:
+    """Return the segments of all recordings; 0.3 s at both ends stay free where initial states are estimated."""
+    edge = 0.3 if estimated else 0.0
+    step = spacing_s or length_s
+    begins = [np.arange(edge, e.duration_s - length_s - edge, step) for e in episodes]
+    return [Span(r, float(b)) for r, times in enumerate(begins) for b in times]
+
+
+def predict_whole(case: Case, models: Mapping[str, Any], test: Mapping[str, Episode]) -> Columns:
+    """Return columns of one free run over each whole test recording."""
+    episodes = list(test.values())
+    if case.name == "disk":  # The initial state is estimated from the samples before the part.
+        begin, settle, config = BEFORE * 0.025 - SETTLE_S, SETTLE_S, case.config
+    else:
+        begin, settle, config = 0.0, 0.0, replace(case.config, initial_state="rest")
+    length = max(e.duration_s for e in episodes) - begin
+    problem = Problem(case.model, episodes, [Span(r, begin, False) for r in range(len(episodes))], length, config)
+    columns = prediction.samples(problem, models, settle)
+    return columns | {"ahead": columns["into"] - settle}
+
+
+def errors_of(case: Case, columns: Columns, recording: int, model: str) -> np.ndarray:
+    """Return a model's errors over one recording, ``(N, joints)`` [rad]."""
+    pick = (columns["recording"] == recording) & (columns["ahead"] > 0)
+    return np.stack([columns[f"{f}_{model}"][pick] - columns[f"{f}_measured"][pick] for f in case.fields], axis=1)
+
+
 def fit(name: str, fold: Fold, data: Path, seed: int) -> Fit:
     """Identify with our own settings, without a limit of time.
 
@@ -65,19 +129,19 @@ def fit(name: str, fold: Fold, data: Path, seed: int) -> Fit:
 
 def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> Fit:
     pipeline = SETS[name]
-    case = identify.make_case(argparse.Namespace(case=pipeline, **dict.fromkeys(identify.BUDGET)))
+    case = make_case(pipeline, {})
     case = replace(case, config=replace(case.config, seed=seed))
     fit_spec, test_spec = fold.spec or ("", "")
     specs = [fit_spec]
     if name == "disk":
         left = int(fit_spec.split()[1])
         specs = [f"{DISK_BLOCK * i}:{DISK_BLOCK * (i + 1)}" for i in range(DISK_BLOCKS) if i != left]
-    fitted = {k: e for spec in specs for k, e in recordings.load(pipeline, data, spec).items()}
-    identified = identify.identify(case, fitted)
+    fitted = {k: e for spec in specs for k, e in load(pipeline, data, spec).items()}
+    identified = identify(case, fitted)
 
     def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
-        test = recordings.load(pipeline, data, test_spec, recordings.PAST)
-        columns = identify.predict(case, {"identified": identified.values}, test)
+        test = load(pipeline, data, test_spec, BEFORE)
+        columns = predict_whole(case, {"identified": identified.values}, test)
         return [_at(case, columns, r, one) for r, one in enumerate(test_recordings)]
 
     tried = identified.search.record.evaluations if identified.search else 0
@@ -98,8 +162,8 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
         fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
     config = replace(pipeline.identify, seed=seed)
     model = robot.identifiable(config.max_delay_s)
-    case = identify.Case(name, segment_split.with_length(config, model), robot, model)
-    identified = _fit_with_terms(case, fitted) if wanted == "auto" else identify.identify(case, fitted)
+    case = Case(name, segment_split.with_length(config, model), robot, model)
+    identified = _fit_with_terms(case, fitted) if wanted == "auto" else identify(case, fitted)
 
     def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
         with tempfile.TemporaryDirectory() as folder:
@@ -112,12 +176,12 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
     return predict, f"{about}; engine {identified.problem.engine.name}"
 
 
-def _fit_with_terms(case: identify.Case, fitted: dict[str, Any]) -> Any:
+def _fit_with_terms(case: Case, fitted: dict[str, Any]) -> Any:
     """Identify with optional terms chosen on held-out parts, as ``--terms auto`` does."""
     c, episodes = replace(case.config, terms="auto"), list(fitted.values())
     model, length = case.model, c.settle_s + c.horizon_s
     table = held_out_parts.widest(model.parameters, c.terms)
-    spans = identify.windows(episodes, length, c.spacing_s, c.initial_state == "free")
+    spans = windows(episodes, length, c.spacing_s, c.initial_state == "free")
     every = fit_model(model, episodes, spans, length, c, table, as_start=True)
     selection = held_out_parts.chosen(every, c, list(fitted))
     fewer, values = table.with_terms(selection.names(table)), as_numbers(every.problem.table, selection.near[0].z)
@@ -160,7 +224,7 @@ def _written(recordings_to_write: Sequence[Recording], folder: Path, gains: bool
 
 
 def _free_run(
-    case: identify.Case, values: dict[str, Any], test: Sequence[Episode], test_recordings: Sequence[Recording]
+    case: Case, values: dict[str, Any], test: Sequence[Episode], test_recordings: Sequence[Recording]
 ) -> dict[str, np.ndarray]:
     """Return columns of one simulation of each test recording, from the same initial state as for all entrants."""
     # Samples before the largest delay are not compared, so that delay is hardly larger than the estimate.
@@ -175,7 +239,7 @@ def _free_run(
 
 
 def _at(
-    case: identify.Case, columns: dict[str, np.ndarray], recording: int, one: Recording, started: bool = False
+    case: Case, columns: dict[str, np.ndarray], recording: int, one: Recording, started: bool = False
 ) -> np.ndarray:
     """Return predicted positions at a recording's stamps, ``(N, joints)``.
 

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benches.identify.sysid import Recording
-from benches.league.cmaes import minimise
+from benches.recorded.search import minimise
+from benches.recorded.sets import Recording
 from sim2real.types import Array, PyTree
 
 Constants = Mapping[str, float | bool]

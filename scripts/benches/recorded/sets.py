@@ -1,4 +1,4 @@
-"""The sets of the league: all recordings, and their parts that are held out in turn.
+"""Recordings of real motors, and the sets of the league: their parts that are held out in turn.
 
 A folder with a ``league.toml`` is a set without code. Its files are read as by ``identify --mjcf``:
 
@@ -14,7 +14,8 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from fnmatch import fnmatch
 from functools import partial
 from itertools import pairwise, product
 from pathlib import Path
@@ -22,12 +23,13 @@ from typing import Any
 
 import numpy as np
 
-from benches.identify import recordings
-from benches.identify.sysid import Recording
-from benches.identify.sysid_rows import recording
 from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.log.importing.importer import import_file
+from sim2real.log.importing.mapping import load_mapping
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 DISK_BLOCK, DISK_BLOCKS, PAST = 5000, 5, 12
@@ -41,6 +43,131 @@ FORCES = ("torque", "duty")
 EMPS = {"mjcf": "emps.xml", "fit": ["fit.npz[0:0.6]"], "test": ["fit.npz[0.6:1]"], "terms": "auto"}
 """The axis's validation file is not read: the end of the estimation file is held out."""
 DESCRIPTION = "league.toml"
+FOLDERS = {"disk": "unbalanced_disk", "xl330": "bam_xl330", "so101_log": "so101"}
+SPECS = {
+    "disk": ":25000", "disk_test": "25000:30000",
+    "xl330": "kp=100,800", "xl330_test": "kp=200",
+    "so101_log": "chirp_sweep[0:0.9] multisine prbs_excitation single_joint_*[0:0.5]",
+    "so101_log_test": "step_response single_joint_*[0.5:1]",
+}  # fmt: skip
+BEFORE = 20
+"""Number of samples before a test part of the disk from which its initial state is estimated."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording of a rig.
+
+    Attributes:
+        t: stamps [s], shape (N,).
+        command: command at each stamp, held until the next, shape (N, k).
+        position: measured joint positions [rad], shape (N, joints).
+        start: position and velocity at the first stamp, shape (joints, 2).
+        constants: constants of this recording; of a servo with a load ``duty_per_rad`` of its position gain, ``mass``
+            [kg] and ``length`` [m] of the load, and ``torque_enable``, shape (N,).
+    """
+
+    t: np.ndarray
+    command: np.ndarray
+    position: np.ndarray
+    start: np.ndarray
+    constants: dict[str, Any] = field(default_factory=dict)
+
+    def part(self, begin: int, end: int, start: np.ndarray | None = None) -> Recording:
+        """Return the samples from ``begin`` up to ``end``."""
+        cut = slice(begin, end)
+        start = self.start if start is None else start
+        return Recording(self.t[cut], self.command[cut], self.position[cut], start, self.constants)
+
+    def joint(self, index: int) -> Recording:
+        """Return one joint and its command."""
+        one = slice(index, index + 1)
+        return Recording(self.t, self.command[:, one], self.position[:, one], self.start[one], self.constants)
+
+
+def recording(episode: Episode, command: str, position_field: str, **constants: object) -> Recording:
+    """Return an episode as a recording; it starts at the first measured position, at rest."""
+    t = episode.steps["sensor"].begun_s
+    commands, position = _column(episode, "actuator", command), _column(episode, "sensor", position_field)
+    start = np.stack([position[0], np.zeros(position.shape[1])], axis=1)
+    return Recording(t, commands, position, start, constants)
+
+
+def _column(episode: Episode, node: str, field: str) -> np.ndarray:
+    data = episode.outputs[node][field]
+    return np.asarray(data, np.float64).reshape(len(data), -1)
+
+
+def load(case: str, data: Path, spec: str, past: int = 0) -> dict[str, Episode]:
+    """Return the recordings of a case that a text selects, by name.
+
+    Args:
+        case: ``disk``, ``xl330`` or ``so101_log``.
+        data: Folder with the case's files, or with its folder, or one of the files.
+        spec: disk: ``[FILE@]A:B``, samples. xl330: ``kp=100,800 motion=sin_sin,up_and_down``, or ``all``. so101_log:
+            names of motions, with ``*``, and with ``[a:b]`` for a part, in shares of its length.
+        past: Further samples of the disk before ``A``.
+
+    Raises:
+        UsageError: When there are no files, or the text selects none of them.
+    """
+    folder = data / FOLDERS[case] if (data / FOLDERS[case]).is_dir() else data
+    pattern = "*.json" if case == "xl330" else "*.npz"
+    files = [folder] if folder.is_file() and folder.match(pattern) else sorted(folder.glob(pattern))
+    if not files:
+        raise UsageError(
+            f"{data} is no file {pattern} and no folder with such files", hint=f"--data: {case}'s recordings"
+        )
+    episodes = {"disk": _load_disk, "xl330": _load_xl330, "so101_log": _load_so101}[case](files, spec, past)
+    if not episodes:
+        names = ", ".join(f.name for f in files)
+        raise UsageError(f"{spec!r} selects no part of {names}", hint="select parts with --fit and --test")
+    return episodes
+
+
+def _mapping(case: str) -> Path:
+    return Path(str(load_pipeline(case).load("__init__").__file__)).with_name("import.toml")
+
+
+def _load_disk(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
+    name, _, part = spec.rpartition("@")
+    first, last = (int(x) if x else None for x in part.split(":"))
+    begin = max(0, (first or 0) - past)
+    chosen = [f for f in files if f.name == name] if name else files[:1]
+    if not chosen:
+        return {}
+    return {spec: import_file(chosen[0], load_mapping(_mapping("disk")), slice(begin, last))}
+
+
+def _load_xl330(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
+    del past
+    wanted = dict(part.split("=") for part in spec.split() if part != "all")
+    episodes = {}
+    for file in files:
+        about = json.loads(file.read_text())
+        labels = {"kp": str(about["kp"]), "motion": about["trajectory"], "file": file.stem}
+        if all(labels[key] in values.split(",") for key, values in wanted.items()):
+            episodes[f"kp {labels['kp']} {labels['motion']} {file.stem}"] = import_file(
+                file, load_mapping(_mapping("xl330"))
+            )
+    return episodes
+
+
+def _load_so101(files: list[Path], spec: str, past: int) -> dict[str, Episode]:
+    del past
+    episodes = {}
+    for part in spec.split():
+        pattern, _, share = part.partition("[")
+        a, b = (float(x) for x in share.rstrip("]").split(":")) if share else (0.0, 1.0)
+        for file in files:
+            if fnmatch(file.stem, pattern):
+                with np.load(file) as content:
+                    count = len(content["t_meas_s"])
+                samples = slice(round(a * count), round(b * count))
+                episodes[f"{file.stem}[{a:g}:{b:g}]" if share else file.stem] = import_file(
+                    file, load_mapping(_mapping("so101_log")), samples
+                )
+    return episodes
 
 
 @dataclass(frozen=True)
@@ -48,7 +175,7 @@ class Fold:
     """Recordings to fit, and held-out ones to predict.
 
     Attributes:
-        spec: Both in the syntax of ``benches/identify/recordings.py``: (fit, test); None for a set without a pipeline.
+        spec: Both in the syntax of ``load``: (fit, test); None for a set without a pipeline.
     """
 
     name: str
@@ -99,8 +226,8 @@ def part(t: np.ndarray, command: np.ndarray, position: np.ndarray, begin: int, e
         ahead: Whether samples behind ``begin`` may be used: for predicted parts only those before it.
     """
     near = slice(max(begin - PAST, 0), begin + (PAST if ahead else 1))
-    if near.stop - near.start < PAST:  # where ours begins: recordings.PAST samples in
-        begin += recordings.PAST
+    if near.stop - near.start < PAST:  # where ours begins: BEFORE samples in
+        begin += BEFORE
         near = slice(begin - PAST, begin + (PAST if ahead else 1))
     fits = [np.polyfit(t[near] - t[begin], angles[near], 3) for angles in position.T]
     start = np.array([[f[3], f[2]] for f in fits])
@@ -145,7 +272,7 @@ def xl330(data: Path) -> list[Fold]:
         for value in values:
             rest = f"{key}=" + ",".join(v for v in values if v != value)
             fit, test = (
-                [_xl330(e) for e in recordings.load("xl330", data, s).values()] for s in (rest, f"{key}={value}")
+                [servo_recording(e) for e in load("xl330", data, s).values()] for s in (rest, f"{key}={value}")
             )
             folds.append(Fold(f"{key} {value}", tuple(fit), tuple(test), (rest, f"{key}={value}")))
     return folds
@@ -156,7 +283,7 @@ def so101(data: Path) -> list[Fold]:
 
     With all 24 others, one of our fits would take longer than ten minutes.
     """
-    every = recordings.load("so101_log", data, "*")
+    every = load("so101_log", data, "*")
     by_motion = {name: recording(e, "goal", "position") for name, e in every.items()}
     count, folds = min(SO101_FOLDS, len(by_motion)), []
     groups = [list(by_motion)[k::count] for k in range(count)]
@@ -192,7 +319,8 @@ def sts3250(data: Path) -> list[Fold]:
     return [Fold(n, tuple(r for m, r in by_motion.items() if m != n), (by_motion[n],)) for n in by_motion]
 
 
-def _xl330(episode: Any) -> Recording:
+def servo_recording(episode: Episode) -> Recording:
+    """Return a recording of the XL330 with its load."""
     on = np.asarray(episode.outputs["actuator"]["enabled"]).reshape(-1) > 0.5
     kp = float(np.asarray(episode.outputs["actuator"]["kp"]).reshape(-1)[0])
     duty_per_rad = kp / 256 * 4096 / (2 * np.pi) / 885

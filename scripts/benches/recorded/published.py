@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from benches.identify.sysid import Recording
+from benches.recorded.sets import Recording
 
 SERVOS = {
     "published_sts3215": (998.22, 2.731, 0.028, 0.052, 0.60, 3.35),

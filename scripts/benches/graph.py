@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benches.graph.shared import EPISODES, MODEL, unroll_of
 from benches.rows import Report, Row, compare, row, values
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.delays import StaticDist
@@ -25,17 +24,19 @@ from sim2real.graph.timeline import Timeline
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.runtime.compilation.wiring import wire
+from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.types import Array, Key, PyTree
 from sim2real.worlds.ode import OdeWorld
 
-DURATION_S = 4.0
+MODEL = load_pipeline("pendulum").load("model")
+DURATION_S, EPISODES = 4.0, 32
 CASES = {
     "plain": ((50.0, 50.0, 0.01), (1,)),
     "hiccups": ((50.0, 50.0, 0.01), (1,)),
     "30_over_100_hz": ((30.0, 100.0, 0.005), (3, 3, 4)),
 }
 """Kinds of timelines: rates of agent and world [Hz], the world's substep [s]; world ticks after each policy step."""
-QUICK = {"copies": [2], "repeats": 1, "cases": ["hiccups"], "build": [10], "mjx": 2, "links": 1}
+QUICK = {"copies": [2], "repeats": 1, "cases": ["hiccups"], "build": [10]}
 
 
 class _Normal:
@@ -222,32 +223,25 @@ def bytes_per_copy(graph: CompiledGraph) -> int:
     )
 
 
-def case(device: str, kind: str, copies: int, repeats: int, unrolls: Sequence[int] = ()) -> list[Row]:
-    """Measure one kind of timelines at one number of copies; with ``unrolls`` also other rows per pass of the loop."""
+def case(device: str, kind: str, copies: int, repeats: int) -> list[Row]:
+    """Measure one kind of timelines at one number of copies."""
     rates, ticks = CASES[kind]
     graph_nodes = nodes(*rates)
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes, kind == "hiccups"))
     world = graph_nodes["world"]
     total = (graph.repetition or graph).wiring.total
     pattern_rows = total // sum(ticks)
+    rows_per_pass = 1 if jax.default_backend() == "cpu" else 2  # as in the graph's loop
     programs = {
         "bare": bare_program(pattern_rows, ticks, world),
         "hand": hand_program(pattern_rows, ticks, world),
         # A pattern of several policy steps is unrolled as it is; twice of it took XLA 8 times as long on an H200.
-        "unrolled": hand_program(pattern_rows, ticks, world, unroll_of(1) if len(ticks) == 1 else 1),
+        "unrolled": hand_program(pattern_rows, ticks, world, rows_per_pass if len(ticks) == 1 else 1),
         "graph": graph_program(graph),
     }
-    others = {}
-    for count in unrolls:
-        other = CompiledGraph(graph_nodes, "agent", graph.timeline)
-        other.rows_per_pass = count
-        others[f"rows_per_pass/{count}"] = graph_program(other)
-    programs |= others
     seconds, compile_s = compare(programs, jax.random.split(jax.random.key(0), copies), repeats)
     # The programs may differ by a tick or two in length: compared per tick.
-    per_tick = {
-        n: s / (total if n == "graph" or n in others else pattern_rows * sum(ticks)) for n, s in seconds.items()
-    }
+    per_tick = {n: s / (total if n == "graph" else pattern_rows * sum(ticks)) for n, s in seconds.items()}
     policy_steps = float(graph.timeline.vertices["agent"].count.mean())
     report = graph.report()
     print(kind, copies, {n: f"{1e3 * s:.2f} ms" for n, s in seconds.items()}, report, file=sys.stderr)
@@ -262,7 +256,6 @@ def case(device: str, kind: str, copies: int, repeats: int, unrolls: Sequence[in
         row(f"{label}/over_bare", round(over["bare"], 3), "1", "physics alone"),
         row(f"{label}/agent_steps_per_s", round(rate), "1/s", f"{hand_rate:.3g} by hand"),
         row(f"{label}/compile_s", round(compile_s["graph"], 2), "s", f"{compile_s['hand']:.2f} by hand", "< 5"),
-        *(row(f"{label}/{n}/over_hand", round(per_tick[n] / per_tick["hand"], 3), "1", "hand-written") for n in others),
     ]
 
 
@@ -290,21 +283,14 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", help="name of the device in the rows; default: cpu or gpu")
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="kinds of timelines")
     parser.add_argument("--build", type=int, nargs="+", default=[1_000, 10_000], help="episodes to draw and to wire")
-    parser.add_argument("--mjx", type=int, default=64, help="copies of the MJX arm; 0: none")
-    parser.add_argument("--links", type=int, default=6, help="links of the MJX arm")
-    parser.add_argument("--unroll", type=int, nargs="+", default=[], help="other numbers of rows in a pass of the loop")
 
 
 def run(options: argparse.Namespace) -> Report:
     """Measure on the device that JAX finds."""
     device = f"graph/{options.name or jax.default_backend()}"
     copies = options.copies or ([1024] if jax.default_backend() == "cpu" else [20_000, 100_000])
-    cases = [(device, kind, count, options.repeats, options.unroll) for count in copies for kind in options.cases]
+    cases = [(device, kind, count, options.repeats) for count in copies for kind in options.cases]
     rows = [r for arguments in cases for r in case(*arguments)]
-    if options.mjx:
-        from benches.graph.mjx import mjx_case  # MuJoCo is not needed without it
-
-        rows += mjx_case(device, options.mjx, options.repeats, options.links)
     graph_nodes = nodes()
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes))
     rows.append(row("graph/bytes_per_copy", bytes_per_copy(graph), "B", goal="< 2000"))

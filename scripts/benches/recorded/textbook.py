@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import least_squares
 
-from benches.identify.sysid import Recording
+from benches.recorded.sets import Recording
 
 STEP_S, LONGEST_STEP_S = 0.002, 0.005
 WINDOW_S = 5.0

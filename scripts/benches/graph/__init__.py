@@ -1,1 +1,0 @@
-"""The graph: compiled, on a simulated clock, on the wall clock."""

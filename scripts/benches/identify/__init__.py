@@ -1,1 +1,0 @@
-"""Recordings of real motors, fitted and predicted."""

@@ -1,1 +1,0 @@
-"""All recordings, and all tools that fit them."""

@@ -1,0 +1,1 @@
+"""Recordings of real motors, and all tools that fit them."""
