@@ -24,7 +24,6 @@ MAY_IMPORT = {
     },
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax_adapter", "sim2real.interop.gymnasium_adapter"},
-    "mixture": {"sim2real.graph.fitting"},
     "parquet": {"sim2real.log.importing.files.lerobot"},
     "lerobot": {"sim2real.hardware.lerobot.device"},
     "tensorboard": {"sim2real.stages.train.tensorboard"},
