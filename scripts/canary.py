@@ -87,8 +87,12 @@ def main() -> int:
                 if options.data is None:
                     continue
                 words += ["--data", str(options.data)]
-            if bench.main([*words, "--json", str(new)]):
-                red.append((command, "", "did not run"))
+            try:
+                why = f"ended with exit code {code}" if (code := bench.main([*words, "--json", str(new)])) else ""
+            except Exception as error:  # the other benches still run
+                why = f"{type(error).__name__}: {error}"
+            if why:
+                red.append((command, "", why))
                 continue
             old = json.loads((ROOT / "reports" / f"{name}.json").read_text())["rows"] if name else []
             committed = {row["name"]: row for row in old}

@@ -1,1 +1,0 @@
-"""Emulated links with known delays, and the methods that estimate them."""
