@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.artifacts.estimation.noise import Noise
 from sim2real.artifacts.files import check, malformed, read_arrays, read_versioned, write_arrays, write_json
+from sim2real.artifacts.identification import Noise
 from sim2real.artifacts.summary import ArtifactTable, Interval
 
 FORMAT = 1

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from sim2real.artifacts.estimation.links import Link
-from sim2real.artifacts.estimation.noise import Noise
-from sim2real.artifacts.estimation.posterior import Posterior
-from sim2real.artifacts.estimation.promise import Bound, Promise, promises_table
-from sim2real.artifacts.estimation.quantity import Quantity
-from sim2real.artifacts.estimation.search import Search
-from sim2real.artifacts.estimation.tried_term import TriedTerm
-from sim2real.artifacts.estimation.worst_second import WorstSecond
 from sim2real.artifacts.files import (
     check,
     make_folder,
@@ -26,6 +20,7 @@ from sim2real.artifacts.files import (
     write_arrays,
     write_json,
 )
+from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run.run_folder import Source
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown
 from sim2real.artifacts.timing import TIMING, Timing
@@ -190,6 +185,437 @@ class HeldOutPart:
     ahead: Mapping[str, float | None]
     free: Mapping[str, float | None] = field(default_factory=dict)
     run_s: float = 0.0
+
+
+_COLUMN = re.compile(r"(.+?)(?:\[(\d+)\])?")
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The differences between one measured quantity and the identified model.
+
+    Attributes:
+        column: A field of the sensor's message, with an index ``[i]`` if the field is a vector.
+        deviation: Standard deviation of the part that changes from sample to sample; includes jitter of sampling times.
+        quantum: Step between neighbouring readings; 0 if readings have no step.
+        bias: Standard deviation of the part that is constant over a segment.
+    """
+
+    column: str
+    unit: str
+    deviation: float
+    quantum: float
+    bias: float
+
+    def __post_init__(self) -> None:
+        """Check the numbers, which can come from a file."""
+        sizes = (self.deviation, self.quantum, self.bias)
+        check(all(math.isfinite(s) and s >= 0.0 for s in sizes), f"{self.column}: noise of {sizes}")
+
+    @property
+    def place(self) -> tuple[str, int | None]:
+        """The field of the message, and the index in it; None if the field is a number."""
+        name, index = _COLUMN.fullmatch(self.column).groups()  # type: ignore[union-attr]  # .+? matches any name
+        return name, None if index is None else int(index)
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A local refinement: the loss before and after, and the number of steps."""
+
+    before: float | None
+    after: float | None
+    steps: int
+
+
+@dataclass(frozen=True)
+class Search:
+    """The search for the estimate.
+
+    Attributes:
+        history: Best loss of each generation ``(G,)``.
+        evaluations: Number of simulated candidates.
+        loss: Best loss of an interrupted search.
+        done: Completed shares of an interrupted search and refinement.
+        engine: The simulator, and the reason for its choice.
+    """
+
+    strategy: str | None = None
+    history: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    evaluations: int = 0
+    refined: tuple[Refinement, ...] = ()
+    seconds: float | None = None
+    loss: float | None = None
+    done: Mapping[str, float] = field(default_factory=dict)
+    engine: str = ""
+
+
+Outcome = Literal["chosen", "mends", "no gain", "not reached", "not fitted"]
+
+
+@dataclass(frozen=True)
+class TriedTerm:
+    """Errors on held-out parts without and with a term.
+
+    Attributes:
+        without: Root mean square without the term [deviations of a measurement].
+        error: The same with the term; None if the set was not fitted, because less than 5 % of gain was predicted.
+        outcome: ``chosen``; ``mends`` if the error falls by more than 5 %; ``not reached`` of a limit without effect.
+    """
+
+    term: str
+    without: float
+    error: float | None
+    outcome: Outcome
+
+    @property
+    def gain(self) -> float | None:
+        """By which share the term lowers the error."""
+        return None if self.error is None or not self.without > 0.0 else 1.0 - self.error / self.without
+
+    def __str__(self) -> str:
+        """Return a few words, for a sentence."""
+        if self.error is None or self.gain is None or self.outcome == "not reached":
+            return f"{self.term} {self.outcome}"
+        return f"{self.term} {self.without:.3g} to {self.error:.3g}"
+
+
+def tried_table(rows: Sequence[TriedTerm]) -> ArtifactTable:
+    """Return a row for each term."""
+    cells = [
+        [r.term, r.without, "" if r.error is None else r.error, "" if r.gain is None else f"{r.gain:.0%}", r.outcome]
+        for r in rows
+    ]
+    return ArtifactTable(("term tried", "error without", "error with", "gain", "outcome"), cells)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One quantity, estimated from each of R recordings alone, and the mean of these estimates.
+
+    Attributes:
+        estimates: Shape ``(R,)``.
+        standard_errors: Shape ``(R,)``.
+        standard_error: Of the mean.
+        between: Deviation between recordings, beyond their standard errors.
+        low95: Lower end of the 95 % interval for a further recording.
+        agree: Whether the standard errors explain the differences between the estimates.
+    """
+
+    name: str
+    unit: str
+    estimates: np.ndarray
+    standard_errors: np.ndarray
+    mean: float
+    standard_error: float
+    between: float
+    low95: float
+    high95: float
+    agree: bool
+
+    def __post_init__(self) -> None:
+        check(self.estimates.shape == self.standard_errors.shape, f"{self.name}: estimates without errors")
+
+
+Reach = Literal["ahead", "free run"]
+AHEAD: Reach = "ahead"
+FREE_RUN: Reach = "free run"
+MAX_ERROR_RATIO = 1.25
+"""Largest ratio of an error to its bound at which the promise is not broken: one error in twenty may exceed its bound,
+and it seldom exceeds it by this."""
+
+PROMISE_BROKEN = "promise broken"
+"""The verdict on an identification whose errors on held-out data exceed their bounds."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How errors grow with the motion of a log: in proportion to a power of one size of the motion.
+
+    Attributes:
+        size: The name of the size, such as ``largest step`` of the goal; see ``growth.sizes``.
+        power: The exponent of the size.
+        usual: Its median over the recordings.
+        low, high: Its least and largest values; the bound for a motion below ``low`` is that for ``low``.
+        bound: The bound for a usual motion; 0 before it is computed.
+    """
+
+    size: str
+    power: float
+    usual: float
+    low: float
+    high: float
+    bound: float = 0.0
+
+    def factor(self, sizes: Mapping[str, float], stretch: float) -> float:
+        """Return the factor of a log's bound over that for a usual motion.
+
+        Args:
+            sizes: The sizes of the log's motion; without this size the motion counts as the largest.
+            stretch: Factor of a motion that leaves the range of all fitted ones; see ``predicted_logs.stretches``.
+        """
+        value = max(sizes.get(self.size, self.high), self.low)
+        return max((value / self.usual) ** self.power, (min(value, self.high) / self.usual) ** self.power * stretch)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A promise: 95 % of the errors of a position on later logs stay below ``bound``.
+
+    Attributes:
+        column: The position among the measured fields, such as ``position[1]``.
+        name: Its name for people.
+        reach: ``ahead``: windows of a horizon, each from a state of its own; ``free run``: one run.
+        seconds: The horizon, or the length of the run [s].
+        scope: What the bound is about: ``this recording`` or ``recordings like these``.
+        growth: How the bound of a single log follows its motion; None if errors do not depend on the motion.
+    """
+
+    column: str
+    name: str
+    unit: str
+    reach: Reach
+    seconds: float
+    bound: float
+    scope: str
+    growth: Growth | None = None
+
+    def on(self, sizes: Mapping[str, float], stretch: float) -> tuple[float, float]:
+        """Return the bound for a log, and its factor over the bound for a usual motion; see ``Growth.factor``."""
+        if self.growth is None or self.growth.size not in sizes:
+            return stretch * self.bound, stretch
+        factor = self.growth.factor(sizes, stretch)
+        return factor * self.growth.bound, factor
+
+
+@dataclass(frozen=True)
+class Promise:
+    """An error beside the bound that was given before the prediction.
+
+    Attributes:
+        source: The predicted data: a held-out part, the held-out quarter, or a log.
+        fresh: Whether the estimates never depended on this data; held-out parts are fitted afterwards.
+        seconds: The horizon, or the length of the run [s]; 0 for a part in older files.
+        error: Root mean square error; None if it is infinite.
+        bound: None if too few parts gave one.
+        stretch: Factor of this data in ``bound``, which needs no prediction: more than 1 if the motion is faster or
+            reaches further than the fitted one. Where errors grow with the motion, its bound over that for a usual one.
+    """
+
+    source: str
+    fresh: bool
+    column: str
+    name: str
+    unit: str
+    reach: Reach
+    seconds: float
+    error: float | None
+    bound: float | None = None
+    stretch: float = 1.0
+
+    @property
+    def ratio(self) -> float | None:
+        """The error over its bound; None without a bound."""
+        return None if self.bound is None else math.inf if self.error is None else self.error / self.bound
+
+    @property
+    def broken(self) -> bool:
+        """Whether the error exceeds its bound by more than ``MAX_ERROR_RATIO``."""
+        return self.ratio is not None and self.ratio > MAX_ERROR_RATIO
+
+    @property
+    def kept(self) -> str:
+        """Whether the promise is kept, as text; an error above its bound by less is ``within`` the ratio."""
+        if self.ratio is None:
+            return "none was made"
+        return "no" if self.broken else "yes" if self.ratio <= 1.0 else f"within {MAX_ERROR_RATIO:g}"
+
+    @property
+    def horizon(self) -> str:
+        """How far the prediction reaches, as text."""
+        if not self.seconds:
+            return self.reach
+        return f"{self.seconds:.3g} s ahead" if self.reach == AHEAD else f"free run of {self.seconds:.3g} s"
+
+    def sentence(self) -> str:
+        """Return the error and its bound as text."""
+        unit, where = f" {self.unit}".rstrip(), self.source
+        how = f"up to {self.seconds:.3g} s ahead" if self.reach == AHEAD else f"in a free run of {self.seconds:.3g} s"
+        size = "diverges" if self.error is None else f"is off by {self.error:.2g}{unit}"
+        ratio = "" if self.ratio is None or self.error is None else f", {self.ratio:.2f} times as much"
+        bound = "" if self.bound is None else f"; promised was {self.bound:.2g}{unit}{ratio and f': {ratio[2:]}'}"
+        wider = f" ({self.stretch:.2g} times the usual bound, for its motion)" if bound and self.stretch != 1.0 else ""
+        return f"{self.name} {size} {how} on {where}{bound}{wider}"
+
+
+def too_many_broken(rows: Sequence[Promise]) -> bool:
+    """Return whether promises about data that no estimate depended on are broken; of twenty alike, one may be.
+
+    Bounds are for 95 % of the errors, so of many some are exceeded although each bound is right.
+    """
+    counts: dict[tuple[str, Reach], list[bool]] = {}
+    for r in rows:
+        if r.fresh and r.ratio is not None:
+            counts.setdefault((r.column, r.reach), []).append(r.broken)
+    return any(sum(those) > len(those) // 20 for those in counts.values())
+
+
+def promises_table(rows: Sequence[Promise]) -> ArtifactTable:
+    """Return a row for each error with a bound, the largest ratio first."""
+    cells = []
+    for r in sorted(rows, key=lambda row: -(row.ratio or 0.0)):
+        if r.ratio is not None:
+            error = math.inf if r.error is None else r.error
+            cells.append([r.name, r.source, r.horizon, r.bound, error, r.unit, f"{r.ratio:.2f}", r.kept])
+    return ArtifactTable(("position", "predicted", "horizon", "promised", "shown", "unit", "ratio", "kept"), cells)
+
+
+_WINDOW_S = 1.0
+_UNEXPLAINED = 0.5
+"""Share of a joint's motion from which an error means that the model does not explain the second."""
+_SMALLER = {"rad": "mrad", "m": "mm", "s": "ms"}
+"""Unit -> a thousandth of it, for errors below 1."""
+
+
+@dataclass(frozen=True)
+class WorstSecond:
+    """The worst second of the joint that the identified model explains worst.
+
+    Attributes:
+        column: Its position's name among the columns of the samples.
+        begin_s: Start of the second in the recording [s].
+        end_s: Its end [s]; a shorter segment has a shorter one.
+        rmse: Root mean square of the residual in it; None if the model diverges.
+        times_noise: The same in deviations of a measurement; None if the model diverges.
+        of_motion: The same as a share of the motion, the deviation of all measured positions of the joint in the
+            recording; None if the model diverges.
+    """
+
+    name: str
+    column: str
+    unit: str
+    recording: int
+    segment: int
+    begin_s: float
+    end_s: float
+    rmse: float | None
+    times_noise: float | None
+    of_motion: float | None
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether the model does not explain this second: a fault of the log, of the robot or of the model."""
+        return self.of_motion is None or self.of_motion >= _UNEXPLAINED
+
+    @property
+    def error(self) -> str:
+        """The error with its unit."""
+        return "the model diverges" if self.rmse is None else with_small_unit(self.rmse, self.unit)
+
+    def text(self, logs: Sequence[Source]) -> str:
+        """Return joint, time and error on one line; of several recordings with the name of its file."""
+        log = logs[self.recording].path.replace("\\", "/").rsplit("/", 1)[-1] if len(logs) > 1 else ""
+        at = f"{self.begin_s:.1f} s" + (f" of {log}" if log else "")
+        return f"joint {self.name}, {at}, {self.error}"
+
+
+def with_small_unit(value: float, unit: str) -> str:
+    """Return an error with its unit, below 1 rad, m or s in thousandths."""
+    if unit in _SMALLER and abs(value) < 1.0:
+        value, unit = 1e3 * value, _SMALLER[unit]
+    return f"{value:.{max(2, len(str(int(abs(value)))))}g} {unit}".rstrip()
+
+
+def worst_window(t_s: np.ndarray, squares: np.ndarray) -> tuple[float, float, float]:
+    """Return begin [s], end [s] and root mean square error of the worst second; infinite if an error is not finite.
+
+    Args:
+        t_s: Times ``(N,)`` [s].
+        squares: Squared errors ``(N,)``.
+    """
+    if not np.isfinite(squares).all():
+        bad = int(np.flatnonzero(~np.isfinite(squares))[0])
+        last = np.searchsorted(t_s, t_s[bad] + _WINDOW_S, side="right") - 1
+        return float(t_s[bad]), float(t_s[last]), math.inf
+    sums = np.concatenate([[0.0], np.cumsum(squares)])
+    # Windows begin at each sample that has a whole second after it, and at the first sample of shorter series.
+    first = np.flatnonzero(t_s <= max(float(t_s[-1]) - _WINDOW_S, float(t_s[0])) + 1e-9)
+    after = np.searchsorted(t_s, t_s[first] + _WINDOW_S + 1e-9, side="right")
+    means = (sums[after] - sums[first]) / (after - first)
+    worst = int(means.argmax())
+    return float(t_s[first[worst]]), float(t_s[after[worst] - 1]), math.sqrt(max(float(means[worst]), 0.0))
+
+
+_LINK_HEADERS = ("link", "estimate", "95 % interval", "unit")
+
+
+@dataclass(frozen=True)
+class Ranged:
+    """A number with its 95 % interval; None if the log does not determine it."""
+
+    value: float | None
+    low95: float | None
+    high95: float | None
+
+
+@dataclass(frozen=True)
+class Link:
+    """The delay of a link, estimated from the motion.
+
+    Attributes:
+        name: The delay's parameter.
+        parts: Delays whose sum has this mean and 95th percentile, as a log of motion determines only their sum; the
+            link's name alone if the log determines its delay alone.
+        mean: Mean of the sum in the middle of a recording [s].
+        deviation: Standard deviation of this link's delay alone [s].
+        p95: 95th percentile of the sum [s].
+        lost: Share of lost messages: their reader uses the previous message again.
+        burst: Mean number of lost messages in a row; None without losses.
+        drift: Rate of the stamps' clock relative to the commands' clock, minus 1 [s/s].
+        delays: Shape ``(K,)``: values of the sum [s].
+        share: Shape ``(K,)``: share of the messages with each of these values.
+        jitter: Standard deviation of the commands' delay, over all links between command and motion together [s].
+    """
+
+    name: str
+    parts: tuple[str, ...]
+    mean: Ranged
+    deviation: Ranged
+    p95: Ranged
+    lost: Ranged
+    burst: Ranged
+    drift: Ranged
+    delays: np.ndarray
+    share: np.ndarray
+    jitter: Ranged = Ranged(None, None, None)
+
+    def rows(self) -> ArtifactTable:
+        """Return a row for each number that the log determines."""
+        total, name = " + ".join(self.parts), self.name
+        numbers = [
+            (f"{total}, mean", self.mean, 1e3, "ms"),
+            (f"{total}, 95 % of the messages", self.p95, 1e3, "ms"),
+            (f"{name}, deviation", self.deviation, 1e3, "ms"),
+            (f"{' + '.join(self.parts[1:]) or 'commands'}, deviation", self.jitter, 1e3, "ms"),
+            (f"{name}, lost", self.lost, 100.0, "%"),
+            (f"{name}, lost in a row", self.burst, 1.0, ""),
+            (f"{name}, drift of the clock", self.drift, 1e6, "us/s"),
+        ]
+        rows = [
+            [label, factor * r.value, Interval(_scaled(r.low95, factor), _scaled(r.high95, factor)), unit]
+            for label, r, factor, unit in numbers
+            if r.value is not None
+        ]
+        return ArtifactTable(_LINK_HEADERS, rows)
+
+
+def links_table(links: Sequence[Link]) -> ArtifactTable:
+    """Return the rows of several links as one table."""
+    return ArtifactTable(_LINK_HEADERS, [row for link in links for row in link.rows().rows])
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value
 
 
 @dataclass(frozen=True, repr=False)

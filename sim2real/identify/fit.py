@@ -7,7 +7,7 @@ from typing import TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.artifacts.estimation.search import Refinement, Search
+from sim2real.artifacts.identification import Refinement, Search
 from sim2real.graph.episode import Episode
 from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel

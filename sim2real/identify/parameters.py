@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim2real.artifacts.estimation.posterior import TRANSFORMS, Posterior, Transform, from_scale
+from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
 from sim2real.identify.parameter_paths import set_leaf
 from sim2real.installation import has_jax

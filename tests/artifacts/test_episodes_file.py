@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.episodes import DRAWS, EPISODES, Episodes, Varied
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.errors import Sim2RealError
 
 

@@ -6,8 +6,6 @@ from dataclasses import fields, is_dataclass, replace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.posterior import Posterior
-from sim2real.artifacts.estimation.search import Refinement
 from sim2real.artifacts.identification import (
     Determined,
     Estimate,
@@ -19,8 +17,10 @@ from sim2real.artifacts.identification import (
     Matrix,
     Prediction,
     Quantity,
+    Refinement,
     Search,
 )
+from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run.run_folder import Source
 from sim2real.errors import Sim2RealError
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.posterior import Alternative, Posterior
 from sim2real.artifacts.files import read_json, write_json
+from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.identify.parameters import Parameter, ParameterTable
 
 

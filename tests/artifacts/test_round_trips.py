@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.episodes import Episodes
-from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.files import read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.identification import Identification, Matrix
+from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.manifest import plain, read_manifest, write_manifest
 from sim2real.artifacts.sensitivity import Sensitivity

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.drift.drift_test import Fitted, Way, _beside_the_rest, drift, ways, weigh
 from sim2real.identify.parameters import Parameter, ParameterTable

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty.noise import above_noise, noises, widening
 from sim2real.identify.uncertainty.uncertainty import Linearised

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.tried_term import TriedTerm
+from sim2real.artifacts.identification import TriedTerm
 from sim2real.identify.validation.refits import REFITS, Refits
 from sim2real.stages.identify.inputs import prepare
 from sim2real.stages.pipeline.open_log import open_recording

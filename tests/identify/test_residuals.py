@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_folds import BIAS, CONFIG, GAIN, NOISE, TAU_S, Model, lag_log
 
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation import prediction

@@ -5,9 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.noise import Noise
-from sim2real.artifacts.estimation.tried_term import TriedTerm, tried_table
-from sim2real.artifacts.identification import Identification, Judgement
+from sim2real.artifacts.identification import Identification, Judgement, Noise, TriedTerm, tried_table
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.validation.optional_terms import Trial
 from sim2real.identify.validation.term_gains import gains

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.posterior import Posterior
 from sim2real.identify.validation.draws import DRAWS, intervals
 
 T = np.arange(0.0, 2.0, 0.1)

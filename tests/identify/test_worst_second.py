@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.worst_second import with_small_unit, worst_window
+from sim2real.artifacts.identification import with_small_unit, worst_window
 from sim2real.identify.validation.verdict import Position
 from sim2real.identify.validation.worst_second import worst_second
 

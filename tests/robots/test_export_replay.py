@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from flax import struct
 
-from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.node import BaseNode

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from sim2real import cli, errors
-from sim2real.artifacts.estimation.links import Link, Ranged
-from sim2real.artifacts.estimation.posterior import Posterior
-from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.identification import Estimate, Identification, Judgement, Link, Ranged
+from sim2real.artifacts.posterior import Posterior
 from sim2real.commands.export.card import facts_of, write_model_card
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_robot import SHEET
 
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.composer.physics.mjx.environment import State
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState

@@ -12,8 +12,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 from benches.hidden import legs
 
 from pipelines.go2.robot import ROBOT
-from sim2real.artifacts.estimation.posterior import Alternative, Posterior
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import OtherMotion, UsageError
 from sim2real.hardware.emulation.truth import read_truth

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sim2real import cli, errors
-from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
+from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run import run_folder
 from sim2real.commands.config import ExportConfig
 from sim2real.commands.export import model as export_model

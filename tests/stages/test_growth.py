@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from test_promises import ANGLE, columns, document, left
 
-from sim2real.artifacts.estimation.promise import AHEAD, Bound, Growth
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import AHEAD, Bound, Growth, Identification
 from sim2real.identify.model import Channel
 from sim2real.identify.problem.segments import Span
 from sim2real.stages.estimation import growth, predicted_logs, promises

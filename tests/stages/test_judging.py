@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.deployment import Advice, Course, Deployment, Gap, Replay, Scores
-from sim2real.artifacts.estimation.drift import Changed, Drift
+from sim2real.artifacts.deployment import Advice, Changed, Course, Deployment, Drift, Gap, Replay, Scores
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.bundle import History
-from sim2real.artifacts.deployment import Advice, Deployment, Gap, Scores
-from sim2real.artifacts.estimation.drift import Changed, Drift
+from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Scores
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, finished, newest, open_stage

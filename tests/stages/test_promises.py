@@ -7,8 +7,17 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Bound, Promise, too_many_broken
-from sim2real.artifacts.identification import HeldOut, HeldOutPart, Identification, Judgement
+from sim2real.artifacts.identification import (
+    AHEAD,
+    FREE_RUN,
+    Bound,
+    HeldOut,
+    HeldOutPart,
+    Identification,
+    Judgement,
+    Promise,
+    too_many_broken,
+)
 from sim2real.identify.validation.verdict import Position
 from sim2real.stages.estimation import estimate, predicted_logs, promises
 from sim2real.stages.estimation.free_run import Lack

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.identification import Estimate
+from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import Sim2RealError
 from sim2real.graph.schedule import draw

@@ -2,8 +2,7 @@
 
 import pytest
 
-from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Promise
-from sim2real.artifacts.identification import HeldOut
+from sim2real.artifacts.identification import AHEAD, FREE_RUN, HeldOut, Promise
 from sim2real.stages.validate.score import position_row
 from sim2real.stages.validate.show import show
 

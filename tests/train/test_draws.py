@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.posterior import Posterior
-from sim2real.artifacts.estimation.quantity import Quantity
-from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
+from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement, Quantity
+from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import UsageError
 from sim2real.train.environment.draws import COUNT, draw_robots, widen_posterior, without_default_ranges
 from sim2real.train.environment.variation import VariationConfig

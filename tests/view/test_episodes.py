@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.episodes import Episodes, Varied
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.view.page.episodes import episodes_svg, picture
 
 

@@ -15,8 +15,7 @@ from sketches import sketched, texts
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
-from sim2real.artifacts.estimation.quantity import Quantity
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import Identification, Quantity
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.run_folder import Source, finished_stages
 from sim2real.view import style, timing

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.artifacts.estimation.links import Link, Ranged
+from sim2real.artifacts.identification import Link, Ranged
 from sim2real.view.identification.links import draw_link, link_blocks
 from sim2real.view.style import new_figure, styled
 

@@ -14,10 +14,9 @@ import pytest
 import synthetic_run
 from sketches import sketched
 
-from sim2real.artifacts.estimation.drift import Changed, Drift
-from sim2real.artifacts.estimation.posterior import Alternative, Posterior
-from sim2real.artifacts.estimation.worst_second import WorstSecond
-from sim2real.artifacts.identification import HeldOutPart, Identification, Judgement
+from sim2real.artifacts.deployment import Changed, Drift
+from sim2real.artifacts.identification import HeldOutPart, Identification, Judgement, WorstSecond
+from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.artifacts.summary import ArtifactTable, words_and_unit
 from sim2real.errors import Sim2RealError
 from sim2real.view.blocks import MISSING, FigureBlock, TableBlock, decimals_for, fixed, number

@@ -16,8 +16,7 @@ from typing import Any
 
 from benches.rows import Report, Row, row
 
-from sim2real.artifacts.estimation.promise import promises_table
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import Identification, promises_table
 from sim2real.artifacts.run.manifest import plain
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, finished
 

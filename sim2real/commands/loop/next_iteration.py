@@ -14,7 +14,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.deploy.next_command import logs_to_identify, needs_timing, terms_to_identify
 
 if TYPE_CHECKING:
-    from sim2real.artifacts.estimation.drift import Drift
+    from sim2real.artifacts.deployment import Drift
     from sim2real.commands.flags import RunFlags
     from sim2real.stages.pipeline.pipeline import Pipeline
 

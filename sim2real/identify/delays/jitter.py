@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize, root_scalar
 
-from sim2real.artifacts.estimation.links import Ranged
+from sim2real.artifacts.identification import Ranged
 from sim2real.graph.node import TICKS_PER_S, to_ticks
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex

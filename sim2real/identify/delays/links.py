@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.links import Link, Ranged
+from sim2real.artifacts.identification import Link, Ranged
 from sim2real.errors import UsageError
 from sim2real.identify.delays import jitter
 from sim2real.identify.delays.delay_residuals import Watched, motion

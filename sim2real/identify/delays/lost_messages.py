@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.artifacts.estimation.links import Ranged
+from sim2real.artifacts.identification import Ranged
 
 _DRAWS = 4000
 """Draws from which intervals are taken."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtr, stdtrit
 
-from sim2real.artifacts.estimation.drift import Changed, Drift
-from sim2real.artifacts.estimation.posterior import Posterior, Transform
+from sim2real.artifacts.deployment import Changed, Drift
 from sim2real.artifacts.identification import ROUND_TRIP
+from sim2real.artifacts.posterior import Posterior, Transform
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem

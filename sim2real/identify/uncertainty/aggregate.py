@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from sim2real.artifacts.estimation.quantity import Quantity
+from sim2real.artifacts.identification import Quantity
 from sim2real.errors import UsageError
 
 _DISAGREES = 0.01

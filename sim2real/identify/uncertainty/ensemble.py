@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.posterior import Alternative, Posterior
+from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.search.refine import refine

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.uncertainty.uncertainty import Linearised, Uncertainty, time_shift
 

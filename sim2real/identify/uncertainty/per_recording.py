@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.quantity import Quantity
-from sim2real.artifacts.identification import ROUND_TRIP
+from sim2real.artifacts.identification import ROUND_TRIP, Quantity
 from sim2real.identify.fit import Fit, Value, as_numbers
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.search.refine import refine

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim2real.artifacts.estimation.posterior import Posterior
+from sim2real.artifacts.posterior import Posterior
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.validation.prediction import labels
 

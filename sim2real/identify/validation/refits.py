@@ -12,8 +12,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from sim2real.artifacts.estimation.tried_term import TriedTerm
 from sim2real.artifacts.files import read_json, write_json
+from sim2real.artifacts.identification import TriedTerm
 from sim2real.errors import Sim2RealError
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Data

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sim2real.artifacts.estimation.tried_term import Outcome, TriedTerm
+from sim2real.artifacts.identification import Outcome, TriedTerm
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.validation.optional_terms import Trial, better
 from sim2real.identify.validation.term_trials import LITTLE

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from sim2real.artifacts.estimation.worst_second import WorstSecond, worst_window
+from sim2real.artifacts.identification import WorstSecond, worst_window
 from sim2real.identify.validation.verdict import NOISE, Position
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple, Unpack
 import numpy as np
 
 from sim2real import pytree
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseNode, NodeOptions

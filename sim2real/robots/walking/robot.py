@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.robots.contract import Robot, RobotDrive

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sim2real.artifacts.deployment import Advice, Deployment
-from sim2real.artifacts.estimation.drift import Drift
+from sim2real.artifacts.deployment import Advice, Deployment, Drift
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.manifest import MANIFEST
 from sim2real.robots.worlds import in_world

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.bundle import GOOD_SUCCESS, Bundle
-from sim2real.artifacts.deployment import AS_HERE, Advice, Deployment, Gap, Replay
-from sim2real.artifacts.estimation.drift import Changed, Drift
-from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO
-from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.deployment import AS_HERE, Advice, Changed, Deployment, Drift, Gap, Replay
+from sim2real.artifacts.identification import MAX_ERROR_RATIO, ROUND_TRIP, Identification
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import OtherMotion, Sim2RealError
 from sim2real.installation import has_jax

@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.posterior import Posterior
-from sim2real.artifacts.estimation.promise import PROMISE_BROKEN, too_many_broken
 from sim2real.artifacts.identification import (
+    PROMISE_BROKEN,
     ROUND_TRIP,
     Determined,
     Estimate,
@@ -17,7 +16,9 @@ from sim2real.artifacts.identification import (
     Identification,
     Judgement,
     Matrix,
+    too_many_broken,
 )
+from sim2real.artifacts.posterior import Posterior
 from sim2real.identify.fit import Fit
 from sim2real.identify.uncertainty import identifiability, noise, uncertainty
 from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible

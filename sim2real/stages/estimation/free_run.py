@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.estimation.posterior import Posterior
 from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import FreeRun, Identification
+from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode
 from sim2real.identify.fit import Fit, OnProgress, fit
 from sim2real.identify.model import IdentifiableModel

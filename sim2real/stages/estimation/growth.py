@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sim2real.artifacts.estimation.promise import Growth
+from sim2real.artifacts.identification import Growth
 from sim2real.graph.episode import Episode
 from sim2real.identify.model import Channel, IdentifiableModel, position_of
 from sim2real.identify.problem.segments import Span, rates

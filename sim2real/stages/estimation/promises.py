@@ -15,8 +15,17 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import stdtrit
 
-from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Bound, Growth, Promise, Reach, too_many_broken
-from sim2real.artifacts.identification import HeldOutPart, Identification
+from sim2real.artifacts.identification import (
+    AHEAD,
+    FREE_RUN,
+    Bound,
+    Growth,
+    HeldOutPart,
+    Identification,
+    Promise,
+    Reach,
+    too_many_broken,
+)
 from sim2real.identify.validation.draws import SPREAD
 from sim2real.identify.validation.folds import MOVES
 from sim2real.identify.validation.verdict import Position

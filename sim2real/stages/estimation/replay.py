@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.deployment import AS_HERE, Replay
-from sim2real.artifacts.estimation.drift import Drift
-from sim2real.artifacts.estimation.noise import Noise
-from sim2real.artifacts.identification import UNFINISHED, Identification
+from sim2real.artifacts.deployment import AS_HERE, Drift, Replay
+from sim2real.artifacts.identification import UNFINISHED, Identification, Noise
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identify.drift import drift_test

@@ -6,9 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.noise import Noise
-from sim2real.artifacts.estimation.tried_term import TriedTerm
-from sim2real.artifacts.identification import FreeRun, Identification
+from sim2real.artifacts.identification import FreeRun, Identification, Noise, TriedTerm
 from sim2real.identify.fit import Fit
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem

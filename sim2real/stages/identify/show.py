@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from sim2real.artifacts.estimation.links import links_table
-from sim2real.artifacts.estimation.tried_term import tried_table
 from sim2real.artifacts.files import number
-from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.identification import ROUND_TRIP, Identification, links_table, tried_table
 from sim2real.stages.terminal.console import MOST_PROMISES, artifact_table, note
 
 

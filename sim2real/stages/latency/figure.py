@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.estimation.links import Link
+from sim2real.artifacts.identification import Link
 from sim2real.artifacts.recording import Recording
 from sim2real.stages.latency.result import Latency, measured
 from sim2real.view.identification.links import draw_link

@@ -1,7 +1,6 @@
 """The printed form of a latency test."""
 
-from sim2real.artifacts.estimation.links import links_table
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import Identification, links_table
 from sim2real.stages.latency.result import Latency
 from sim2real.stages.terminal.console import artifact_table, note, table
 from sim2real.types import Json

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.artifacts.episodes import Episodes, Varied
-from sim2real.artifacts.estimation.noise import Noise
-from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.identification import ROUND_TRIP, Identification, Noise
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.node import TICKS_PER_S, BaseNode
 from sim2real.robots.control_loop.loop import DELAYS

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.artifacts.estimation.posterior import TRANSFORMS, Posterior, from_scale
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.posterior import TRANSFORMS, Posterior, from_scale
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError

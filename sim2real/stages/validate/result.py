@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sim2real.artifacts.estimation.promise import FREE_RUN, Promise, promises_table
+from sim2real.artifacts.identification import FREE_RUN, Promise, promises_table
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.types import Json
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.promise import AHEAD, FREE_RUN, Promise, too_many_broken
-from sim2real.artifacts.identification import HeldOut, Identification
+from sim2real.artifacts.identification import AHEAD, FREE_RUN, HeldOut, Identification, Promise, too_many_broken
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
 from sim2real.identify.problem.segments import check_log

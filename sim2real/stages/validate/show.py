@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from sim2real.artifacts.estimation.promise import MAX_ERROR_RATIO, promises_table
+from sim2real.artifacts.identification import MAX_ERROR_RATIO, promises_table
 from sim2real.stages.estimation.promises import broken_sentences
 from sim2real.stages.terminal.console import MOST_PROMISES, artifact_table, note, table
 from sim2real.stages.validate.result import ACCEPTED

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.posterior import TRANSFORMS, Posterior
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.posterior import TRANSFORMS, Posterior
 from sim2real.errors import UsageError
 from sim2real.train.environment.variation import VariationConfig
 

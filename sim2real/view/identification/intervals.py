@@ -7,8 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from sim2real.artifacts.estimation.quantity import Quantity
-from sim2real.artifacts.identification import Estimate
+from sim2real.artifacts.identification import Estimate, Quantity
 from sim2real.view import style
 from sim2real.view.blocks import pretty_unit
 from sim2real.view.style import BLUE, GREEN, GRID, INK, MUTED, ORANGE, SHADE, new_figure, styled, to_svg

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from sim2real.artifacts.estimation.links import Link, links_table
 from sim2real.artifacts.files import number
+from sim2real.artifacts.identification import Link, links_table
 from sim2real.view.blocks import Block, FigureBlock, TableBlock
 from sim2real.view.style import BLUE, INK, ORANGE, new_figure, styled, to_svg
 

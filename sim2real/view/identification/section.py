@@ -5,10 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.estimation.posterior import from_scale
-from sim2real.artifacts.estimation.quantity import Quantity
-from sim2real.artifacts.identification import Estimate, Identification
-from sim2real.artifacts.joints import joint_rows, joints_table
+from sim2real.artifacts.identification import Estimate, Identification, Quantity
+from sim2real.artifacts.posterior import from_scale
 from sim2real.artifacts.run.run_folder import StageFolder
 from sim2real.log.schema import unit_of
 from sim2real.view.blocks import (
@@ -56,7 +54,6 @@ def identify_section(artifact: StageFolder) -> PageSection:
     opening = worst_figure(result, "identify-worst")
     # Order the blocks from the results to the details.
     blocks = [
-        *_joints(result),
         *_promises(result),
         *_parameters(result),
         *_aggregate(result),
@@ -92,15 +89,6 @@ def _banner(result: Identification) -> Banner | None:
     reasons = [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons]
     reasons[1:1] = [f"next: {result.verdict.next}"] if result.verdict.next else []
     return Banner(tone, title, reasons)
-
-
-def _joints(result: Identification) -> list[Block]:
-    """Return a row for each joint with its verdict; empty for a single joint."""
-    rows = joint_rows(result)
-    if len(rows) < 2:
-        return []
-    tones: list[Tone] = ["bad" if r.errors.beaten_by else "doubt" if r.doubts else "good" for r in rows]
-    return [replace(TableBlock.of("Joints, the worst first", joints_table(result)), tones=tones)]
 
 
 def _promises(result: Identification) -> list[Block]:

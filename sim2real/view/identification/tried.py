@@ -1,7 +1,6 @@
 """The block of an identification's page with the optional terms that were tried."""
 
-from sim2real.artifacts.estimation.tried_term import tried_table
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import Identification, tried_table
 from sim2real.view.blocks import Block, TableBlock
 
 

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.artifacts.estimation.worst_second import WorstSecond
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import Identification, WorstSecond
 from sim2real.log.schema import unit_of
 from sim2real.view.blocks import FigureBlock
 from sim2real.view.identification.figures import GOAL

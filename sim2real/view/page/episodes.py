@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sim2real.artifacts.episodes import Episodes, Varied
-from sim2real.artifacts.estimation.noise import Noise
+from sim2real.artifacts.identification import Noise
 from sim2real.view.style import BLUE, INK, MUTED, ORANGE, new_figure, styled, to_svg
 
 _COLUMNS, _BINS = 3, 40

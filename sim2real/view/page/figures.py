@@ -8,7 +8,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
 from sim2real.artifacts.bundle import History
-from sim2real.artifacts.estimation.worst_second import with_small_unit, worst_window
+from sim2real.artifacts.identification import with_small_unit, worst_window
 from sim2real.log.schema import unit_of
 from sim2real.view import style
 from sim2real.view.blocks import FigureBlock

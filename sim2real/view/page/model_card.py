@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from sim2real.artifacts.estimation.links import Link
+from sim2real.artifacts.identification import Link
 from sim2real.artifacts.summary import ArtifactTable, Interval
 from sim2real.types import Json
 from sim2real.view import style

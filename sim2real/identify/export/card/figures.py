@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from sim2real.artifacts.estimation.posterior import TRANSFORMS
 from sim2real.artifacts.identification import ROUND_TRIP
+from sim2real.artifacts.posterior import TRANSFORMS
 from sim2real.types import Json
 
 if TYPE_CHECKING:

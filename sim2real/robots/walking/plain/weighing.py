@@ -15,8 +15,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from sim2real.artifacts.estimation.posterior import Posterior, from_scale
 from sim2real.artifacts.identification import Estimate, Identification
+from sim2real.artifacts.posterior import Posterior, from_scale
 from sim2real.errors import OtherMotion, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.robots.control_loop.loop import DELAYS

@@ -1,1 +1,0 @@
-"""Parts of an identification's artifact: posterior, noise, links, drift."""
