@@ -16,15 +16,14 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import check_bursts
-from sim2real.runtime.clock import Clock
+from sim2real.runtime.clock import Clock, MonotonicClock
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.failure import noted
 from sim2real.runtime.init import collect, init_graph_state, key_numbers
 from sim2real.runtime.simulated import SimulatedRun
 from sim2real.runtime.statistics import NodeStatistics
-from sim2real.runtime.stepper import Stepper
-from sim2real.runtime.wall_clock.handover import Reply
-from sim2real.runtime.wall_clock.wall_clock import WallClockRun
+from sim2real.runtime.stepper import Reply, Stepper
+from sim2real.runtime.wall_clock import WallClockRun
 from sim2real.types import Key, PyTree
 
 _INTERRUPTED_S = 1.0
@@ -47,6 +46,7 @@ class AsyncGraph:
     Args:
         nodes: The nodes, by name or as a list.
         supervisor: The node at whose steps ``reset``, ``step`` and ``run`` return, usually the policy.
+        clock: The clock; a ``MonotonicClock`` is the wall clock with the time of this object, e.g. of a test.
         real_time_factor: Largest number of simulated seconds per second; 0: no limit. Simulated clock only.
         duration_s: Length of drawn timelines [s]; the simulated clock needs this or ``timeline``.
         timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
@@ -63,7 +63,7 @@ class AsyncGraph:
         self,
         nodes: Mapping[str, BaseNode] | Sequence[BaseNode],
         supervisor: BaseNode,
-        clock: Clock = Clock.WALL_CLOCK,
+        clock: Clock | MonotonicClock = Clock.WALL_CLOCK,
         real_time_factor: float = 0.0,
         recorder: Recorder | None = None,
         duration_s: float | None = None,
@@ -75,7 +75,9 @@ class AsyncGraph:
         _check_supervisor(supervisor, nodes)
         self.nodes = collect(nodes, supervisor)
         self.supervisor = supervisor
-        self.clock = Clock(clock)
+        own_time = isinstance(clock, MonotonicClock)
+        self.clock = Clock.WALL_CLOCK if own_time else Clock(clock)
+        self._monotonic = clock if own_time else MonotonicClock()
         self.recorder = recorder
         self._factor, self._duration_s, self._timeline = real_time_factor, duration_s, timeline
         self._timeout_s, self._spin_s, self._step_timeout_s = timeout_s, spin_s, step_timeout_s
@@ -132,17 +134,21 @@ class AsyncGraph:
     def stop(self, timeout_s: float = 10.0) -> None:
         """Stop the graph, at any time and from any thread; without effect on a stopped graph.
 
-        A start in progress is ended too: after this call no node's startup is running or will run.
+        A start in progress is ended too: after this call no node's startup is running or will run. A signal's handler
+        raises an exception instead, as that of Ctrl-C does: leaving ``with graph:`` then stops the graph.
 
         Raises:
             Sim2RealError: The failure that stopped the graph, if no call has raised it yet; or a node did not end.
         """
-        atexit.unregister(self.stop)
         with self._lock:
             self._stops += 1
             run = self._run
-        if run is not None:
-            run.stop(timeout_s)
+        try:
+            if run is not None:
+                run.stop(timeout_s)
+        finally:
+            if run is None or run.stopped:  # else it was interrupted, and the exit of the interpreter tries again
+                atexit.unregister(self.stop)
 
     def run_for(self, duration_s: float) -> GraphState:
         """Let the graph run for a while, the supervisor making its own steps, and return the graph's state.
@@ -280,7 +286,7 @@ class AsyncGraph:
         if self.clock is Clock.SIMULATED:
             run = SimulatedRun(*common, *self._timeline_of(graph_state), self._factor)
         else:
-            run = WallClockRun(*common, self._spin_s, self._timeout_s, self._step_timeout_s)
+            run = WallClockRun(*common, self._monotonic, self._spin_s, self._timeout_s, self._step_timeout_s)
 
         # Publish it, so that stop() in another thread finds it, and begin.
         with self._lock:

@@ -29,22 +29,41 @@ class Clock(Enum):
 
 
 class MonotonicClock:
-    """Ticks [us] since the episode's start, on the machine's monotonic clock; negative before it."""
+    """Ticks [us] since the episode's start, on the machine's monotonic clock; negative before it.
+
+    The threads of a graph read the time and wait for each other through this class alone: tests give ``AsyncGraph`` one
+    whose time passes only while every thread waits.
+    """
+
+    event, condition, lock = threading.Event, threading.Condition, threading.Lock
 
     def __init__(self) -> None:
-        self.origin_ns = time.monotonic_ns()
+        self.origin_ns = self.monotonic_ns()
+
+    @staticmethod
+    def monotonic_ns() -> int:
+        """Return the machine's monotonic time [ns]."""
+        return time.monotonic_ns()
+
+    def monotonic_s(self) -> float:
+        """Return the machine's monotonic time [s]."""
+        return self.monotonic_ns() / 1e9
 
     def begin(self, lead_s: float) -> None:
         """Set time 0 to ``lead_s`` seconds from now, so that every thread sleeps before its first slot."""
-        self.origin_ns = time.monotonic_ns() + int(lead_s * 1e9)
+        self.origin_ns = self.monotonic_ns() + int(lead_s * 1e9)
 
     def now(self) -> int:
         """Return the time [ticks]."""
-        return (time.monotonic_ns() - self.origin_ns) // _NS_PER_TICK
+        return (self.monotonic_ns() - self.origin_ns) // _NS_PER_TICK
 
     def now_s(self) -> float:
         """Return the time [s]."""
-        return (time.monotonic_ns() - self.origin_ns) / 1e9
+        return (self.monotonic_ns() - self.origin_ns) / 1e9
+
+    def keep_time(self) -> None:
+        """Give the calling thread a real-time priority; see the function."""
+        keep_time()
 
     def sleep_past(self, tick: int, stopping: threading.Event, spin: int = 0) -> bool:
         """Sleep until the clock shows more than ``tick``; return False if ``stopping`` was set meanwhile.

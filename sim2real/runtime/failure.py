@@ -30,7 +30,11 @@ def named(error: BaseException, node: str, during: str) -> Sim2RealError:
     if isinstance(error, Sim2RealError):
         error.add_note(f"node {node!r}, {during}")
         return error
-    failed = NodeFailed(f"node {node!r} failed in its {during}: {type(error).__name__}: {error}", node)
+    try:
+        text = str(error)
+    except Exception:
+        text = "(its text cannot be read)"
+    failed = NodeFailed(f"node {node!r} failed in its {during}: {type(error).__name__}: {text}", node)
     failed.__cause__ = error
     return failed
 

@@ -20,8 +20,7 @@ from sim2real.graph.times import Edge
 from sim2real.runtime.data import Message, NodeData, snapshot
 from sim2real.runtime.failure import GraphTimeout, named
 from sim2real.runtime.statistics import NodeStatistics, StepLog
-from sim2real.runtime.stepper import Result, Stepper, overwritten
-from sim2real.runtime.wall_clock.handover import Reply
+from sim2real.runtime.stepper import Reply, Result, Stepper, overwritten
 
 _NEVER = 2**62
 
@@ -140,7 +139,7 @@ class SimulatedRun:
         self._pending: StepState | None = None
         self._stopping = threading.Event()
         self._stop_lock = threading.Lock()
-        self._stopped = False
+        self.stopped = False
         self._origin_s = 0.0
 
     @property
@@ -213,9 +212,9 @@ class SimulatedRun:
         del timeout_s
         self._stopping.set()
         with self._stop_lock:
-            if self._stopped:
+            if self.stopped:
                 return
-            self._stopped = True
+            self.stopped = True
         # Record the messages that no step consumed.
         for node in self._nodes.values():
             node.set_clock(None)

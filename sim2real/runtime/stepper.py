@@ -16,7 +16,6 @@ from sim2real.graph.node import BaseNode, to_ticks
 from sim2real.later import jax, jnp
 from sim2real.runtime.data import NodeData
 from sim2real.runtime.match import matched
-from sim2real.runtime.wall_clock.handover import Reply
 from sim2real.types import PyTree
 
 if TYPE_CHECKING:
@@ -40,6 +39,23 @@ class Result(NamedTuple):
     changed: dict[str, PyTree]
     ts: Number | None
     leaves: list[np.ndarray]
+
+
+class Reply(NamedTuple):
+    """The caller's answer to an offered step state.
+
+    Attributes:
+        step_state: The step state after the step; None: unchanged.
+        leaves: The step's output, as ``Format.pack`` returns it; None: the node's ``step`` is called.
+    """
+
+    step_state: StepState | None = None
+    leaves: list[np.ndarray] | None = None
+
+    @property
+    def autonomous(self) -> bool:
+        """Whether the node's ``step`` is called with ``step_state``."""
+        return self.leaves is None
 
 
 class Stepper:

@@ -1,8 +1,8 @@
-"""A graph on the wall clock: one thread per node, and the timing rules with measured times."""
+"""A graph on the wall clock: starts and stops the nodes' threads, and watches them."""
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from typing import NoReturn
 
@@ -14,11 +14,8 @@ from sim2real.runtime.clock import MonotonicClock, realtime
 from sim2real.runtime.data import NodeData, snapshot
 from sim2real.runtime.failure import GraphTimeout
 from sim2real.runtime.statistics import NodeStatistics
-from sim2real.runtime.stepper import Stepper
-from sim2real.runtime.wall_clock.channel import MessageChannel
-from sim2real.runtime.wall_clock.handover import Handover, Reply
-from sim2real.runtime.wall_clock.node_thread import NodeThread, Shared
-from sim2real.runtime.wall_clock.watchdog import LAST_RESORT_S, Watchdog, step_limits
+from sim2real.runtime.stepper import Reply, Stepper
+from sim2real.runtime.threads import Handover, MessageChannel, NodeThread, Shared
 
 _LEAD_S = 0.005
 _POLL_S = 0.05
@@ -43,14 +40,15 @@ class WallClockRun:
         graph_state: GraphState,
         recorder: Recorder | None,
         autonomous: bool,
+        clock: MonotonicClock,
         spin_s: float,
         timeout_s: float,
         step_timeout_s: float | None,
     ) -> None:
         self._nodes, self._supervisor, self._data = nodes, supervisor, data
         self._graph_state, self._recorder, self._gym = graph_state, recorder, not autonomous
-        self._clock = MonotonicClock()
-        self._handover = Handover(autonomous)
+        self._clock = clock
+        self._handover = Handover(autonomous, clock)
         self._shared = Shared(self._clock, recorder, graph_state, self._wake, round(spin_s * TICKS_PER_S), timeout_s)
         self._channels = {(n, c.name): MessageChannel(c, self._clock) for n in nodes for c in nodes[n].inputs.values()}
         self._threads: dict[str, NodeThread] = {}
@@ -61,8 +59,9 @@ class WallClockRun:
             self._threads[name] = NodeThread(steppers[name], data[name], inputs, outputs, self._shared, handover)
         self._watchdog = Watchdog(self._threads.values(), step_limits(nodes, step_timeout_s), self._shared)
         self._process = ExitStack()
-        self._stop_lock = threading.Lock()
-        self._stopped = False
+        self._stop_lock = clock.lock()
+        self.stopped = False
+        """Whether ``stop`` has ended all nodes, or told which one it could not end."""
 
     @property
     def ended(self) -> bool:
@@ -82,14 +81,14 @@ class WallClockRun:
             # Before the startups, which may switch torque on: a garbage collection stops all threads, for 0.5 s in a
             # large process, and a servo's watchdog would trip.
             self._process.enter_context(realtime())
-            deadline = time.monotonic() + timeout_s
+            deadline = self._clock.monotonic_s() + timeout_s
             # Under the lock: stop() in another thread then finds either no thread started or all of them.
             self._watchdog.start()
             for thread in self._threads.values():
                 thread.start()
         for name, thread in self._threads.items():
             while not (thread.ready.wait(_POLL_S) or self.ended):
-                if time.monotonic() > deadline:
+                if self._clock.monotonic_s() > deadline:
                     self._shared.fail(
                         GraphTimeout(
                             f"node {name!r} has not finished its startup after {timeout_s:g} s",
@@ -97,17 +96,17 @@ class WallClockRun:
                         )
                     )
         self.check()
+
+        # All nodes are ready: start the clock. Under the lock: once stop() has returned, nothing starts any more.
         with self._stop_lock:
             self._refuse_if_stopped()
-
-        # All nodes are ready: start the clock.
-        self._clock.begin(_LEAD_S)
-        for node in self._nodes.values():
-            node.set_clock(self._clock.now_s, self._clock.origin_ns)
-        if self._recorder is not None:
-            ahead_ns = self._clock.origin_ns - time.monotonic_ns()
-            self._recorder.start(time.time_ns() + ahead_ns, self._clock.origin_ns)
-        self._shared.go.set()
+            self._clock.begin(_LEAD_S)
+            for node in self._nodes.values():
+                node.set_clock(self._clock.now_s, self._clock.origin_ns)
+            if self._recorder is not None:
+                ahead_ns = self._clock.origin_ns - self._clock.monotonic_ns()
+                self._recorder.start(time.time_ns() + ahead_ns, self._clock.origin_ns)
+            self._shared.go.set()
 
     def _refuse_if_stopped(self) -> None:
         if self.ended:
@@ -157,15 +156,19 @@ class WallClockRun:
         return ended
 
     def stop(self, timeout_s: float) -> None:
-        """Stop all nodes and make them safe; raise the graph's failure, if it has one that was not raised yet."""
-        deadline = time.monotonic() + timeout_s
-        self._shared.stop(timeout_s)
+        """Stop all nodes and make them safe; raise the graph's failure, if it has one that was not raised yet.
+
+        A call that is interrupted, e.g. by Ctrl-C, can be made again.
+        """
+        self._shared.timeout_s = timeout_s
+        self._shared.stop()
         if threading.current_thread() in self._threads.values():
             return  # a node stops its own graph: its thread cannot wait for itself
+        deadline = self._clock.monotonic_s() + timeout_s
         with self._stop_lock:
-            if not self._stopped:
-                self._stopped = True
+            if not self.stopped:
                 self._end(deadline)
+                self.stopped = True
             failure = self._shared.deliver()
         if failure is not None:
             raise failure
@@ -186,12 +189,12 @@ class WallClockRun:
 
     def _end(self, deadline: float) -> None:
         # Wait for the threads.
-        begin = time.monotonic()
+        begin = self._clock.monotonic_s()
         for thread in self._threads.values():
             if thread.ident is not None:
-                thread.over.wait(max(0.0, deadline - time.monotonic()))
-                if not thread.made_safe:
-                    thread.join(max(0.0, deadline - time.monotonic()))
+                over = thread.over.wait(max(0.0, deadline - self._clock.monotonic_s()))
+                if over and not thread.made_safe:
+                    thread.join(LAST_RESORT_S)
         self._watchdog.finish()
         self._process.close()
 
@@ -200,7 +203,7 @@ class WallClockRun:
             if thread.is_alive() and not thread.failed:
                 if not thread.made_safe:
                     thread.make_safe_from_outside(LAST_RESORT_S)
-                waited_s = time.monotonic() - begin
+                waited_s = self._clock.monotonic_s() - begin
                 self._shared.fail(
                     GraphTimeout(
                         f"node {name!r} is still in its {thread.during} {waited_s:.1f} s after the stop; "
@@ -229,3 +232,89 @@ class WallClockRun:
         if self.ended:
             raise Sim2RealError("the graph was stopped while a step was awaited", hint="call reset() to start it again")
         raise GraphTimeout(message, hint="is one of its blocking inputs silent?")
+
+
+MIN_LIMIT_S, PERIODS = 1.0, 10.0
+"""By default a step counts as hanging after ``PERIODS`` periods of its node, but not before ``MIN_LIMIT_S`` [s]: on a
+busy laptop a step can be delayed by a few hundred milliseconds."""
+LAST_RESORT_S = 1.0
+"""Longest wait for a node's ``stop`` that another thread than the node's calls [s]."""
+_GRACE_S = 0.2
+"""Longest time of a startup after the graph was stopped, before the node's ``stop`` is called [s]."""
+
+
+def step_limits(nodes: Mapping[str, BaseNode], limit_s: float | None) -> dict[str, float]:
+    """Return the longest time of a step of each node [s].
+
+    ``limit_s`` is the limit for all nodes; 0: no limit; None: the default, ten periods of the node but at least 1 s.
+    """
+    if limit_s is None:
+        return {name: max(MIN_LIMIT_S, PERIODS / node.rate) for name, node in nodes.items()}
+    return dict.fromkeys(nodes, limit_s or float("inf"))
+
+
+class Watchdog(threading.Thread):
+    """Stops the graph when a step takes too long, and calls ``stop`` of a node whose own thread is busy.
+
+    Args:
+        limits: Node name -> longest time of a step [s].
+    """
+
+    def __init__(self, threads: Iterable[NodeThread], limits: Mapping[str, float], shared: Shared) -> None:
+        super().__init__(name="sim2real:watchdog of the graph", daemon=True)
+        self._threads, self._limits, self._shared = list(threads), limits, shared
+        self._quit, self._over = shared.clock.event(), shared.clock.event()
+
+    def run(self) -> None:
+        """Check the threads until the graph has stopped; whatever ends this thread earlier stops the graph."""
+        try:
+            self._shared.clock.keep_time()
+            self._watch()
+        except BaseException as error:
+            self._shared.fail(Sim2RealError(f"the watchdog of the graph failed: {type(error).__name__}: {error}"))
+        finally:
+            self._over.set()
+
+    def finish(self) -> None:
+        """End the watchdog, after the graph has stopped."""
+        self._quit.set()
+        if self.ident is not None:
+            self._over.wait()
+
+    def _watch(self) -> None:
+        # Sleep between checks until the earliest time at which a thread could exceed its limit.
+        shared, stopped_s = self._shared, 0.0
+        while not self._quit.is_set():
+            now = shared.clock.monotonic_s()
+            if shared.stopping.is_set():
+                stopped_s = stopped_s or now
+            rests = [self._look(t, now, stopped_s) for t in self._threads if not t.made_safe]
+            rest = max(0.0, min([*rests, *self._limits.values()]))
+            waiting = self._quit if stopped_s else shared.stopping
+            waiting.wait(min(rest, threading.TIMEOUT_MAX))
+
+    def _look(self, thread: NodeThread, now: float, stopped_s: float) -> float:
+        """Act if a thread has exceeded its limit; return the time until the next check [s]."""
+        limit = self._limits[thread.node.name]
+        since, during = thread.since_s, thread.during
+        if since is None:
+            return limit
+        if during == "startup" and not stopped_s:
+            return limit  # startups have their own timeout, in WallClockRun.begin
+        # Time until the step, or the startup of a stopped graph, has taken too long.
+        rest = stopped_s + _GRACE_S - now if during == "startup" else since + limit - now
+        if rest > 0 or thread.since_s != since:
+            return rest
+        # Stop the graph, and make the node safe from outside of its thread.
+        if not stopped_s:
+            thread.failed = True
+            self._shared.fail(
+                GraphTimeout(
+                    f"node {thread.node.name!r} hangs: its {during} has taken {limit:g} s, so the graph stopped",
+                    hint="give its device or its wait a timeout, or AsyncGraph a longer step_timeout_s",
+                )
+            )
+        thread.make_safe_from_outside(LAST_RESORT_S)
+        if during != "startup":  # a startup may still end, after which its thread calls stop and ends
+            thread.over.set()
+        return limit

@@ -1,1 +1,0 @@
-"""A graph on the wall clock: one thread for each node."""
