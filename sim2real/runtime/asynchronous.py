@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import threading
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -85,7 +84,7 @@ class AsyncGraph:
         self._jit: dict[str, bool] = dict.fromkeys(self.nodes, True)
         self._run: WallClockRun | SimulatedRun | None = None
         self._run_data: dict[str, NodeData] = {}
-        self._lock = threading.Lock()
+        self._lock = self._monotonic.lock()
         self._stops = 0
         self._check_options()
 
@@ -271,6 +270,7 @@ class AsyncGraph:
         return data
 
     def _start(self, graph_state: GraphState, autonomous: bool, timeout_s: float) -> WallClockRun | SimulatedRun:
+        stops = self._stops
         if self._run is not None:
             self._run.check()
             if self._run.alive:
@@ -280,7 +280,6 @@ class AsyncGraph:
                 )
 
         # Compile the steps, and make the run.
-        stops = self._stops
         data = self._prepare(graph_state)
         common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, autonomous)
         if self.clock is Clock.SIMULATED:

@@ -10,9 +10,11 @@ from sim2real.graph import BaseNode, EmpiricalDist, Jitter, Scheduling
 
 
 class Plain(BaseNode):
-    """Counts its steps in plain Python, sleeps a while in each, and notes everything that is called."""
+    """Counts its steps in plain Python, is busy for a while in each, and notes everything that is called."""
 
     jittable = False
+    clock = time
+    """Whose ``sleep`` keeps a step busy."""
 
     def __init__(self, *args, busy=(0.0,), **kwargs):
         super().__init__(*args, **kwargs)
@@ -40,7 +42,7 @@ class Plain(BaseNode):
         self.threads.add(threading.get_ident())
         seconds = self.busy[int(step_state.seq) % len(self.busy)]
         if seconds:
-            time.sleep(seconds)
+            self.clock.sleep(seconds)
         return step_state.replace(state=step_state.state + 1), Value(x=step_state.seq)
 
 
