@@ -26,11 +26,16 @@ def longest_burst(edge: Edge, reader: Vertex) -> int:
     return int(np.diff(newest, axis=1).max(initial=0))
 
 
-def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex) -> np.ndarray:
+def overfull(
+    connection: Connection, edge: Edge, reader: Vertex, sender: Vertex, delay_s: float | None = None
+) -> np.ndarray:
     """Return the steps at which a trainable delay may need messages that are no longer in the window.
 
     The window is long enough for a sender that keeps its rate. In a burst, the same number of messages spans less time:
     at the largest delay, the message that a step should read has then left the window.
+
+    Args:
+        delay_s: The delay, where it does not change while the graph runs [s]; default: the largest one.
 
     Returns:
         Shape ``(E, N)``, bool; False without a trainable delay.
@@ -43,7 +48,7 @@ def overfull(connection: Connection, edge: Edge, reader: Vertex, sender: Vertex)
     if not (edge.seq_in.shape[1] and reader.start.shape[1]):
         return np.zeros(reader.start.shape, bool)
     sent = np.take_along_axis(sender.end, oldest.clip(0), axis=1)
-    young = reader.start - sent < to_ticks(dist.max) - _ROUNDING
+    young = reader.start - sent < to_ticks(dist.max if delay_s is None else delay_s) - _ROUNDING
     return young & (oldest >= 0) & (np.arange(reader.start.shape[1]) < reader.count[:, None])
 
 
@@ -56,21 +61,29 @@ def bursty_episodes(nodes: Mapping[str, BaseNode], timeline: Timeline) -> np.nda
     return bursty
 
 
-def check_bursts(nodes: Mapping[str, BaseNode], timeline: Timeline) -> None:
-    """Check that every window is long enough for every trainable delay within its bounds."""
+def check_bursts(
+    nodes: Mapping[str, BaseNode], timeline: Timeline, delays: Mapping[str, Mapping[str, TrainableDist]] | None = None
+) -> None:
+    """Check that every window is long enough for every trainable delay within its bounds, or for given ``delays``.
+
+    Args:
+        delays: Node -> input -> the delay, where it does not change while the graph runs.
+    """
     for (name, input_name), edge in timeline.edges.items():
         if name not in nodes or input_name not in nodes[name].inputs:
             continue
         connection, reader = nodes[name].inputs[input_name], timeline.vertices[name]
-        # Steps whose window would have lost a message at the largest delay.
-        places = np.argwhere(overfull(connection, edge, reader, timeline.vertices[edge.sender]))
+        # Steps whose window would have lost a message.
+        given = (delays or {}).get(name, {}).get(input_name)
+        delay_s = None if given is None else round(float(given.delay), 6)
+        places = np.argwhere(overfull(connection, edge, reader, timeline.vertices[edge.sender], delay_s))
         if len(places) and isinstance(connection.delay_dist, TrainableDist):
             episode, step = places[0]
             raise UsageError(
                 f"input {input_name!r} of node {name!r}: messages of {edge.sender!r} come in bursts that its window of "
                 f"{connection.total_window} does not hold: at {reader.start[episode, step] / TICKS_PER_S:.3f} s of "
-                f"episode {episode} a delay of {connection.delay_dist.max:g} s would need a message that has left it "
-                f"({len(places)} such steps)",
+                f"episode {episode} a delay of {connection.delay_dist.max if delay_s is None else delay_s:g} s would "
+                f"need a message that has left it ({len(places)} such steps)",
                 hint="drop these episodes (sim2real.graph.windows.bursty_episodes finds them), or lengthen the "
                 "window: TrainableDist.create(..., burst=2)",
             )

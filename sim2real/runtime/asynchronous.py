@@ -311,11 +311,11 @@ class AsyncGraph:
         if self._timeline is not None:
             if not 0 <= eps < self._timeline.episodes:
                 raise UsageError(f"there is no episode {eps}: the timeline has {self._timeline.episodes}")
-            check_bursts(self.nodes, self._timeline[[eps]])
+            check_bursts(self.nodes, self._timeline[[eps]], graph_state.delays)
             return self._timeline, eps
         seed = [int(graph_state.eps), *key_numbers(graph_state.rng[self.supervisor.name])]
         timeline = draw(self.nodes, self._duration_s or 0.0, 1, np.random.default_rng(seed))
-        check_bursts(self.nodes, timeline)
+        check_bursts(self.nodes, timeline, graph_state.delays)
         return timeline, 0
 
     def _running(self) -> WallClockRun | SimulatedRun:

@@ -11,6 +11,8 @@ from scipy import stats
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, InputState, Jitter, StaticDist, TrainableDist
+from sim2real.graph.schedule import draw
+from sim2real.graph.windows import check_bursts
 
 EMPTY = 1e6
 
@@ -223,3 +225,18 @@ def test_gradients_against_finite_differences(interp):
     finite = (float(read(0.034)) - float(read(0.032))) / 0.002
     assert slope == pytest.approx(finite, rel=2e-2, abs=1e-3)
     assert (slope == 0.0) == (interp == "zoh")
+
+
+def test_the_simulated_clock_refuses_a_burst_only_where_its_own_delay_needs_a_message_that_has_left_the_window():
+    """At 5 ms the window holds what 40 ms would not: a compiled graph may be given that delay later."""
+    sender = BaseNode("sender", 50, delay_dist=EmpiricalDist(np.array([0.001, 0.001, 0.055]), block=3), delay=0.001)
+    reader = BaseNode("reader", 50)
+    reader.connect(sender, delay_dist=TrainableDist.create(0.005, 0.0, 0.04))
+    nodes = {"sender": sender, "reader": reader}
+    timeline = draw(nodes, 1.0)
+    connection = reader.inputs["sender"]
+    with pytest.raises(UsageError, match="bursts"):
+        check_bursts(nodes, timeline)
+    check_bursts(nodes, timeline, {"reader": {"sender": connection.delay_dist}})
+    with pytest.raises(UsageError, match="bursts"):
+        check_bursts(nodes, timeline, {"reader": {"sender": connection.delay_dist.with_delay(0.04)}})
