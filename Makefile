@@ -5,8 +5,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.ready-docs
 WARP_READY := .venv/.ready-warp
-# LeRobot cannot be installed beside the viewer (pyproject.toml): a test installs the part that it needs.
-EXTRAS := --all-extras --no-extra lerobot
+EXTRAS := --all-extras
 SYNC := UV_PROJECT_ENVIRONMENT=.venv UV_PYTHON_DOWNLOADS=never UV_COMPILE_BYTECODE=1 VIRTUAL_ENV= $(BIN)/uv sync --locked --inexact --quiet
 
 .PHONY: demo test night bench figures docs format wheel

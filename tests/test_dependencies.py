@@ -25,7 +25,6 @@ MAY_IMPORT = {
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax_adapter", "sim2real.interop.gymnasium_adapter"},
     "parquet": {"sim2real.log.importing.files.lerobot"},
-    "lerobot": {"sim2real.hardware.lerobot.device"},
     "tensorboard": {"sim2real.stages.train.tensorboard"},
     "unitree": {f"sim2real.hardware.unitree.{name}" for name in ("dds", "emulator", "messages")},
     "warp": set(),  # MJX imports Warp itself
@@ -131,7 +130,7 @@ def test_an_extra_is_imported_only_where_the_error_names_it(extra, imported):
     assert hints or not packages
 
 
-@pytest.mark.parametrize("extra", [name for name in EXTRAS if name not in ("warp", "lerobot")])
+@pytest.mark.parametrize("extra", [name for name in EXTRAS if name != "warp"])
 def test_developers_have_every_extra_but_two(extra):
     assert re.search(rf"sim2real\[[^]]*\b{extra}\b", str(PROJECT["optional-dependencies"]["dev"]))
 

@@ -12,7 +12,6 @@ BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     DEVICES: {
         "dynamixel": "sim2real.hardware.dynamixel.device:servos",
         "feetech": "sim2real.hardware.feetech.device:servos",
-        "lerobot": "sim2real.hardware.lerobot.device:servos",
         "unitree": "sim2real.hardware.unitree.device:legs",
     },
     WORLDS: {},

@@ -1,1 +1,0 @@
-"""Robots of LeRobot as devices."""
