@@ -15,6 +15,7 @@ from typing import Final, Literal, Self, TypeAlias
 import numpy as np
 
 from sim2real.errors import UsageError
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 
 
 @dataclass(frozen=True)
@@ -233,6 +234,11 @@ class Device(ABC):
         """Name -> further part of a reading; default: none."""
         return {}
 
+    @property
+    def clock(self) -> Clock:
+        """The clock of the stamps of readings, and of everything that watches the device; default: the machine's."""
+        return SYSTEM_CLOCK
+
     # -- from open to close
 
     @abstractmethod
@@ -364,6 +370,9 @@ class Device(ABC):
     @abstractmethod
     def disable(self) -> None:
         """Bring the motors into the safe state, then torque off, confirmed by every motor; `enable` may follow.
+
+        A motor that does not confirm keeps no other one on: all are switched off, then the error is raised. Until the
+        next `enable` the device sends nothing that could move a motor, not even what another thread has begun.
 
         Raises:
             HardwareLost: A motor does not answer.

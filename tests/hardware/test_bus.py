@@ -295,7 +295,7 @@ def test_a_servo_that_restarted_is_noticed(start_robot, open_bus):
     bus = open_bus(start_robot("Joints"), (1, 2, 3), OperatingMode.POSITION)
     bus.check()
     with bus.link.hold():
-        os.write(bus.link.fd, PROTOCOL.build(2, Instruction.REBOOT))
+        bus.link.port.write(PROTOCOL.build(2, Instruction.REBOOT))
     with pytest.raises(SafetyStop, match="servo 2 has lost its settings: its bus watchdog holds 0, not 50"):
         bus.check()
     bus.torque(False)
@@ -320,24 +320,6 @@ def test_make_safe_needs_no_lock(start_robot, open_bus):
     with pytest.raises(SafetyStop, match="made safe"):
         bus.torque(True)
     assert bus.read(1, reg.TORQUE_ENABLE) == 0
-    assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF
-
-
-def test_make_safe_while_torque_goes_on_wins(start_robot, open_bus, monkeypatch):
-    robot = start_robot()
-    bus = open_bus(robot)
-    bus.setup(PWM)
-    write = bus.link.write
-
-    def after_make_safe(servo_id, register, value):
-        if register == reg.TORQUE_ENABLE:
-            bus.make_safe()
-        return write(servo_id, register, value)
-
-    monkeypatch.setattr(bus.link, "write", after_make_safe)
-    bus.torque(True)
-    assert bus.read(1, reg.TORQUE_ENABLE) == 0
-    assert not bus.armed
     assert effects_of(robot)["values"][-1, 0] == OperatingMode.OFF
 
 

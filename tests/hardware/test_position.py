@@ -1,7 +1,6 @@
 """Three position servos on one bus, through the rig, on a real emulator."""
 
 import math
-import os
 import time
 
 import numpy as np
@@ -129,7 +128,7 @@ def test_gains_and_profile_reach_servos_and_plant(open_arm):
 def test_a_rebooted_servo_gets_its_settings_again(open_arm):
     rig, _ = open_arm()
     with rig.device.link.hold():
-        os.write(rig.device.link.fd, PROTOCOL.build(3, Instruction.REBOOT))
+        rig.device.link.port.write(PROTOCOL.build(3, Instruction.REBOOT))
     assert rig.device.read(3, reg.POSITION_P_GAIN) == 640
     rig.start()
     assert rig.device.read(3, reg.POSITION_P_GAIN) == 800

@@ -291,7 +291,7 @@ def test_a_servo_that_resets_in_motion_stops_the_robot_within_a_second(open_rig,
     run(rig, value, 0.3)
     link = rig.device.link
     with link.hold():
-        os.write(link.fd, PROTOCOL.build(1, Instruction.REBOOT))
+        link.port.write(PROTOCOL.build(1, Instruction.REBOOT))
     begin_s = time.monotonic()
     with pytest.raises(SafetyStop, match=r"servo 1 has lost its settings|moved at .* or more just before"):
         run(rig, value, 5.0)

@@ -4,20 +4,16 @@ The makers' packages are not used because they do not time their reads. They pol
 after a fixed 34 ms, drop the error bytes of a synchronised read, and confuse a late answer with the next one.
 """
 
-import os
-import select
-import termios
 import threading
-import time
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import ClassVar, Final, cast
+from typing import ClassVar, Final
 
 import numpy as np
 
-from sim2real.errors import HardwareLost
+from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.bus.packets import Answer, Instruction, Packet, PacketFormat, Parser, of_servos
 from sim2real.hardware.bus.port import LinkConfig, open_port
 from sim2real.hardware.bus.registers import MemoryTable, Register
@@ -25,6 +21,8 @@ from sim2real.hardware.device import Counters, Transaction
 from sim2real.hardware.safety.guardian import Guardian
 
 _LOCK_TIMEOUT_S: Final = 0.5
+_SAFE_REPEATS: Final = 5
+_SAFE_PAUSE_S: Final = 0.002
 _FORCED_ATTEMPTS: Final = 5
 _MIN_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
 _PADS: Final = 4
@@ -37,8 +35,12 @@ class ServoLink(ABC):
     """Owner of port and lock. Every method may be called from any thread.
 
     Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
+    The same holds while `at_rest` is set: such an instruction raises SafetyStop, also if it waits for the lock, or for
+    the answer to its first attempt, when `at_rest` is set.
 
     Attributes:
+        at_rest: Whether the torque was taken off and not switched on again.
+        off_packet: The instruction that takes the torque of all servos off; no servo answers it.
         ping_bytes: Bytes of data of the answer to a ping.
 
     Raises:
@@ -53,7 +55,8 @@ class ServoLink(ABC):
         self.config = config
         self.guardian: Guardian | None = None
         self.closed = False
-        self.torque_withheld = False
+        self.torque_withheld = self.at_rest = False
+        self.off_packet = b""
         # Counts of this session; the lock serialises transactions.
         self._transactions = self._retries = self._lost = self._late = self._withheld = 0
         self._late_us = array("i")
@@ -65,8 +68,8 @@ class ServoLink(ABC):
         self._unheard: set[int] = set()  # lengths of answers that are missing and may still come
         self._silent_ns, self._missed = (0, 0), 0  # begin and end of the present silence, and its missing answers
         self._sent_ns = 0
-        self._serial = open_port(config)
-        self.fd = cast(int, self._serial.fileno())
+        self.port = open_port(config.port, config.baud_rate)
+        self.clock = self.port.clock
 
     @abstractmethod
     def require_fine(self, answer: Answer, what: str) -> None:
@@ -118,10 +121,11 @@ class ServoLink(ABC):
 
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
         """Write a register, and wait for the answer; some servos confirm a value that they refuse, see `set`."""
-        if self._withholds(register, (value,)):
+        moves = self._moves(register, (value,))
+        if moves and self.torque_withheld:
             return self._withhold(register, {servo_id: value})
-        packet = self.form.write(servo_id, register, value)
-        return self._exchange(lambda: (packet, 0), (servo_id,), f"write of {value} to {register.name}")[1]
+        packet, what = self.form.write(servo_id, register, value), f"write of {value} to {register.name}"
+        return self._exchange(lambda: (packet, 0), (servo_id,), what, moves=moves)[1]
 
     def set(self, servo_id: int, register: Register, value: int) -> None:
         """Write a register if it holds another value; raise HardwareLost if the servo does not keep it."""
@@ -141,10 +145,11 @@ class ServoLink(ABC):
 
     def write_each(self, register: Register, values: Mapping[int, int]) -> Transaction:
         """Write a register of several servos, id -> value in counts, with one instruction that no servo answers."""
-        if self._withholds(register, values.values()):
+        moves = self._moves(register, values.values())
+        if moves and self.torque_withheld:
             return self._withhold(register, values)
         packet = self.form.write_each(register, values)
-        return self._exchange(lambda: (packet, 0), (), f"write of {register.name}")[1]
+        return self._exchange(lambda: (packet, 0), (), f"write of {register.name}", moves=moves)[1]
 
     def ping(self, servo_id: int) -> bytes:
         """Return the data of a servo's answer to a ping, also with an error; raise HardwareLost without an answer."""
@@ -183,11 +188,29 @@ class ServoLink(ABC):
                 ids.append(answer.servo_id)
         return ids
 
+    def send_off(self) -> None:
+        """Take the torque of all servos off with one instruction, after the one that is on the wire. Never raises."""
+        held = self._lock.acquire(timeout=_LOCK_TIMEOUT_S)
+        try:
+            with suppress(Exception):
+                self._send(self.off_packet)
+        finally:
+            if held:
+                self._lock.release()
+
+    def make_safe(self) -> None:
+        """Take the torque of all servos off, without the lock and without waiting for answers. Never raises.
+
+        The instruction may collide with an answer on the wire and be lost, so it is sent five times within 8 ms.
+        """
+        self.at_rest = True
+        self._repeat_off(_SAFE_PAUSE_S)
+
     def close(self) -> None:
         """Close the port; later instructions raise HardwareLost. Never raises itself."""
         self.closed = True
-        with suppress(OSError):
-            self._serial.close()
+        with suppress(Exception):
+            self.port.close()
 
     @contextmanager
     def hold(self) -> Iterator[None]:
@@ -203,6 +226,7 @@ class ServoLink(ABC):
         servo_ids: Sequence[int],
         what: str,
         despite_error: bool = False,
+        moves: bool = False,
     ) -> tuple[list[Answer], Transaction]:
         """Repeat an instruction until all servos have answered, or the bus counts as lost.
 
@@ -210,16 +234,18 @@ class ServoLink(ABC):
             instruction: Returns its bytes, and the number of data bytes of each answer.
             servo_ids: The servos that answer, in this order.
             despite_error: Whether errors in the answers are ignored.
+            moves: Whether it could move a motor, or switch a torque on.
 
         Raises:
             HardwareLost: There was no answer within the configured limits.
-            SafetyStop: A servo has stopped itself; the guardian has taken over, or has died.
+            SafetyStop: A servo has stopped itself; the guardian has taken over, or has died; or the instruction moves,
+                and the torque was taken off.
         """
-        requested_ns = time.monotonic_ns()
+        requested_ns = self.clock.now_ns()
         losses = 0
         request = f"{what}{of_servos(servo_ids)}"
         with self.hold():
-            began_ns = time.monotonic_ns()
+            began_ns = self.clock.now_ns()
             # A bus that was lost just now is lost for the next instruction, too, after a single missing answer.
             if began_ns - self._silent_ns[1] > 1e9 * self.config.max_silence_s:
                 self._silent_ns, self._missed = (began_ns, began_ns), 0
@@ -228,6 +254,9 @@ class ServoLink(ABC):
                 if self.guardian is not None:
                     self.guardian.beat()
                 packet, length = instruction()
+                # Checked with the lock: whoever takes the torque off gets it afterwards.
+                if moves and self.at_rest:
+                    raise SafetyStop(f"no {what} is sent: the torque was taken off", hint="enable the device again")
                 try:
                     answers = None
                     # A write never waits for an empty line: it may take the torque off.
@@ -237,7 +266,11 @@ class ServoLink(ABC):
                 except OSError as failure:
                     self._require_watching()
                     raise HardwareLost(f"{self.config.port} failed during {request}: {failure}") from failure
-                now_ns = time.monotonic_ns()
+                finally:
+                    # `make_safe` takes no lock: this instruction may have followed it, and some servos wake up at it.
+                    if moves and self.at_rest:
+                        self._repeat_off(0.0)  # the line is quiet, and others wait for it
+                now_ns = self.clock.now_ns()
                 if answers is not None:
                     self._silent_ns = (0, 0) if servo_ids else self._silent_ns
                     late_ns = self._count_answer(now_ns, self._wire_ns(packet, servo_ids, length))
@@ -256,6 +289,15 @@ class ServoLink(ABC):
             if answer.error and not despite_error:
                 self.require_fine(answer, what)
         return answers, transaction
+
+    def _repeat_off(self, pause_s: float) -> None:
+        if not self.off_packet or self.closed:
+            return
+        with suppress(Exception):
+            for repeat in range(_SAFE_REPEATS):
+                if repeat and pause_s:
+                    self.clock.sleep(pause_s)
+                self.port.write(self.off_packet)
 
     def _passed(self, servo_id: int) -> bool:
         """Read as many bytes as no other read; the line keeps the order, so no late answer comes after them."""
@@ -294,12 +336,9 @@ class ServoLink(ABC):
         """Drop late answers to earlier instructions, also incomplete ones, and send an instruction."""
         self._parser.clear()
         self._waiting.clear()
-        try:
-            self._serial.reset_input_buffer()
-        except termios.error as error:  # raised by pyserial when the adapter is unplugged
-            raise OSError(str(error)) from error
-        self._sent_ns = time.monotonic_ns()
-        os.write(self.fd, packet)
+        self.port.flush()
+        self._sent_ns = self.clock.now_ns()
+        self.port.write(packet)
 
     def _receive(self, servo_id: int, length: int, end_ns: int) -> Answer | None:
         """Return a servo's answer with `length` bytes of data, or its refusal without data.
@@ -320,12 +359,8 @@ class ServoLink(ABC):
                 packet = self._waiting.pop(0)
                 if packet.intact and (answer := self.form.answer(packet)) is not None:
                     return answer
-            left_s = (end_ns - time.monotonic_ns()) * 1e-9
-            if left_s <= 0.0 or not select.select([self.fd], [], [], left_s)[0]:
+            if not (data := self.port.read(end_ns)):
                 return None
-            data = os.read(self.fd, 4096)
-            if not data:
-                raise OSError("the port is ready to be read, but has no data: was it unplugged?")
             self._waiting += [packet for packet, _ in self._parser.feed(data)]
 
     def _count_answer(self, now_ns: int, wire_ns: int) -> int:
@@ -351,10 +386,9 @@ class ServoLink(ABC):
         if self.guardian is not None:
             self.guardian.require_watching()
 
-    def _withholds(self, register: Register, values: Iterable[int]) -> bool:
-        """Whether a write could move a motor in a dry run."""
-        moves = register in self.table.goals or (register == self.table.torque and any(values))
-        return self.torque_withheld and moves
+    def _moves(self, register: Register, values: Iterable[int]) -> bool:
+        """Whether a write could move a motor, or switch its torque on."""
+        return register in self.table.goals or (register == self.table.torque and any(values))
 
     def _withhold(self, register: Register, values: Mapping[int, int]) -> Transaction:
         """Read the register in place of a write, so that the bus is as busy and its loss is noticed."""

@@ -1,13 +1,19 @@
-"""The serial port of a bus of servos, and the time limits that hold on it."""
+"""The port of a bus of servos, and the time limits that hold on it."""
 
 import math
+import os
+import select
+import termios
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final, Protocol, cast
 
 import serial
 from serial.tools import list_ports
 
 from sim2real.errors import HardwareLost, UsageError
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
+from sim2real.hardware.safety.guardian import BusGuardian, Guardian
 
 
 @dataclass(frozen=True)
@@ -53,13 +59,95 @@ class LinkConfig:
             raise UsageError(f"silence_s = {self.silence_s} is outside [0, {self.longest_silence_s}]")
 
 
-def open_port(config: LinkConfig) -> serial.Serial:
-    """Return the open port, exclusively; raise HardwareLost if it cannot be opened, or another process uses it."""
-    try:
-        return serial.Serial(config.port, config.baud_rate, timeout=0, exclusive=True)
-    except (OSError, ValueError) as error:  # serial.SerialException is an OSError
-        ports = ", ".join(f"{p.device} ({p.description})" for p in list_ports.comports()) or "none"
-        raise HardwareLost(
-            f"serial port {config.port} cannot be opened: {error}",
-            hint=f"serial ports here: {ports}; a port that is there but refused needs group 'dialout'",
-        ) from error
+class Port(Protocol):
+    """Bytes from and to a device, on the device's clock. Every method may be called from any thread.
+
+    Attributes:
+        clock: The time of the device.
+    """
+
+    clock: Clock
+
+    def write(self, data: bytes) -> None:
+        """Send bytes without waiting; OSError if that cannot be done."""
+        ...
+
+    def read(self, until_ns: int) -> bytes:
+        """Return the bytes that have arrived; none if there are none until a time [ns]; OSError if the port is gone."""
+        ...
+
+    def flush(self) -> None:
+        """Drop the bytes that have arrived; OSError if the port is gone."""
+        ...
+
+    def close(self) -> None:
+        """Close the port; OSError if that cannot be done."""
+        ...
+
+    def guardian(
+        self, off: bytes, servos: Sequence[tuple[bytes, Sequence[bytes]]], silence_s: float, answer_s: float
+    ) -> Guardian:
+        """Return a guardian of the servos on this port, which has started; see `BusGuardian`."""
+        ...
+
+
+class SerialPort:
+    """A serial port of this computer, which no other process can open meanwhile.
+
+    Raises:
+        HardwareLost: It cannot be opened, or another process uses it.
+    """
+
+    def __init__(self, address: str, baud_rate: int) -> None:
+        self.clock: Clock = SYSTEM_CLOCK
+        try:
+            self._serial = serial.Serial(address, baud_rate, timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:  # serial.SerialException is an OSError
+            ports = ", ".join(f"{p.device} ({p.description})" for p in list_ports.comports()) or "none"
+            raise HardwareLost(
+                f"serial port {address} cannot be opened: {error}",
+                hint=f"serial ports here: {ports}; a port that is there but refused needs group 'dialout'",
+            ) from error
+        self._fd = cast(int, self._serial.fileno())
+
+    def write(self, data: bytes) -> None:
+        """Send bytes without waiting; OSError if that cannot be done."""
+        os.write(self._fd, data)
+
+    def read(self, until_ns: int) -> bytes:
+        """Return the bytes that have arrived; none if there are none until a time [ns]; OSError if the port is gone."""
+        left_s = (until_ns - self.clock.now_ns()) * 1e-9
+        if left_s <= 0.0 or not select.select([self._fd], [], [], left_s)[0]:
+            return b""
+        data = os.read(self._fd, 4096)
+        if not data:
+            raise OSError("the port is ready to be read, but has no data: was it unplugged?")
+        return data
+
+    def flush(self) -> None:
+        """Drop the bytes that have arrived; OSError if the port is gone."""
+        try:
+            self._serial.reset_input_buffer()
+        except termios.error as error:  # raised by pyserial when the adapter is unplugged
+            raise OSError(str(error)) from error
+
+    def close(self) -> None:
+        """Close the port; OSError if that cannot be done."""
+        self._fd = -1  # the operating system gives the number to the next file that is opened
+        self._serial.close()
+
+    def guardian(
+        self, off: bytes, servos: Sequence[tuple[bytes, Sequence[bytes]]], silence_s: float, answer_s: float
+    ) -> Guardian:
+        """Return a guardian in a process of its own, which shares the open port and its lock."""
+        return BusGuardian(self._fd, off, servos, silence_s, answer_s)
+
+
+EMULATED: Final[dict[str, Callable[[int], Port]]] = {}
+"""Address -> opens, at a baud rate, the port of an emulated robot in this process: `emulation.virtual`."""
+
+
+def open_port(address: str, baud_rate: int) -> Port:
+    """Return the open port of an address; raise HardwareLost if it cannot be opened, or another process uses it."""
+    emulated = EMULATED.get(address)
+    return SerialPort(address, baud_rate) if emulated is None else emulated(baud_rate)

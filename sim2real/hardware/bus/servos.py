@@ -2,10 +2,8 @@
 
 import atexit
 import logging
-import os
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Final, Generic, Self, TypeVar
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
@@ -13,13 +11,11 @@ from sim2real.hardware.bus.link import ServoLink
 from sim2real.hardware.bus.models import ServoModel
 from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
 from sim2real.hardware.bus.port import LinkConfig
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.device import Counters, WithoutHost
-from sim2real.hardware.safety.guardian import BusGuardian
 
 _LOGGER = logging.getLogger(__name__)
-_SAFE_REPEATS: Final = 5
 _SHARED_PINGS: Final = 3
-_SAFE_PAUSE_S: Final = 0.002
 
 L = TypeVar("L", bound=ServoLink)
 
@@ -65,6 +61,7 @@ class GuardedServos(Generic[L]):
         self.armed = self.halted = False
         self.models = {}
         self._link = self.link_type(self.config)
+        self._link.off_packet = self._off_packet
         atexit.register(self.close)
 
     @property
@@ -78,6 +75,11 @@ class GuardedServos(Generic[L]):
     def motors(self) -> tuple[str, ...]:
         """Names of the servos."""
         return tuple(f"servo {i}" for i in self.ids)
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the port; before it is open, the machine's."""
+        return SYSTEM_CLOCK if self._link is None else self._link.clock
 
     @property
     def silence_s(self) -> float:
@@ -113,6 +115,8 @@ class GuardedServos(Generic[L]):
         self.ids = tuple(servo_ids)
         # Built here, as make_safe must not need any time.
         self._off_packet = form.write_each(torque, dict.fromkeys(self.ids, 0)) if self.ids else b""
+        if self._link is not None:
+            self._link.off_packet = self._off_packet
 
     def find(self, servo_id: int, whose: str = "") -> bytes:
         """Return the data of a servo's answer to a ping.
@@ -181,19 +185,45 @@ class GuardedServos(Generic[L]):
         """
         if self.halted:
             raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
-        if not self.config.guardian:
-            return
         link = self.link
-        if link.guardian is None:
-            queries = link.form.torque_queries(link.table.torque, self.ids)
-            times_s = self.config.silence_s, self.config.reply_timeout_s
-            link.guardian = BusGuardian(link.fd, self._off_packet, queries, *times_s)
-        link.guardian.arm()
+        if self.config.guardian:
+            if link.guardian is None:
+                queries = link.form.torque_queries(link.table.torque, self.ids)
+                times_s = self.config.silence_s, self.config.reply_timeout_s
+                link.guardian = link.port.guardian(self._off_packet, queries, *times_s)
+            link.guardian.arm()
+        link.at_rest = False
+        if self.halted:  # in another thread, or by a signal
+            link.at_rest = True
+            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
+
+    def disable(self) -> None:
+        """Switch the torque off: of all servos at once, then of each one until it confirms.
+
+        The guardian watches until all have confirmed: if one does not, the guardian goes on trying.
+
+        Raises:
+            HardwareLost: A servo does not confirm; the others were switched off.
+        """
+        with self._unguarded():
+            if unconfirmed := self._release(self.ids):
+                raise HardwareLost(
+                    f"servos {unconfirmed} on {self.config.port} do not confirm that their torque is off",
+                    hint="cut their power",
+                )
+
+    def switched_on(self) -> None:
+        """Note that torque is on; raise SafetyStop if it was taken off meanwhile."""
+        self.armed = True
+        if self.link.at_rest:
+            self.armed = False
+            raise SafetyStop("torque stays off: the servos have been made safe", hint="open them again")
 
     @contextmanager
-    def unguarded(self) -> Iterator[None]:
+    def _unguarded(self) -> Iterator[None]:
         """Take the torque off in this block: the guardian watches until its end, unless it has acted already."""
         self.armed = False
+        self.link.at_rest = True
         guardian = self.link.guardian
         if guardian is not None and not guardian.settle():
             guardian.disarm()  # it has taken over or died: take the torque off all the same
@@ -204,23 +234,17 @@ class GuardedServos(Generic[L]):
     def make_safe(self) -> None:
         """Take the torque off without a lock and without waiting for answers: for signal handlers and watchdog threads.
 
-        It takes no lock because the code that a signal interrupts may hold it. The instruction may collide with an
-        answer on the wire and be lost, so it is sent five times within 8 ms. Torque cannot be switched on again
+        It takes no lock because the code that a signal interrupts may hold it. Torque cannot be switched on again
         afterwards.
         """
-        self.halted, self.armed = True, False
-        link = self._link
-        if not self._off_packet or link is None or link.closed:
-            return
-        with suppress(OSError):
-            for repeat in range(_SAFE_REPEATS):
-                time.sleep(_SAFE_PAUSE_S if repeat else 0.0)
-                os.write(link.fd, self._off_packet)
-
-    def stop_if_halted(self) -> None:
-        """Take the torque off after `make_safe`, as an instruction that switches it on may have followed."""
-        if self.halted:
-            self.make_safe()
+        # In this order, as `guard` in another thread allows motion and then looks for `halted`, and `switched_on` sets
+        # `armed` and then looks for `at_rest`.
+        self.halted = True
+        if self._link is not None:
+            self._link.at_rest = True
+        self.armed = False
+        if self._link is not None:
+            self._link.make_safe()
 
     def close(self) -> None:
         """Take the torque off, and close the port. Never raises; may be called twice, and before `open`.
@@ -230,19 +254,24 @@ class GuardedServos(Generic[L]):
         link = self._link
         if link is None or link.closed:
             return
-        self.halted, self.armed = True, False
+        self.halted = True
+        link.at_rest, self.armed = True, False
         guardian = link.guardian
         # Let a guardian that takes the torque off finish, as both use the same line.
         if guardian is not None:
             guardian.settle()
         # Release every servo; the guardian continues with those that do not confirm.
-        unconfirmed = [servo_id for servo_id in self.models if not self.release(servo_id)]
-        if unconfirmed:
+        if unconfirmed := self._release(self.models):
             _LOGGER.error("servos %s did not confirm that their torque is off", unconfirmed)
         link.close()
         if guardian is not None:
             guardian.end(confirmed=not unconfirmed)
         atexit.unregister(self.close)
+
+    def _release(self, servo_ids: Iterable[int]) -> list[int]:
+        """Take the torque of all servos off at once; return those that do not confirm it. Never raises."""
+        self.link.send_off()
+        return [servo_id for servo_id in servo_ids if not self.release(servo_id)]
 
     def release(self, servo_id: int) -> bool:
         """Take a servo's torque off, and return whether it has confirmed; never raises."""

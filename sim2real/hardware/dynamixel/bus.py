@@ -142,10 +142,7 @@ class ServoBus(GuardedServos[BusLink]):
         if on:
             self._torque_on()
             return
-        with self.unguarded():
-            for servo_id in self.ids:
-                self.write(servo_id, reg.TORQUE_ENABLE, 0)
-                self.write(servo_id, reg.BUS_WATCHDOG, 0)
+        self.disable()
 
     def read_state(self, ids: Sequence[int] | None = None) -> Reading:
         """Read position, velocity and load of servos in one transaction.
@@ -224,17 +221,13 @@ class ServoBus(GuardedServos[BusLink]):
     def _torque_on(self) -> None:
         self.armed = False
         self.guard()
-        try:
-            for servo_id in self.ids:
-                # A tripped watchdog refuses goals, so it is cleared first and armed last.
-                self.write(servo_id, reg.BUS_WATCHDOG, 0)
-                self._rest_goal(servo_id)
-                self.write(servo_id, reg.TORQUE_ENABLE, 1)
-                self.write(servo_id, reg.BUS_WATCHDOG, self.config.watchdog_count)
-            self.armed = True
-        finally:
-            # `make_safe` in another thread may have come between two of these writes.
-            self.stop_if_halted()
+        for servo_id in self.ids:
+            # A tripped watchdog refuses goals, so it is cleared first and armed last.
+            self.write(servo_id, reg.BUS_WATCHDOG, 0)
+            self._rest_goal(servo_id)
+            self.write(servo_id, reg.TORQUE_ENABLE, 1)
+            self.write(servo_id, reg.BUS_WATCHDOG, self.config.watchdog_count)
+        self.switched_on()
 
     def _rest_goal(self, servo_id: int) -> None:
         mode = self.read(servo_id, reg.OPERATING_MODE)

@@ -58,10 +58,6 @@ class DynamixelServos(ServoBus, Device):
         """Return the share of full torque that the servos apply, from command and angles, all ``(n,)``."""
         return self.drive.effort(command, position_rad)
 
-    def disable(self) -> None:
-        """Switch the torque off, confirmed by every servo."""
-        self.torque(False)
-
 
 def servos(port: str, ids: Sequence[int], drive: Drive, *, baud_rate: int, silence_s: float) -> DynamixelServos:
     """Return servos on a port, not opened yet: the device of the name ``dynamixel``; see ``DeviceFactory``."""

@@ -88,7 +88,8 @@ class StsServos(GuardedServos[StsLink], Device):
         try:
             for joint in self.joints:
                 self._find(joint)
-                self._force_off(joint.servo_id)
+                if not self.release(joint.servo_id):
+                    raise HardwareLost(f"servo {joint.servo_id} does not confirm that its torque is off")
                 self._prepare(joint)
         except BaseException:
             self.close()
@@ -104,17 +105,14 @@ class StsServos(GuardedServos[StsLink], Device):
         link = self.link
         self.guard()
         goals = []
-        try:
-            for joint in self.joints:
-                self._write_settings(joint.servo_id)
-                goals.append(self._rest_count(joint, link.read(joint.servo_id, reg.PRESENT_POSITION)))
-                # The goal comes before torque: some firmware switches it on at this write, and holds the position.
-                link.set(joint.servo_id, reg.GOAL_POSITION, goals[-1])
-                link.write(joint.servo_id, reg.TORQUE_ENABLE, 1)
-            self._rest = (np.array(goals) - self._zero) * self._scale
-            self.armed = True
-        finally:
-            self.stop_if_halted()
+        for joint in self.joints:
+            self._write_settings(joint.servo_id)
+            goals.append(self._rest_count(joint, link.read(joint.servo_id, reg.PRESENT_POSITION)))
+            # The goal comes before torque: some firmware switches it on at this write, and holds the position.
+            link.set(joint.servo_id, reg.GOAL_POSITION, goals[-1])
+            link.write(joint.servo_id, reg.TORQUE_ENABLE, 1)
+        self._rest = (np.array(goals) - self._zero) * self._scale
+        self.switched_on()
 
     def rest(self) -> np.ndarray:
         """Return the angles that the servos hold since `enable` [rad], ``(n,)``."""
@@ -138,8 +136,6 @@ class StsServos(GuardedServos[StsLink], Device):
         Raises:
             SafetyStop: An angle is not finite or outside the joint's range, a servo reports an alarm, or torque is off.
         """
-        if self.halted:  # a goal could switch the torque on again
-            raise SafetyStop("no command is sent: the servos have been made safe", hint="open them again")
         # Refuse every angle before any is sent.
         goals = {}
         for joint, angle in zip(self.joints, values.tolist(), strict=True):
@@ -150,12 +146,9 @@ class StsServos(GuardedServos[StsLink], Device):
             goals[joint.servo_id] = count
         # One servo confirms its goal; several share one instruction without answers.
         link = self.link
-        try:
-            if len(goals) == 1:
-                return link.write(self.ids[0], reg.GOAL_POSITION, goals[self.ids[0]])
-            return link.write_each(reg.GOAL_POSITION, goals)
-        finally:
-            self.stop_if_halted()
+        if len(goals) == 1:
+            return link.write(self.ids[0], reg.GOAL_POSITION, goals[self.ids[0]])
+        return link.write_each(reg.GOAL_POSITION, goals)
 
     def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
         """Return the duty that the P gain computes from the position error, ignoring the profile."""
@@ -177,12 +170,6 @@ class StsServos(GuardedServos[StsLink], Device):
                         f"servo {servo_id} has lost its settings: {register.name} is {current}, not {value}",
                         hint="did its supply fail for a moment?",
                     )
-
-    def disable(self) -> None:
-        """Switch the torque off, confirmed by every servo."""
-        with self.unguarded():
-            for servo_id in self.ids:
-                self._force_off(servo_id)
 
     def _find(self, joint: CalibratedJoint) -> None:
         """Find a joint's servo; raise HardwareLost if it is not there, another model, or calibrated differently."""
@@ -240,10 +227,6 @@ class StsServos(GuardedServos[StsLink], Device):
                 hint="move it by hand, or calibrate again",
             )
         return goal
-
-    def _force_off(self, servo_id: int) -> None:
-        if not self.link.force(servo_id, reg.TORQUE_ENABLE, 0):
-            raise HardwareLost(f"servo {servo_id} does not confirm that its torque is off", hint="cut its power")
 
 
 def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, silence_s: float) -> StsServos:

@@ -1,22 +1,24 @@
 """The control process's side of the guardian: starts it, sends it signs of life, and reads its messages."""
 
+import math
 import os
 import select
 import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from sim2real.errors import HardwareLost, SafetyStop
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.safety import guardian_process as process
 
 _START_TIMEOUT_S: Final = 10.0
 _SETTLE_TIMEOUT_S: Final = 1.0
+_KILL_S: Final = 0.01
 _BEATS: Final = 10  # number of signs of life in the longest silence
 _INTERVAL_S: Final = 0.01  # between signs of life if silence is not limited
 # Send buffer for about 50 unread signs of life (on Linux 770 bytes each, of twice this size); when it is full, the
@@ -28,45 +30,54 @@ _HEARD_S: Final = 0.5
 _DEAD: Final = "the guardian has died or was stopped: the torque would stay on if this process died too"
 
 
-class Guardian:
-    """A separate process that makes the motors safe when this one dies, or gives no sign of life while torque is on.
+class Channel(Protocol):
+    """The control process's end of the connection to a guardian.
 
-    In normal operation it only receives signs of life from `beat`, which cost 10 us each, and answers them: a guardian
-    that died or was stopped is noticed at the next one. If this process dies while the guardian is stopped, the kernel
-    lets it continue (Linux), and it makes the motors safe. It reports its actions on stderr.
+    Attributes:
+        pid: The guardian's process id.
+        clock: The time of the device.
+    """
+
+    pid: int
+    clock: Clock
+
+    def send(self, message: bytes) -> None:
+        """Send a message, without waiting; OSError if the guardian has died, or does not read."""
+        ...
+
+    def receive(self, until_ns: int) -> bytes | None:
+        """Return messages; None if there are none until a time [ns]; b"" if the guardian has died."""
+        ...
+
+    def is_stopped(self) -> bool:
+        """Return whether the guardian was stopped, as by a debugger."""
+        ...
+
+    def close(self, wait_s: float) -> None:
+        """Close the connection; then wait for the guardian's end, and kill it after a time [s]; 0: do not wait."""
+        ...
+
+
+class Process:
+    """A guardian's process, which shares a socket with this one.
 
     Args:
         program: Arguments of Python that start the process: flags, then a file or a module. It gets the file descriptor
-            of the link to this process, and the longest silence, and then ``arguments``.
-        silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
-            counts.
+            of the socket, and the longest silence, and then ``arguments``.
+        longest_s: The longest silence [s].
         pass_fds: Further file descriptors that the process inherits.
-        settle_s: Longest time until the motors are in the safe state [s].
 
     Raises:
-        HardwareLost: It does not start.
+        HardwareLost: It cannot be started.
     """
 
     def __init__(
-        self,
-        program: Sequence[str],
-        silence_s: float,
-        arguments: Sequence[str] = (),
-        pass_fds: Sequence[int] = (),
-        settle_s: float = _SETTLE_TIMEOUT_S,
+        self, program: Sequence[str], longest_s: float, arguments: Sequence[str] = (), pass_fds: Sequence[int] = ()
     ) -> None:
-        self._settle_s = settle_s
-        self._silence_s = silence_s
-        self._interval_s = silence_s / _BEATS or _INTERVAL_S
-        self._beat_s = 0.0
-        self._unheard_s: float | None = None  # when the first sign of life was sent that was not answered yet
-        self._armed = self._tripped = False
-        self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
-        self._messages = b""
+        self.clock: Clock = SYSTEM_CLOCK
         # The signs of life go over a socket with a small buffer, which is full when the guardian hangs.
         self._link, other = socket.socketpair()
         self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNHEARD_BYTES)
-        longest_s = silence_s + self._interval_s if silence_s else 0.0  # signs of life are one interval apart
         command = [sys.executable, *program, str(other.fileno()), repr(longest_s), *arguments]
         try:
             # In a new session, so that Ctrl-C in a terminal reaches only the control process.
@@ -84,18 +95,83 @@ class Guardian:
             ) from error
         finally:
             other.close()
+        self.pid = self._process.pid
+        self._link.setblocking(False)
+
+    def send(self, message: bytes) -> None:
+        """Send a message, without waiting; OSError if the guardian has died, or does not read."""
+        self._link.send(message)
+
+    def receive(self, until_ns: int) -> bytes | None:
+        """Return messages; None if there are none until a time [ns]; b"" if the guardian has died."""
+        left_s = max(0.0, 1e-9 * (until_ns - self.clock.now_ns()))
+        try:
+            if left_s and not select.select([self._link], [], [], left_s)[0]:
+                return None
+            return self._link.recv(256, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return None
+        except (OSError, ValueError):
+            return b""
+
+    def is_stopped(self) -> bool:
+        """Return whether the guardian was stopped, as by a debugger."""
+        with suppress(ChildProcessError, AttributeError):  # it has ended; or this system cannot tell
+            return os.waitid(os.P_PID, self.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+        return False
+
+    def close(self, wait_s: float) -> None:
+        """Close the connection; then wait for the guardian's end, and kill it after a time [s]; 0: do not wait."""
+        self._link.close()
+        if not wait_s:
+            return
+        try:
+            self._process.wait(wait_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class Guardian:
+    """A separate process that makes the motors safe when this one dies, or gives no sign of life while torque is on.
+
+    In normal operation it only receives signs of life from `beat`, which cost 10 us each, and answers them: a guardian
+    that died or was stopped is noticed at the next one. If this process dies while the guardian is stopped, the kernel
+    lets it continue (Linux), and it makes the motors safe. It reports its actions on stderr.
+
+    Args:
+        start: Starts the guardian, given the longest silence [s].
+        silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited, only this process' death
+            counts.
+        settle_s: Longest time until the motors are in the safe state [s].
+
+    Raises:
+        HardwareLost: It does not start.
+    """
+
+    def __init__(
+        self, start: Callable[[float], Channel], silence_s: float, settle_s: float = _SETTLE_TIMEOUT_S
+    ) -> None:
+        self._settle_s = settle_s
+        self._silence_s = silence_s
+        self._interval_s = silence_s / _BEATS or _INTERVAL_S
+        self._beat_s = -math.inf
+        self._unheard_s: float | None = None  # when the first sign of life was sent that was not answered yet
+        self._armed = self._tripped = False
+        self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
+        self._messages = b""
+        # Signs of life are one interval apart.
+        self._channel = start(silence_s + self._interval_s if silence_s else 0.0)
         # Torque may go on only once it watches.
         if not self._hears(process.READY, _START_TIMEOUT_S):
-            self._process.kill()
-            self.end(confirmed=True)
+            self._channel.close(_KILL_S)
             raise HardwareLost("the guardian does not start", hint="torque stays off without it")
         self._messages = b""
-        self._link.setblocking(False)
 
     @property
     def pid(self) -> int:
         """The guardian's process id."""
-        return self._process.pid
+        return self._channel.pid
 
     @property
     def took_over(self) -> bool:
@@ -109,7 +185,7 @@ class Guardian:
             SafetyStop: As in `beat`.
         """
         with self._lock:
-            self._armed, self._beat_s, self._unheard_s = True, 0.0, None
+            self._armed, self._beat_s, self._unheard_s = True, -math.inf, None
         try:
             self.beat()
         except SafetyStop:
@@ -129,7 +205,7 @@ class Guardian:
             SafetyStop: The guardian has taken the torque off, or has died; also at all later calls.
         """
         with self._lock:
-            now_s = time.monotonic()
+            now_s = self._now_s()
             if not self._armed or (not self._messages and now_s - self._beat_s < self._interval_s):
                 return
             self._beat_s = now_s
@@ -150,14 +226,14 @@ class Guardian:
 
         A guardian that takes over reads the servos' answers, which are then missing here.
         """
-        self._beat_s = 0.0
+        self._beat_s = -math.inf
         self.beat()
 
     def trip(self) -> None:
         """Let it make the motors safe now. Without a lock, for signal handlers; never raises."""
         self._tripped = True
         with suppress(OSError):  # it has died, or does not read
-            self._link.send(process.TRIP)
+            self._channel.send(process.TRIP)
 
     def settle(self) -> bool:
         """Wait until the motors are in the safe state, if it is making them safe. Never raises.
@@ -169,7 +245,7 @@ class Guardian:
             with self._lock:
                 self._listen()
                 if not self._messages:
-                    self._require_running(time.monotonic())
+                    self._require_running(self._now_s())
         except SafetyStop:
             return False
         if self.took_over and process.SAFE not in self._messages:
@@ -185,55 +261,46 @@ class Guardian:
         if confirmed:
             with suppress(SafetyStop):
                 self._send(process.LEAVE)
-        self._link.close()
-        if not confirmed:
-            return
-        try:
-            self._process.wait(_SETTLE_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+        self._channel.close(_SETTLE_TIMEOUT_S if confirmed else 0.0)
+
+    def _now_s(self) -> float:
+        return 1e-9 * self._channel.clock.now_ns()
 
     def _send(self, message: bytes) -> None:
         try:
-            self._link.send(message)
+            self._channel.send(message)
         except OSError as error:  # it has died, or does not read
             raise SafetyStop(_DEAD, hint="start again") from error
 
     def _require_running(self, now_s: float) -> None:
         """Raise SafetyStop if the guardian was stopped, or has not answered for long."""
-        stopped = self._unheard_s is not None and now_s - self._unheard_s > _HEARD_S
-        if not stopped and hasattr(os, "waitid"):
-            with suppress(ChildProcessError):  # it has ended, and its socket is closed: `_send` raises
-                flags = os.WSTOPPED | os.WNOHANG | os.WNOWAIT
-                stopped = os.waitid(os.P_PID, self._process.pid, flags) is not None
-        if stopped:
+        unheard = self._unheard_s is not None and now_s - self._unheard_s > _HEARD_S
+        if unheard or self._channel.is_stopped():
             raise SafetyStop(_DEAD, hint="start again")
 
-    def _listen(self) -> None:
-        """Read the guardian's messages; raise SafetyStop if it has died."""
-        while True:
-            try:
-                received = self._link.recv(256, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                return
-            except OSError:
-                received = b""
+    def _listen(self, until_ns: int = 0) -> bool:
+        """Read the guardian's messages, waiting until a time [ns]; return whether there were any.
+
+        Raises:
+            SafetyStop: It has died.
+        """
+        heard = False
+        while (received := self._channel.receive(0 if heard else until_ns)) is not None:
             if not received:
                 raise SafetyStop(_DEAD, hint="start again")
+            heard = True
             if process.HEARD in received:
                 self._unheard_s = None
             self._messages += received.replace(process.HEARD, b"")
+        return heard
 
     def _hears(self, message: bytes, timeout_s: float) -> bool:
         """Wait for a message; return False after the timeout, a report of failure, or the guardian's death."""
-        end_s = time.monotonic() + timeout_s
+        end_ns = self._channel.clock.now_ns() + round(1e9 * timeout_s)
         with suppress(SafetyStop):
             while message not in self._messages and process.FAILED not in self._messages:
-                left_s = end_s - time.monotonic()
-                if left_s <= 0.0 or not select.select([self._link], [], [], left_s)[0]:
+                if not self._listen(end_ns):
                     break
-                self._listen()
         return message in self._messages
 
 
@@ -260,4 +327,5 @@ class BusGuardian(Guardian):
         # -I -S: neither the user's site packages nor the working directory may affect what runs there.
         program = ["-I", "-S", str(Path(process.__file__))]
         packets = [f"{query.hex()}:{','.join(a.hex() for a in answers)}" for query, answers in servos]
-        super().__init__(program, silence_s, [str(port_fd), repr(answer_s), off.hex(), *packets], (port_fd,))
+        arguments = [str(port_fd), repr(answer_s), off.hex(), *packets]
+        super().__init__(lambda longest_s: Process(program, longest_s, arguments, (port_fd,)), silence_s)

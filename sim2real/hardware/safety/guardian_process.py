@@ -9,11 +9,17 @@ few modules, so that it starts within 20 ms. The packets, which depend on the pr
 `sim2real.hardware.safety.guardian`.
 """
 
+from __future__ import annotations
+
 import os
 import select
 import signal
 import sys
 import time
+
+TYPE_CHECKING = False  # importing typing or collections.abc takes a third of the start
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 READY, BEAT, REST, LEAVE, TRIP = b"r", b"+", b"-", b"q", b"!"
 HEARD, TRIPPED, SAFE, FAILED = b".", b"t", b"s", b"f"
@@ -24,7 +30,10 @@ _PRIORITY = 3  # above the threads that it watches, which have 1: should one nev
 
 
 class Guard:
-    """Decides when to make the motors safe; a subclass does it."""
+    """Decides when to make the motors safe; a subclass does it.
+
+    `watch` runs it in a process; `begin`, `hear` and `look` are its steps.
+    """
 
     cut = "cut the motors' power"
     """The advice to a person if the motors do not confirm."""
@@ -35,103 +44,104 @@ class Guard:
         """Make the motors safe and take their torque off; return the reason if that failed, else ""."""
         raise NotImplementedError
 
+    def now_s(self) -> float:
+        """Return the time [s]."""
+        return time.monotonic()
+
+    def report(self, message: str) -> None:
+        """Tell a person."""
+        _write(2, f"{message}\n".encode())
+
     def watch(self, link: int, silence_s: float) -> None:
         """Wait until the control process ends it; act when it dies, or is silent for too long with torque on.
 
         Args:
             silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
         """
-        # Report readiness; the control process then arms it with each beat.
-        armed, tripped, heard_s = False, False, time.monotonic()
-        _write(link, READY)
+        self.begin(silence_s, lambda message: _write(link, message))
         while True:
-            watched = armed and not tripped and silence_s > 0.0
-            wait_s = max(0.0, heard_s + silence_s - time.monotonic()) if watched else None
-            if select.select([link], [], [], wait_s)[0]:  # messages first: this process may be late itself
-                messages = _receive_messages(link)
-                if messages.endswith(LEAVE):
-                    return
-                if TRIP in messages and not tripped:
-                    tripped = True
-                    self._trip(link, "the control process stopped the robot")
-                    continue
-                if not messages:
-                    if armed or self.at_rest:
-                        self.make_safe("the control process is gone")
-                    return
-                armed, heard_s = messages.endswith(BEAT), time.monotonic()
-                if armed:
-                    _write(link, HEARD)
-            elif watched and time.monotonic() - heard_s >= silence_s:
-                # Stay until the control process leaves: it may resume, and switch torque on before it notices.
-                tripped = True
-                self._trip(link, f"the control process was silent for {silence_s:.2f} s")
+            due_s = self.due_s()
+            wait_s = None if due_s is None else max(0.0, due_s - self.now_s())
+            # Messages first: this process may be late itself.
+            if not select.select([link], [], [], wait_s)[0]:
+                self.look()
+            elif not self.hear(_receive_messages(link)):
+                return
 
-    def _trip(self, link: int, reason: str) -> None:
-        _write(link, TRIPPED)
-        _write(link, SAFE if self.make_safe(reason) else FAILED)
+    def begin(self, silence_s: float, say: Callable[[bytes], None]) -> None:
+        """Report readiness; the control process then arms it with each sign of life."""
+        self._silence_s, self._say = silence_s, say
+        self._armed, self._tripped, self._heard_s = False, False, self.now_s()
+        say(READY)
+
+    def due_s(self) -> float | None:
+        """Return the time at which the control process has been silent for too long [s]; None: never."""
+        watched = self._armed and not self._tripped and self._silence_s > 0.0
+        return self._heard_s + self._silence_s if watched else None
+
+    def look(self) -> None:
+        """Make the motors safe if the control process has been silent for too long."""
+        due_s = self.due_s()
+        if due_s is not None and self.now_s() >= due_s:
+            # Stay until the control process leaves: it may resume, and switch torque on before it notices.
+            self._trip(f"the control process was silent for {self._silence_s:.2f} s")
+
+    def hear(self, messages: bytes) -> bool:
+        """Process messages of the control process; none: it has died. Return whether to go on."""
+        if messages.endswith(LEAVE):
+            return False
+        if TRIP in messages and not self._tripped:
+            self._trip("the control process stopped the robot")
+            return True
+        if not messages:
+            if self._armed or self.at_rest:
+                self.make_safe("the control process is gone")
+            return False
+        self._armed, self._heard_s = messages.endswith(BEAT), self.now_s()
+        if self._armed:
+            self._say(HEARD)
+        return True
+
+    def _trip(self, reason: str) -> None:
+        self._tripped = True
+        self._say(TRIPPED)
+        self._say(SAFE if self.make_safe(reason) else FAILED)
 
     def make_safe(self, reason: str) -> bool:
         """Take the torque off, report it on stderr, and return whether all motors have confirmed."""
-        begin_s = time.monotonic()
-        failure = self.take_torque_off()
-        took_ms = 1e3 * (time.monotonic() - begin_s)
+        begin_s = self.now_s()
+        try:
+            failure = self.take_torque_off()
+        except Exception as error:
+            failure = f"{type(error).__name__}: {error}"
+        took_ms = 1e3 * (self.now_s() - begin_s)
         if failure:
             result = f"torque off could NOT be confirmed, {failure}; {self.cut}"
         else:
             result = f"torque is off, confirmed after {took_ms:.0f} ms"
-        _write(2, f"sim2real guardian: {reason}: {result}\n".encode())
+        self.report(f"sim2real guardian: {reason}: {result}")
         return not failure
 
 
-class BusGuard(Guard):
-    """Takes the torque of servos on a bus off; arguments as in `sim2real.hardware.safety.guardian.BusGuardian`."""
+class FdPort:
+    """The open port of servos, shared with the control process."""
 
-    cut = "cut the servos' power"
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
 
-    def __init__(self, port_fd: int, answer_s: float, off: bytes, servos: list[tuple[bytes, list[bytes]]]) -> None:
-        self._fd, self._answer_s, self._off, self._servos = port_fd, answer_s, off, servos
+    def now_s(self) -> float:
+        """Return the time [s]."""
+        return time.monotonic()
 
-    def take_torque_off(self) -> str:
-        """Switch all servos off, repeatedly until each has confirmed; return the reason if that failed, else "".
-
-        Repeated, because the first packet is lost if the control process died while it was writing one, and because
-        the control process, if it resumes, may read an answer in place of this one.
-        """
-        end = time.monotonic() + GIVE_UP_S
-        unconfirmed = self._servos
-        try:
-            self._drain()
-            while unconfirmed and time.monotonic() < end:
-                self._send(self._off)
-                unconfirmed = [servo for servo in unconfirmed if not self._confirms(*servo)]
-        except OSError as error:
-            return f"the port failed: {error}"
-        count = len(unconfirmed)
-        return f"{count} of {len(self._servos)} servos did not answer for {GIVE_UP_S:g} s" if count else ""
-
-    def _drain(self) -> None:
-        """Wait until no more bytes arrive: on a half-duplex line, sending now would collide with an answer."""
-        end = time.monotonic() + _LONGEST_ANSWER_S
-        while time.monotonic() < end and self._receive(_QUIET_S):
-            pass
-
-    def _send(self, packet: bytes) -> None:
+    def write(self, packet: bytes) -> None:
+        """Send a packet; it is lost if the buffer is full."""
         try:
             os.write(self._fd, packet)
-        except BlockingIOError:  # the buffer is full: the packet is lost, and sent again in the next round
+        except BlockingIOError:
             time.sleep(_QUIET_S)
 
-    def _confirms(self, query: bytes, answers: list[bytes]) -> bool:
-        self._send(query)
-        end, heard = time.monotonic() + self._answer_s, b""
-        while (left_s := end - time.monotonic()) > 0.0:
-            heard += self._receive(left_s)
-            if any(answer in heard for answer in answers):
-                return True
-        return False
-
-    def _receive(self, wait_s: float) -> bytes:
+    def receive(self, wait_s: float) -> bytes:
+        """Return the bytes that have arrived; none if there are none for a time [s]."""
         if not select.select([self._fd], [], [], wait_s)[0]:
             return b""
         try:
@@ -141,6 +151,53 @@ class BusGuard(Guard):
         if not data:
             raise OSError("it has been unplugged")
         return data
+
+
+class BusGuard(Guard):
+    """Takes the torque of servos on a bus off; arguments as in `sim2real.hardware.safety.guardian.BusGuardian`.
+
+    Args:
+        port: An `FdPort`, or an object with its methods.
+    """
+
+    cut = "cut the servos' power"
+
+    def __init__(self, port: FdPort, answer_s: float, off: bytes, servos: list[tuple[bytes, list[bytes]]]) -> None:
+        self._port, self._answer_s, self._off, self._servos = port, answer_s, off, servos
+        self.now_s = port.now_s
+
+    def take_torque_off(self) -> str:
+        """Switch all servos off, repeatedly until each has confirmed; return the reason if that failed, else "".
+
+        Repeated, because the first packet is lost if the control process died while it was writing one, and because
+        the control process, if it resumes, may read an answer in place of this one.
+        """
+        end = self.now_s() + GIVE_UP_S
+        unconfirmed = self._servos
+        try:
+            self._drain()
+            while unconfirmed and self.now_s() < end:
+                self._port.write(self._off)
+                unconfirmed = [servo for servo in unconfirmed if not self._confirms(*servo)]
+        except OSError as error:
+            return f"the port failed: {error}"
+        count = len(unconfirmed)
+        return f"{count} of {len(self._servos)} servos did not answer for {GIVE_UP_S:g} s" if count else ""
+
+    def _drain(self) -> None:
+        """Wait until no more bytes arrive: on a half-duplex line, sending now would collide with an answer."""
+        end = self.now_s() + _LONGEST_ANSWER_S
+        while self.now_s() < end and self._port.receive(_QUIET_S):
+            pass
+
+    def _confirms(self, query: bytes, answers: list[bytes]) -> bool:
+        self._port.write(query)
+        end, heard = self.now_s() + self._answer_s, b""
+        while (left_s := end - self.now_s()) > 0.0:
+            heard += self._port.receive(left_s)
+            if any(answer in heard for answer in answers):
+                return True
+        return False
 
 
 def _receive_messages(link: int) -> bytes:
@@ -187,7 +244,7 @@ def main(arguments: list[str]) -> None:
     link, silence_s, port_fd, answer_s, off, *rest = arguments
     packets = [text.partition(":") for text in rest]
     servos = [(bytes.fromhex(q), [bytes.fromhex(a) for a in answers.split(",")]) for q, _, answers in packets]
-    BusGuard(int(port_fd), float(answer_s), bytes.fromhex(off), servos).watch(int(link), float(silence_s))
+    BusGuard(FdPort(int(port_fd)), float(answer_s), bytes.fromhex(off), servos).watch(int(link), float(silence_s))
 
 
 if __name__ == "__main__":

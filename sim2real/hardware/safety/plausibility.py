@@ -91,6 +91,7 @@ class Plausibility:
             SafetyStop: A position jumped or lies outside of the envelope, or a joint stands still although it was
                 pushed in both directions.
         """
+        self._require_finite(position_rad)
         self._require_inside(position_rad)
         if self._t_s is None or len(position_rad) != len(self._position):
             self._begin(position_rad, t_s, unsure_s, effort)
@@ -124,6 +125,14 @@ class Plausibility:
         fastest = np.inf if self._config.max_speed_rad_s is None else self._config.max_speed_rad_s
         self._fastest = np.broadcast_to(np.asarray(fastest, np.float64), n)
         self._stuck = np.broadcast_to(np.asarray(self._config.stuck_effort, np.float64), n)
+
+    def _require_finite(self, position_rad: np.ndarray) -> None:
+        """Refuse values that are no numbers, which pass every comparison."""
+        for i in np.flatnonzero(~np.isfinite(position_rad)):
+            raise SafetyStop(
+                f"{self._config.joint(int(i))} reads {position_rad[i]} rad, which is not an angle",
+                hint="look at the encoder and the cable",
+            )
 
     def _require_inside(self, position_rad: np.ndarray) -> None:
         if self._config.envelope_rad is None:

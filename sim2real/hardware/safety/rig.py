@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import logging
 import threading
-import time
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,9 +16,11 @@ from sim2real.hardware.device import Device, Reading, Transaction
 from sim2real.hardware.joint import Joint, Mounting
 from sim2real.hardware.safety.gate import GateConfig, SafetyGate
 from sim2real.hardware.safety.plausibility import Plausibility, require_parts
-from sim2real.runtime.clock import keep_time
 
+_LOGGER = logging.getLogger(__name__)
 _CHECK_PERIOD_S: Final = 0.5
+_STOP_WAIT_S: Final = 2.0
+"""Longest wait of `Rig.stop` for a command that is being sent, or for the torque that is going on."""
 _STILL_RAD_S: Final = 0.05
 """A joint this slow is at rest."""
 _FADE: Final = 0.4
@@ -51,7 +53,10 @@ class Rig:
 
     Three mechanisms stop its motors. Every exit of this context takes the torque off. The device's watcher outside of
     this process does so when this process dies or hangs. A watchdog thread here sends the gate's replacement of a stale
-    command when commands stop while measurements go on: zero, or the last command.
+    command when commands stop while measurements go on: zero, or the last command. Any error in it makes the motors
+    safe; the next call raises it.
+
+    `start`, `stop`, `command` and the watchdog share one lock: after `stop` nothing is sent.
 
     Args:
         device: The device, not opened yet.
@@ -85,11 +90,13 @@ class Rig:
         self.repeats = 0
         self._lock = threading.Lock()
         self._done = threading.Event()
+        self._on = False  # whether commands may be sent
         self._failure: Sim2RealError | None = None
         self.timeouts = 0
         self.measuring, self.commanding = BusUse(), BusUse()
         # Open the device, and refuse a gate beyond its reach.
         device.open()
+        self.clock = device.clock
         try:
             self._require_reach()
         except BaseException:
@@ -125,36 +132,63 @@ class Rig:
         return self._plausibility.suspects
 
     def start(self) -> None:
-        """Switch the torque on, at rest, and start the watchdog of stale commands."""
-        # A new event for the new watchdog: an old one that still runs must end at the old event.
-        self._done.set()
-        self._done = threading.Event()
-        self._commanded_s = self._speed_rad_s = self._failure = self._sampled_s = self._eased_s = None
-        self._tick, self.repeats = None, 0
-        self.measuring, self.commanding = BusUse(), BusUse()
-        self._require_reach()
-        # The slew limit starts from the command that the motors follow at rest.
-        self.device.enable()
-        self.gate.reset(self._mounting.to_joints(self.device.rest()))
-        self._plausibility.reset()
-        self._sent = self.gate.fallback
-        threading.Thread(target=self._watch, args=(self._done,), name="sim2real:watchdog", daemon=True).start()
+        """Switch the torque on, at rest, and start the watchdog of stale commands; torque is off if this raises."""
+        with self._lock:
+            # A new event for the new watchdog: an old one that still runs must end at the old event.
+            self._done.set()
+            self._done = threading.Event()
+            self._commanded_s = self._speed_rad_s = self._failure = self._sampled_s = self._eased_s = None
+            self._tick, self.repeats = None, 0
+            self.measuring, self.commanding = BusUse(), BusUse()
+            self._require_reach()
+            try:
+                # The slew limit starts from the command that the motors follow at rest.
+                self.device.enable()
+                self.gate.reset(self._mounting.to_joints(self.device.rest()))
+                self._plausibility.reset()
+                self._sent = self.gate.fallback
+                self._on = True
+                self._start_watchdog(self._done)
+            except BaseException as error:
+                self._on = False
+                self._done.set()
+                try:
+                    self.device.disable()
+                except BaseException as then:
+                    self.device.make_safe()
+                    error.add_note(f"then: {then}")
+                raise
 
     def stop(self) -> None:
-        """Switch the torque off; the rig can be started again."""
+        """Switch the torque off; the rig can be started again.
+
+        Raises:
+            HardwareLost: A motor does not confirm; or a command hangs, and the motors were made safe.
+        """
         self._done.set()
-        self._sent = None
-        self.device.disable()
+        # A command that is being sent comes first, and none follows.
+        if not self._lock.acquire(timeout=_STOP_WAIT_S):
+            self.stop_quietly()
+            raise HardwareLost(
+                f"a command has not returned for {_STOP_WAIT_S:g} s: the motors were made safe meanwhile",
+                hint="open the device again",
+            )
+        try:
+            self._on, self._sent = False, None
+            self.device.disable()
+        finally:
+            self._lock.release()
 
     def stop_quietly(self) -> None:
-        """Switch the torque off while another error is reported; never raises."""
+        """Switch the torque off while another error is reported; takes no lock, never raises."""
         self._done.set()
-        self._sent = None
+        self._on, self._sent = False, None
         self.device.make_safe()
 
     def close(self) -> None:
-        """Make safe and close the device; never raises."""
+        """Make safe and close the device; takes no lock, never raises."""
         self._done.set()
+        self._on = False
         self.device.close()
 
     def measure(self) -> Reading:
@@ -199,17 +233,19 @@ class Rig:
             SafetyStop: The gate stopped the robot, or a motor has stopped itself.
             HardwareLost: The device is silent.
         """
-        self._check()
         with self._lock:
+            self._check()
+            if not self._on:
+                raise SafetyStop("no command is sent: the torque is off", hint="start the rig first")
             allowed = self.gate.apply(self._softened(command), age_s, now_s, self._speed_rad_s)
             self.commanding.add(self.device.command(self._mounting.to_motors(allowed)))
             self._sent = allowed
-            self._commanded_s = time.monotonic()
+            self._commanded_s = self._now_s()
         return allowed
 
     def require_fresh(self) -> None:
         """Raise SafetyStop if the newest measurement is older than ``max_sample_age_s``."""
-        now_s, max_age_s = time.monotonic(), self.gate.config.max_sample_age_s
+        now_s, max_age_s = self._now_s(), self.gate.config.max_sample_age_s
         age_s = 0.0 if self._sampled_s is None else now_s - self._sampled_s  # before the first, the robot is at rest
         if age_s > max_age_s:
             # A process that was stopped for a while reports the guardian's action as the reason.
@@ -225,14 +261,14 @@ class Rig:
 
         Voltages fade to zero, goals keep their values, and legs sit down.
         """
-        self._eased_s = time.monotonic()
+        self._eased_s = self._now_s()
 
     @property
     def eased(self) -> bool:
         """Whether a soft stop is over: all joints are still, or ``stop_s`` has passed."""
         if self._eased_s is None:
             return False
-        passed_s = time.monotonic() - self._eased_s
+        passed_s = self._now_s() - self._eased_s
         config = self.gate.config
         if config.has_columns:
             faded = passed_s > _FADE * config.stop_s
@@ -246,7 +282,7 @@ class Rig:
             return command
         # A goal that is held stays the last one; a voltage that fades is the agent's newest.
         columns, holds = self.gate.config.has_columns, self.gate.config.holds
-        left = 1.0 - (time.monotonic() - self._eased_s) / (_FADE * self.gate.config.stop_s)
+        left = 1.0 - (self._now_s() - self._eased_s) / (_FADE * self.gate.config.stop_s)
         last = self._sent if holds or columns else np.asarray(command)
         return self._mounting.to_joints(self.device.soften(self._mounting.to_motors(last), max(0.0, left)))
 
@@ -258,11 +294,11 @@ class Rig:
             speed_rad_s: A motor this slow or slower counts as still [rad/s].
             for_s: Time for which all must be still without a break [s].
         """
-        end = time.monotonic() + timeout_s
+        end = self._now_s() + timeout_s
         still_since: float | None = None
         while True:
             reading = self.measure()
-            now = time.monotonic()
+            now = self._now_s()
             # Restart the time of stillness at every motion.
             if np.max(np.abs(reading.velocity_rad_s)) > speed_rad_s:
                 still_since = None
@@ -275,7 +311,7 @@ class Rig:
                     f"the robot still moves after {timeout_s:g} s with torque off",
                     hint="hold it still, or allow longer with --settle-s",
                 )
-            time.sleep(0.02)
+            self.clock.sleep(0.02)
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -283,7 +319,7 @@ class Rig:
 
     def _supervise(self) -> None:
         """Let the device check twice a second for motors that stopped without an error in their answers."""
-        now_s = time.monotonic()
+        now_s = self._now_s()
         if now_s - self._checked_s > _CHECK_PERIOD_S:
             self.device.check()  # before the state is read, not after: a measurement should not wait
             self._checked_s = now_s
@@ -302,31 +338,50 @@ class Rig:
                 hint="narrow the limit, or set the joints' zeros and the motors' own limits",
             )
 
-    def _watch(self, done: threading.Event) -> None:
-        """Send the gate's fallback before the first command, and when the last one is too old: its loop may hang."""
-        keep_time()
-        # Look five times in each timeout of the motors' own watchdog.
+    def _start_watchdog(self, done: threading.Event) -> None:
         timeout_s = self.gate.config.command_timeout_s
+        # Look five times in each timeout of the motors' own watchdog.
         period_s = min(timeout_s, self.device.silence_s or timeout_s) / 5
-        while not done.is_set():
+        self.clock.repeat(lambda: self._watch(done), period_s, done, "sim2real:watchdog")
+
+    def _watch(self, done: threading.Event) -> None:
+        """Send the gate's fallback before the first command, and when the last one is too old: its loop may hang.
+
+        Raises nothing: an error makes the motors safe, is printed, and is raised by the loop's next call, if the loop
+        still runs.
+
+        Args:
+            done: The event of the watchdog that calls this; the rig may have been stopped and started since.
+        """
+        try:
             with self._lock:
-                if done.is_set():
-                    return
-                # Before the first command the graph starts up, and the motors' own watchdog must not trip.
-                waiting = self._commanded_s is None
-                late = not waiting and time.monotonic() - (self._commanded_s or 0.0) > timeout_s
-                if waiting or late:
-                    try:
-                        fallback = self.gate.fallback
-                        self.device.command(self._mounting.to_motors(fallback))
-                        self._sent = fallback
-                    except Sim2RealError as error:
-                        self._failure = error
-                        return
-                if late:
-                    self.timeouts += 1
-                    self._commanded_s = time.monotonic()
-            done.wait(period_s)
+                if self._on and not done.is_set():
+                    self._replace_stale_command()
+        except BaseException as error:
+            if isinstance(error, Sim2RealError):
+                failure = error
+            else:
+                failure = SafetyStop(f"the watchdog of stale commands failed: {type(error).__name__}: {error}")
+                failure.__cause__ = error
+            self._failure, self._on = failure, False
+            done.set()
+            self.device.make_safe()
+            _LOGGER.error("the motors were made safe: %s", failure, exc_info=error)
+
+    def _replace_stale_command(self) -> None:
+        # Before the first command the graph starts up, and the motors' own watchdog must not trip.
+        waiting = self._commanded_s is None
+        late = not waiting and self._now_s() - (self._commanded_s or 0.0) > self.gate.config.command_timeout_s
+        if waiting or late:
+            fallback = self.gate.fallback
+            self.device.command(self._mounting.to_motors(fallback))
+            self._sent = fallback
+        if late:
+            self.timeouts += 1
+            self._commanded_s = self._now_s()
+
+    def _now_s(self) -> float:
+        return 1e-9 * self.clock.now_ns()
 
 
 def _require_stale(gate: GateConfig, device: Device) -> None:

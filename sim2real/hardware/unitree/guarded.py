@@ -12,7 +12,7 @@ from typing import Final
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Counters
-from sim2real.hardware.safety.guardian import Guardian
+from sim2real.hardware.safety.guardian import Guardian, Process
 from sim2real.hardware.unitree.dds import LEASE_S, Address, DdsLink
 from sim2real.hardware.unitree.legs import NAMES, LegDrive
 from sim2real.hardware.unitree.messages import COMMAND_TOPIC, LowCmd
@@ -130,7 +130,9 @@ class GuardedLegs:
         # The guardian watches before the first command.
         if self._guardian is None:
             arguments = [str(self.address), session.mark, repr(self.drive.damping), repr(self.drive.lie_s)]
-            self._guardian = Guardian(_PROGRAM, self._silence_s, arguments, settle_s=self.drive.lie_s + _SETTLE_S)
+            self._guardian = Guardian(
+                lambda longest_s: Process(_PROGRAM, longest_s, arguments), self._silence_s, self.drive.lie_s + _SETTLE_S
+            )
         _require_alone(session.robot, SafetyStop)
         self._guardian.arm()
         # Commands may be lost, so each state is answered with one until all motors are on.
@@ -202,7 +204,7 @@ class GuardedLegs:
         session, guardian = self._session, self._guardian
         if session is None or guardian is None or not self._on or self._leaving:
             return
-        with suppress(HardwareLost):
+        with suppress(Exception):
             session.robot.write(self._damp)
         guardian.trip()
 
@@ -237,8 +239,8 @@ class GuardedLegs:
         drive = replace(self.drive, lie_s=0.0) if guardian.took_over else self.drive
         try:
             failure = sit_down(robot, drive, _CONFIRM_S, live)
-        except HardwareLost as error:
-            failure = str(error)
+        except Exception as error:  # whatever it is, the guardian goes on
+            failure = f"{type(error).__name__}: {error}"
         self._on = bool(failure)
         return failure
 

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import numpy as np
@@ -148,7 +147,7 @@ def test_a_servo_that_restarts(serve, connect):
     device.enable()
     device.check()
     with device.link.hold():
-        os.write(device.link.fd, PROTOCOL.build(2, Instruction.REBOOT))
+        device.link.port.write(PROTOCOL.build(2, Instruction.REBOOT))
         time.sleep(0.02)
     with pytest.raises(SafetyStop, match="servo 2 has lost its settings: torque_enable is 0, not 1"):
         device.check()
@@ -166,41 +165,6 @@ def test_readings_that_cannot_be_true_stop_the_rig(serve, faults, said):
     device = StsServos(config, [Joint(f"joint{i}", i) for i in IDS])
     with pytest.raises(SafetyStop, match=said), Rig(device, gate) as rig:
         swing(rig, 5.0, lambda: robot.strike(**faults))
-    assert_off(robot)
-
-
-def test_no_goal_switches_torque_on_again_once_made_safe(serve, connect):
-    """Some firmware does that; a goal may be on its way at that moment."""
-    robot = serve()
-    device = connect(robot)
-    device.enable()
-    thread = threading.Thread(target=drive, args=(device, 0.3))
-    thread.start()
-    time.sleep(0.1)
-    device.make_safe()
-    thread.join()
-    with pytest.raises(SafetyStop, match="made safe"):
-        device.command(device.rest())
-    with pytest.raises(SafetyStop, match="made safe"):
-        device.enable()
-    time.sleep(0.02)
-    assert_off(robot)
-
-
-def test_a_goal_that_was_on_its_way_is_followed_by_torque_off(serve, connect, monkeypatch):
-    robot = serve()
-    device = connect(robot)
-    device.enable()
-    time.sleep(0.02)
-    write_each = device.link.write_each
-
-    def after_make_safe(register, values):
-        device.make_safe()
-        return write_each(register, values)
-
-    monkeypatch.setattr(device.link, "write_each", after_make_safe)
-    device.command(device.rest())
-    time.sleep(0.02)
     assert_off(robot)
 
 
@@ -237,7 +201,7 @@ config = StsConfig({port!r}, silence_s={silence_s}, max_silence_s=1.0, guardian=
 device = StsServos(config, [Joint(f"joint{{i}}", i) for i in (1, 2, 3)])
 
 def die_in_the_middle_of_a_packet(number, frame):
-    os.write(device.link.fd, device._off_packet[:6])
+    device.link.port.write(device._off_packet[:6])
     os.kill(os.getpid(), signal.SIGKILL)
 
 signal.signal(signal.SIGUSR1, die_in_the_middle_of_a_packet)

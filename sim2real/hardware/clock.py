@@ -1,0 +1,56 @@
+"""The clock of a device: the machine's monotonic clock, or the time of an emulated robot in the same process."""
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final, Protocol
+
+
+class Clock(Protocol):
+    """The time of a device and of everything that watches it."""
+
+    def now_ns(self) -> int:
+        """Return the time [ns]."""
+        ...
+
+    def sleep(self, duration_s: float) -> None:
+        """Return after a time [s]."""
+        ...
+
+    def repeat(self, call: Callable[[], None], period_s: float, done: threading.Event, name: str) -> None:
+        """Call a function now and after every period until ``done`` is set, beside the caller.
+
+        Args:
+            call: Raises nothing.
+        """
+        ...
+
+
+class SystemClock:
+    """CLOCK_MONOTONIC; what it repeats runs in a thread of its own."""
+
+    def now_ns(self) -> int:
+        """Return the time [ns]."""
+        return time.monotonic_ns()
+
+    def sleep(self, duration_s: float) -> None:
+        """Return after a time [s]."""
+        time.sleep(duration_s)
+
+    def repeat(self, call: Callable[[], None], period_s: float, done: threading.Event, name: str) -> None:
+        """Start a daemon thread with the priority of a control loop."""
+
+        def run() -> None:
+            with suppress(Exception):  # a slower thread is better than none
+                from sim2real.runtime.clock import keep_time  # the emulators' processes do not need the runtime
+
+                keep_time()
+            while not done.is_set():
+                call()
+                done.wait(period_s)
+
+        threading.Thread(target=run, name=name, daemon=True).start()
+
+
+SYSTEM_CLOCK: Final = SystemClock()
