@@ -31,7 +31,8 @@ night: $(WARP_READY)
 	$(PYTEST) -m "(night or hypothesis) and not process" --numprocesses 2 --dist loadfile \
 	  --hypothesis-profile=night --hypothesis-seed=$(SEED); tests=$$?; \
 	$(PYTEST) -m "night and process"; process=$$?; \
-	[ $$tests = 0 ] && [ $$process = 0 ]
+	$(BIN)/python scripts/canary.py $(if $(DATA),--data $(DATA)); canary=$$?; \
+	[ $$tests = 0 ] && [ $$process = 0 ] && [ $$canary = 0 ]
 
 # Short benches beside the committed reports, 10 to 15 minutes; DATA=DIR adds the recordings of real motors.
 bench: $(READY)

@@ -40,7 +40,6 @@ BENCHES = {
     "league": ("recorded.league", "every recording, held out in parts, against mujoco.sysid, PACE and BAM"),
     "legs-identify": ("legs_identify", "hidden Go2s: the errors of identified parameters and delays"),
     "light": ("light", "sim2real-robot in a new environment: its size, and record's processor time"),
-    "log": ("log", "the cost of recording for a control loop, cut files, and reading a range"),
     "randomise": ("hidden.randomise", "success on hidden robots by what the training was given"),
     "runner": ("runner", "a step of a policy in numpy, and the loop of twelve joints at 500 Hz"),
     "scaling": ("train", "training on all devices of a host against one"),

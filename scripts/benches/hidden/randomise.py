@@ -7,6 +7,7 @@ have play. A deployment succeeds that stays up: within 18 degrees of upright for
 from __future__ import annotations
 
 import argparse
+import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -17,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from benches.hidden import robots as hidden
-from benches.hidden import wall_clock as hidden_wall
 from benches.jobs import robots
 from benches.rows import Report, Row, markdown, row, share, values
 
@@ -36,6 +36,7 @@ WAYS: dict[str, dict[str, Any]] = {
 """Data sheet; 30 % around it; the estimate; its posterior; the posterior with misfit, timing and noise. The width of
 the draws grows to its final value during the training."""
 WEAR = hidden.Wear(jitter_s=0.008, lost=0.05, play_rad=0.02, noise_rad=0.05, hiccups_hz=1.5, hiccup_s=0.04)
+PLANT = f"{Path(__file__).with_name('plant.py')}:HiddenPlant"
 QUICK = {"robots": 1, "trials": 1, "seconds": 2.0, "steps": 512, "generations": 5, "record_s": 8.0, "envs": 16}
 
 
@@ -127,8 +128,8 @@ def recorded(robot: hidden.Hidden, pipeline: Any, options: argparse.Namespace, f
     from sim2real.artifacts.recording import Recording
 
     if options.clock == "wall":
-        hidden_wall.put_on_the_bus(robot, pipeline)
-        return hidden_wall.record(pipeline, folder, options.record_s, options.record_volts, robot.seed)
+        put_on_the_bus(robot, pipeline)
+        return record_on_the_bus(pipeline, folder, options.record_s, options.record_volts, robot.seed)
     excited = hidden.excited(options.record_s, robot.seed, options.record_volts)
     folder.mkdir()
     path = folder / "session.mcap"
@@ -141,7 +142,7 @@ def deployed(
 ) -> list[tuple[np.ndarray, ...]]:
     """Return times [s], true angles [rad] and speeds [rad/s] of each deployment of a policy."""
     if options.clock == "wall":
-        return hidden_wall.deploy(pipeline, bundle, folder, options.seconds, options.trials)
+        return deploy_on_the_bus(pipeline, bundle, folder, options.seconds, options.trials)
     return [played(robot, bundle, options, 1 + trial) for trial in range(options.trials)]
 
 
@@ -195,6 +196,63 @@ def controller(bundle: Any, volts: float) -> Callable[[float, float], float]:
         return command
 
     return act
+
+
+# On the wall clock: as emulated servos on a bus, recorded and deployed to by the stages themselves.
+
+
+def put_on_the_bus(robot: hidden.Hidden, pipeline: Any) -> None:
+    """Make a hidden robot the pipeline's emulated one, for this process; latencies are uniform, as wide as its own.
+
+    The computer's own pauses are those of this machine: ``hiccups`` are not played.
+    """
+    pipeline_robot = pipeline.load()
+    jitter = math.sqrt(3.0) * robot.jitter
+    emulator = replace(
+        pipeline_robot.drive.embedded.emulator,
+        sensing_latency_s=robot.sensing,
+        sensing_jitter_s=min(jitter, robot.sensing),
+        actuation_latency_s=robot.acting,
+        actuation_jitter_s=min(jitter, robot.acting),
+        reply_loss=float(robot.lost),
+    )
+    names = ("gain", "gravity", "damping", "friction", "play", "noise")
+    plant = {n: float(getattr(robot, n)) for n in names} | {
+        "speed_noise": float(hidden.SPEED_NOISE * robot.noise),
+        "seed": robot.seed,
+    }
+    pipeline_robot.drive.embedded = replace(
+        pipeline_robot.drive.embedded, plant=PLANT, emulator=emulator, plant_args=plant
+    )
+
+
+def record_on_the_bus(pipeline: Any, folder: Path, seconds: float, volts: float, seed: int) -> Any:
+    """Return a recording of the robot on the bus.
+
+    Args:
+        volts: Its largest voltage [V].
+    """
+    import sim2real
+
+    folder.mkdir()
+    config = replace(pipeline.record, duration_s=seconds, amplitude=volts, seed=seed)
+    return sim2real.record(pipeline, folder, config)
+
+
+def deploy_on_the_bus(
+    pipeline: Any, bundle: Any, folder: Path, seconds: float, trials: int
+) -> list[tuple[np.ndarray, ...]]:
+    """Return times [s], true angles [rad] and speeds [rad/s] of each deployment to the robot on the bus."""
+    import sim2real
+
+    folder.mkdir()
+    config = replace(pipeline.deploy, duration_s=seconds, episodes=trials, measure_delay=False)
+    deployment = sim2real.deploy(pipeline, bundle, folder, config)
+    motions = []
+    for recording in deployment.recordings:
+        t_s, states = recording.true_states()
+        motions.append((t_s, states["th"], states["thdot"]))
+    return motions
 
 
 TRAINED_ON = {
