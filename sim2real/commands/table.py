@@ -2,7 +2,9 @@
 
 from sim2real.commands.command_kinds import Command, CommandGroup, ConfigCommand, FunctionCommand, PipelineStage
 
-_BASELINES = "Ends with code 1 if a baseline predicts as well."
+_BASELINES = (
+    "Ends with code 1 if an error exceeds the expected one, a baseline predicts as well, or a log is not scored."
+)
 
 # fmt: off
 COMMANDS: dict[str, Command] = {

@@ -64,10 +64,10 @@ def test_a_model_and_a_log_give_parameters_that_hold_on_a_later_log(workplace, c
     model = mujoco.MjModel.from_xml_path(str(folder / "identified.xml"))
     assert model.dof_damping[0] == pytest.approx(rows["damping"], rel=1e-5)
     assert cli.main(["validate", str(folder / "parameters.json"), "--log", "later.npz", "--json"]) == 0
-    ahead, free = json.loads(capsys.readouterr().out)["ledger"]
-    assert (ahead["reach"], ahead["kept"]) == ("ahead", "yes")
-    assert (free["reach"], free["kept"], free["ratio"]) == ("free run", "none was made", None)
-    assert ahead["ratio"] == pytest.approx(ahead["error"] / ahead["bound"])
+    ahead, free = json.loads(capsys.readouterr().out)["errors"]
+    assert (ahead["kind"], ahead["exceeded"]) == ("ahead", False)
+    assert (free["kind"], free["expected"], free["ratio"]) == ("free run", None, None)
+    assert ahead["ratio"] == pytest.approx(ahead["error"] / ahead["expected"])
     assert cli.main(["export", "identified", str(folder / "parameters.json"), "--out", "exported.xml"]) == 0
     assert "not expressed" not in capsys.readouterr().err
     t, goal, q = simulated(1)

@@ -175,7 +175,7 @@ def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
     assert {p["name"] for p in checked.parameters} >= {"gain", "friction", "round_trip_delay"}
     assert "friction" in checked._repr_html_()
     scored = sim2real.validate("pendulum", run_copy / "identify", recorded(tmp_path / "later.mcap", 7))
-    assert scored.positions["th"]["rmse"]["identified"] > 0.0
+    assert scored.errors[0].error > 0.0
     assert scored.identified == run.identification.verdict.status
     with pytest.raises(UsageError, match="which these parameters were identified from"):
         sim2real.validate("pendulum", run_copy / "identify", run.recording)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sim2real import cli
+from sim2real.artifacts.identification import Identification, Judgement
 from sim2real.commands import model_flags
 from sim2real.errors import UsageError
 from sim2real.log import read_log
@@ -57,6 +58,19 @@ def test_a_model_and_a_log_describe_a_robot(workplace):
     names = [p.name for p in found.load().dynamics()]
     assert names == ["kp", "damping", "armature", "frictionloss_pan_joint", "frictionloss_lift_joint"]
     assert found.words == ("--mjcf", "robot.xml")
+
+
+def test_a_later_log_is_read_by_the_mapping_of_the_identification(workplace, recorded):
+    found = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"])
+    folder = workplace / "identify"
+    folder.mkdir()
+    for name, text in found.texts().items():
+        (folder / name).write_text(text)
+    later = from_model.pipeline_beside(folder, Identification("robot", (), Judgement("", ()), ()))
+    t, goal, q = recorded
+    np.savez("still.npz", t_s=t, q_rad=0 * q, goal_rad=0 * goal)  # at rest, from which no mapping can be proposed
+    log = open_recording(Path("still.npz"), later, later.load())
+    assert log.episode.outputs["sensor"]["position"].shape == q.shape
 
 
 def test_the_next_command_describes_the_robot_again(workplace):

@@ -1,72 +1,98 @@
-"""What a later log says of an identification: a joint that rests there says nothing."""
+"""What later logs say of an identification."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from sim2real.artifacts.identification import AHEAD, FREE_RUN, HeldOut, Promise
-from sim2real.stages.validate.score import position_row
-from sim2real.stages.validate.show import show
+from sim2real.artifacts.identification import AHEAD, FREE_RUN, Bound, Estimate, Identification, Judgement
+from sim2real.artifacts.recording import Recording
+from sim2real.errors import UsageError
+from sim2real.stages.pipeline.open_log import open_recording
+from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.validate import stage
+from sim2real.stages.validate.config import ValidateConfig
+from sim2real.stages.validate.stage import LaterError, Validation, identified_robot
 
-SCORE = HeldOut("elbow", "q", "rad", 8.0, {"identified": 0.004, "nominal": 0.05, "hold": 0.0}, ("hold",))
-
-
-def ledger(bound, free=0.004):
-    """The rows of the elbow on one log."""
-    reaches = ((AHEAD, 8.0, 0.004), (FREE_RUN, 20.0, free))
-    return [Promise("b.mcap", True, "q", "elbow", "rad", reach, s, error, bound) for reach, s, error in reaches]
-
-
-RESULT = {"horizon_s": 8.0, "rmse": 0.004, "free_run_rmse": 0.004, "identified": "accepted", "why": [], "fitted": []}
-RESULT |= {"beyond": [], "drawn": [], "ledger": [], "better": True, "promise_kept": None}
+ROOT = Path(__file__).parents[2]
+LOGS = [ROOT / "datasets" / "pendulum" / f"{name}.mcap" for name in ("chirp", "multisine")]
 
 
-@pytest.mark.parametrize(("moves", "beaten_by"), [(True, ["hold"]), (False, [])])
-def test_that_a_joint_rests_beats_no_model_of_how_it_moves(moves, beaten_by, capsys):
-    row = position_row(SCORE, ledger(0.02) if moves else [], moves)
-    assert row["beaten_by"] == beaten_by
-    assert row["over_promised"] == (pytest.approx(0.2) if moves else None)
-    show({**RESULT, "positions": {"elbow": row}, "better": not beaten_by})
-    said = capsys.readouterr().err
-    assert ("elbow did not move here" in said) == (not moves)
-    assert ("beaten are elbow by hold" in said) == moves
+def error(log="b.mcap", size=0.004, expected=0.02, kind=AHEAD, **changes):
+    row = LaterError(log, "elbow", "rad", kind, 8.0, size, expected, baselines={"hold": 0.2})
+    return replace(row, **changes)
 
 
 @pytest.mark.parametrize(
-    ("identified", "fitted", "said", "never"),
+    ("rows", "changes", "holds", "named"),
     [
-        ("accepted", [], "verdict: holds on this log", "not accepted"),
-        ("hit a bound", [], "the identification itself was not accepted: hit a bound: gain is at its bound", "none"),
-        ("accepted", ["a.mcap is b.mcap"], "verdict: none: a log that was fitted is no test", "holds on this log"),
+        ([error()], {}, True, "this log"),
+        ([error(), error("c.mcap")], {}, True, "2 logs"),
+        ([error(size=0.0249)], {}, True, "this log"),
+        ([error(size=0.031)], {}, False, "1.55"),
+        ([error(size=None)], {}, False, "diverges"),
+        ([error()] * 99 + [error("bad.mcap", 0.031, kind=FREE_RUN)], {}, False, "bad.mcap"),
+        ([error(beaten_by=("hold",))], {}, False, "hold"),
+        ([error()], {"refused": {"a.mcap": "it lasts 0.1 s"}}, False, "a.mcap"),
+        ([error()], {"fitted": ["b.mcap is a.mcap"]}, True, "fitted"),
+        ([error(expected=None)], {}, True, "expects no error"),
     ],
 )
-def test_a_fitted_log_is_no_test_and_a_bad_identification_is_named(identified, fitted, said, never, capsys):
-    result = {**RESULT, "positions": {"elbow": position_row(SCORE, ledger(0.02), False)}, "promise_kept": True}
-    show({**result, "identified": identified, "why": ["gain is at its bound"], "fitted": fitted})
-    err = capsys.readouterr().err
-    assert said in err
-    assert never not in err
-
-
-def test_a_free_run_that_breaks_its_promise_does_not_hold(capsys):
-    rows = ledger(0.02, free=0.031)
-    row = position_row(SCORE, rows, True)
-    assert (row["free run"], row["promised, free run"], row["over_promised"]) == (0.031, 0.02, pytest.approx(1.55))
-    beyond = ["'position' of 'sensor' reaches [-2, 2], fitted was [-1, 1]"]
-    show({**RESULT, "positions": {"elbow": row}, "ledger": rows, "promise_kept": False, "beyond": beyond})
+def test_an_error_above_the_expected_one_is_named_and_fails(rows, changes, holds, named, monkeypatch, capsys):
+    found = Validation("arm", 8.0, tuple(sorted(rows, key=lambda e: -(e.ratio or 0.0))), **changes)
+    assert found.holds == holds
+    assert named in found.verdict
+    monkeypatch.setattr(stage.Identification, "load", lambda path: Identification("arm", (), Judgement("", ()), ()))
+    monkeypatch.setattr(stage.from_model, "pipeline_beside", lambda *given: None)
+    monkeypatch.setattr(stage, "open_recording", lambda *given: None)
+    monkeypatch.setattr(stage, "score", lambda *given: found)
+    for as_json in (False, True):
+        assert stage.run(ValidateConfig(Path("run"), ("b.mcap",), json=as_json)) == holds
     out, err = capsys.readouterr()
-    rows = [line.split()[-5:] for line in out.splitlines() if "b.mcap" in line]
-    assert rows == [["0.02", "0.031", "rad", "1.55", "no"], ["0.02", "0.004", "rad", "0.20", "yes"]]
-    assert "elbow is off by 0.031 rad in a free run of 20 s on b.mcap; promised was 0.02 rad: 1.55 times" in err
-    assert "beyond the fitted data, so bounds are wider" in err
-    assert "holds on this log" not in err
+    assert f"verdict: {found.verdict}" in err
+    document = json.loads(out[out.index("{") :])
+    assert document["holds"] == holds
+    ratio = document["errors"][0]["ratio"]
+    assert (math.inf if ratio == "inf" else ratio) == found.errors[0].ratio
 
 
-def test_of_many_logs_a_few_intervals_are_printed_and_the_others_counted(capsys):
-    logs = [f"{i:02d}.csv" for i in range(30)]
-    rows = [Promise(log, True, "q", "elbow", "rad", FREE_RUN, 5.0, 0.01, 0.02) for log in logs]
-    drawn = [{"log": log, "column": "q", "low95": 0.01, "high95": 0.02} for log in logs]
-    row = position_row(SCORE, rows, False)
-    show({**RESULT, "positions": {"elbow": row}, "ledger": rows, "drawn": drawn, "promise_kept": True})
-    out, err = capsys.readouterr()
-    assert out.count("for 95 % of draws") == 12
-    assert "and 18 more intervals of draws: --json has all" in err
-    assert "verdict: holds on these 30 logs" in err
+def identification(upper_s=0.06, world=None, expected=1.0, horizon_s=1.0):
+    """The pendulum at the values of its data sheet, with an expected error of its angle."""
+    pipeline = load_pipeline("pendulum")
+    parameters = tuple(
+        Estimate(p.name, p.unit, p.kind, "", p.nominal, p.nominal, "accepted", lower=p.low,
+                 upper=upper_s if p.kind == "delay" else p.high)
+        for p in pipeline.load().identifiable(0.06).parameters
+    )  # fmt: skip
+    bounds = (Bound("th", "th", "rad", AHEAD, horizon_s, expected, "this recording"),)
+    return pipeline, Identification(
+        "pendulum", (), Judgement("accepted", ()), parameters, bounds=bounds, settle_s=0.3, world=world
+    )
+
+
+def test_an_identification_is_scored_in_its_world_and_with_its_delays():
+    pipeline, found = identification(upper_s=0.2)
+    assert identified_robot(found, pipeline)[1].max_delay_s == 0.2
+    assert identified_robot(identification()[1], pipeline)[1].max_delay_s == pipeline.identify.max_delay_s
+    with pytest.raises(UsageError, match="nowhere"):
+        identified_robot(identification(world="nowhere")[1], pipeline)
+
+
+def test_each_log_is_scored_alone_and_a_bad_one_does_not_stop_the_others():
+    pipeline, found = identification(expected=1e-6)
+    good, short = (open_recording(path, pipeline) for path in LOGS)
+    lacking = Recording(Path("lacking.mcap"), replace(short.episode, steps={}, outputs={}))
+    config = ValidateConfig(horizon_s=1.0, free_run_s=2.0)
+    scored = stage.score(found, pipeline, [good, lacking, short], config, {"unreadable.csv": "no columns"})
+    assert set(scored.refused) == {"lacking.mcap", "unreadable.csv"}
+    ahead = {e.log: e for e in scored.errors if e.kind == AHEAD}
+    assert set(ahead) == {good.path.name, short.path.name}
+    assert all(e.ratio == pytest.approx(e.error / 1e-6) for e in ahead.values())
+    assert {e.seconds for e in scored.errors if e.kind == FREE_RUN} == {2.0}
+    assert not scored.holds
+    (alone,) = [e for e in stage.score(found, pipeline, [good], config).errors if e.kind == AHEAD]
+    assert alone.error == pytest.approx(ahead[good.path.name].error, rel=1e-6)
+    with pytest.raises(UsageError, match="lacking"):
+        stage.score(found, pipeline, [lacking], config)

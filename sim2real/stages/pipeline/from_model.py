@@ -15,7 +15,7 @@ from sim2real.graph.episode import Episode
 from sim2real.log.importing import importer
 from sim2real.log.importing.files import bags
 from sim2real.log.importing.files.foreign import open_foreign
-from sim2real.log.importing.mapping import ImportMapping, load_mapping
+from sim2real.log.importing.mapping import MAPPING, ImportMapping, load_mapping, to_toml
 from sim2real.log.importing.proposal import pipeline_name
 from sim2real.log.reader import read_log
 from sim2real.robots.from_model import model_file
@@ -82,8 +82,9 @@ class DescribedPipeline(Pipeline):
         return replace(self, mapping=mapping)
 
     def texts(self) -> Mapping[str, str]:
-        """Return the files that describe the robot: name -> text."""
-        return files_of(self.description)
+        """Return the files that describe the robot and the columns of its logs: name -> text."""
+        mapping = {} if self.mapping is None else {MAPPING: to_toml(self.mapping)}
+        return {**files_of(self.description), **mapping}
 
 
 def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
@@ -150,13 +151,16 @@ def from_file(path: Path, name: str) -> DescribedPipeline:
 
 
 def pipeline_beside(parameters: Path, identification: Identification) -> Pipeline:
-    """Return the robot that parameters are of: described beside them, or a pipeline.
+    """Return the robot that parameters are of, with the mapping of its logs: described beside them, or a pipeline.
 
     Args:
         parameters: Their file, or its folder.
     """
     beside = (parameters if parameters.is_dir() else parameters.parent) / ROBOT_FILE
-    return from_file(beside, identification.pipeline) if beside.is_file() else load_pipeline(identification.pipeline)
+    if not beside.is_file():
+        return load_pipeline(identification.pipeline)
+    described, file = from_file(beside, identification.pipeline), beside.with_name(MAPPING)
+    return replace(described, mapping=load_mapping(file, described.name)) if file.is_file() else described
 
 
 def files_of(description: RobotConfig) -> dict[str, str]:
