@@ -1,5 +1,6 @@
 """Every bench runs with --quick and writes a report, or refuses without a GPU. Figures are not looked at."""
 
+import importlib
 import json
 import sys
 from pathlib import Path
@@ -82,6 +83,23 @@ def test_league_continues_from_its_results(tmp_path):
 @pytest.mark.parametrize("name", ON_A_GPU)
 def test_training_on_warp_is_refused_without_a_gpu(name):
     assert bench.main([name, "--quick"]) == 2
+
+
+@pytest.mark.parametrize("name", bench.BENCHES)
+def test_help_of_a_bench(name, capsys):
+    """Its module can be imported, and its quick values are those of flags."""
+    with pytest.raises(SystemExit) as end:
+        bench.main([name, "--help"])
+    assert end.value.code == 0
+    text, module = capsys.readouterr().out, bench.module_of(name)
+    assert callable(module.run)
+    assert all(f"--{flag.replace('_', '-')}" in text for flag in module.QUICK if flag != "flags")
+
+
+@pytest.mark.parametrize("function", sorted({f for f, *_ in (*figures.TABLES.values(), *figures.IMAGES.values())}))
+def test_functions_of_tables_exist(function):
+    module, _, name = function.rpartition(".")
+    assert callable(getattr(importlib.import_module(f"benches.{module}"), name))
 
 
 def test_goals():
