@@ -55,7 +55,7 @@ def frozen():
 @pytest.fixture(autouse=True, scope="module")
 def figures_as_data(request):
     """Draw one picture a module in the folders whose tests make whole pages; they read texts and titles of figures."""
-    if request.path.parent.name not in ("integration", "process", "stages", "robots", "pipelines"):
+    if request.path.parent.name not in ("process", "stages", "robots", "pipelines"):
         yield
         return
     from sketches import sketched  # matplotlib is imported for tests that need it

@@ -1,4 +1,4 @@
-"""The four stages, one after the other and one by one, with tiny budgets."""
+"""A finished run: complete, true to its robot, and what is made from it."""
 
 import json
 import re
@@ -8,18 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from live_robots import PATIENT, TINY, manifest_of
+from live_robots import TINY, manifest_of
 from shared_run import copied, recorded
 
 import sim2real
 from sim2real import cli
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.episodes import Episodes
-from sim2real.artifacts.run.run_folder import STAGES, finished, newest
+from sim2real.artifacts.run.run_folder import STAGES
 from sim2real.errors import UsageError
-from sim2real.log.reader import read_log
-
-pytestmark = pytest.mark.process
 
 NOTEBOOK = Path(__file__).parents[2] / "docs" / "guides" / "notebook.md"
 
@@ -57,28 +54,12 @@ def test_a_resumed_run_is_complete(finished_run_dir):
     assert log == {"path": "record/session.mcap", "sha256": recorded["sha256"]}
 
 
-@pytest.mark.night
 def test_resuming_a_finished_run_does_nothing(run_copy, capsys):
     before = {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
     root = run_copy.parent.parent
     assert cli.main(["run", "pendulum", "--resume", str(run_copy), "--runs", str(root)]) == 0
     assert capsys.readouterr().err.count("finished before, skipped") == 4
     assert before == {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
-
-
-@pytest.mark.night  # `make test` numbers attempts in test_an_interrupted_stage_is_run_again
-def test_deploying_again_keeps_the_first_deployment(finished_run_dir, tmp_path):
-    run_dir = tmp_path / "runs" / "pendulum" / "copy"
-    copied(finished_run_dir, run_dir)
-    first = manifest_of(run_dir / "deploy")["started"]
-    flags = ["--episodes", "2", "--duration-s", "1", "--runs", str(tmp_path / "runs"), "--strict-timing"]
-    flags += [*PATIENT, "--no-measure-delay"]  # what it was trained with is hardly identified
-    assert cli.main(["deploy", "pendulum", *flags]) in (0, 5)  # a busy machine may miss deadlines; all is written
-    assert manifest_of(run_dir / "deploy")["started"] == first
-    again = run_dir / "deploy.2"
-    assert {p.name for p in again.glob("*.mcap")} == {"episode_0.mcap", "episode_1.mcap"}
-    assert all(read_log(p).complete for p in again.glob("*.mcap"))
-    assert len(strict_json(again / "result.json")["episodes"]) == 2
 
 
 @pytest.mark.night  # `make test` moves a run folder in test_run_folder.py
@@ -181,35 +162,6 @@ def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
         sim2real.validate("pendulum", run_copy / "identify", run.recording)
     forced = sim2real.validate("pendulum", run_copy / "identify", run.recording, {"force": True})
     assert "identified from" in forced.fitted[0]
-
-
-@pytest.mark.night
-def test_a_new_recording_is_what_identify_takes_next(finished_run_dir, tmp_path):
-    copied(finished_run_dir, tmp_path / "pendulum" / finished_run_dir.name)
-    assert cli.main(["record", "pendulum", "--duration-s", "1", "--runs", str(tmp_path), *PATIENT]) == 0
-    latest = newest(tmp_path, "pendulum", "record")
-    assert latest.run_dir.name != finished_run_dir.name
-    # Too short to identify from: the stage says so instead of falling back to the older one.
-    assert cli.main(["identify", "pendulum", "--runs", str(tmp_path)]) == 2
-    assert finished(latest.run_dir, "identify") is None
-    # Named, the older run is used, and gets the new attempt.
-    flags = ["--run", finished_run_dir.name, "--runs", str(tmp_path), "--generations", "0", "--refine-steps", "3"]
-    assert cli.main(["identify", "pendulum", "--folds", "0", "--free-run-s", "0", *flags]) == 0
-    assert (tmp_path / "pendulum" / finished_run_dir.name / "identify.2").is_dir()
-
-
-@pytest.mark.night
-def test_an_interrupted_stage_is_run_again(finished_run_dir, tmp_path, capsys):
-    run_dir = tmp_path / "pendulum" / "copy"
-    copied(finished_run_dir, run_dir)
-    path = run_dir / "deploy" / "manifest.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "status": "running", "exit_code": None}))
-    flags = ["--resume", "copy", "--runs", str(tmp_path), "--deploy.episodes", "1", "--deploy.duration-s", "1"]
-    flags += ["--deploy.no-measure-delay"]
-    assert cli.main(["run", "pendulum", *flags]) == 0
-    assert capsys.readouterr().err.count("finished before, skipped") == 3
-    assert manifest_of(run_dir / "deploy.2")["status"] == "finished"
-    assert manifest_of(run_dir / "deploy")["status"] == "running"
 
 
 @pytest.mark.parametrize("command", ["info", "report"])
