@@ -123,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one bench; return the exit code."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     module, options = parse(words)
-    from sim2real.artifacts.run.manifest import plain
+    from sim2real.artifacts.files import plain
     from sim2real.errors import Sim2RealError
     from sim2real.stages.terminal.console import table
 

@@ -6,9 +6,10 @@ import os
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, BinaryIO, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -91,13 +92,41 @@ def write_json(path: Path, document: object) -> None:
     Raises:
         Sim2RealError: When a text has bytes that are no text, which names of files can have.
     """
-    try:
-        text = msgspec.json.format(msgspec.json.encode(document, enc_hook=_plain), indent=1)
-    except UnicodeEncodeError as error:
-        raise Sim2RealError(f"{path} cannot be written: {error.object!r} has bytes that are no text") from None
+    with replacing(path) as stream:
+        stream.write(to_json(document))
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """Yield a stream whose bytes replace a file when the block ends, on the disk and at once; an error leaves it."""
     draft = path.with_name(f".{path.name}.tmp")
-    draft.write_bytes(text)
+    try:
+        with draft.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+    except BaseException:
+        draft.unlink(missing_ok=True)
+        raise
     os.replace(draft, path)
+
+
+def to_json(document: object) -> bytes:
+    """Return a document as JSON: dataclasses as objects, arrays as lists, infinite numbers and NaN as null.
+
+    Raises:
+        TypeError: When a value has no form in JSON.
+        Sim2RealError: When a text has bytes that are no text.
+    """
+    try:
+        return msgspec.json.format(msgspec.json.encode(document, enc_hook=_encoded), indent=1)
+    except UnicodeEncodeError as error:
+        raise Sim2RealError(f"{error.object!r} cannot be written: it has bytes that are no text") from None
+
+
+def plain(value: object) -> Json:
+    """Return a value as the dicts, lists, texts, numbers and null that a JSON file of it has; see ``to_json``."""
+    return msgspec.json.decode(to_json(value))
 
 
 def _numbers(kind: Any, value: Json) -> Json:
@@ -137,7 +166,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write arrays to a compressed npz file.
+    """Write arrays to a compressed npz file; a reader finds the old file or the new one, never a part.
 
     Raises:
         Sim2RealError: When a name has a null character, at which a zip file cuts it off.
@@ -145,7 +174,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     if invalid := [name for name in arrays if "\0" in name]:
         raise Sim2RealError(f"{path} cannot be written: the name {invalid[0]!r} has a null character")
     # numpy.savez_compressed would do the same, but cannot write an array called "file".
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+    with replacing(path) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, values in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asanyarray(values), allow_pickle=False)
@@ -166,8 +195,13 @@ def number(value: float | None, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
-def _plain(value: object) -> Json:
-    """Return NumPy's arrays and numbers as lists and numbers of Python."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} has no plain JSON form: {value!r}")
+def _encoded(value: object) -> Json:
+    """Return a value that is not of JSON's types as one that is: paths as texts, arrays as lists."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if isinstance(value, Integral | Real):
+        return int(value) if isinstance(value, Integral) else float(value)
+    array = np.asarray(value)
+    if array.dtype == object:
+        raise TypeError(f"{type(value).__name__} has no form in JSON: {value!r}")
+    return array.tolist()

@@ -1,7 +1,6 @@
 """Files that a stage writes while it computes, for a viewer that joins it: curves, and the best fit so far."""
 
 import json
-import os
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -9,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from sim2real.artifacts.files import replacing
 
 PROGRESS = "progress.jsonl"
 """One line for each point of the curves: ``epoch_ns`` and ``values``, name -> a number for each seed."""
@@ -26,8 +27,5 @@ def write_progress(folder: Path, values: Mapping[str, np.ndarray | float]) -> No
 def write_best_fit(folder: Path, columns: Mapping[str, np.ndarray]) -> None:
     """Replace the best fit so far, at once: a reader never sees a part of it."""
     arrays: dict[str, Any] = dict(columns)
-    unfinished = folder / f"{BEST_FIT}.part"
-    with suppress(OSError):
-        with open(unfinished, "wb") as stream:
-            np.savez(stream, **arrays)
-        os.replace(unfinished, folder / BEST_FIT)
+    with suppress(OSError), replacing(folder / BEST_FIT) as stream:
+        np.savez(stream, **arrays)

@@ -5,7 +5,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from sim2real.artifacts.run.manifest import plain, versions
+from sim2real.artifacts.files import plain
+from sim2real.artifacts.run.manifest import versions
 from sim2real.artifacts.run.run_folder import STAGES, attempts, run_folders
 from sim2real.artifacts.run.stage_status import stage_status
 from sim2real.commands.flags import flags_of

@@ -15,14 +15,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sim2real.artifacts import files
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.episodes import Episodes
-from sim2real.artifacts.files import read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.files import plain, read_arrays, read_json, write_arrays, write_json
 from sim2real.artifacts.identification import Identification, Matrix
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run.iterations import Iterations
-from sim2real.artifacts.run.manifest import plain, read_manifest, write_manifest
+from sim2real.artifacts.run.manifest import read_manifest, write_manifest
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
@@ -132,6 +133,25 @@ def test_arrays_of_any_name(tmp_path, name):
     found = read_arrays(tmp_path / "x.npz")
     np.testing.assert_array_equal(found[name], NUMBERS)
     assert found["other"].shape == (0, 2)
+
+
+@pytest.mark.parametrize("write", [write_json, write_arrays])
+def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, write):
+    write(tmp_path / "x", {"a": np.zeros(1)})
+    before = (tmp_path / "x").read_bytes()
+    with pytest.raises((TypeError, ValueError)):
+        write(tmp_path / "x", {"a": np.ones(1), "b": np.array([object()])})
+    assert (tmp_path / "x").read_bytes() == before
+    assert [f.name for f in tmp_path.iterdir()] == ["x"]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(files.os, "fsync", lambda fd: done.append("synced"))
+    monkeypatch.setattr(files.os, "replace", lambda draft, path: done.append("named"))
+    write_json(tmp_path / "x.json", {})
+    write_arrays(tmp_path / "x.npz", {})
+    assert done == ["synced", "named"] * 2
 
 
 def test_an_array_whose_name_a_zip_file_cuts_off_is_refused(tmp_path):

@@ -6,16 +6,14 @@ import os
 import subprocess
 import sys
 import threading
-from dataclasses import dataclass
 from datetime import datetime
-from enum import Enum
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sim2real.artifacts.run import locks, run_folder
-from sim2real.artifacts.run.manifest import git_state, plain, read_manifest, sha256, write_manifest
+from sim2real.artifacts.run import manifest, run_folder
+from sim2real.artifacts.run.manifest import git_state, read_manifest, sha256, write_manifest
 from sim2real.commands import info
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.stages.config import RecordConfig, TrainConfig
@@ -117,7 +115,7 @@ def test_a_stage_that_ends_while_it_is_read_did_not_die(tmp_path):
 
 
 def test_without_locks_a_stage_counts_as_running(tmp_path, monkeypatch):
-    monkeypatch.setattr(locks, "fcntl", None)
+    monkeypatch.setattr(manifest, "fcntl", None)
     with run_folder.open_stage(tmp_path, "pendulum", "record", None) as stage:
         (attempt,) = run_folder.attempts(stage.run_dir, "record")
         assert attempt.manifest["status"] == "running"
@@ -293,25 +291,6 @@ def test_outputs_that_are_unknown_or_gone(tmp_path):
     done.output("log").unlink()
     with pytest.raises(Sim2RealError, match="is missing"):
         done.output("log")
-
-
-class Colour(Enum):
-    RED = 1
-
-
-@dataclass
-class Nested:
-    where: Path
-    colour: Colour
-    values: tuple[float, ...]
-
-
-def test_plain_types_only():
-    value = plain({"a": Nested(Path("x/y"), Colour.RED, (1, float("inf"))), 2: {"z", "y"}, "b": np.bool_(True)})
-    assert value == {"a": {"where": "x/y", "colour": "RED", "values": [1, "inf"]}, "2": ["y", "z"], "b": True}
-    assert json.loads(json.dumps(value, allow_nan=False)) == value
-    with pytest.raises(TypeError, match="no plain JSON form"):
-        plain(object())
 
 
 def test_a_manifest_that_cannot_be_written_leaves_the_old_one(tmp_path):

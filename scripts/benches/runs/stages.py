@@ -16,8 +16,8 @@ from typing import Any
 
 from benches.rows import Report, Row, row
 
+from sim2real.artifacts.files import plain
 from sim2real.artifacts.identification import Identification, promises_table
-from sim2real.artifacts.run.manifest import plain
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, finished
 
 

@@ -1,22 +1,29 @@
-"""A stage's ``manifest.json``: inputs, configuration, outputs and status; plain JSON, replaced atomically."""
+"""A stage's ``manifest.json``: inputs, configuration, outputs and status, replaced atomically.
 
-import dataclasses
+A lock on it shows readers that the process of the stage still runs. The kernel releases the lock when the process ends
+for any reason. On a platform or file system without locks, a stage counts as running, because its end cannot be
+detected.
+"""
+
 import errno
 import hashlib
 import json
-import math
 import os
 import platform
 import subprocess
 from collections.abc import Mapping
-from enum import Enum
-from numbers import Integral, Real
+from contextlib import suppress
 from pathlib import Path, PurePath
 
-from sim2real.artifacts.run.locks import held_lock, read_with_lock
+from sim2real.artifacts.files import to_json
 from sim2real.errors import Sim2RealError
 from sim2real.installation import version
 from sim2real.types import Json
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 MANIFEST = "manifest.json"
 RUNNING = "running"
@@ -24,6 +31,7 @@ DIED = "died"
 """Status of a stage whose process ended without writing its end: it was killed, or the machine lost its power."""
 _TEXTS = ("pipeline", "stage", "status", "started")
 _DRAFT = f".{MANIFEST}.tmp"
+_LOCKED = (errno.EAGAIN, errno.EACCES)
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 # Most manifests have 4 kB; manifests with long summaries are larger.
 _RESERVED_BYTES = 32 * 1024
@@ -36,7 +44,7 @@ def read_manifest(folder: Path) -> dict[str, Json] | None:
     The status is `died` if the manifest has `running` and no process holds the lock on it.
     """
     try:
-        text, locked = read_with_lock(folder / MANIFEST)
+        text, locked = _read_with_lock(folder / MANIFEST)
         manifest = json.loads(text)
     except (OSError, ValueError, RecursionError):
         return None
@@ -75,16 +83,16 @@ def write_manifest(folder: Path, manifest: Mapping[str, Json], lock: bool = Fals
     Raises:
         TypeError: When a value has no plain JSON form.
     """
-    text = json.dumps(plain(manifest), indent=2, allow_nan=False)
+    text = to_json(manifest)
     draft = folder / _DRAFT
     # Overwrite the reserved bytes, then cut the file to its length: this needs no new space on a full disk.
     with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as file:
-        file.write(f"{text}\n".encode())
+        file.write(text)
         file.truncate()
         file.flush()
         os.fsync(file.fileno())
         # Lock before the rename: no reader finds the manifest without its lock.
-        held = held_lock(file.fileno()) if lock else None
+        held = _held_lock(file.fileno()) if lock else None
     os.replace(draft, folder / MANIFEST)
     return held
 
@@ -106,43 +114,6 @@ def readable_error(error: BaseException, folder: Path) -> BaseException:
         f"the disk is full: {error.strerror}{where}",
         hint=f"free some space, or name a folder elsewhere with --runs DIR; the files written so far are in {folder}",
     )
-
-
-def plain(value: object) -> Json:
-    """Return a value as dicts, lists, strings, numbers, booleans and None.
-
-    Dataclasses become dicts, arrays nested lists, enums their names, paths strings; numbers that JSON lacks become the
-    strings 'inf', '-inf' and 'nan'.
-
-    Raises:
-        TypeError: When the value, or one inside it, is of another type.
-    """
-    # Test scalars first, then containers; arrays come last, as they need NumPy.
-    # Values of JSON, then numbers, paths and containers.
-    if value is None or isinstance(value, bool | str):
-        return value
-    if isinstance(value, Enum):
-        return value.name
-    if isinstance(value, Integral):
-        return int(value)
-    if isinstance(value, Real):
-        number = float(value)
-        return number if math.isfinite(number) else str(number)
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    if isinstance(value, Mapping):
-        return {str(name): plain(v) for name, v in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
-    # Dataclasses by field, arrays as lists.
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    import numpy as np  # here, as `sim2real info` starts faster without it
-
-    array = np.asarray(value)
-    if array.dtype == object:
-        raise TypeError(f"{type(value).__name__} has no plain JSON form: {value!r}")
-    return plain(array.tolist())
 
 
 def sha256(path: Path) -> str:
@@ -210,3 +181,46 @@ def git_state(folder: Path | None = None) -> dict[str, Json] | None:
         }
     except (OSError, subprocess.SubprocessError):
         return None
+
+
+def _held_lock(fd: int) -> int | None:
+    """Lock an open file; return a new file descriptor that holds the lock until it is closed, or None without locks."""
+    if fcntl is None:
+        return None
+    duplicate = os.dup(fd)
+    try:
+        fcntl.flock(duplicate, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(duplicate)
+        return None
+    return duplicate
+
+
+def _read_with_lock(path: Path) -> tuple[str, bool]:
+    """Return a file's text, and whether the process that writes it holds the lock on it.
+
+    Raises:
+        OSError: When it cannot be read.
+        UnicodeDecodeError: When it is no UTF-8.
+    """
+    while True:
+        with path.open("rb") as file:
+            locked = _is_locked(file.fileno())
+            text = file.read().decode("utf-8")
+            with suppress(FileNotFoundError):
+                # The writer replaces the file before it releases the lock: read the new file if this is the old one.
+                if not locked and os.stat(path).st_ino != os.fstat(file.fileno()).st_ino:
+                    continue
+            return text, locked
+
+
+def _is_locked(fd: int) -> bool:
+    """Return whether another open file holds the lock; also True without locks."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return error.errno in _LOCKED or error.errno in (errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL)
+    fcntl.flock(fd, fcntl.LOCK_UN)
+    return False

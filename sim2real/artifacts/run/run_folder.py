@@ -17,10 +17,10 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
+from sim2real.artifacts.files import plain
 from sim2real.artifacts.run.manifest import (
     RUNNING,
     git_state,
-    plain,
     read_manifest,
     readable_error,
     reserve,

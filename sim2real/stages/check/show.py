@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
-from sim2real.artifacts.run.manifest import plain
+from sim2real.artifacts.files import plain
 from sim2real.stages.check.result import Checked
 from sim2real.stages.terminal.console import pairs, table
 from sim2real.types import Json

@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from sim2real.artifacts.run.manifest import RUNNING, plain, read_manifest, sha256
+from sim2real.artifacts.files import plain
+from sim2real.artifacts.run.manifest import RUNNING, read_manifest, sha256
 from sim2real.artifacts.run.run_folder import StageFolder, attempts, run_folders
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.pipeline.find_run import find_run

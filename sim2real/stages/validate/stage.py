@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sim2real.artifacts.files import plain, to_json
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.manifest import plain
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.model import IdentifiableModel
@@ -199,8 +198,9 @@ def run(config: ValidateConfig) -> bool:
             refused[path] = str(error)
     found = score(identification, pipeline, logs, config, refused)
     if config.json:
-        rows = [{**plain(e), "ratio": plain(e.ratio), "exceeded": e.exceeded} for e in found.errors]
-        print(json.dumps({**plain(found), "errors": rows, "verdict": found.verdict, "holds": found.holds}, indent=1))
+        rows = [{**plain(e), "ratio": e.ratio, "exceeded": e.exceeded} for e in found.errors]
+        document = {**plain(found), "errors": rows, "verdict": found.verdict, "holds": found.holds}
+        print(to_json(document).decode())
         return found.holds
     table = found.rows()
     print(artifact_table(ArtifactTable(table.headers, table.rows[:_SHOWN])))
