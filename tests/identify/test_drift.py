@@ -135,7 +135,8 @@ WAY_OF_TWO = Way("friction", np.array([0.0, 1.0]))
 
 
 @pytest.mark.parametrize(
-    ("true", "named"), [((20.0, 12.0), "friction"), ((20 / 1.3, 6 / 1.3), "load"), ((20, 6), None)]
+    ("true", "named"),
+    [pytest.param((20.0, 12.0), "friction", marks=pytest.mark.night), ((20 / 1.3, 6 / 1.3), "load"), ((20, 6), None)],
 )
 def test_what_a_log_shows_is_named(true, named):
     found, x = drift(Robot(np.array(true)), OF_TWO, 1.0, CAUSES)

@@ -9,6 +9,7 @@ from sim2real.identify.uncertainty import per_recording
 from sim2real.identify.uncertainty.per_recording import identify_each
 
 
+@pytest.mark.night
 def test_each_recording_says_what_it_says_alone():
     episodes = [lag_log(1), lag_log(2, 2 * BIAS)]
     whole = fit(Model(), episodes, [*spans(0), *spans(1)], LENGTH_S, CONFIG)

@@ -30,9 +30,6 @@ def quietly(call, *arguments):
         return call(*arguments)
 
 
-pytestmark = pytest.mark.process
-
-
 def read_quietly(path):
     return quietly(read_log, path)
 
@@ -199,6 +196,7 @@ def test_files_that_are_no_logs(tmp_path, session_log):
             read(foreign)
 
 
+@pytest.mark.process
 def test_a_killed_process_leaves_all_but_the_last_quarter_of_a_second(tmp_path):
     path = tmp_path / "killed.mcap"
     program = textwrap.dedent("""

@@ -10,8 +10,6 @@ import pytest
 
 from sim2real.hardware.plant import OperatingMode, load_plant
 
-pytestmark = pytest.mark.process
-
 FILE = Path(__file__).resolve().parents[2] / "pipelines" / "arm" / "plant.py"
 ArmPlant = functools.partial(load_plant, f"{FILE}:ArmPlant")  # as the emulator gets it
 SMOOTH = {"coulomb": (0.0, 0.0, 0.0)}

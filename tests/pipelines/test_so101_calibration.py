@@ -77,12 +77,12 @@ WHOLE_MOTION = {
     "servos exchanged", "a servo mounted turned", "a direction turned in the file", "a zero that is off",
     "a horn that has slipped", "a joint at its stop when calibrated",
 }  # fmt: skip
-"""Faults that a motion of the hand shows. `make test` moves it in real time for one of them, and leaves the others to
-test_so101_hand_motion.py, where it takes no time."""
-IN_FULL = WHOLE_MOTION - {"servos exchanged"}
+"""Faults that a motion of the hand shows: in the gate in test_so101_hand_motion.py, where it takes no time."""
 
 
-@pytest.mark.parametrize("fault", [pytest.param(f, marks=pytest.mark.night) if f in IN_FULL else f for f in FAULTS])
+@pytest.mark.parametrize(
+    "fault", [pytest.param(f, marks=pytest.mark.night) if f in WHOLE_MOTION else f for f in FAULTS]
+)
 def test_a_fault_is_found_before_a_motor_moves(arm, tmp_path, fault):
     plant, changes, emulation, message = FAULTS[fault]
     wrong = arm(changes, emulation, **plant)

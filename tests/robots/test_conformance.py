@@ -9,12 +9,14 @@ from sim2real.robots import testing
 from sim2real.robots.roles import Roles
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.process
-
 
 @pytest.mark.parametrize(
     "name",
-    ["pendulum", *(pytest.param(n, marks=pytest.mark.night) for n in ("arm", "so101")), "disk", "xl330", "so101_log"],
+    [
+        pytest.param("pendulum", marks=pytest.mark.process),
+        *(pytest.param(n, marks=[pytest.mark.process, pytest.mark.night]) for n in ("arm", "so101")),
+        *("disk", "xl330", "so101_log"),
+    ],
 )
 def test_every_pipeline_here_has_a_robot(name, tmp_path):
     pipeline = load_pipeline(name)

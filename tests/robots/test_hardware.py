@@ -178,7 +178,9 @@ def test_a_joint_without_weight_is_brought_back_to_where_episodes_start(episodes
     assert np.abs(back).max() < 0.1
 
 
-@pytest.mark.parametrize("why", ["zero of the encoder", "rest that does not hold"])
+@pytest.mark.parametrize(
+    "why", ["zero of the encoder", pytest.param("rest that does not hold", marks=pytest.mark.night)]
+)
 def test_an_arm_that_rests_somewhere_else_is_refused(arm, tmp_path, why):
     """Brought to where it should rest, the shoulder falls."""
     if why.startswith("zero"):

@@ -267,7 +267,10 @@ SUM = '<joint joint="crank" coef="1"/><joint joint="rocker" coef="-2"/>'
 @pytest.mark.parametrize(
     ("inner", "outer", "rest", "rocker"),
     [
-        (COUPLER.format('<joint name="p" type="ball"/>'), "", f"<equality>{PIN}</equality>", 1.0),
+        pytest.param(
+            COUPLER.format('<joint name="p" type="ball"/>'), "", f"<equality>{PIN}</equality>", 1.0,
+            marks=pytest.mark.night,
+        ),
         pytest.param("", FREED, f"<equality>{PIN}{PINNED}</equality>", 1.0, marks=pytest.mark.night),
         pytest.param(
             "", "", f'<tendon><fixed name="t">{SUM}</fixed></tendon><equality><tendon tendon1="t"/></equality>', 0.5,

@@ -21,6 +21,7 @@ def problem():
     return Problem(converged_robot().identifiable(MAX_DELAY_S), [pair_log()], spans, SEGMENT_S, config)
 
 
+@pytest.mark.night
 def test_trees_share_rollouts_with_the_same_derivatives(problem):
     states, rolled_out = problem.evaluator._initial, []
     errors = states._errors

@@ -100,7 +100,7 @@ def test_a_world_that_is_not_of_mujoco_takes_the_compiled_engine(motor):
         choose("c", *motor)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+@pytest.mark.parametrize("backend", ["cpu", pytest.param("gpu", marks=pytest.mark.night)])
 def test_auto_takes_c_where_it_can_beside_an_accelerator_too(pair, backend, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     model = pair.identifiable(0.03)

@@ -104,6 +104,7 @@ def test_the_arm_moves_alike_on_c_and_on_mjx(arm):
     np.testing.assert_allclose(rewards, expected, atol=1e-3)
 
 
+@pytest.mark.night
 def test_other_learners_see_the_joints_and_get_bounds_for_the_goals():
     """A composed task of servos, without its graph, for brax and gymnasium: what it shows, and what it may be told."""
     pytest.importorskip("gymnasium", reason="pip install 'sim2real[interop]'")

@@ -15,7 +15,7 @@ from sim2real.train.networks.policy import Policy
 STEPS = 4
 
 
-@pytest.fixture(scope="module", params=["pendulum", "arm", "so101"])
+@pytest.fixture(scope="module", params=["pendulum", "arm", pytest.param("so101", marks=pytest.mark.night)])
 def robot(request):
     return load_pipeline(request.param).load()
 

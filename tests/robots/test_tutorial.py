@@ -12,8 +12,6 @@ from sim2real.log.reader import read_log
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.record import stage as record_stage
 
-pytestmark = pytest.mark.process
-
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.md"
 
 
@@ -35,6 +33,7 @@ def head(tmp_path, monkeypatch):
     return load_pipeline("head")
 
 
+@pytest.mark.process
 def test_the_twin_is_recorded_and_differs_from_the_model(head, tmp_path):
     gate = replace(head.record.gate, servo_watchdog_s=0.5)  # a busy machine is not what is tested
     config = replace(head.record, duration_s=3.0, gate=gate)
@@ -50,6 +49,7 @@ def test_the_twin_is_recorded_and_differs_from_the_model(head, tmp_path):
     assert {n: found[n] / nominal[n] for n in found} == pytest.approx(factors, rel=1e-6)
 
 
+@pytest.mark.process
 @pytest.mark.night  # `make test` records and runs its twin, and other devices pass the suite in tests/hardware
 def test_it_passes_the_test_that_the_page_has(head, tmp_path):
     names: dict = {}

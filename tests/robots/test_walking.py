@@ -86,6 +86,7 @@ def test_play_writes_a_picture(tmp_path, capsys):
     assert "walked for 0.5 s" in capsys.readouterr().err
 
 
+@pytest.mark.night
 def test_play_writes_a_film(tmp_path):
     run(PlayConfig("go2", seconds=0.5, video=tmp_path / "a.mp4", runs=tmp_path))
     assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"

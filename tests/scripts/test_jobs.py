@@ -15,7 +15,6 @@ SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 sys.path.insert(0, str(SCRIPTS))
 from benches import jobs  # noqa: E402
 
-pytestmark = pytest.mark.process
 TASK = """
 import os, time
 
@@ -67,6 +66,7 @@ def test_a_task_that_fails_ends_the_bench_but_a_robot_loses_no_other(where):
     assert [robot["number"] for robot in failed] == [0]
 
 
+@pytest.mark.process
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a process with its parent")
 def test_a_killed_bench_leaves_no_process(tmp_path):
     def until(holds):

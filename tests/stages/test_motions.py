@@ -18,8 +18,6 @@ from sim2real.robots.servo.drive import ServoDrive
 from sim2real.stages.excitation.played import played
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.process
-
 ARM = load_pipeline("so101")
 SERVOS = ARM.load().drive.servos
 LOW, HIGH = np.array(SERVOS.low), np.array(SERVOS.high)
@@ -135,6 +133,7 @@ def test_files_without_a_motion_are_refused(tmp_path):
         replace(ARM.record, excitation="wobble")
 
 
+@pytest.mark.process
 @pytest.mark.night
 def test_a_recorded_motion_of_the_pendulum_is_checked_and_played(tmp_path, capsys):
     t_s = np.arange(0.0, 3.0, 0.02)
@@ -180,6 +179,7 @@ def by_hand(tmp_path_factory):
     return recording, pose
 
 
+@pytest.mark.process
 def test_a_recording_by_hand_has_no_command_and_no_torque(by_hand):
     recording, pose = by_hand
     assert set(recording.episode.steps) == {"sensor"}
@@ -190,6 +190,8 @@ def test_a_recording_by_hand_has_no_command_and_no_torque(by_hand):
     assert recording.episode.metadata["dry_run"] is True
 
 
+@pytest.mark.process
+@pytest.mark.night
 def test_no_stage_identifies_from_it_and_the_message_names_what_to_do(by_hand, capsys):
     recording, _ = by_hand
     robot = load_pipeline("so101")
@@ -200,6 +202,7 @@ def test_no_stage_identifies_from_it_and_the_message_names_what_to_do(by_hand, c
     assert "a recording by hand determines no parameter" in capsys.readouterr().err
 
 
+@pytest.mark.process
 @pytest.mark.night
 def test_its_log_is_a_motion_that_the_arm_reaches_slowly(by_hand, tmp_path):
     recording, _ = by_hand

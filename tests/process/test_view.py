@@ -89,8 +89,8 @@ def test_the_viewer_gets_every_signal_lateness_and_the_robot(tmp_path, pipeline)
 @pytest.mark.parametrize(
     ("number", "problem"),
     [
-        pytest.param(signal.SIGKILL, "its process ended early", marks=pytest.mark.night),
-        (signal.SIGSTOP, "its process hangs"),
+        (signal.SIGKILL, "its process ended early"),
+        pytest.param(signal.SIGSTOP, "its process hangs", marks=pytest.mark.night),
     ],
 )
 def test_a_viewer_that_dies_or_hangs_costs_no_row(tmp_path, capsys, number, problem):
