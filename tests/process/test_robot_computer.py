@@ -1,8 +1,6 @@
 """A robot's computer, on which JAX is not installed: it records, deploys and reads logs."""
 
-import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -59,14 +57,8 @@ def assert_works(command, folder, robot, bundle):
     assert code == errors.OK, said
     code, said = call(command, folder, "check", robot)
     assert "samples in" in said
-    assert "95 % of the power of" in said
-    if robot == "pendulum":  # its physics is a compiled graph
-        assert code == errors.USAGE
-        assert "which parameters this recording determines is computed with JAX" in said
-    else:  # the motion of a second may leave a parameter open
-        assert code in (errors.OK, errors.ERROR), said
-        assert "s.e. from a minute" in said
-        assert "friction_gripper" in said
+    assert code == errors.USAGE
+    assert "computed with JAX" in said
     once = ["--bundle", bundle, "--episodes", "1", "--no-measure-delay"]
     code, said = call(command, folder, "deploy", robot, *flags, *once)
     assert code == errors.OK, said
@@ -106,39 +98,6 @@ def test_a_motion_by_hand_is_recorded_and_seen_and_check_refuses_it(tmp_path):
     code, said = call(WITHOUT_JAX, tmp_path, "view", log.parents[1], "--save", "run.rrd")
     assert code == errors.OK, said
     assert (tmp_path / "run.rrd").stat().st_size > 1000
-
-
-@pytest.mark.night
-@pytest.mark.parametrize("robot", ["arm", pytest.param("so101", marks=pytest.mark.night)])
-def test_check_determines_the_same_parameters_with_and_without_jax(tmp_path, robot):
-    seconds = ["--duration-s", "12", *PATIENT]
-    code, said = call(WITHOUT_JAX, tmp_path, "record", robot, *seconds)
-    assert code == errors.OK, said
-    (log,) = tmp_path.glob(f"runs/{robot}/*/record/session.mcap")
-    both = []
-    for command in (WITHOUT_JAX, (sys.executable, "-m", "sim2real.cli")):
-        line = [*command, "check", robot, "--json", "--log", str(log)]
-        done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-        assert done.returncode == errors.OK, done.stderr
-        both.append(json.loads(done.stdout))
-    light, whole = both
-    errors_of = [
-        [p.pop("standard_error_per_minute") for p in c["parameters"] if p.pop("percent_of_nominal") or True]
-        for c in both
-    ]
-    np.testing.assert_allclose(*errors_of, rtol=2e-3)  # programs compute in single precision
-    assert light.pop("condition") == pytest.approx(whole.pop("condition"), rel=2e-3)
-    # Sentences print these errors with two digits, so one just between two roundings differs in the last.
-    (light_words, light_figures), (whole_words, whole_figures) = (_figures_apart(c.pop("recommendation")) for c in both)
-    assert light_words == whole_words
-    assert light_figures == pytest.approx(whole_figures, rel=0.06)
-    assert light == whole
-
-
-def _figures_apart(sentences: list[str]) -> tuple[list[str], list[float]]:
-    """The sentences without the figures before a unit, and these figures."""
-    figure = re.compile(r"\b\d+(?:\.\d+)?(?= ?%| s\b)")
-    return [figure.sub("?", s) for s in sentences], [float(f) for s in sentences for f in figure.findall(s)]
 
 
 @pytest.mark.night

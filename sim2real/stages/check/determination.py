@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from sim2real.artifacts.files import number
-from sim2real.artifacts.identification import ROUND_TRIP, Determined
+from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.model import IdentifiableModel
@@ -16,62 +17,82 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.uncertainty import identifiability, uncertainty
 from sim2real.identify.uncertainty.round_trip import SURE_S
-from sim2real.stages.check.coverage import coverage
-from sim2real.stages.check.sources import PLANNED, JudgedLogs
 from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.types import Json
 
 _MIN_SEGMENT_S = 0.3
 _MAX_SEGMENTS = 120
 """Of a longer log this many segments are simulated, evenly distributed: more do not change the result."""
 
 
-def judge(
-    model: IdentifiableModel,
-    source: JudgedLogs,
-    config: IdentifyConfig,
-    parameters: ParameterTable,
-    units: Mapping[str, str],
-) -> dict[str, Json]:
-    """Return the coverage of the recordings and the parameters that they determine, as JSON.
+@dataclass(frozen=True)
+class ParameterCheck:
+    """What recordings say of one parameter.
 
-    Args:
-        units: Field -> unit.
+    Attributes:
+        standard_error_per_minute: Standard error to expect from one minute of such data.
+        determined: ``alone``, ``in a group`` of which only combinations are determined, or ``no``.
+        excite: The motion that determines it, as text.
     """
-    # Simulate all segments at the nominal values, with derivatives.
-    spans, length_s = cut_segments(source.episodes, config)
-    problem = Problem(model, source.episodes, spans, length_s, config, parameters)
+
+    name: str
+    unit: str
+    nominal: float | None
+    standard_error_per_minute: float
+    determined: str
+    excite: str = ""
+
+    @property
+    def percent_of_nominal(self) -> float | None:
+        """The standard error as a share of the nominal value [%]; None without one."""
+        return 100 * self.standard_error_per_minute / abs(self.nominal) if self.nominal else None
+
+
+@dataclass(frozen=True)
+class Determination:
+    """Which parameters recordings determine.
+
+    Attributes:
+        segment_s: Length of a segment [s].
+        condition: Condition number of the Jacobian, its columns in widths of the bounds.
+        undetermined: Groups of parameters; only combinations of the parameters in a group are determined.
+    """
+
+    segments: int
+    segment_s: float
+    condition: float | None
+    undetermined: tuple[tuple[str, ...], ...]
+    messages: tuple[str, ...]
+    parameters: tuple[ParameterCheck, ...]
+
+
+def determine(
+    model: IdentifiableModel, episodes: Sequence[Episode], config: IdentifyConfig, parameters: ParameterTable
+) -> Determination:
+    """Return which parameters recordings determine: their residuals are simulated once, at the nominal values."""
+    spans, length_s = cut_segments(episodes, config)
+    problem = Problem(model, episodes, spans, length_s, config, parameters)
     linearised = uncertainty.linearise(problem, problem.table.start())
-    determined = identifiability.from_linearised(problem, linearised)
-    rows = _parameter_rows(problem, determined)
-    round_trip = _round_trip_row(problem, linearised)
+    found = identifiability.from_linearised(problem, linearised)
+    grouped = {name for group in found.undetermined for name in group}
+    errors = found.standard_error_per_minute.values()
+    rows = [
+        ParameterCheck(
+            *(c.label, c.parameter.unit, c.parameter.nominal, number(error)),
+            *("in a group" if c.label in grouped else "alone", c.parameter.excite),
+        )
+        for c, error in zip(problem.table.columns, errors, strict=True)
+    ]
+    groups, messages = list(found.undetermined), list(found.messages)
     # With free initial states only the sum of the delays is determined. That suffices, so it is no open group.
-    messages = list(determined.messages)
-    delays = [c.label for c in problem.table.columns if c.parameter.kind == "delay"]
-    only_delays = [g for g in determined.undetermined if round_trip and set(g) <= set(delays)]
-    open_groups = [list(g) for g in determined.undetermined if g not in only_delays]
-    if round_trip and round_trip["determined"] == "no":
-        open_groups.append(delays)
-        messages.append(f"not even the sum of {' and '.join(delays)} is determined: let the commands change more")
-    return {
-        "source": PLANNED if source.planned else "log",
-        "recordings": covered(model, source, units),
-        "segments": problem.segments,
-        "segment_s": length_s,
-        "condition": determined.condition,
-        "determined": not open_groups,
-        "undetermined": open_groups,
-        "only_sum_of_delays": bool(only_delays) and delays not in open_groups,
-        "messages": messages,
-        "parameters": [*rows, *([round_trip] if round_trip else [])],
-    }
-
-
-def covered(model: IdentifiableModel, source: JudgedLogs, units: Mapping[str, str]) -> list[dict[str, Json]]:
-    """Return the coverage of each recording."""
-    pairs = zip(source.names, source.episodes, strict=True)
-    return [{"name": name, **coverage(episode, model, units)} for name, episode in pairs]
+    if (total := _round_trip(problem, linearised)) is not None:
+        delays = tuple(c.label for c in problem.table.columns if c.parameter.kind == "delay")
+        groups = [g for g in groups if not set(g) <= set(delays)]
+        if total.determined == "no":
+            groups.append(delays)
+            messages.append(f"not even the sum of {' and '.join(delays)} is determined: let the commands change more")
+        rows.append(total)
+    return Determination(problem.segments, length_s, found.condition, tuple(groups), tuple(messages), tuple(rows))
 
 
 def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:
@@ -94,28 +115,8 @@ def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[l
     return spans, length_s
 
 
-def _parameter_rows(problem: Problem, determined: Determined) -> list[dict[str, Json]]:
-    """Return a row for each parameter, with the standard error to expect from one minute of such data."""
-    grouped = {name for group in determined.undetermined for name in group}
-    rows = []
-    for column, error in zip(problem.table.columns, determined.standard_error_per_minute.values(), strict=True):
-        p = column.parameter
-        rows.append(
-            {
-                "name": column.label,
-                "unit": p.unit,
-                "nominal": p.nominal,
-                "standard_error_per_minute": number(error),
-                "percent_of_nominal": 100 * number(error) / abs(p.nominal) if p.nominal else None,
-                "determined": "in a group" if column.label in grouped else "alone",
-                "excite": p.excite,
-            }
-        )
-    return rows
-
-
-def _round_trip_row(problem: Problem, linearised: uncertainty.Linearised) -> dict[str, Json] | None:
-    """Return the row of the sum of the delays; None if the model has no direction that shifts the delays in time."""
+def _round_trip(problem: Problem, linearised: uncertainty.Linearised) -> ParameterCheck | None:
+    """Return the sum of the delays; None if the model has no direction that shifts the delays in time."""
     shift = uncertainty.time_shift(problem.table)
     if not shift.any():
         return None
@@ -130,11 +131,5 @@ def _round_trip_row(problem: Problem, linearised: uncertainty.Linearised) -> dic
         information = jacobian.T @ jacobian * seconds / duration_s + linearised.prior[np.ix_(free, free)]
         return float(np.sqrt(np.linalg.inv(information)[np.ix_(delays, delays)].sum()))
 
-    return {
-        "name": ROUND_TRIP,
-        "unit": "s",
-        "nominal": None,
-        "standard_error_per_minute": standard_error(60.0),
-        "percent_of_nominal": None,
-        "determined": "alone" if standard_error(duration_s) < SURE_S else "no",
-    }
+    determined = "alone" if standard_error(duration_s) < SURE_S else "no"
+    return ParameterCheck(ROUND_TRIP, "s", None, standard_error(60.0), determined)

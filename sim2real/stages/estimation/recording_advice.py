@@ -1,45 +1,13 @@
-"""Advice on a recording, in sentences, from the results of a check; and commands to identify again."""
+"""The commands that identify again."""
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
-
-_GOAL = 0.01
-"""Standard error to reach, as a fraction of the nominal value."""
-_SHORT_S = 12.0
-_MOVING, _COVERED, _ONE_SIDED = 0.3, 0.5, 0.2
-
-
-def recommend(result: Mapping[str, Any], identify: str, record: str) -> list[str]:
-    """Return sentences: first the problems of the data, then the next step.
-
-    Args:
-        result: The result of ``check.judge``.
-        identify: The command that identifies from this data.
-        record: The command that records the planned excitation.
-    """
-    planned = result["source"] != "log"
-    have_s = sum(r["sampling"]["duration_s"] for r in result["recordings"])
-    texts = [f"only {have_s:.1f} s: too little to fit one part and check on another"] if have_s < _SHORT_S else []
-    texts += [sentence for r in result["recordings"] for sentence in _about(r, len(result["recordings"]) > 1)]
-    enough = _enough(result)
-    if not result["determined"]:
-        names = ", ".join(dict.fromkeys(n for group in result["undetermined"] for n in group))
-        texts.append(f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one")
-        texts += _better(result)
-    if result["only_sum_of_delays"]:
-        texts.append("of the delays before and after the world only the sum is determined: no log separates them")
-    if enough:
-        texts.append(enough)
-    if result["determined"]:
-        texts.append(f"next: {record if planned else identify}")
-    return texts
 
 
 def again(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str) -> str:
@@ -87,50 +55,3 @@ def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str =
             )
     words += ["--runs", str(root)] if Path(root) != Path("runs") else []
     return shlex.join([*words, *further])
-
-
-def _about(recording: Mapping[str, Any], several: bool) -> Iterator[str]:
-    """Yield a sentence for each problem of one recording."""
-    which = f"{recording['name']}: " if several else ""
-    s = recording["sampling"]
-    if s["gaps"]:
-        yield f"{which}{s['gaps']} gaps in the measurements, the longest {s['longest_gap_s']:.3g} s"
-    for j in recording["joints"]:
-        if not j["moving"]:
-            yield f"{which}{j['name']} does not move at all: nothing about it is determined"
-            continue
-        if j["moving"] < _MOVING:
-            yield f"{which}{j['name']} moves {j['moving']:.0%} of the time: excite it more, or for longer"
-        if not _ONE_SIDED < j["forward"] < 1 - _ONE_SIDED:
-            yield f"{which}{j['name']} moves almost only one way: friction and an offset then look alike"
-        if j["position"]["covered"] < _COVERED:
-            share = j["position"]["covered"]
-            yield f"{which}{j['name']} stays in {share:.0%} of its range: vary the level of the excitation"
-    yield from (f"{which}{sentence}" for sentence in recording["about_torque"])
-    if recording["commands"] and all(c["low_hz"] is None for c in recording["commands"]):
-        yield f"{which}no command changes: gains and delays of the actuator are not determined"
-
-
-def _better(result: Mapping[str, Any]) -> list[str]:
-    """Return the motions that the undetermined parameters name."""
-    open_names = {n for group in result["undetermined"] for n in group}
-    motions = [p["excite"] for p in result["parameters"] if p["name"] in open_names and p.get("excite")]
-    return [f"record instead: {'; '.join(dict.fromkeys(motions))}"] if motions else []
-
-
-def _enough(result: Mapping[str, Any]) -> str:
-    """Return how long to record, by the parameter with the largest standard error."""
-    alone = [p for p in result["parameters"] if p["percent_of_nominal"] is not None and p["determined"] == "alone"]
-    if not alone:
-        return ""
-    worst = max(alone, key=lambda p: p["percent_of_nominal"])
-    seconds = 60.0 * (worst["percent_of_nominal"] / (100 * _GOAL)) ** 2
-    have = sum(r["sampling"]["duration_s"] for r in result["recordings"])
-    about = f"{worst['name']} is least certain: {worst['percent_of_nominal']:.2g} % of nominal from a minute"
-    if seconds <= have:
-        return f"{about}; {have:.0f} s are enough for {_GOAL:.0%}, if the model is right"
-    return f"{about}; {_GOAL:.0%} takes {_time(seconds)} of such data, or a better excitation"
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min" if seconds < 7200 else "hours"

@@ -1,16 +1,21 @@
 """The printed form of a recording session."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sim2real.artifacts.recording import Recording
 from sim2real.robots.contract import Robot
-from sim2real.stages.check.result import Checked
 from sim2real.stages.on_robot.episode import timing_rows
 from sim2real.stages.on_robot.open_robot import show_withheld, warn
 from sim2real.stages.terminal.console import note, shown, table
 from sim2real.types import Json
+
+if TYPE_CHECKING:
+    from sim2real.stages.check.stage import Checked
 
 
 def show(summary: Mapping[str, Json], dry_run: bool) -> None:
