@@ -34,7 +34,7 @@ def minimise(
 
     rng, box = np.random.default_rng(seed), np.tile([0.0, 1.0], (len(start), 1))
     best, lowest, evaluated = start.copy(), np.inf, 0
-    run = CMA(start, sigma, box, seed=seed, population_size=population)
+    run = CMA(start, sigma, box, n_max_resampling=10, seed=seed, population_size=population)
     while True:
         candidates = np.array([run.ask() for _ in range(run.population_size)])
         values = np.nan_to_num(losses(candidates), nan=WORST_LOSS, posinf=WORST_LOSS)
@@ -46,4 +46,5 @@ def minimise(
         run.tell(list(zip(candidates, values.tolist(), strict=True)))
         if np.ptp(values) <= 1e-3 * abs(values.min()) or run.should_stop():
             place, count = rng.uniform(0.0, 1.0, len(start)), 2 * run.population_size
-            run = CMA(place, sigma, box, seed=int(rng.integers(2**31)), population_size=count)
+            seed = int(rng.integers(2**31))
+            run = CMA(place, sigma, box, n_max_resampling=10, seed=seed, population_size=count)
