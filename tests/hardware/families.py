@@ -1,7 +1,7 @@
 """The families of servos that all tests of safety run on, each with an emulated robot in virtual time."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ IDS = (1, 2, 3)
 MODES = {0: "off", 1: "speed", 3: "position", 16: "voltage"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Family:
     """Servos of one kind: their emulation, their driver, and a command that moves them."""
 
@@ -38,12 +38,11 @@ class Family:
     torque: Any
     moving: np.ndarray
     gate: Mapping[str, Any]
-    plant_args: Mapping[str, Any] = field(default_factory=lambda: {"ids": list(IDS)})
-    settings: Mapping[str, Any] = field(default_factory=dict)
 
-    def robot(self, **settings: Any) -> VirtualRobot:
+    def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> VirtualRobot:
         """Return an emulated robot, on which the torque is off."""
-        return VirtualRobot(f"{PLANTS}:{self.plant}", self.emulation(**{**self.settings, **settings}), self.plant_args)
+        config = self.emulation(**(settings or {}))
+        return VirtualRobot(f"{PLANTS}:{plant or self.plant}", config, {"ids": list(IDS), **plant_args})
 
     def device(self, robot: VirtualRobot, **limits: Any) -> Device:
         return self.make(robot.port, **limits)

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
@@ -13,7 +11,6 @@ from sim2real.hardware.testing import DeviceConformance
 PLANTS = Path(__file__).parent / "plants.py"
 
 
-@pytest.mark.process
 class TestOneServoByVoltage(DeviceConformance):
     emulation = EmulatorConfig
     plant = f"{PLANTS}:FirstOrder"
@@ -23,7 +20,6 @@ class TestOneServoByVoltage(DeviceConformance):
         return DynamixelServos(BusConfig(port, max_silence_s=0.5, silence_s=0.6), [1], VoltageDrive(5.0))
 
 
-@pytest.mark.process
 class TestThreeServosByAngle(DeviceConformance):
     emulation = EmulatorConfig
     plant = f"{PLANTS}:Joints"

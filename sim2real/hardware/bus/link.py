@@ -66,7 +66,9 @@ class ServoLink(ABC):
         self._waiting: list[Packet] = []
         self._pad = self._barriers = 0
         self._unheard: set[int] = set()  # lengths of answers that are missing and may still come
-        self._silent_ns, self._missed = (0, 0), 0  # begin and end of the present silence, and its missing answers
+        # Begin and end of the present silence, None after an answer; and its missing answers.
+        self._silent_ns: tuple[int, int] | None = None
+        self._missed = 0
         self._sent_ns = 0
         self.port = open_port(config.port, config.baud_rate)
         self.clock = self.port.clock
@@ -247,8 +249,9 @@ class ServoLink(ABC):
         with self.hold():
             began_ns = self.clock.now_ns()
             # A bus that was lost just now is lost for the next instruction, too, after a single missing answer.
-            if began_ns - self._silent_ns[1] > 1e9 * self.config.max_silence_s:
-                self._silent_ns, self._missed = (began_ns, began_ns), 0
+            silent_ns = self._silent_ns
+            if silent_ns is None or began_ns - silent_ns[1] > 1e9 * self.config.max_silence_s:
+                silent_ns, self._missed = (began_ns, began_ns), 0
             while True:
                 # Show the guardian that this process lives, as often as the bus is used.
                 if self.guardian is not None:
@@ -272,16 +275,17 @@ class ServoLink(ABC):
                         self._repeat_off(0.0)  # the line is quiet, and others wait for it
                 now_ns = self.clock.now_ns()
                 if answers is not None:
-                    self._silent_ns = (0, 0) if servo_ids else self._silent_ns
+                    if servo_ids:
+                        self._silent_ns = None
                     late_ns = self._count_answer(now_ns, self._wire_ns(packet, servo_ids, length))
                     break
                 # An answer is missing: ask for more bytes next time, and give up after the longest silence.
                 losses += 1
                 self._lost += 1
                 self._missed += 1
-                self._silent_ns = (self._silent_ns[0], now_ns)
+                self._silent_ns = silent_ns = (silent_ns[0], now_ns)
                 self._pad = (self._pad + 1) % _PADS
-                self._require_heard(request)
+                self._require_heard(request, 1e-9 * (silent_ns[1] - silent_ns[0]))
                 self._retries += 1
             transaction = Transaction(self._sent_ns, began_ns - requested_ns, now_ns - began_ns, losses, late_ns)
         # Outside of the lock, as the error's cause is read from the servo.
@@ -371,8 +375,7 @@ class ServoLink(ABC):
         self._late += late_ns > 1e9 * self.config.late_after_s
         return late_ns
 
-    def _require_heard(self, what: str) -> None:
-        silent_s = 1e-9 * (self._silent_ns[1] - self._silent_ns[0])
+    def _require_heard(self, what: str, silent_s: float) -> None:
         if self._missed >= _MIN_LOSSES and silent_s > self.config.max_silence_s:
             self._require_watching()
             raise HardwareLost(

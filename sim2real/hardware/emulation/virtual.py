@@ -1,8 +1,8 @@
-"""An emulated bus of servos in this process and in virtual time: no thread, no waiting, every instant exact.
+"""Emulated robots in this process and in virtual time: no thread, no waiting, every instant exact.
 
 `VirtualRobot` is the robot behind an address, the port of whoever opens that address, and the clock of both. Time goes
 on while the host waits for an answer or sleeps, event by event; it stands still while the host computes. The guardian
-is the guardian process's own code, without the process.
+is the guardian process's own code, without the process: it acts when it is due, and the host goes on when it has acted.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import tempfile
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
@@ -23,64 +24,47 @@ from sim2real.hardware.emulation.emulated_bus import BusEmulation, truth_header
 from sim2real.hardware.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.hardware.plant import Plant, load_plant
 from sim2real.hardware.safety.guardian import Guardian
-from sim2real.hardware.safety.guardian_process import BusGuard
+from sim2real.hardware.safety.guardian_process import BusGuard, FdPort, Guard
 
-_NUMBERS: Final = count()
+NUMBERS: Final = count()
 
 
-class VirtualRobot:
-    """Emulated servos at `port`, from construction until `stop`; see `EmbeddedRobot` for the arguments.
+class VirtualTime(ABC):
+    """The clock of an emulated robot, its guardian, and the ends of its host; a subclass is the robot.
 
     Attributes:
-        port: The address, which `open_port` knows.
         clock: The robot itself.
-        bus: The emulated bus.
         reports: What the guardian told a person.
         guardian_works: False: the guardian was stopped, and hears nothing.
+        host_lives: False: the host's process has died.
     """
 
-    def __init__(
-        self,
-        plant: str | Plant,
-        config: BusEmulation,
-        plant_args: Mapping[str, Any] | None = None,
-        truth_path: Path | None = None,
-    ) -> None:
-        self.plant = load_plant(plant, dict(plant_args or {})) if isinstance(plant, str) else plant
+    def __init__(self, truth_path: Path | None) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="sim2real-robot-")
         self.truth_path = Path(self._folder.name) / "truth.bin" if truth_path is None else truth_path
-        self._log = TruthLog(self.truth_path, truth_header(self.plant, config, 0))
-        self.port = f"virtual:{next(_NUMBERS)}"
         self.clock: Clock = self
         self.reports: list[str] = []
-        self.guardian_works = True
-        self.host_lives = True
-        self._config = config
+        self.guardian_works = self.host_lives = True
+        self._log: TruthLog
         self._now_ns = 0
-        self._baud_rate: int | None = None  # None: no host has opened the port
-        self._inbox: list[bytes] = []
         self._watchers: dict[threading.Event, list[Any]] = {}  # what is called, its period [ns], when it is due [ns]
         self._calling = False
-        self._guard: _Guard | None = None
-        self.bus = type(config).bus_type(self.plant, config, self._log, self._take, 0, self.now_ns)
-        EMULATED[self.port] = self._open
+        self._guard: Guard | None = None
 
-    # -- the robot
+    @abstractmethod
+    def _next_ns(self) -> int | None:
+        """Return the time of the robot's next event [ns]; None: there is none."""
 
-    def strike(self, **faults: Any) -> None:
-        """Let faults begin, or end, now; named as the fields of `Emulation`."""
-        self._config = replace(self._config, **faults)
-        self.bus._config = self._config
-        if hasattr(self.bus, "config"):
-            setattr(self.bus, "config", self._config)  # noqa: B010 - the families' own settings
-        self.bus.begin_faults(self._now_ns)
+    @abstractmethod
+    def _advance(self, t_ns: int) -> None:
+        """Let the robot get to a time [ns], at or before its next event."""
 
     def stall(self, duration_s: float) -> None:
         """Stop the host's process for a time [s], with all its threads."""
         self._pass(self._now_ns + round(1e9 * duration_s))
 
     def kill_host(self) -> None:
-        """Let the host's process die: its port and its connection to the guardian are closed."""
+        """Let the host's process die: its connections to the robot and to the guardian are closed."""
         self.host_lives = False
         self._watchers.clear()
         if self._guard is not None:
@@ -88,7 +72,6 @@ class VirtualRobot:
 
     def stop(self) -> None:
         """End the robot, after which its truth is complete. May be called twice."""
-        EMULATED.pop(self.port, None)
         self._log.close()
 
     def truth(self) -> Truth:
@@ -125,6 +108,99 @@ class VirtualRobot:
         del name
         self._watchers[done] = [call, round(1e9 * period_s), self._now_ns]
 
+    def watch(self, guard: Guard | None) -> None:
+        """Let a guardian watch the host from now on, or none."""
+        self._guard = guard
+
+    def _pass(self, until_ns: int, arrived: Callable[[], object] = lambda: False) -> None:
+        """Let time pass, event by event, to a time [ns] or until something has arrived."""
+        while not arrived():
+            due_ns = min((t for t in (self._next_ns(), self._guard_due_ns()) if t is not None), default=until_ns)
+            self._now_ns = max(self._now_ns, min(due_ns, until_ns))
+            self._advance(self._now_ns)
+            guard_ns = self._guard_due_ns()
+            if self._guard is not None and guard_ns is not None and guard_ns <= self._now_ns:
+                self._guard.look()
+            if self._now_ns >= until_ns:
+                return
+
+    def _guard_due_ns(self) -> int | None:
+        due_s = None if self._guard is None or not self.guardian_works else self._guard.due_s()
+        return None if due_s is None else math.ceil(1e9 * due_s) + 1
+
+
+class VirtualChannel:
+    """The host's end of the connection to a guardian in virtual time; see `Channel`."""
+
+    pid = 0
+
+    def __init__(self, robot: VirtualTime, guard: Guard, longest_s: float) -> None:
+        self.clock: Clock = robot
+        self._robot, self._guard, self._messages = robot, guard, b""
+        robot.watch(guard)
+        guard.begin(longest_s, self._say, robot.reports.append)
+
+    def _say(self, message: bytes) -> None:
+        self._messages += message
+
+    def send(self, message: bytes) -> None:
+        """Send a message, at which the guardian acts at once."""
+        if self._robot.guardian_works:
+            self._guard.hear(message)
+
+    def receive(self, until_ns: int) -> bytes | None:
+        """Return messages; None if there are none: the guardian answers at once, or never."""
+        del until_ns
+        messages, self._messages = self._messages, b""
+        return messages or None
+
+    def is_stopped(self) -> bool:
+        """Return whether the guardian was stopped."""
+        return not self._robot.guardian_works
+
+    def close(self, wait_s: float) -> None:
+        """Close the connection."""
+        if not wait_s and self._robot.guardian_works:  # the host leaves without a word: as if it had died
+            self._guard.hear(b"")
+        self._robot.watch(None)
+
+
+class VirtualRobot(VirtualTime):
+    """Emulated servos at `port`, from construction until `stop`; see `EmbeddedRobot` for the arguments.
+
+    Attributes:
+        port: The address, which `open_port` knows.
+        bus: The emulated bus.
+    """
+
+    def __init__(
+        self,
+        plant: str | Plant,
+        config: BusEmulation,
+        plant_args: Mapping[str, Any] | None = None,
+        truth_path: Path | None = None,
+    ) -> None:
+        super().__init__(truth_path)
+        self.plant = load_plant(plant, dict(plant_args or {})) if isinstance(plant, str) else plant
+        self._log = TruthLog(self.truth_path, truth_header(self.plant, config, 0))
+        self._config = config
+        self._baud_rate: int | None = None  # None: no host has opened the port
+        self._inbox: list[bytes] = []
+        self.bus: Any = type(config).bus_type(self.plant, config, self._log, self._take, 0, self.now_ns)
+        self.port = f"virtual:{next(NUMBERS)}"
+        EMULATED[self.port] = self._open
+
+    def strike(self, **faults: Any) -> None:
+        """Let faults begin, or end, now; named as the fields of `Emulation`."""
+        self._config = replace(self._config, **faults)
+        self.bus._config = self.bus.config = self._config
+        self.bus.begin_faults(self._now_ns)
+
+    def stop(self) -> None:
+        """End the robot, after which its truth is complete. May be called twice."""
+        EMULATED.pop(self.port, None)
+        super().stop()
+
     # -- the port
 
     def _open(self, baud_rate: int) -> Port:
@@ -137,16 +213,13 @@ class VirtualRobot:
         """Send bytes to the servos; OSError if the port is gone."""
         self._require_port()
         if self._baud_rate == self.bus.baud_rate:
-            self.bus.feed(data, self._now_ns)
-            self.bus.run_until(self._now_ns)
+            self._feed(data)
 
     def read(self, until_ns: int) -> bytes:
         """Return the bytes that have arrived; none if there are none until a time [ns]; OSError if the port is gone."""
         self._require_port()
-        self._pass(until_ns, until_bytes=True)
+        data = self._take_until(until_ns)
         self._require_port()
-        data = b"".join(self._inbox)
-        self._inbox.clear()
         return data
 
     def flush(self) -> None:
@@ -164,65 +237,43 @@ class VirtualRobot:
     ) -> Guardian:
         """Return a guardian that acts in virtual time."""
         rows = [(query, list(answers)) for query, answers in servos]
-        guard = _Guard(self, _GuardPort(self), answer_s, off, rows)
-        return Guardian(lambda longest_s: _VirtualChannel(self, guard, longest_s), silence_s)
+        guard = BusGuard(_GuardPort(self), answer_s, off, rows)
+        return Guardian(lambda longest_s: VirtualChannel(self, guard, longest_s), silence_s)
 
-    # -- for the guardian
+    def _require_port(self) -> None:
+        if self._baud_rate is None or not self.host_lives:
+            raise OSError("the port is closed")
+        self._require_line()
 
-    def watch(self, guard: _Guard | None) -> None:
-        """Let a guardian watch the host from now on, or none."""
-        self._guard = guard
-
-    def guardian_writes(self, packet: bytes) -> None:
-        """Send bytes to the servos, also when the host has died; OSError if the port is gone."""
+    def _require_line(self) -> None:
         if self.bus.unplugged(self._now_ns):
             raise OSError("the port is gone")
-        self.bus.feed(packet, self._now_ns)
+
+    def _feed(self, data: bytes) -> None:
+        self._require_line()
+        self.bus.feed(data, self._now_ns)
         self.bus.run_until(self._now_ns)
 
-    def guardian_reads(self, wait_s: float) -> bytes:
-        """Return the bytes that have arrived; none if there are none for a time [s]; OSError if the port is gone."""
-        self._pass(self._now_ns + max(1, round(1e9 * wait_s)), until_bytes=True)
-        if self.bus.unplugged(self._now_ns):
-            raise OSError("the port is gone")
+    def _take_until(self, until_ns: int) -> bytes:
+        self._pass(until_ns, lambda: self._inbox)
+        self._require_line()
         data = b"".join(self._inbox)
         self._inbox.clear()
         return data
-
-    # -- time
-
-    def _require_port(self) -> None:
-        if self._baud_rate is None or not self.host_lives or self.bus.unplugged(self._now_ns):
-            raise OSError("the port is gone")
 
     def _take(self, answer: bytes) -> bool:
         self._inbox.append(answer)
         return True
 
-    def _pass(self, until_ns: int, until_bytes: bool = False) -> None:
-        """Let time pass, event by event."""
-        while not (until_bytes and self._inbox):
-            due_ns = min((t for t in (self.bus.next_due_ns(), self._guard_due_ns()) if t is not None), default=until_ns)
-            if due_ns >= until_ns:
-                break
-            self._step(max(self._now_ns, due_ns))
-        if not (until_bytes and self._inbox):
-            self._step(max(self._now_ns, until_ns))
+    def _next_ns(self) -> int | None:
+        return self.bus.next_due_ns()
 
-    def _step(self, t_ns: int) -> None:
-        self._now_ns = t_ns
+    def _advance(self, t_ns: int) -> None:
         self.bus.run_until(t_ns)
-        due_ns = self._guard_due_ns()
-        if self._guard is not None and due_ns is not None and due_ns <= t_ns:
-            self._guard.look()
-
-    def _guard_due_ns(self) -> int | None:
-        due_s = None if self._guard is None or not self.guardian_works else self._guard.due_s()
-        return None if due_s is None else math.ceil(1e9 * due_s) + 1
 
 
-class _GuardPort:
-    """The virtual port, as the guardian's own code uses it."""
+class _GuardPort(FdPort):
+    """The virtual port, as the guardian's own code uses it; see `FdPort`."""
 
     def __init__(self, robot: VirtualRobot) -> None:
         self._robot = robot
@@ -231,50 +282,8 @@ class _GuardPort:
         return 1e-9 * self._robot.now_ns()
 
     def write(self, packet: bytes) -> None:
-        self._robot.guardian_writes(packet)
+        self._robot._feed(packet)
 
     def receive(self, wait_s: float) -> bytes:
-        return self._robot.guardian_reads(wait_s)
-
-
-class _Guard(BusGuard):
-    """The guardian process's own decisions and packets."""
-
-    def __init__(self, robot: VirtualRobot, port: Any, *arguments: Any) -> None:
-        super().__init__(port, *arguments)
-        self._robot = robot
-
-    def report(self, message: str) -> None:
-        self._robot.reports.append(message)
-
-
-class _VirtualChannel:
-    """The host's end of the connection to the guardian."""
-
-    pid = 0
-
-    def __init__(self, robot: VirtualRobot, guard: _Guard, longest_s: float) -> None:
-        self.clock: Clock = robot
-        self._robot, self._guard, self._messages = robot, guard, b""
-        robot.watch(guard)
-        guard.begin(longest_s, self._say)
-
-    def _say(self, message: bytes) -> None:
-        self._messages += message
-
-    def send(self, message: bytes) -> None:
-        if self._robot.guardian_works:
-            self._guard.hear(message)
-
-    def receive(self, until_ns: int) -> bytes | None:
-        del until_ns  # the guardian answers at once, or never
-        messages, self._messages = self._messages, b""
-        return messages or None
-
-    def is_stopped(self) -> bool:
-        return not self._robot.guardian_works
-
-    def close(self, wait_s: float) -> None:
-        if not wait_s and self._robot.guardian_works:  # the host leaves without a word: as if it had died
-            self._guard.hear(b"")
-        self._robot.watch(None)
+        # At least 1 ns, so that time goes on.
+        return self._robot._take_until(self._robot.now_ns() + max(1, round(1e9 * wait_s)))

@@ -48,17 +48,13 @@ class Guard:
         """Return the time [s]."""
         return time.monotonic()
 
-    def report(self, message: str) -> None:
-        """Tell a person."""
-        _write(2, f"{message}\n".encode())
-
     def watch(self, link: int, silence_s: float) -> None:
         """Wait until the control process ends it; act when it dies, or is silent for too long with torque on.
 
         Args:
             silence_s: Longest time without a sign of life while torque is on [s]; 0: unlimited.
         """
-        self.begin(silence_s, lambda message: _write(link, message))
+        self.begin(silence_s, lambda message: _write(link, message), lambda text: _write(2, f"{text}\n".encode()))
         while True:
             due_s = self.due_s()
             wait_s = None if due_s is None else max(0.0, due_s - self.now_s())
@@ -68,9 +64,14 @@ class Guard:
             elif not self.hear(_receive_messages(link)):
                 return
 
-    def begin(self, silence_s: float, say: Callable[[bytes], None]) -> None:
-        """Report readiness; the control process then arms it with each sign of life."""
-        self._silence_s, self._say = silence_s, say
+    def begin(self, silence_s: float, say: Callable[[bytes], None], tell: Callable[[str], None]) -> None:
+        """Report readiness; the control process then arms it with each sign of life.
+
+        Args:
+            say: Sends a message to the control process.
+            tell: Tells a person.
+        """
+        self._silence_s, self._say, self._tell = silence_s, say, tell
         self._armed, self._tripped, self._heard_s = False, False, self.now_s()
         say(READY)
 
@@ -119,7 +120,7 @@ class Guard:
             result = f"torque off could NOT be confirmed, {failure}; {self.cut}"
         else:
             result = f"torque is off, confirmed after {took_ms:.0f} ms"
-        self.report(f"sim2real guardian: {reason}: {result}")
+        self._tell(f"sim2real guardian: {reason}: {result}")
         return not failure
 
 
@@ -157,7 +158,7 @@ class BusGuard(Guard):
     """Takes the torque of servos on a bus off; arguments as in `sim2real.hardware.safety.guardian.BusGuardian`.
 
     Args:
-        port: An `FdPort`, or an object with its methods.
+        port: An `FdPort`.
     """
 
     cut = "cut the servos' power"

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
 from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.emulation import StsEmulation
@@ -12,7 +10,6 @@ from sim2real.hardware.testing import DeviceConformance
 PLANTS = Path(__file__).parents[1] / "plants.py"
 
 
-@pytest.mark.process
 class TestStsServos(DeviceConformance):
     emulation = StsEmulation
     plant = f"{PLANTS}:Joints"
