@@ -4,18 +4,18 @@ from virtual_bus import PLANTS, VirtualBus
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.emulation import EmulatedBus, EmulatorConfig
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
+from sim2real.hardware.emulation.virtual import VirtualRobot
 from sim2real.hardware.plant import OperatingMode
 
 
 @pytest.fixture
 def start_robot(tmp_path):
-    """Start an emulator process; stopped at the end of the test."""
+    """Start an emulated robot in virtual time; stopped at the end of the test."""
     robots = []
 
     def start(plant="FirstOrder", config=None, **plant_args):
         path = tmp_path / f"truth{len(robots)}.bin"
-        robots.append(EmbeddedRobot(f"{PLANTS}:{plant}", config or EmulatorConfig(), plant_args, path))
+        robots.append(VirtualRobot(f"{PLANTS}:{plant}", config or EmulatorConfig(), plant_args, path))
         return robots[-1]
 
     yield start
@@ -25,12 +25,11 @@ def start_robot(tmp_path):
 
 @pytest.fixture
 def open_bus():
-    """Open a bus to a robot and shake hands with the servos given; patient, for the machine may be busy."""
+    """Open a bus to a robot and shake hands with the servos given."""
     buses = []
 
     def open_(robot, ids=(1,), mode=None, **config):
-        patience = {"max_silence_s": 1.0, "silence_s": 1.0}
-        bus = ServoBus(BusConfig(robot.port, **{**patience, **config}))
+        bus = ServoBus(BusConfig(robot.port, **{"silence_s": 1.0, **config}))
         buses.append(bus)
         bus.open()
         bus.handshake(dict.fromkeys(ids))

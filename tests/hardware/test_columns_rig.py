@@ -1,7 +1,6 @@
 """A rig of two legs in memory, with columns and parts: stale commands, soft stops, repeated samples, and the log."""
 
 import math
-import time
 
 import jax
 import numpy as np
@@ -24,16 +23,6 @@ from sim2real.hardware.device import (
 )
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
-from sim2real.log.reader import read_log
-from sim2real.log.writer import McapRecorder
-from sim2real.robots.control_loop.hardware import Excitation, ServoActuator, ServoSensor
-from sim2real.robots.control_loop.loop import control_nodes
-from sim2real.robots.control_loop.messages import Goals
-from sim2real.robots.roles import ROLES
-from sim2real.robots.walking.drive import BodySensor
-from sim2real.runtime.asynchronous import AsyncGraph
-
-pytestmark = pytest.mark.process
 
 N, DAMPING = 2, 3.0
 COLUMNS = (
@@ -76,7 +65,7 @@ class Legs(IdleDevice):
     parts = {"quaternion": ReadingPart("1", (4,), norm=(0.9, 1.1)), "gyro": ReadingPart("rad/s", (3,), -50.0, 50.0)}  # noqa: RUF012
 
     def __init__(self, period_s=0.002):
-        self.period_s, self.begin_s, self.heard = period_s, time.monotonic(), []
+        self.period_s, self.begin_s, self.heard = period_s, 1e-9 * self.clock.now_ns(), []
         self.position, self.speed, self.quaternion = np.array([0.2, -0.1]), np.zeros(N), np.array([1.0, 0, 0, 0])
 
     def without_host(self):
@@ -90,7 +79,7 @@ class Legs(IdleDevice):
 
     def command(self, values):
         self.heard.append(np.array(values))
-        return Transaction(time.monotonic_ns(), 0, 0, 0)
+        return Transaction(self.clock.now_ns(), 0, 0, 0)
 
     def effort(self, command, position_rad):
         q, _, kp, _, tau = command.T
@@ -101,7 +90,7 @@ class Legs(IdleDevice):
         return np.stack([q, 0.0 * q, kp * left, np.full(N, DAMPING), 0.0 * q], axis=-1)
 
     def measure(self):
-        tick = int((time.monotonic() - self.begin_s) / self.period_s)
+        tick = int((1e-9 * self.clock.now_ns() - self.begin_s) / self.period_s)
         q, dq, kp, kd, tau = self.heard[-1].T if self.heard else np.zeros((5, N))
         torque = kp * (q - self.position) + kd * (dq - self.speed) + tau
         self.speed = self.speed + 0.002 * torque / 0.1
@@ -125,10 +114,10 @@ def test_a_stale_command_damps_and_does_not_go_limp():
     device = Legs()
     with Rig(device, gate(command_timeout_s=0.05)) as rig:
         rig.start()
-        rig.command(standing(), 0.0, time.monotonic())
-        end = time.monotonic() + 5.0
-        while rig.timeouts == 0 and time.monotonic() < end:
-            time.sleep(0.01)
+        rig.command(standing(), 0.0, 1e-9 * rig.clock.now_ns())
+        end = 1e-9 * rig.clock.now_ns() + 5.0
+        while rig.timeouts == 0 and 1e-9 * rig.clock.now_ns() < end:
+            rig.clock.sleep(0.01)
         assert rig.timeouts
     np.testing.assert_array_equal(device.heard[-1][:, 1:], np.tile([0.0, 0.0, DAMPING, 0.0], (N, 1)))
 
@@ -137,13 +126,13 @@ def test_a_soft_stop_is_the_device_s_own():
     device = Legs()
     with Rig(device, gate()) as rig:
         rig.start()
-        rig.command(standing(), 0.0, time.monotonic())
+        rig.command(standing(), 0.0, 1e-9 * rig.clock.now_ns())
         rig.ease()
-        end = time.monotonic() + 5.0
-        while not rig.eased and time.monotonic() < end:
-            rig.command(standing(), 0.0, time.monotonic())
+        end = 1e-9 * rig.clock.now_ns() + 5.0
+        while not rig.eased and 1e-9 * rig.clock.now_ns() < end:
+            rig.command(standing(), 0.0, 1e-9 * rig.clock.now_ns())
             rig.measure()
-            time.sleep(0.005)
+            rig.clock.sleep(0.005)
         assert rig.eased
     gains = np.array([sent[:, 2] for sent in device.heard if sent[0, 3] == DAMPING and sent[0, 2] > 0.0])
     assert len(gains) > 3
@@ -165,7 +154,7 @@ def test_a_sample_that_was_read_before_keeps_its_stamp_and_is_not_checked_again(
         assert rig.measure().transaction.t_sent_ns == first.transaction.t_sent_ns
         assert rig.repeats == 1
         # A device that repeats one sample for ever has stopped measuring.
-        time.sleep(0.1)
+        rig.clock.sleep(0.1)
         with pytest.raises(SafetyStop, match="newest measurement"):
             rig.require_fresh()
 
@@ -187,36 +176,3 @@ def test_a_gate_beyond_the_reach_of_a_column_is_refused():
 
 def test_the_reaction_without_a_host_is_a_sentence():
     assert str(Legs().without_host()[0]) == "leg (FR_hip, FL_hip) damps its joint after 0.5 s"
-
-
-def test_the_log_has_every_part_and_every_column_with_its_unit(tmp_path):
-    """The nodes of a robot on hardware, in a graph on the wall clock: what they send is in the log by name."""
-    device, log = Legs(), tmp_path / "log.mcap"
-    body = BodySensor(device.motors, np.zeros(N))
-
-    def controllers(goal):
-        return JointCommands(goal, np.zeros(N), np.full(N, 200.0), np.full(N, 1.0), np.zeros(N))
-
-    with Rig(device, gate()) as rig:
-        sensor = ServoSensor(ROLES.sensor, 50.0, rig, body.read, body.at_rest, delay=0.002)
-        player = Excitation(ROLES.supervisor, 50.0, np.zeros((20, N)), Goals, delay=0.002)
-        actuator = ServoActuator(ROLES.actuator, 50.0, rig, "goal", controllers, delay=0.002)
-        graph = AsyncGraph(control_nodes(sensor, player, actuator), player)
-        state = graph.init(jax.random.key(0), {})
-        graph.warmup(state)
-        inputs = [(name, i) for name, node in graph.nodes.items() for i in node.inputs]
-        units = {name: {**body.units, **UNITS} for name in graph.nodes}
-        graph.recorder = McapRecorder(log, {}, {}, state.aux["outputs"], inputs, {}, units)
-        graph.start(state)
-        graph.run_for(0.4)
-        graph.stop()
-        graph.recorder.close("finished", 0, {})
-    outputs = read_log(log).outputs
-    found = read_log(log).units
-    assert found[ROLES.sensor]["gyro"] == "rad/s"
-    assert UNITS.items() <= found[ROLES.actuator].items()
-    np.testing.assert_allclose(outputs[ROLES.sensor]["gyro"][-1], [0.1, 0.2, 0.3], rtol=1e-6)
-    np.testing.assert_allclose(outputs[ROLES.sensor]["quaternion"][-1], [1.0, 0.0, 0.0, 0.0])
-    # The gate's limit of 100 N m/rad is in the log, and on the motors.
-    np.testing.assert_allclose(outputs[ROLES.actuator]["kp"][-1], [100.0, 100.0])
-    assert any(np.all(sent[:, 2] == 100.0) for sent in device.heard)

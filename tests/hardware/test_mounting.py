@@ -1,6 +1,5 @@
 """Mountings of joints: whatever zero, direction and gear are between joint and motor, joints move and stop the same."""
 
-import time
 from types import MappingProxyType
 
 import numpy as np
@@ -106,9 +105,7 @@ def timeline(device, rows, gate, wanted):
     seen, stopped = [], ""
     with Rig(device, gate, as_joints(rows)) as rig:
         rig.start()
-        end_s = time.monotonic() + 5.0
-        while not device.heard and time.monotonic() < end_s:  # the watchdog sends what is safe, once
-            time.sleep(0.001)
+        rig.clock.sleep(0.001)  # the watchdog sends what is safe, once
         try:
             for step, command in enumerate(wanted):
                 reading = rig.measure()

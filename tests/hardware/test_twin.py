@@ -11,8 +11,6 @@ from sim2real.hardware.emulation.twin import TwinPlant
 from sim2real.hardware.plant import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.process
-
 CENTRE_RAD = 2048 * RAD_PER_COUNT
 FACTORS = {"gain": 0.87, "damping": 0.252 / 0.23, "armature": 1.25, "friction": 1.5}
 

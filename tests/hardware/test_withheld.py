@@ -1,7 +1,5 @@
 """Torque withheld: the rig does all that it does, and the servos get neither torque nor a goal."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -15,8 +13,6 @@ from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 
-pytestmark = pytest.mark.process
-
 START_RAD = np.array([0.5, -0.8, 0.3])
 
 
@@ -26,7 +22,7 @@ def open_rig(start_robot):
 
     def open_(drive, plant, ids, withhold=True, **gate):
         robot = start_robot(plant)
-        bus = BusConfig(robot.port, max_silence_s=1.0, silence_s=1.0)
+        bus = BusConfig(robot.port, silence_s=1.0)
         rigs.append(Rig(DynamixelServos(bus, ids, drive), GateConfig(command_timeout_s=0.1, **gate)))
         if withhold:
             rigs[-1].withhold_torque()
@@ -51,9 +47,9 @@ def test_positions_start_where_the_joints_are_and_pass_the_gate(open_rig):
     rig, robot = open_rig(drive, "Joints", (1, 2, 3), limit=1.0, slew_per_s=2.0, stale="hold")
     rig.start()
     assert rig.gate.fallback == pytest.approx(START_RAD, abs=reg.RAD_PER_COUNT)
-    time.sleep(0.6)  # the looks for servos that have lost their settings must find them as they should be
+    rig.clock.sleep(0.6)  # the looks for servos that have lost their settings must find them as they should be
     rig.measure()
-    begin = time.monotonic()
+    begin = 1e-9 * rig.clock.now_ns()
     sent = [rig.command(np.array([0.5, -3.0, 0.3]), 0.0, begin + 0.02 * k) for k in range(20)]
     rig.measure()
     np.testing.assert_allclose(sent[-1], [0.5, -1.0, 0.3], atol=1e-2)
@@ -73,9 +69,9 @@ def test_a_motor_that_is_not_pushed_may_stand_still(open_rig):
     rig, robot = open_rig(VoltageDrive(5.0), "FirstOrder", (1,), limit=4.0, stuck_s=0.05)
     rig.start()
     for k in range(40):
-        assert rig.command(np.array([4.0 if k % 20 < 10 else -4.0]), 0.0, time.monotonic()).tolist()[0] != 0.0
+        assert rig.command(np.array([4.0 if k % 20 < 10 else -4.0]), 0.0, 1e-9 * rig.clock.now_ns()).tolist()[0] != 0.0
         rig.measure()
-        time.sleep(0.01)
+        rig.clock.sleep(0.01)
     assert rig.suspects == []
     assert rig.measure().velocity_rad_s[0] == 0.0
     rig.stop()
@@ -85,8 +81,8 @@ def test_a_motor_that_is_not_pushed_may_stand_still(open_rig):
 def test_a_policy_that_hangs_gets_the_same_answer(open_rig):
     rig, robot = open_rig(VoltageDrive(5.0), "FirstOrder", (1,), limit=4.0)
     rig.start()
-    rig.command(np.array([2.0]), 0.0, time.monotonic())
-    time.sleep(0.3)
+    rig.command(np.array([2.0]), 0.0, 1e-9 * rig.clock.now_ns())
+    rig.clock.sleep(0.3)
     assert rig.timeouts >= 1
     rig.stop()
     assert_untouched(robot, reg.GOAL_PWM, rig.device, (1,))
@@ -100,7 +96,7 @@ def test_the_guardian_watches_as_well(start_robot, open_bus):
     bus.withhold_torque()
     bus.torque(True)
     assert bus.guardian_pid is not None
-    time.sleep(0.6)
+    robot.stall(0.6)
     with pytest.raises(SafetyStop, match="the guardian has taken the torque off"):
         bus.read_state()
     assert robot.truth().of(Kind.EFFECT).size == 0

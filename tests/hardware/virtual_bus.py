@@ -1,11 +1,10 @@
-import subprocess
-import sys
-import time
+from functools import cached_property
 from pathlib import Path
 
 from sim2real.hardware.device import Device
 from sim2real.hardware.emulation.emulated_bus import truth_header
 from sim2real.hardware.emulation.truth import TruthLog, read_truth
+from sim2real.hardware.emulation.virtual import VirtualTime
 from sim2real.hardware.plant import load_plant
 
 PLANTS = Path(__file__).parent / "plants.py"
@@ -48,20 +47,24 @@ class VirtualBus:
         return read_truth(self._path)
 
 
-def kill_when_ready(code):
-    """Run a host that prints "ready", kill it 0.3 s later, and return when [ns], 0.25 s after that."""
-    host = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert host.stdout.readline() == "ready\n"
-    time.sleep(0.3)
-    killed_ns = time.monotonic_ns()
-    host.kill()
-    host.wait()
-    time.sleep(0.25)
-    return killed_ns
+class IdleTime(VirtualTime):
+    """Virtual time in which nothing happens by itself."""
+
+    def __init__(self):
+        super().__init__(None)
+
+    def _next_ns(self):
+        return None
+
+    def _advance(self, t_ns): ...
 
 
 class IdleDevice(Device):
-    """A device without hardware: opening, torque and checks do nothing."""
+    """A device without hardware, in virtual time: opening, torque and checks do nothing."""
+
+    @cached_property
+    def clock(self):
+        return IdleTime()
 
     def open(self): ...
     def close(self): ...

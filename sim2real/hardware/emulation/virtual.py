@@ -67,8 +67,12 @@ class VirtualTime(ABC):
         """Let the host's process die: its connections to the robot and to the guardian are closed."""
         self.host_lives = False
         self._watchers.clear()
-        if self._guard is not None:
-            self._guard.hear(b"")
+        self.guardian_hears(b"")
+
+    def guardian_hears(self, messages: bytes) -> None:
+        """Pass messages of the host to the guardian, which acts on them at once; none: the host has died."""
+        if self._guard is not None and self.guardian_works:
+            self._guard_acts(lambda guard: guard.hear(messages))
 
     def stop(self) -> None:
         """End the robot, after which its truth is complete. May be called twice."""
@@ -120,9 +124,18 @@ class VirtualTime(ABC):
             self._advance(self._now_ns)
             guard_ns = self._guard_due_ns()
             if self._guard is not None and guard_ns is not None and guard_ns <= self._now_ns:
-                self._guard.look()
+                self._guard_acts(lambda guard: guard.look())
             if self._now_ns >= until_ns:
                 return
+
+    def _guard_acts(self, act: Callable[[Guard], object]) -> None:
+        """Let the guardian do one thing; it hears and sees nothing else until that is done, though time passes."""
+        guard, self._guard = self._guard, None
+        assert guard is not None
+        try:
+            act(guard)
+        finally:
+            self._guard = guard
 
     def _guard_due_ns(self) -> int | None:
         due_s = None if self._guard is None or not self.guardian_works else self._guard.due_s()
@@ -136,7 +149,7 @@ class VirtualChannel:
 
     def __init__(self, robot: VirtualTime, guard: Guard, longest_s: float) -> None:
         self.clock: Clock = robot
-        self._robot, self._guard, self._messages = robot, guard, b""
+        self._robot, self._messages = robot, b""
         robot.watch(guard)
         guard.begin(longest_s, self._say, robot.reports.append)
 
@@ -145,8 +158,7 @@ class VirtualChannel:
 
     def send(self, message: bytes) -> None:
         """Send a message, at which the guardian acts at once."""
-        if self._robot.guardian_works:
-            self._guard.hear(message)
+        self._robot.guardian_hears(message)
 
     def receive(self, until_ns: int) -> bytes | None:
         """Return messages; None if there are none: the guardian answers at once, or never."""
@@ -160,8 +172,8 @@ class VirtualChannel:
 
     def close(self, wait_s: float) -> None:
         """Close the connection."""
-        if not wait_s and self._robot.guardian_works:  # the host leaves without a word: as if it had died
-            self._guard.hear(b"")
+        if not wait_s:  # the host leaves without a word: as if it had died
+            self._robot.guardian_hears(b"")
         self._robot.watch(None)
 
 

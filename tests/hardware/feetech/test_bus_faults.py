@@ -5,11 +5,9 @@ import pytest
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.emulation import EmulatedBus, EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import OperatingMode
-
-pytestmark = pytest.mark.process
 
 
 def answer_twice(robot, servo_id, place, join):
@@ -50,11 +48,10 @@ def test_a_late_answer_is_no_second_servo(serve, connect):
         connect(serve(config=StsEmulation(return_delay_us=0, seed=seed, late=0.3, late_s=0.012))).close()
 
 
-def test_dynamixels_too(serve, monkeypatch):
-    monkeypatch.setattr("sts_bench.StsBus", EmulatedBus)
+def test_dynamixels_too(serve):
     robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
     answer_twice(robot, 1, 4, one_after_the_other)
-    with ServoBus(BusConfig(robot.port, max_silence_s=1.0)) as bus:
+    with ServoBus(BusConfig(robot.port)) as bus:
         assert bus.handshake({2: None}) == {2: 1060}
         with pytest.raises(HardwareLost, match=r"two servos on .* have the id 1: both answer, and both would obey"):
             bus.handshake({1: None})
@@ -64,11 +61,10 @@ ALARMS = {"input voltage": 0, "overheating": 2, "motor encoder": 3, "electrical 
 
 
 @pytest.mark.parametrize("bit", ALARMS.values(), ids=ALARMS)
-def test_an_alarm_in_motion_is_named_and_torque_ends_off(serve, monkeypatch, bit):
+def test_an_alarm_in_motion_is_named_and_torque_ends_off(serve, bit):
     """As when the supply breaks down under load."""
-    monkeypatch.setattr("sts_bench.StsBus", EmulatedBus)
     robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
-    with ServoBus(BusConfig(robot.port, max_silence_s=1.0, silence_s=1.0)) as bus:
+    with ServoBus(BusConfig(robot.port, silence_s=1.0)) as bus:
         bus.handshake({1: None, 2: None})
         bus.setup(OperatingMode.PWM)
         bus.torque(True)

@@ -1,16 +1,13 @@
 """What the device does with servos that behave, and what it refuses."""
 
 import math
-import time
 
 import numpy as np
 import pytest
-from plants import lateness_s, mean_latencies
-from sts_bench import IDS, PLANTS
+from sts_bench import IDS
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
@@ -20,8 +17,6 @@ from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.registry import load_device
 
-pytestmark = pytest.mark.process
-
 
 def test_it_moves_and_measures(serve, connect):
     robot = serve()
@@ -30,10 +25,10 @@ def test_it_moves_and_measures(serve, connect):
     assert device.rest() == pytest.approx([0.5, -0.8, 0.3], abs=reg.RAD_PER_COUNT)
     goal = device.rest() + np.array([0.2, 0.1, -0.1])
     for _ in range(60):
-        before_ns = time.monotonic_ns()
+        before_ns = device.clock.now_ns()
         device.command(goal)
         reading = device.measure()
-        time.sleep(0.01)
+        device.clock.sleep(0.01)
     assert reading.position_rad == pytest.approx(goal, abs=0.02)
     asked = reading.transaction
     assert before_ns <= asked.t_sent_ns <= before_ns + 10**9
@@ -60,7 +55,7 @@ def test_facts_for_a_log_are_those_of_the_registers(serve, connect):
 def test_one_servo_confirms_its_goals(serve, connect):
     device = connect(serve(ids=[4], start_rad=[0.0]), ids=(4,))
     device.enable()
-    assert device.command(np.array([0.01])).transfer_ns > 10_000 * (9 + 6)
+    assert device.command(np.array([0.01])).transfer_ns == 10_000 * (9 + 6)
 
 
 def test_settings_are_read_back_and_nothing_is_made_permanent(serve, connect):
@@ -87,30 +82,6 @@ def test_speeds_of_servos_with_the_other_unit(serve, connect):
     device = connect(robot, ids=(1,), drive=StsDrive(speed_rad_s=3.0))
     assert device.measure().velocity_rad_s == pytest.approx([1.0], abs=0.04)
     assert robot.bus.servos[1].get(reg.GOAL_SPEED) == 39  # of 0.732 rpm
-
-
-def test_a_dry_run_moves_nothing(serve, connect):
-    robot = serve()
-    device = connect(robot)
-    device.withhold_torque()
-    device.enable()
-    assert device.torque_withheld
-    assert device.rest() == pytest.approx([0.5, -0.8, 0.3], abs=reg.RAD_PER_COUNT)
-    for _ in range(5):
-        device.command(device.rest() + 0.3)
-        device.measure()
-    device.check()
-    device.disable()
-    assert device.counters.withheld >= 11
-    device.close()
-    assert np.all(robot.truth().of(Kind.EFFECT)["values"][:, 0] == OperatingMode.OFF)
-
-
-def test_torque_that_is_on_cannot_be_withheld(serve, connect):
-    device = connect(serve())
-    device.enable()
-    with pytest.raises(UsageError, match="cannot be withheld"):
-        device.withhold_torque()
 
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf, 3.2, -0.6])
@@ -197,27 +168,6 @@ def test_servos_that_answer_reads_only_are_told_to_answer_all(serve, connect):
     device = connect(robot)
     device.enable()
     device.check()
-
-
-def test_the_emulator_as_a_process_keeps_its_latencies(tmp_path, connect):
-    """The robot that stages get; the position tells when it was sampled, 0.4 ms a count."""
-    config = StsEmulation(sensing_latency_s=0.004, actuation_latency_s=0.006)
-    plant = {"ids": [1, 2], "speed_rad_s": 4.0}
-    with EmbeddedRobot(f"{PLANTS}:Ramp", config, plant, tmp_path / "truth.bin") as robot:
-        device = connect(robot, joints=[Joint("a", 1, zero_count=0), Joint("b", 2, zero_count=0)])
-        readings = [device.measure() for _ in range(30)]
-        device.enable()
-        device.command(device.rest())
-        device.close()
-        time.sleep(0.02)
-        robot.stop()
-        truth = robot.truth()
-    means = mean_latencies(truth)
-    assert means["actuation_s"] == pytest.approx(0.0062, abs=0.0005)
-    assert means["sensing_s"] == pytest.approx(0.0043 + lateness_s(truth).mean(), abs=0.0005)
-    sent_s = 1e-9 * np.array([r.transaction.t_sent_ns - truth.header["start_ns"] for r in readings])
-    sampled_s = np.array([r.position_rad for r in readings]) / 4.0
-    assert np.median(sent_s[:, None] - sampled_s) == pytest.approx(0.004 - 0.0001, abs=0.001)
 
 
 def test_servos_by_the_devices_name(serve):
