@@ -6,12 +6,17 @@ import subprocess
 import sys
 import textwrap
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 
+from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.hardware.emulation.truth import read_truth
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
+PLANTS = Path(__file__).parents[1] / "hardware" / "plants.py"
 FAULTY = """
 import time
 from dataclasses import replace
@@ -115,3 +120,38 @@ def start_cli():
     for process in processes:
         process.kill()
         process.communicate()
+
+
+@pytest.fixture
+def start_robot(tmp_path):
+    """Start emulated servos in a process of their own; stopped at the end of the test."""
+    robots = []
+
+    def start(plant="FirstOrder", config=None, **plant_args):
+        path = tmp_path / f"truth{len(robots)}.bin"
+        robots.append(EmbeddedRobot(f"{PLANTS}:{plant}", config or EmulatorConfig(), plant_args, path))
+        return robots[-1]
+
+    yield start
+    for robot in robots:
+        robot.stop()
+
+
+@pytest.fixture
+def open_bus():
+    """Open a bus to a robot and shake hands with the servos given; patient, for the machine may be busy."""
+    buses = []
+
+    def open_(robot, ids=(1,), mode=None, **config):
+        bus = ServoBus(BusConfig(robot.port, **{"max_silence_s": 1.0, "silence_s": 1.0, **config}))
+        buses.append(bus)
+        bus.open()
+        bus.handshake(dict.fromkeys(ids))
+        if mode is not None:
+            bus.setup(mode)
+            bus.torque(True)
+        return bus
+
+    yield open_
+    for bus in buses:
+        bus.close()

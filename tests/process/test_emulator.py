@@ -26,7 +26,7 @@ from sim2real.hardware.plant import load_plant
 
 pytestmark = pytest.mark.process
 
-PLANTS = Path(__file__).parent / "plants.py"
+PLANTS = Path(__file__).parents[1] / "hardware" / "plants.py"
 OK = 0
 
 
