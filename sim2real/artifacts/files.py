@@ -1,5 +1,7 @@
 """JSON and array files of artifacts, read into typed dataclasses, with errors that name the file."""
 
+from __future__ import annotations
+
 import dataclasses
 import math
 import os
@@ -9,13 +11,18 @@ from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, BinaryIO, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
-import numpy as np
 
 from sim2real.errors import Sim2RealError
+from sim2real.later import Later
 from sim2real.types import Json
+
+if TYPE_CHECKING:
+    import numpy as np
+else:
+    np = Later("numpy")  # a manifest, which `--help` of a stage reads, has no arrays
 
 T = TypeVar("T")
 
@@ -145,7 +152,7 @@ def _numbers(kind: Any, value: Json) -> Json:
             hints = get_type_hints(kind)
             return {name: _numbers(hints.get(name), v) for name, v in value.items()}
         return {name: _numbers(inner[-1] if inner else None, v) for name, v in value.items()}
-    if isinstance(value, list) and inner and kind is not np.ndarray:
+    if isinstance(value, list) and inner:
         kinds = [inner[0]] * len(value) if len(inner) == 1 or inner[-1] is Ellipsis else inner
         return [_numbers(k, v) for k, v in zip(kinds, value, strict=False)] + value[len(kinds) :]
     return value
