@@ -19,6 +19,7 @@ PROCESS := $(PYTEST) -m "process and not night"
 test: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/lint-imports --no-cache --no-logo
 	$(BIN)/pyright
 	$(PYTEST) -m "not process and not night" --numprocesses 2 --dist loadfile
 	$(PROCESS) || $(PROCESS) --last-failed --last-failed-no-failures none

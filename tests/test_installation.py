@@ -1,5 +1,6 @@
 """The two distributions: one at a time, the same packages of the same versions, and numbers drawn without JAX."""
 
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -24,6 +25,15 @@ def test_the_light_distribution_asks_for_packages_of_the_whole_one():
     assert light["requires-python"] == whole["requires-python"]
     extras = light["optional-dependencies"]
     assert extras.items() <= whole["optional-dependencies"].items()
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="only a checkout knows which files git ignores")
+def test_the_source_distribution_holds_every_file_of_the_checkout():
+    """So it can run `make test`: without a list of its own, it has every file that git does not ignore."""
+    targets = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]["targets"]
+    assert "sdist" not in targets
+    ignored = ["git", "ls-files", "--cached", "--ignored", "--exclude-standard"]
+    assert subprocess.run(ignored, cwd=ROOT, capture_output=True, text=True, check=True).stdout == ""
 
 
 def test_two_distributions_in_one_folder_are_refused(tmp_path):

@@ -85,15 +85,15 @@ class RecordedRobot(Identified, Protocol):
     if TYPE_CHECKING:  # Each is an attribute or a property.
 
         @property
-        def units(self) -> Mapping[str, str]: ...  # noqa: D102
+        def units(self) -> Mapping[str, str]: ...
         @property
-        def roles(self) -> Roles: ...  # noqa: D102
+        def roles(self) -> Roles: ...
         @property
-        def profile_rad_s(self) -> float: ...  # noqa: D102
+        def profile_rad_s(self) -> float: ...
         @property
-        def export_lead_s(self) -> float: ...  # noqa: D102
+        def export_lead_s(self) -> float: ...
         @property
-        def causes(self) -> Mapping[str, Mapping[str, float]]: ...  # noqa: D102
+        def causes(self) -> Mapping[str, Mapping[str, float]]: ...
     else:
         units: Mapping[str, str]
         roles, profile_rad_s, export_lead_s, causes = ROLES, math.inf, 0.0, MappingProxyType({})

@@ -18,7 +18,6 @@ from sim2real.hardware.plant import OperatingMode
 pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
 
 TESTS = Path(__file__).parents[1]
-PAGE = TESTS.parent / "docs" / "tutorial_device.md"
 IDENTIFY = """
 from dataclasses import replace
 from pathlib import Path
@@ -110,17 +109,3 @@ def test_it_is_identified_in_a_world_of_its_own(call, log):
     loop = by_name["loop"]
     assert (loop.truth, loop.nominal) == (20.0, 25.0)
     assert loop.estimate == pytest.approx(loop.truth, rel=0.1)
-
-
-def test_the_page_has_the_files_that_are_installed(site):
-    """In their order, whole; a long one is cut into blocks, with words between."""
-    blocks = re.findall(r"^```(?:python|toml)\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
-    page = _lines("".join(blocks))
-    files = ["pyproject.toml", "turntable/odrive.py", "turntable/odrive_emulation.py", "turntable/plant.py"]
-    files += ["test_odrive.py", "turntable/__init__.py", "turntable/robot.py", "turntable/oiled.py"]
-    assert page == _lines("".join((TESTS / "plugin" / name).read_text() for name in files))
-    assert {p.name for p in (site / "turntable").glob("*.py")} == {Path(f).name for f in files if "/" in f}
-
-
-def _lines(text):
-    return [line for line in text.splitlines() if line]

@@ -33,11 +33,11 @@ class Emulated(Protocol):
     if TYPE_CHECKING:
 
         @property
-        def seed(self) -> int: ...  # noqa: D102
+        def seed(self) -> int: ...
         @property
-        def actuation_latency_s(self) -> float: ...  # noqa: D102
+        def actuation_latency_s(self) -> float: ...
         @property
-        def actuation_jitter_s(self) -> float: ...  # noqa: D102
+        def actuation_jitter_s(self) -> float: ...
 
 
 class EmbeddedRobot:

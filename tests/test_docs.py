@@ -1,0 +1,213 @@
+"""The pages: their Python runs, their command lines have flags that exist, their links and names lead somewhere."""
+
+import ast
+import contextlib
+import functools
+import importlib
+import importlib.util
+import io
+import itertools
+import re
+import shlex
+import textwrap
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from sim2real import cli
+from sim2real.commands.table import COMMANDS
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+NIGHT, PROCESS = pytest.mark.night, pytest.mark.process
+OPTIONAL = {"stable_baselines3"}
+"""Packages that no extra brings: their blocks are left out where they are not installed."""
+GROUPS = {"sim2real.pipelines", "sim2real.devices", "sim2real.worlds"}
+"""Groups of entry points, which are named like modules."""
+
+# -- Python
+
+
+def python_of(page: str) -> list[str]:
+    """Return the blocks of Python of a page, or of a module's docstring, where they are indented behind ``::``."""
+    if not page.endswith(".md"):
+        blocks = re.findall(r"::\n\n((?:    .*\n|\n)+)", importlib.import_module(page).__doc__ or "")
+        return [textwrap.dedent(block) for block in blocks]
+    return re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
+
+
+MARKS = {
+    "docs/graph.md": [PROCESS],
+    "docs/guides/compose.md": [NIGHT],
+    "docs/guides/interop.md": [NIGHT],
+    "docs/guides/notebook.md": [NIGHT, PROCESS],
+    "docs/reference/runs.md": [NIGHT],
+    "docs/tutorial.md": [NIGHT, PROCESS],
+    "sim2real.identify": [NIGHT],
+    "sim2real.runtime": [NIGHT, PROCESS],
+}
+TINY_FIT = '{"generations": 2, "population": 8, "refine": 1, "refine_steps": 3, "folds": 0, "free_run_s": 0.0}'
+TINY_PPO = '{"episode_s": 2.0, "timelines": 4, "ppo": {"total_steps": 512, "num_envs": 16, "minibatches": 2}}'
+SMALLER = {
+    "docs/guides/interop.md": {"1_000_000": "64", "num_envs=64": "num_envs=2", "num_envs=128": "num_envs=2"},
+    "docs/guides/notebook.md": {'"generations": 10': '"generations": 2'},
+    "docs/reference/runs.md": {
+        ", recording)": f", recording, {TINY_FIT})",
+        ", identification)": f", identification, {TINY_PPO})",
+    },
+    "sim2real.identify": {"FitConfig()": "FitConfig(population=8, generations=2, refine=1, refine_steps=3)"},
+}
+"""Page -> what it computes -> what is computed here instead."""
+FILES = {"docs/tutorial.md": ("pipelines/head/__init__.py", "pipelines/head/robot.py")}
+"""Pages whose first blocks are files."""
+TRUE = {
+    "docs/graph.md": [
+        "abs(nodes['agent'].phase - 0.003) < 1e-9 and abs(nodes['actuator'].phase - 0.007) < 1e-9",
+        "abs(statistics.age_s['sensor'].p99 - 0.001) < 1e-9",
+        "(Actuator.sent[0], Actuator.sent[-1]) == ('torque on', 'torque off') and len(Actuator.sent) > 5",
+        "heights[0] < -0.5 and heights.max() > 0.9",  # pushing in the direction of motion swings it up
+        "abs(float(estimate.parameters['mass']) / 0.0509 - 1.0) < 0.1 and estimate.loss < 0.1 * estimate.start",
+    ],
+    "docs/guides/compose.md": ["arm.joints[0].full_identifier == 'arm/shoulder'"],
+    "docs/guides/import.md": ["len(episode.outputs['sensor']['th']) == len(episode.steps['sensor'].start) == 20_000"],
+    "docs/guides/interop.md": ["robot.length == 249"],
+    "docs/guides/robot_computer.md": [
+        "abs(features(Measurement(3.141592653589793)) - [-1.0, 0.0]).max() < 1e-6",
+        "abs(reward(Measurement(3.141592653589793)) + 1.0) < 1e-6",
+    ],
+    "docs/tutorial.md": ["test_the_head_is_a_robot(folder) is None"],
+    "sim2real.identify": ["judgement.status and (spread.low <= spread.high).all()"],
+    "sim2real.runtime": ["abs(float(simulated) - float(of_first_episode)) < 1e-6 and of_all_episodes.shape == (4,)"],
+}
+"""Page -> what its text says about the names that its blocks leave behind."""
+
+
+def optional(block: str) -> set[str]:
+    """Return the optional packages that a block imports and that are not installed."""
+    imported = (n.module or "" for n in ast.walk(ast.parse(block)) if isinstance(n, ast.ImportFrom))
+    packages = {name.split(".")[0] for name in imported}
+    return {name for name in packages & OPTIONAL if not importlib.util.find_spec(name)}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=MARKS.get(page, []))
+        for page in [*(p.relative_to(ROOT).as_posix() for p in PAGES), "sim2real.identify", "sim2real.runtime"]
+        if python_of(page)
+    ],
+)
+def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request):
+    blocks = [(i, block) for i, block in enumerate(python_of(page), start=1) if not optional(block)]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(jax, "device_put_replicated", None, raising=False)  # interop.md defines it, for all of JAX
+    (tmp_path / "datasets").symlink_to(ROOT / "datasets")
+    if page == "docs/guides/import.md":
+        (tmp_path / "pipelines").symlink_to(ROOT / "pipelines")
+        np.savez(tmp_path / "disk_fit.npz", u=np.zeros(20_001), th=np.linspace(0.0, 1.0, 20_001))
+    for file, (_, text) in zip(FILES.get(page, ()), list(blocks), strict=False):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(text)
+        del blocks[0]
+    names = {"__name__": "page", "folder": tmp_path}
+    for number, block in blocks:
+        for large, small in SMALLER.get(page, {}).items():
+            block = block.replace(large, small)
+        if "runs/pendulum/TIME" in block or '"session.mcap"' in block:
+            run = request.getfixturevalue("finished_run_dir")
+            block = block.replace("runs/pendulum/TIME", str(run))
+            block = block.replace('"session.mcap"', repr(str(run / "record" / "session.mcap")))
+        exec(compile(block, f"{page}, block {number}", "exec"), names)
+    assert [claim for claim in TRUE.get(page, ()) if not eval(claim, names)] == []
+
+
+def test_the_pictures_of_the_timing_rules_show_what_the_schedule_computes():
+    """Compared by their data, which each picture holds."""
+    spec = importlib.util.spec_from_file_location("draw_timing", ROOT / "docs" / "draw_timing.py")
+    drawing = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(drawing)
+    cases = dict(drawing.cases())
+    shown = {path.stem: drawing.described(path) for path in (ROOT / "docs" / "timing").glob("*.svg")}
+    assert shown == cases, "run `python docs/draw_timing.py`"
+    assert {name[0] for name in cases} == set("1234567"), "a picture for each rule"
+
+
+# -- command lines
+
+LINE = re.compile(r"^(?: *\w*\$ |    )(?:\w+=\S+ )?(sim2real [a-z]+(?: .*)?)$|`(sim2real [a-z][^`]*)`", re.MULTILINE)
+
+
+@functools.cache
+def help_of(*words: str) -> str:
+    """Return the help of a command with these arguments before ``--help``; empty if they are no command."""
+    text = ""
+    for flag in ("--help", "--help-all"):
+        with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()):
+            text += out.getvalue() if cli.main([*words, flag]) == 0 else ""
+    return text
+
+
+def unknown_flags(line: str) -> list[str]:
+    """Return the flags in a command line that the help of its command does not list."""
+    words = shlex.split(re.split(r"&&|;|\|", line)[0], comments=True)
+    flags = [word.split("=")[0] for word in words if word.startswith("--") and word not in ("--help", "--mjcf")]
+    command, *names = itertools.takewhile(lambda word: not word.startswith("-"), words[1:])
+    names = [*names[:1], *(["--mjcf", "robot.xml"] if "--mjcf" in words else [])]
+    text = help_of(command) + help_of(command, *names) if flags else ""
+    return [flag for flag in flags if not re.search(rf"{flag}(?![\w-])", text)]
+
+
+def test_command_lines_of_pages_have_flags_that_exist():
+    found = [(page.name, m) for page in PAGES for m in LINE.findall(page.read_text().replace("\\\n", " "))]
+    lines = {(page, " ".join((quoted or inline).split())) for page, (quoted, inline) in found}
+    wrong = {key: flags for key in lines if key[1].split()[1] in COMMANDS if (flags := unknown_flags(key[1]))}
+    assert wrong == {}
+    assert {key for key in lines if key[1].split()[1] not in COMMANDS} == set(), "commands that do not exist"
+    assert unknown_flags("sim2real train pendulum --seed 1 --sead 2  # --none") == ["--sead"]
+
+
+# -- links and names
+
+
+def without_code(text: str) -> str:
+    """Return a page without its blocks of code."""
+    return re.sub(r"^(`{3,}).*?^\1$", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as MyST and GitHub make them."""
+    headings = re.findall(r"^#+ (.+)$", without_code(page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_and_paths_of_a_page_lead_to_files_and_headings(page):
+    text = without_code(page.read_text())
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        name, _, anchor = target.partition("#")
+        path = page.parent / name if name else page
+        if not target.startswith("https://"):
+            assert path.exists(), target
+            assert not anchor or path.suffix != ".md" or anchor in anchors(path), target
+    if not page.stem.startswith("tutorial"):  # they name the reader's files
+        paths = re.findall(r"`((?:sim2real|pipelines|scripts|tests|datasets|reports)/[\w/.*-]+\.\w+)`", text)
+        assert [path for path in paths if not list(ROOT.glob(path))] == []
+
+
+def test_names_of_modules_classes_and_functions_on_pages_exist():
+    names = {m[0]: p.name for p in PAGES for m in re.finditer(r"\bsim2real(?:\.[A-Za-z_]\w*)+", p.read_text())}
+    assert [(page, name) for name, page in names.items() if name not in GROUPS and not exists(name)] == []
+    assert not exists("sim2real.graph.no_such_module")
+
+
+def exists(name: str) -> bool:
+    """Return whether a dotted name is a module, or a name in one."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        path = ROOT.joinpath(*parts[:length])
+        if path.with_suffix(".py").is_file() or (path / "__init__.py").is_file():
+            value = importlib.import_module(".".join(parts[:length]))
+            return functools.reduce(lambda at, part: getattr(at, part, None), parts[length:], value) is not None
+    return False
