@@ -27,10 +27,10 @@ def test_what_takes_too_much_is_refused_at_once(tmp_path, name, door):
     head = '<!DOCTYPE r [<!ENTITY x "y">]>' if name == "entities" else ""
     text = f"{head}<mujoco>{beside}{BODY % inside}</mujoco>"
     (tmp_path / "model.xml").write_text(text)
-    begun_s = time.perf_counter()
+    begun_s = time.process_time()
     with pytest.raises(UsageError, match=reason):
         mjcf.from_xml_string(text) if door == "string" else mjcf.from_path(tmp_path / "model.xml")
-    assert time.perf_counter() - begun_s < 5.0
+    assert time.process_time() - begun_s < 5.0
 
 
 @pytest.mark.night

