@@ -58,7 +58,9 @@ def test_a_training_streams_its_curves_and_a_viewer_joins_it(run_copy, tmp_path)
     assert (run_copy / "train.2" / "progress.jsonl").is_file(), "a viewer joins a training that has none"
 
 
-@pytest.mark.parametrize("follow", [True, pytest.param(False, marks=pytest.mark.night)])
+@pytest.mark.process
+@pytest.mark.night
+@pytest.mark.parametrize("follow", [True, False])
 def test_a_run_is_served_to_browsers_until_ctrl_c(run_copy, follow):
     command = [sys.executable, "-m", "sim2real.cli", "view", str(run_copy), "--web", *(["--follow"] if follow else [])]
     environment = {**os.environ, "RERUN_ANALYTICS_ENABLED": "0"}
