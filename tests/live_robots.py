@@ -10,7 +10,7 @@ from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
 
 TINY = [
-    *("--identify.generations=10", "--identify.population=8", "--identify.refine=1", "--identify.folds=0"),
+    *("--identify.generations=10", "--identify.population=8", "--identify.folds=0"),
     *("--train.episode-s=2", "--train.timelines=4", "--train.force", "--train.no-sensitivity"),
     *("--train.ppo.total-steps=512", "--train.ppo.num-envs=16", "--train.ppo.minibatches=2"),
     *("--train.ppo.evaluations=1", "--deploy.episodes=1", "--deploy.duration-s=2"),

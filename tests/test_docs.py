@@ -57,7 +57,7 @@ SMALLER = {
         ", recording)": f", recording, {TINY_FIT})",
         ", identification)": f", identification, {TINY_PPO})",
     },
-    "sim2real.identify": {"FitConfig()": "FitConfig(population=8, generations=2, refine=1, refine_steps=3)"},
+    "sim2real.identify": {"FitConfig()": "FitConfig(population=8, generations=2, refine_steps=3)"},
 }
 """Page -> what it computes -> what is computed here instead."""
 FILES = {"docs/tutorial.md": ("pipelines/head/__init__.py", "pipelines/head/robot.py")}

@@ -21,7 +21,6 @@ PIPELINE = Pipeline(
         jacobian="finite",
         population=24,
         generations=12,
-        refine=1,
         refine_steps=10,
         max_delay_s=0.04,
         free_run_s=0.0,

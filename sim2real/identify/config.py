@@ -28,16 +28,10 @@ class FitConfig:
     """Candidates a generation."""
     generations: int = 80
     """Most generations of a run; 0 skips the search and refines from the nominal values."""
-    restarts: int = 0
-    """Further runs of the search (BIPOP): in turn with a doubled population, and from a random place."""
     std: float = 0.7
     """Spread of the first generation; 1 covers about half of the bounds' width."""
-    batch: int = 0
-    """Random segments on which each generation's candidates are compared; 0 means all."""
-    refine: int = 3
-    """Number of best candidates that Levenberg-Marquardt refines; 0 skips the refinement."""
     refine_steps: int = 25
-    """Largest number of steps of Levenberg-Marquardt in a round; there are up to three rounds."""
+    """Largest number of steps of Levenberg-Marquardt in a round, of which there are up to four; 0 skips them."""
     long_s: float | None = 0.0
     """Length of the segments of a last refinement [s]; 0, or logs shorter than two of them, skip it. None: 5 s if no
     goals of positions are commanded, as errors of a force add up in a free run, else 0."""
@@ -48,8 +42,6 @@ class FitConfig:
     difference: float = 3e-3
     """Step of finite differences; 1 is about a quarter of the bounds' width. Large steps smooth the kinks of
     friction."""
-    devices: int = 1
-    """Number of this host's devices that a generation's candidates are divided among; for the compiled engine."""
     seed: int = 0
     """Seed of the search."""
 
@@ -57,25 +49,20 @@ class FitConfig:
         """Check the values before a log is read."""
         if not 0.0 < self.max_delay_s <= 1.0:
             raise UsageError(f"max_delay_s must lie in (0, 1] s, got {self.max_delay_s}")
-        if self.population < 4 or self.generations < 0 or self.restarts < 0:
+        if self.population < 4 or self.generations < 0:
             raise UsageError(
-                "the search needs a population of 4 at least, and no negative numbers of generations and restarts, got "
-                f"{self.population}, {self.generations} and {self.restarts}"
+                "the search needs a population of 4 at least, and no negative number of generations, got "
+                f"{self.population} and {self.generations}"
             )
-        if self.generations == 0 and self.refine == 0:
-            raise UsageError("generations and refine are both 0: no parameter would be identified")
+        if self.generations == 0 and self.refine_steps == 0:
+            raise UsageError("generations and refine_steps are both 0: no parameter would be identified")
         if not 1e-4 <= self.difference <= 1.0:
             raise UsageError(f"difference must lie in [0.0001, 1], got {self.difference}")
         if not (self.reach > 0.0 and self.std > 0.0):
             raise UsageError(f"reach and std must be above 0, got {self.reach} and {self.std}")
         if not 0.0 <= self.skip_s <= 10.0:
             raise UsageError(f"skip_s must lie in [0, 10] s, got {self.skip_s}")
-        if min(self.batch, self.refine, self.refine_steps, self.long_s or 0.0) < 0:
-            raise UsageError("batch, refine, refine_steps and long_s must not be negative")
-        if self.devices < 1 or self.population % self.devices:
-            raise UsageError(
-                f"devices must be 1 at least and divide the population of {self.population}, got {self.devices}",
-                hint=f"make population a multiple of {self.devices}" if self.devices > 1 else None,
-            )
+        if min(self.refine_steps, self.long_s or 0.0) < 0:
+            raise UsageError("refine_steps and long_s must not be negative")
         if not 0 <= self.seed < 2**31:
             raise UsageError(f"seed must lie in [0, 2**31), got {self.seed}")

@@ -117,16 +117,16 @@ def fit(
     # Refine from the nominal values, too, with short and with long delays: a delay may imitate an inertia.
     starts, result = problem.table.starts() if end is None else end[None], None
     z, loss = starts[0], float("nan")
-    # Search globally; its best candidates are further starts of the refinement.
+    # Search globally; its best candidate is a further start of the refinement.
     if config.generations and end is None:
         result = run_search(problem, starts[0], report)
-        starts = np.stack([*result.finalists[: config.refine], starts[0]])
+        starts = np.stack([result.z, *starts])
         z, loss = result.z, result.loss
     # Refine by least squares, first on windows, then on long segments.
-    refined, longer = list[Refined](), bool(config.refine and config.long_s and long_spans)
-    if config.refine and as_start and problem.table.terms:
+    refined, longer = list[Refined](), bool(config.refine_steps and config.long_s and long_spans)
+    if config.refine_steps and as_start and problem.table.terms:
         refined += _roughly(problem, starts, report)
-    elif config.refine and (end is None or not longer):
+    elif config.refine_steps and (end is None or not longer):
         # Where all segments take long, the best of several descents on some of them begins the descent on all.
         few = few_of(problem) if end is None else problem
         refined += [_refine(few, starts, report)] if few is not problem else []
@@ -166,25 +166,21 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
     Args:
         start: Shape ``(P,)``: middle of the first generation.
     """
-    total = problem.config.generations * (1 + problem.config.restarts)
     # At a bound the map to values is flat, and a search that begins there stays there.
     start = np.clip(start, -_OFF_BOUNDS, _OFF_BOUNDS)
+    config = problem.config
 
-    def advance(generations: int, best: float, z: np.ndarray) -> None:
+    def advance(best: float, z: np.ndarray) -> None:
         if report:
-            report("search", generations / total, best, z)
+            report("search", 1.0 / config.generations, best, z)
 
-    compiling, data, config = _compiling(report, "search", start), problem.data, problem.config
     free = config.initial_state == "free"
     # Centre the delays: a log does not determine how their sum is shared between both sides of the world.
     middle = lambda z: centred(problem.table, z) if free else z  # noqa: E731
-    loss_of = lambda z: problem.loss(middle(z), on_compile=compiling)  # noqa: E731
-    result = search(
-        problem.evaluator.searched(data), start, config, data, np.asarray(data.weight), advance,
-        problem.residuals.searches, compiling, loss_of, host=problem.engine.name == "c",
-    )  # fmt: skip
-    finalists = np.array([middle(z) for z in result.finalists])
-    result = replace(result, z=finalists[0], finalists=finalists)
+    _compiling(report, "search", start)(True)
+    result = search(problem.evaluator.searched(problem.data), start, config, advance)
+    z = middle(result.z)
+    result = replace(result, z=z, loss=problem.loss(z))
     if report:  # this loss is exact; a generation's losses linearise initial states at its middle
         report("search", 0.0, result.loss, result.z)
     return result

@@ -97,9 +97,26 @@ def test_what_diverges_is_no_number_and_says_nothing(tmp_path, monkeypatch, capf
     ("own", "names", "match"),
     [
         (model(), ("no_such",), "no field 'no_such'"),
-        (SLED, ("body_mass",), "inertia of body 'sled' as compiled"),
+        (SLED, ("body_ipos",), "inertia of body 'sled' as compiled"),
     ],
 )
 def test_what_c_would_not_look_at_is_refused(own, names, match):
     with pytest.raises(UsageError, match=match):
         Rollouts(own, SUBSTEPS, names)
+
+
+@pytest.mark.parametrize(
+    ("joint", "field"), [("slide", "dof_armature"), ("hinge", "dof_armature"), ("slide", "body_mass")]
+)
+def test_balanced_joints_follow_what_their_inertia_follows_from(joint, field):
+    """C takes the inertia of a wheel or of a carriage on a rail as compiled, unless it is renewed."""
+    balanced = mujoco.MjModel.from_xml_string(f"""
+    <mujoco><option integrator="implicitfast" gravity="0 0 0"/><worldbody><body name="b">
+      <joint name="j" type="{joint}" axis="1 0 0" armature="0.05"/>
+      <inertial pos="0 0 0" mass="0.05" diaginertia="0.05 0.05 0.05"/></body></worldbody>
+      <actuator><motor joint="j"/></actuator></mujoco>""")
+    values = np.array([0.05, 0.15, 0.35])
+    rows = np.stack([np.zeros_like(values), values], axis=1) if field == "body_mass" else values[:, None]
+    at_rest = Start(*(np.zeros((1, 1)) for _ in range(3)))
+    *_, qacc = Rollouts(balanced, 1, (field,))({field: rows}, at_rest, np.ones((1, 1, 1, 1)))
+    np.testing.assert_allclose(qacc[:, -1, 0], 1.0 / (values + 0.05), rtol=1e-6)

@@ -118,6 +118,9 @@ class Robot:
         x = self.table.low + self.table.span / (1.0 + jnp.exp(-z))
         return jnp.tensordot(self.slopes, x - self.true, 1) + self.noise
 
+    def compared(self, data=None):
+        return np.ones(self.at(np.zeros(len(self.table))).residuals.shape[:2], bool)
+
     def at(self, z, data=None):
         r, J = (np.asarray(f(jnp.asarray(z))) for f in (self._residuals, jax.jacfwd(self._residuals)))
         return Evaluation(r, J, r, np.zeros(0), np.zeros((0, 2)), float(np.mean(r**2)))

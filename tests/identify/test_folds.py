@@ -151,7 +151,7 @@ def spans(recording):
     return [Span(recording, float(b)) for b in np.arange(0.4, DURATION_S - LENGTH_S - 0.3, LENGTH_S)]
 
 
-CONFIG = FitConfig(max_delay_s=0.02, generations=0, refine=1, initial_state="free")
+CONFIG = FitConfig(max_delay_s=0.02, generations=0, initial_state="free")
 
 
 @pytest.fixture(scope="module")

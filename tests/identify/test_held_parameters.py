@@ -15,7 +15,7 @@ from sim2real.stages.estimation.segment_split import long_spans
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined
 
-CONFIG = IdentifyConfig(max_delay_s=0.02, generations=0, refine=1, terms="auto", horizon_s=LENGTH_S, settle_s=0.0)
+CONFIG = IdentifyConfig(max_delay_s=0.02, generations=0, terms="auto", horizon_s=LENGTH_S, settle_s=0.0)
 
 
 class Twice(Model):

@@ -52,12 +52,17 @@ def test_errors_of_the_model_are_no_noise():
 def test_residuals_are_above_the_noise_by_the_errors_of_the_model(slow, ratio):
     rng, t = np.random.default_rng(0), np.arange(SEGMENTS * LENGTH).reshape(SEGMENTS, LENGTH) * 0.02
     raw = rng.standard_normal((SEGMENTS, LENGTH, 2)) + slow * np.sqrt(2.0) * np.sin(2 * t)[..., None]
-    raw[::2, -20:] = 0.0  # what is no residual
-    assert above_noise(raw) == pytest.approx(ratio, rel=0.03)
+    compared = np.ones(raw.shape[:2], bool)
+    raw[::2, -20:], compared[::2, -20:] = 7.0, False
+    assert above_noise(linearised(raw, compared)) == pytest.approx(ratio, rel=0.03)
+
+
+def linearised(raw, compared):
+    return Linearised(raw, np.zeros((*raw.shape, 1)), np.eye(1), np.zeros(1), raw, compared)
 
 
 def test_what_was_not_measured_is_not_noise():
-    assert above_noise(np.zeros((3, 8, 1))) == np.inf
+    assert above_noise(linearised(np.zeros((3, 8, 1)), np.zeros((3, 8), bool))) == np.inf
 
 
 def test_missing_samples_and_short_segments_are_left_out():
@@ -109,5 +114,6 @@ def test_draws_predict_as_spread_out_as_the_segments_are(spread):
 
 
 def test_without_samples_nothing_is_widened():
-    at = Linearised(np.zeros((1, 5, 1)), np.zeros((1, 5, 1, 2)), np.eye(2), np.zeros(2), np.zeros((1, 5, 1)))
+    none = np.zeros((1, 5), bool)
+    at = Linearised(np.zeros((1, 5, 1)), np.zeros((1, 5, 1, 2)), np.eye(2), np.zeros(2), np.zeros((1, 5, 1)), none)
     assert widening(TABLE, at, SimpleNamespace(scale_covariance=np.eye(2))) == 1.0

@@ -73,6 +73,9 @@ class Stub:
             shaped, J.reshape(*shaped.shape, -1), shaped, values[1], slopes[1] * stretch, float(np.float32(loss))
         )
 
+    def compared(self, data=None):
+        return np.ones((1, self.measurements), bool)
+
     def loss(self, z, data=None, on_compile=None):
         return self.at(z).loss
 

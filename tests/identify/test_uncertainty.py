@@ -81,6 +81,7 @@ def test_measurements_that_are_masked_do_not_count():
         np.diag(12.0 / np.array([2 * WIDE]) ** 2),
         np.zeros(1),
         np.zeros((1, 100, 1)),
+        np.arange(100)[None] < 40,
     )
     again = from_linearised(stub(linear_table(1)), padded)
     np.testing.assert_allclose(again.standard_error, found.standard_error, rtol=1e-6)

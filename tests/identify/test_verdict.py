@@ -85,7 +85,7 @@ def test_the_longest_horizon_on_held_out_data_decides():
 GOOD = {"identified": 0.01, "no delay": 0.05, "nominal": 0.2, "hold": 0.4, "told": 0.1}
 
 
-@pytest.mark.parametrize("worse", [{"identified": 50.0}, {"told": 0.009}, {"hold": 0.01}, {"no delay": 0.009}])
+@pytest.mark.parametrize("worse", [{"identified": 50.0}, {"told": 0.009}, {"hold": 0.01}])
 def test_every_position_has_to_improve_on_every_baseline(worse):
     assert judge(both(GOOD, GOOD), positions=TWO).status == "accepted"
     for culprit, prediction in (("tilt", both(GOOD, GOOD | worse)), ("pan", both(GOOD | worse, GOOD))):
@@ -99,7 +99,7 @@ def test_the_worst_position_comes_first_and_all_are_told():
     assert [r.split("data ")[1].split(" ")[0] for r in found.reasons] == ["tilt", "pan"]
     assert "0.8 times no delay" in found.reasons[0]
     lost = judge(both(GOOD | {"identified": 50.0}, GOOD), positions=TWO)
-    assert "pan is no better than: no delay (0.05 rad), nominal (0.2 rad), hold (0.4 rad), told (0.1 rad)" in str(lost)
+    assert "pan is no better than: nominal (0.2 rad), hold (0.4 rad), told (0.1 rad)" in str(lost)
 
 
 def test_where_commands_are_no_positions_nothing_was_told():
@@ -114,11 +114,8 @@ def test_a_joint_that_stood_still_cannot_be_predicted_better_than_its_noise():
     assert judge(both(GOOD, drifts), positions=TWO).status == "no improvement on held-out data"
 
 
-def test_worse_than_without_delays_is_a_failure_and_as_good_is_none():
-    found = judge(rows(0.17, 1.0, **{"no delay": 0.1}))
-    assert found.status == "no improvement on held-out data"
-    assert "no delay (0.1 rad); its own error is 0.17 rad" in found.reasons[0]
-    assert not any("as well" in r for r in found.reasons)
+def test_a_rough_fit_without_delays_decides_nothing():
+    assert judge(rows(0.17, 1.0, **{"no delay": 0.1})).status == "accepted"
     found = judge(rows(0.1, 1.0, **{"no delay": 0.1}))
     assert found.status == "accepted"
     assert any("does not need one" in r for r in found.reasons)

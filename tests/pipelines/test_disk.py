@@ -75,7 +75,7 @@ def synthetic():
 @pytest.fixture(scope="module")
 def fitted(synthetic):
     """The synthetic recording, identified from the nominal values, without a search: for it, ``swing`` is given."""
-    config = replace(PIPELINE.identify, generations=0, refine=1, refine_steps=12, long_s=0.0)
+    config = replace(PIPELINE.identify, generations=0, refine_steps=12, long_s=0.0)
     model, spans = PIPELINE.load().identifiable(MAX_DELAY_S), [Span(0, float(b)) for b in np.arange(0.3, 17.5, 2.0)]
     table = model.parameters.with_fixed({"swing": TRUTH["swing"]})
     return fit(model, [synthetic.episode], spans, 2.0, config, table)

@@ -26,7 +26,7 @@ import sim2real
 
 turntable = sim2real.load_pipeline("turntable")
 brief = replace(turntable.identify, settle_s=0.2, horizon_s=0.4, folds=0, free_run_s=0.0)
-tiny = replace(brief, generations=0, refine=1, refine_steps=3)
+tiny = replace(brief, generations=0, refine_steps=3)
 recording = sim2real.Recording.load(Path({log!r}))
 found = sim2real.identify(turntable.load(), recording, replace(tiny, world="oiled", fix={{"drag": 0.0}}))
 folder = Path("found")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.robots.from_model.mjcf import driven, gains_of, joints_of, limit_of, read_model
+from sim2real.robots.from_model.mjcf import driven, force_of, gains_of, joints_of, limit_of, read_model
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern, expand, place
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.from_model.usual_parameters import usual_terms
@@ -56,6 +56,21 @@ def test_what_a_file_says_of_its_joints(model_file):
     assert (limit_of(own, "left_hip"), limit_of(own, "right_hip")) == (3.0, None)
     assert gains_of(own, "left_hip") == (12.0, 0.7)
     assert gains_of(own, "right_hip") is None
+
+
+def test_a_gear_counts_in_what_a_file_says(tmp_path):
+    """Before the gear a motor makes 5 N m at most, and a servo sees 3 times the joint's angle."""
+    path = tmp_path / "geared.xml"
+    path.write_text("""<mujoco><worldbody>
+      <body><joint name="m"/><geom size=".1"/></body><body pos="1 0 0"><joint name="s"/><geom size=".1"/></body>
+    </worldbody><actuator><motor joint="m" gear="25" ctrllimited="true" ctrlrange="-5 5"/>
+      <position joint="s" kp="4" kv="0.5" gear="3" forcelimited="true" forcerange="-2 2"/></actuator></mujoco>""")
+    own = read_model(path)
+    assert (force_of(own, "m"), limit_of(own, "m"), gains_of(own, "m")) == (25.0, 125.0, None)
+    assert (force_of(own, "s"), limit_of(own, "s"), gains_of(own, "s")) == (None, 6.0, (36.0, 4.5))
+    robot = MjcfRobot(RobotConfig(model=path, joints=("m",), commands=("torque",), terms=(ParameterPattern("gain"),)))
+    (gain,) = robot.dynamics()
+    assert (gain.nominal, gain.low, gain.high) == (25.0, pytest.approx(0.05), pytest.approx(500.0))
 
 
 def test_a_drive_has_no_defaults_of_the_files_servos(model_file):

@@ -73,7 +73,7 @@ def test_logs_that_are_too_short(fails, tmp_path, log):
 def test_a_truncated_log_works_with_a_warning(tmp_path, log, capsys):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(log.read_bytes()[: log.stat().st_size * 4 // 5])
-    flags = ["--log", cut, "--generations", 0, "--refine", 1, "--refine-steps", 3, "--free-run-s", 0]
+    flags = ["--log", cut, "--generations", 0, "--refine-steps", 3, "--free-run-s", 0]
     flags += ["--folds", 0, "--runs", tmp_path]
     assert cli.main(["identify", "pendulum", *map(str, flags)]) == 0
     said = capsys.readouterr()

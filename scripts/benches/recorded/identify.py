@@ -27,12 +27,12 @@ from sim2real.identify.fit import Fit, refit
 from sim2real.stages.estimation import held_out_parts, promises
 from sim2real.stages.estimation.predicted_logs import LEAST_PARTS
 
-BUDGET = ("generations", "population", "refine", "long_s")
+BUDGET = ("generations", "population", "long_s")
 ITERATIONS = {"disk": 40, "xl330": 25, "so101": 8}
 """Largest number of iterations of mujoco.sysid; 15 for the SO-101 change no figure."""
 DISK_SAMPLES, SO101_SPAN_S = 6000, 60.0
 """What mujoco.sysid fits of a longer recording: as in the figures published with the disk; of the SO-101 the begin."""
-QUICK = {"fit": ":200", "test": "200:300", "generations": 2, "population": 8, "refine": 1, "long_s": 0.0}
+QUICK = {"fit": ":200", "test": "200:300", "generations": 2, "population": 8, "long_s": 0.0}
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +44,6 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=int, nargs="+", help="seeds of the search (xl330: 0 1 2, else 0)")
     parser.add_argument("--generations", type=int, help="of the search; default: the pipeline's")
     parser.add_argument("--population", type=int, help="of the search; default: the pipeline's")
-    parser.add_argument("--refine", type=int, help="finalists that are refined; default: the pipeline's")
     parser.add_argument("--long-s", type=float, help="segments of the last refinement [s]; default: the pipeline's")
 
 

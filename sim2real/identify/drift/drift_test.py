@@ -213,7 +213,7 @@ def _beside_the_rest(at: Linearised, way: Way, root: np.ndarray, variance: float
     informed = np.sum(weights**2, axis=1)
     segments = float(informed.sum() ** 2 / np.sum(informed**2))
     # Fast motion has large residuals and informs most: each segment counts with its own residuals.
-    squares, counted = np.sum(residuals**2, axis=1), np.count_nonzero(residuals, axis=1)
+    squares, counted = np.sum(residuals**2, axis=1), at.compared.sum(axis=1) * at.residuals.shape[-1]
     uneven = squares / np.maximum(counted, 1) * counted.sum() / max(float(squares.sum()), 1e-300)
     spread = float(np.sum(pulls**2)) * segments / max(segments - 1.0, 0.5)
     by_log = unit**2 * max(float(informed @ uneven) / variance, spread)
@@ -232,14 +232,15 @@ def _with_the_rest(at: Linearised, root: np.ndarray, variance: float) -> float:
     # In units of the posterior's deviations: a delay with a deviation of 1 us would make the sum ill-conditioned.
     pulled, informed = root.T @ (flat.T @ rest), root.T @ (flat.T @ flat) @ root
     gain = pulled @ np.linalg.solve(informed + variance * np.eye(len(root)), pulled)
-    return float(rest @ rest - gain) / max(int(np.count_nonzero(rest)), 1)
+    return float(rest @ rest - gain) / max(at.count, 1)
 
 
 def _finite(at: Linearised) -> Linearised:
     """Return the linearisation without segments that cannot be simulated, such as of an unstable motion."""
     whole = np.isfinite(at.residuals).all(axis=(1, 2)) & np.isfinite(at.jacobian).all(axis=(1, 2, 3))
     gone = lambda a: np.where(whole.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)  # noqa: E731
-    return replace(at, residuals=gone(at.residuals), jacobian=gone(at.jacobian), raw=gone(at.raw))
+    compared = at.compared & np.asarray(whole)[:, None]
+    return replace(at, residuals=gone(at.residuals), jacobian=gone(at.jacobian), raw=gone(at.raw), compared=compared)
 
 
 def weigh(fitted: Sequence[Fitted], loss: float, table: ParameterTable, posterior: Posterior, seconds: float) -> Drift:

@@ -63,22 +63,6 @@ def choose(
     return Choice("c", "requested" if wanted == "c" else "the world is MuJoCo's", model)
 
 
-def check_devices(count: int, engine: Choice) -> None:
-    """Raise an error if devices are missing, or the engine does not use them."""
-    if count == 1:
-        return
-    if engine.name == "c":
-        raise UsageError(
-            f"devices={count}, but C MuJoCo simulates on the processors of this host, on all of them ({engine.why})",
-            hint="remove --devices, or take --engine compiled",
-        )
-    if count > (there := jax.local_device_count()):
-        raise UsageError(
-            f"devices={count}, but JAX finds {there} on this host: {jax.local_devices()[0].device_kind}",
-            hint="on a CPU, XLA_FLAGS=--xla_force_host_platform_device_count=8 makes 8 of it, for tests",
-        )
-
-
 def _world(nodes: Mapping[str, BaseNode], messages: Mapping[str, PyTree]) -> PyTree:
     worlds = [n for n in nodes.values() if isinstance(n, BaseWorld)]
     if len(worlds) != 1 or not all(hasattr(worlds[0], n) for n in _NEEDED):

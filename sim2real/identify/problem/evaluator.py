@@ -58,7 +58,7 @@ class Evaluator(Protocol):
         ...
 
     def searched(self, data: Data) -> PyTree:
-        """Return the losses of a generation, in the form that ``search`` takes."""
+        """Return the losses of generations, as ``search`` takes them."""
         ...
 
     def lively(self, data: Data, most: int | None = None) -> Data:
@@ -122,9 +122,8 @@ class CompiledEvaluator:
         return np.asarray(program(single(points), single(around), data), np.float64)[: len(candidates)]
 
     def searched(self, data: Data) -> PyTree:
-        """See ``Evaluator``: traceable ``Losses``, whose data is an argument."""
-        del data
-        return self._residuals.losses
+        """See ``Evaluator``."""
+        return lambda candidates, middle, new: self.losses(candidates, middle, data)
 
     def lively(self, data: Data, most: int | None = None) -> Data:
         """See ``Evaluator``: all, as a program simulates the segments without weight, too."""

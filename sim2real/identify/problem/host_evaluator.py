@@ -121,20 +121,14 @@ class OutsideEvaluator:
         return self.losses_with(candidates, self._states(around, data), data)
 
     def searched(self, data: Data) -> PyTree:
-        """See ``Evaluator``: ``HostLosses`` on some segments; a block of generations keeps the states of its first."""
+        """See ``Evaluator``: losses of the segments with most motion; generations of one middle share its states."""
         states: list[InitialState | None] = [None]
         most_moved = self.lively(data)
 
-        def losses(candidates: np.ndarray, around: np.ndarray, pick: np.ndarray | None, fresh: bool) -> np.ndarray:
-            # Losses of a batch of segments, or of those with most motion.
-            part = most_moved
-            if pick is not None:
-                weight = np.zeros(len(data.fitted), np.float32)
-                weight[pick] = 1.0
-                part = data._replace(weight=weight)
-            if fresh:
-                states[0] = self._states(around, data if pick is not None else most_moved)
-            return self.losses_with(candidates, states[0], part)
+        def losses(candidates: np.ndarray, middle: np.ndarray, new: bool) -> np.ndarray:
+            if new:
+                states[0] = self._states(middle, most_moved)
+            return self.losses_with(candidates, states[0], most_moved)
 
         return losses
 

@@ -21,7 +21,7 @@ from sim2real.graph.windows import make_room
 from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.engine import check_devices, choose
+from sim2real.identify.problem.engine import choose
 from sim2real.identify.problem.evaluator import CompiledEvaluator, Evaluator
 from sim2real.identify.problem.host_evaluator import OutsideEvaluator
 from sim2real.identify.problem.programs import OnCompile
@@ -123,7 +123,6 @@ class Problem:
         engine = choose(self.config.engine, nodes, self.model.given, self.config.jacobian)
         if engine.name != "c" and not has_jax():
             raise NotInstalled(f"this needs JAX, as {engine.why}")
-        check_devices(self.config.devices, engine)
         return SegmentResiduals(self.model, nodes, self.table, self.config, engine)
 
     @property
@@ -171,6 +170,11 @@ class Problem:
         r, J, raw = (np.asarray(a, np.float64)[:count, :steps] for a in evaluated[:3])
         prior, slope = (np.asarray(a, np.float64) for a in (evaluated.prior, evaluated.prior_jacobian))
         return Evaluation(r, J, raw, prior, slope, float(evaluated.loss))
+
+    def compared(self, data: Data | None = None) -> np.ndarray:
+        """Return where measurements of fitted segments are compared, ``(S, K)``, bool; not in those without weight."""
+        weight = np.asarray((self.data if data is None else data).weight)[: len(self.train)]
+        return (self._ts[self.train] >= 0.0) & (weight[:, None] > 0.0)
 
     def loss(self, z: Array, data: Data | None = None, on_compile: OnCompile | None = None) -> float:
         """Return the loss at ``z (P,)``."""
@@ -231,13 +235,25 @@ class Problem:
         other.readings, other.data = readings, self.data._replace(measured=pytree.map(jnp.asarray, measured))
         return other
 
-    def recut(self, spans: Sequence[Span], length_s: float, moved: Retimed = lambda recorded: recorded) -> Problem:
+    def recut(
+        self,
+        spans: Sequence[Span],
+        length_s: float,
+        moved: Retimed = lambda recorded: recorded,
+        ends_s: Sequence[float] | None = None,
+    ) -> Problem:
         """Return the same recordings cut into other segments; both problems share programs.
 
         Args:
             length_s: Length of a segment [s].
+            ends_s: Time in each segment after which measurements are not compared [s]; default: ``length_s``.
         """
-        return Problem(self.model, self._recordings, spans, length_s, self.config, moved=moved, like=self)
+        other = Problem(self.model, self._recordings, spans, length_s, self.config, moved=moved, like=self)
+        if ends_s is not None:
+            ends = dict(zip(spans, ends_s, strict=True))
+            until = np.array([ends[span] for span in other.spans])
+            other._ts = np.where(other._ts <= until[:, None], other._ts, -1.0)
+        return other
 
 
 def _evaluator(residuals: SegmentResiduals, on_c: bool) -> Evaluator:

@@ -72,7 +72,6 @@ class SegmentResiduals:
             prior the bias of that estimate would seem to separate the delays.
         forward: Whether derivatives are taken in forward mode; else by finite differences.
         programs: The compiled programs by name.
-        searches: The compiled programs of ``search``.
     """
 
     def __init__(
@@ -91,7 +90,6 @@ class SegmentResiduals:
         self.prior = 30.0 * np.array(sigmas, np.float32)
         self.forward = config.jacobian == "forward"
         self.programs: dict[str, Program] = {}
-        self.searches: dict[tuple[object, ...], Program] = {}
         self._late = [p.name for p in table if p.side == "measurement"]
 
     @functools.cached_property

@@ -95,7 +95,7 @@ def minimise(
         parameters: Name -> start, a number or an array.
         bounds: Name -> (lowest, highest), numbers or arrays. Positive bounds of a decade or more are searched on a
             logarithmic scale.
-        config: Strategy, population, generations, restarts, spread and seed of the search; a dict has the settings that
+        config: Strategy, population, generations, spread and seed of the search; a dict has the settings that
             differ from the default.
         compiled: False: the loss is plain Python, and is called for each candidate in turn.
 
@@ -107,7 +107,7 @@ def minimise(
         raise UsageError(f"{', '.join(lacking)}: parameters and bounds must have the same names")
     if not parameters:
         raise UsageError("there is no parameter to search for")
-    config, scale = replace(_configured(config), batch=0), _Scale(parameters, bounds)
+    config, scale = _configured(config), _Scale(parameters, bounds)
 
     def one(z: Array) -> PyTree:
         value = jnp.asarray(loss(scale.parameters(z)))
@@ -118,18 +118,15 @@ def minimise(
     def number(z: np.ndarray) -> float:
         return float(np.asarray(loss(scale.parameters(np.asarray(z, np.float64), np))))
 
-    # Search, in one compiled program or candidate by candidate.
+    # Search, with a compiled program for a generation, or candidate by candidate.
     begin, size = scale.first(), scale.value.size
-    if compiled:
-        alone = jax.jit(one)
-        at = lambda z: float(alone(jnp.asarray(z, jnp.float32)))  # noqa: E731
-        result = search(lambda c, around, data, pick: jax.vmap(one)(c), begin, config, alone=at)
-    else:
-        at = number
-        result = search(lambda c, *rest: np.array([number(z) for z in c]), begin, config, alone=at, host=True)
+    program = jax.jit(jax.vmap(one))
+    every = lambda c: np.asarray(program(jnp.asarray(c, jnp.float32)))  # noqa: E731
+    losses = every if compiled else lambda c: np.array([number(z) for z in c])
+    first = float(losses(np.stack([begin] * config.population))[0] if compiled else number(begin))
+    result = search(lambda candidates, middle, new: losses(candidates), begin, config)
 
     # Keep the start if the search finds nothing better.
-    first = at(begin)
     better = result.loss < first or not np.isfinite(first)
     values = scale.parameters(np.asarray(result.z if better else begin, np.float64).reshape(size), np)
     return Minimum(

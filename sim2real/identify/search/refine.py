@@ -272,7 +272,11 @@ class _Descent:
     def _deviation(self, stacked: np.ndarray) -> float:
         """Return the deviation of the residuals of segments, behind which those of the priors stand, ``(N,)``."""
         of_segments = stacked[: len(stacked) - sum(c.parameter.prior is not None for c in self._problem.table.columns)]
-        return deviation(of_segments.reshape(len(self._data.fitted), -1, len(self._problem.fields)))
+        residuals = of_segments.reshape(len(self._data.fitted), -1, len(self._problem.fields))
+        compared = np.zeros(residuals.shape[:2], bool)
+        there = self._problem.compared(self._data)
+        compared[: there.shape[0], : there.shape[1]] = there
+        return deviation(residuals, compared)
 
     def _report(self, loss: float, z: np.ndarray) -> None:
         self.steps += 1

@@ -60,7 +60,7 @@ def _optima(estimate: Fit, at: Linearised, spread: Uncertainty) -> list[Alternat
     difference between segments at most. All optima have the same share.
     """
     problem, table = estimate.problem, estimate.problem.table
-    near, score, posteriors = [at.x], _by_segment(at.residuals), []
+    near, score, posteriors = [at.x], _by_segment(at.residuals, at.compared), []
     # Compare without absent parameters: all values on one side of their bound explain the recordings alike.
     informed = np.flatnonzero([v not in ABSENT for v in spread.verdict])
     precision = np.linalg.pinv(spread.scale_covariance[np.ix_(informed, informed)])
@@ -69,7 +69,7 @@ def _optima(estimate: Fit, at: Linearised, spread: Uncertainty) -> list[Alternat
         return all(float(d @ precision @ d) > len(d) for d in ((x - other)[informed] for other in near))
 
     def as_good(residuals: np.ndarray) -> bool:
-        off = _by_segment(residuals) - score
+        off = _by_segment(residuals, at.compared) - score
         return len(off) > 1 and bool(off.mean() <= off.std(ddof=1) / np.sqrt(len(off)))
 
     # Test each end by a linear step first, as a refinement takes longer.
@@ -144,10 +144,9 @@ def _widened(covariance: np.ndarray, table: ParameterTable, fewer: ParameterTabl
     return covariance * np.outer(factor, factor)
 
 
-def _by_segment(residuals: np.ndarray) -> np.ndarray:
+def _by_segment(residuals: np.ndarray, compared: np.ndarray) -> np.ndarray:
     """Return the mean square of the residuals ``(S, C, F)`` of each segment, ``(S,)``."""
-    rows = residuals.reshape(len(residuals), -1)
-    return np.sum(rows**2, axis=1) / np.maximum(np.count_nonzero(rows, axis=1), 1)
+    return np.sum(residuals**2, axis=(1, 2)) / np.maximum(compared.sum(axis=1) * residuals.shape[-1], 1)
 
 
 def _named(table: ParameterTable, present: np.ndarray) -> list[str]:

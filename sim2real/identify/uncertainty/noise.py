@@ -60,7 +60,8 @@ def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> floa
     residuals the factor is 1.
     """
     raw = at.raw.transpose(0, 2, 1)  # (S, F, C): one row a field of a segment
-    inside, (total, white, count) = raw != 0.0, _squares(raw)
+    inside = np.broadcast_to(at.compared[:, None], raw.shape)
+    total, white, count = _squares(raw, at.compared)
     slow = max(0.0, total - white) / count if count else 0.0
     # Compare it with the spread of the predictions, without the shift of time.
     J = at.jacobian.transpose(0, 2, 1, 3)[inside]
@@ -70,20 +71,23 @@ def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> floa
     return float(np.sqrt(1.0 + slow / predicted)) if predicted > 0.0 else 1.0
 
 
-def above_noise(raw: np.ndarray) -> float:
-    """Return the ratio of residuals ``(S, C, F)`` to the noise of the sensor, which no model predicts."""
-    total, white, _ = _squares(raw.transpose(0, 2, 1))
+def above_noise(at: Linearised) -> float:
+    """Return the ratio of the residuals to the noise of the sensor, which no model predicts."""
+    total, white, _ = _squares(at.raw.transpose(0, 2, 1), at.compared)
     return float(np.sqrt(total / white)) if white > 0.0 else np.inf
 
 
-def _squares(raw: np.ndarray) -> tuple[float, float, int]:
+def _squares(raw: np.ndarray, compared: np.ndarray) -> tuple[float, float, int]:
     """Return the sum of squares of residuals ``(S, F, C)``, the share of white noise in it, and their number.
 
-    In each field third differences separate white noise from slow errors; a 0 is no residual.
+    In each field third differences separate white noise from slow errors.
+
+    Args:
+        compared: Shape ``(S, C)``, bool: which residuals count.
     """
     total, noise, count = 0.0, 0.0, 0
     for field in range(raw.shape[1]):
-        rows = [r[r != 0.0] for r in raw[:, field]]
+        rows = [r[counts] for r, counts in zip(raw[:, field], compared, strict=True)]
         rows = [r for r in rows if r.size > _ORDER]
         if not rows:
             continue

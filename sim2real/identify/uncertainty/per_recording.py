@@ -52,7 +52,8 @@ def identify_each(estimate: Fit) -> list[tuple[Mapping[str, Value], Uncertainty]
             change, z = end.jacobian @ step, table.at_scale(end.x + step)
             end = replace(end, residuals=end.residuals + change, raw=end.raw + change, x=end.x + step)
         # Compute the uncertainty from the residuals of this recording.
-        part = replace(end, residuals=end.residuals[mask], jacobian=end.jacobian[mask], raw=end.raw[mask])
+        part = replace(end, residuals=end.residuals[mask], jacobian=end.jacobian[mask], raw=end.raw[mask],
+            compared=end.compared[mask])  # fmt: skip
         alone.append((as_numbers(table, z), from_linearised(problem, part)))
     return alone
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -44,6 +44,8 @@ class Linearised:
         prior: Shape ``(P, P)``: precision that priors and bounds add; the bounds' is that of a uniform distribution.
         x: Shape ``(P,)``: the point.
         raw: Shape ``(S, C, F)``: the residuals without a robust loss.
+        compared: Shape ``(S, C)``, bool: where a measurement was compared, as an exact residual is 0, too; default: in
+            all places.
     """
 
     residuals: np.ndarray
@@ -51,6 +53,16 @@ class Linearised:
     prior: np.ndarray
     x: np.ndarray
     raw: np.ndarray
+    compared: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), bool))
+
+    def __post_init__(self) -> None:
+        if not self.compared.size:
+            object.__setattr__(self, "compared", np.ones(self.residuals.shape[:2], bool))
+
+    @property
+    def count(self) -> int:
+        """Number of residuals."""
+        return int(self.compared.sum()) * self.residuals.shape[-1]
 
 
 @dataclass(frozen=True)
@@ -117,7 +129,8 @@ def linearise(problem: Problem, z: np.ndarray, data: Data | None = None) -> Line
     onward = J @ (x - at)
     priors = evaluation.prior_jacobian / stretch
     prior = priors.T @ priors + np.diag(12.0 / table.span**2)
-    return Linearised(evaluation.residuals + onward, J, prior, x, evaluation.raw + onward)
+    compared = problem.compared(data)
+    return Linearised(evaluation.residuals + onward, J, prior, x, evaluation.raw + onward, compared)
 
 
 def uncertainty(problem: Problem, z: np.ndarray) -> Uncertainty:
@@ -194,15 +207,20 @@ def loss_variance(problem: Problem, at: Linearised) -> float:
     return float(np.sum(at.residuals**2)) / max(count - free, 1) * inflation
 
 
-def deviation(residuals: np.ndarray) -> float:
-    """Return the deviation of a residual ``(S, K, F)``, larger where residuals are correlated in time."""
-    return float(np.sqrt(np.sum(residuals**2) / max(np.count_nonzero(residuals), 1) * _inflation(residuals)))
+def deviation(residuals: np.ndarray, compared: np.ndarray) -> float:
+    """Return the deviation of a residual ``(S, K, F)``, larger where residuals are correlated in time.
+
+    Args:
+        compared: Shape ``(S, K)``, bool: which residuals count.
+    """
+    count = int(compared.sum()) * residuals.shape[-1]
+    return float(np.sqrt(np.sum(residuals**2) / max(count, 1) * _inflation(residuals, compared)))
 
 
 def _freedom(problem: Problem, at: Linearised) -> tuple[int, int, float]:
     """Return how many residuals there are, how many numbers were fitted, and the factor for correlation in time."""
     states = 2 * len(problem.channels) * len(at.residuals) * bool(problem.config.initial_state == "free")
-    return int(np.count_nonzero(at.residuals)), len(at.x) + states, _inflation(at.residuals)
+    return at.count, len(at.x) + states, _inflation(at.residuals, at.compared)
 
 
 def between_parts(
@@ -380,9 +398,9 @@ def _widening(ratio: np.ndarray, freedom: np.ndarray, quantile: float, repeated:
     return 1.0 + share * (np.maximum(ratio * special.stdtrit(freedom, 0.975) / quantile, 1.0) - 1.0)
 
 
-def _inflation(r: np.ndarray) -> float:
+def _inflation(r: np.ndarray, compared: np.ndarray) -> float:
     """Return the factor on the variance for the correlation of successive residuals in segments, ``(E, C, F)``."""
     now, later = r[:, :-1], r[:, 1:]
-    both = (now != 0.0) & (later != 0.0)
+    both = compared[:, :-1] & compared[:, 1:]
     rho = float(np.clip((now * later)[both].sum() / np.maximum((now**2)[both].sum(), 1e-12), 0.0, 0.95))
     return (1 + rho) / (1 - rho)

@@ -207,11 +207,11 @@ def _free(
             begins = [s.begin_s for s in fitted if s.recording == r]
             first, last = max(begin, min(begins)), min(end, max(begins) + problem.segment_s)
             where.append((k, Span(r, first, False), last - first))
-    # Cut all runs to the length of the shortest, so that one program serves them.
-    length_s = min(longest_s, *(w[2] for w in where))
-    runs = problem.recut([w[1] for w in where], length_s)
+    # Each run ends with its part; all are simulated for the length of the longest, so that one program serves them.
+    lengths_s = [min(longest_s, w[2]) for w in where]
+    runs = problem.recut([w[1] for w in where], max(lengths_s), ends_s=lengths_s)
     fold = np.array([w[0] for w in where])
-    return _errors(runs, stacked, fold, np.arange(len(where)), settle_s, len(parts)), length_s - settle_s
+    return _errors(runs, stacked, fold, np.arange(len(where)), settle_s, len(parts)), max(lengths_s) - settle_s
 
 
 def _errors(

@@ -151,14 +151,14 @@ def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistic
     """
     size = len(at.x)
     rows = [(at.residuals[mask].reshape(-1), at.jacobian[mask].reshape(-1, size)) for mask in parts]
-    variance = float(np.sum(at.residuals**2)) / max(np.count_nonzero(at.residuals), 1)
+    variance = float(np.sum(at.residuals**2)) / max(at.count, 1)
     return Statistics(
         x=at.x,
         value=np.array([r @ r for r, _ in rows]),
         gradient=np.array([J.T @ r for r, J in rows]),
         information=np.array([J.T @ J for _, J in rows]),
         prior=at.prior * variance,
-        count=np.array([max(np.count_nonzero(r), 1) for r, _ in rows], np.float64),
+        count=np.array([max(int(at.compared[m].sum()) * len(at.raw[0, 0]), 1) for m in parts], np.float64),
     )
 
 

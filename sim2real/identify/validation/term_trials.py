@@ -311,7 +311,7 @@ class Trials:
         rows = folds.predicted(self._estimate, self._parts, stats, present, list(ends), *self._times)
         ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
             [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
-        return Trial(present, z, loss, stats, tuple(rows), ahead, free, above_noise(at.raw), not unjudged)
+        return Trial(present, z, loss, stats, tuple(rows), ahead, free, above_noise(at), not unjudged)
 
     def _names(self, present: np.ndarray) -> tuple[str, ...]:
         return tuple(n for n, there in zip(self._problem.table.terms, present, strict=True) if there)

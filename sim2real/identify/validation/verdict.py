@@ -18,8 +18,6 @@ from sim2real.log.schema import unit_of
 Status = Literal["accepted", "not converged", "no improvement on held-out data", "not identifiable", "hit a bound"]
 _BETTER = 0.95
 """Largest ratio of the held-out error to that of a baseline with which the estimate is better."""
-_ALIKE = 1.05
-"""Largest ratio of two errors that count as equal."""
 NOISE = 2.0
 """Errors below this many deviations of the measurement count as noise."""
 _MOST = 3
@@ -84,9 +82,9 @@ def _scored(p: Position, horizon_s: float, errors: Mapping[str, float | None]) -
     error, noise = finite.pop("identified"), NOISE * p.sigma
     best = min(finite.values(), default=math.inf)
     excess = max(error, noise) / max(best, noise) if math.isfinite(best) else 0.0
-    # The model without delays counts as better only where it is better by more than chance.
-    limits = {m: (_ALIKE if m == NO_DELAY else _BETTER) * e for m, e in finite.items()}
-    beaten_by = () if error <= noise else tuple(m for m, limit in limits.items() if error > limit)
+    # The model without delays is a rough fit: it is shown, and decides nothing.
+    others = {m: e for m, e in finite.items() if m != NO_DELAY}
+    beaten_by = () if error <= noise else tuple(m for m, e in others.items() if error > _BETTER * e)
     rmse = {m: e if math.isfinite(e) else None for m, e in {"identified": error, **finite}.items()}
     return excess, HeldOut(p.name, p.column, p.unit, horizon_s, rmse, beaten_by)
 

@@ -208,7 +208,11 @@ def set_drives(spec: MjSpec, drives: Mapping[str, JointDrive]) -> None:
 def limit_of(model: MjModel, joint: str) -> float | None:
     """Return the largest torque that the file's own actuator or joint allows [N m or N]; None: no limit."""
     number = model.joint(joint).id
-    ranges = [model.actuator_forcerange[i] for i in _actuators(model, number) if model.actuator_forcelimited[i]]
+    ranges = [
+        model.actuator_forcerange[i] * model.actuator_gear[i, 0]
+        for i in _actuators(model, number)
+        if model.actuator_forcelimited[i]
+    ]
     # The control of a motor is its torque, so a range of the control is a limit, too.
     ranges += [
         model.actuator_ctrlrange[i] * model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0]
@@ -221,10 +225,22 @@ def limit_of(model: MjModel, joint: str) -> float | None:
 
 
 def gains_of(model: MjModel, joint: str) -> tuple[float, float] | None:
-    """Return stiffness and damping of the file's own position or velocity servo; None: the joint has none."""
+    """Return stiffness and damping at the joint of the file's position or velocity servo; None: the joint has none.
+
+    A gear multiplies the force, and the angle and the speed that the servo sees.
+    """
     for i in _actuators(model, model.joint(joint).id):
         if model.actuator_biastype[i] == int(mj.mjtBias.mjBIAS_AFFINE):
-            return float(-model.actuator_biasprm[i, 1]), float(-model.actuator_biasprm[i, 2])
+            square = float(model.actuator_gear[i, 0]) ** 2
+            return float(-square * model.actuator_biasprm[i, 1]), float(-square * model.actuator_biasprm[i, 2])
+    return None
+
+
+def force_of(model: MjModel, joint: str) -> float | None:
+    """Return the force at the joint for a command of 1 to the file's motor, with its gear; None: the joint has none."""
+    for i in _actuators(model, model.joint(joint).id):
+        if model.actuator_biastype[i] == int(mj.mjtBias.mjBIAS_NONE):
+            return abs(float(model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0]))
     return None
 
 

@@ -37,7 +37,7 @@ from sim2real.robots.from_model.joints.quantities import (
     letters,
 )
 from sim2real.robots.from_model.joints.sharing import sharing
-from sim2real.robots.from_model.mjcf import gains_of, limit_of, slides_of, unit_for
+from sim2real.robots.from_model.mjcf import force_of, gains_of, limit_of, slides_of, unit_for
 from sim2real.types import Array, MjModel, PyTree, Scalar
 from sim2real.worlds.drive_terms import NO_LIMIT
 from sim2real.worlds.driven import PAYLOAD
@@ -239,6 +239,8 @@ def _parameter(term: ParameterPattern, name: str, nominal: float, own_size: floa
     else:
         below, above = WIDE[term.what]
         low, high = nominal / below, nominal * above
+        if term.what == "gain":  # a log may hold the force at the joint although the file's motor has a gear
+            low, high = min(nominal, 1.0) / below, max(nominal, 1.0) * above
     low, high = (bound if bound is not None else usual for bound, usual in ((term.low, low), (term.high, high)))
     return Parameter(name, unit, nominal, low, high, transform, kind, about, free=term.free, excite=EXCITE[term.what],
         vanishes=term.what in VANISHING, limits=term.what in LIMITS, term=term.term,
@@ -274,6 +276,8 @@ def _nominal(term: ParameterPattern, names: Sequence[str], file_model: MjModel, 
             values.append(value + (gains[1] if gains else 0.0))
         elif term.what in ("kp", "kd") and (gains := gains_of(file_model, name)):
             values.append(gains[term.what == "kd"])
+        elif term.what == "gain" and (force := force_of(file_model, name)):
+            values.append(force)
         elif term.what == "torque" and (limit := limit_of(file_model, name)):
             values.append(limit)
     positive = [v for v in values if v > 0]

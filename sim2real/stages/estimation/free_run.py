@@ -59,12 +59,12 @@ def free_runs(
     splits = [split_of(episode, r < fitted, config) for r, episode in enumerate(episodes)]
     ends = [reach(episode, config)[1] for episode in episodes]
     least_s = config.settle_s + config.horizon_s
-    # Take the held-out part of each log that is long enough, all cut to the length of the shortest.
+    # Take the held-out part of each log that is long enough, each to its own end.
     held_out = [Span(r, split, False) for r, split in enumerate(splits) if ends[r] - split > least_s]
     if not held_out or not config.free_run_s:
         return [], {}, {}
-    length_s = min(config.free_run_s, min(ends[s.recording] - s.begin_s for s in held_out))
-    problem = estimate.windows.recut(held_out, length_s)
+    lengths_s = [min(config.free_run_s, ends[s.recording] - s.begin_s) for s in held_out]
+    problem = estimate.windows.recut(held_out, max(lengths_s), ends_s=lengths_s)
     columns = prediction.samples(problem, models, config.settle_s)
     rows = prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s)
     bands, errors = intervals(problem, columns, models["identified"], posterior, config.settle_s)

@@ -20,7 +20,6 @@ def onward(pipeline: Pipeline, config: IdentifyConfig, root: Path, file: Path) -
     usual = pipeline.identify
     effort = {
         "generations": max(config.generations, usual.generations),
-        "refine": max(config.refine, usual.refine, 1),
         "refine-steps": max(2 * config.refine_steps, usual.refine_steps),
     }
     flags = " ".join(f"--{name} {number}" for name, number in effort.items())

@@ -76,6 +76,8 @@ def tested(
             promise *= promises.room(identification, position.column)
             promise = max(promise, _NOISE * position.sigma) * max(1.0, now / moved if now and moved else 1.0)
             promise = math.hypot(promise, alike.get(position.column, 0.0))
+            # A model that diverges on its own motion bounds nothing.
+            promise = promise if math.isfinite(promise) else None
         free = _free_run(identification, position.column)
         rows.append(Replay(position.name, position.unit, ahead_s, rmse, promise, position.column, free))
     return rows, drifted
@@ -113,9 +115,9 @@ def _of_noise(
         errors = prediction.errors(noisy, predicted, ["identified"], settle_s, [ahead_s])
         rmse = next(e.rmse for e in errors if e.held_out and e.model == "identified")
         for column in fields:
-            error = rmse.get(column)  # of a prediction that diverged no bound follows
-            rows[column].append(error if error is not None and math.isfinite(error) else 0.0)
-    return {column: float(np.quantile(errors, 0.95)) for column, errors in rows.items()}
+            error = rmse.get(column)
+            rows[column].append(error if error is not None and math.isfinite(error) else math.inf)
+    return {column: float(np.quantile(errors, 0.95, method="higher")) for column, errors in rows.items()}
 
 
 def _held_out(identification: Identification, model: str, ahead_s: float) -> Mapping[str, float]:

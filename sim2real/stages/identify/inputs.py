@@ -29,7 +29,7 @@ from sim2real.stages.pipeline.pipeline import Pipeline
 
 _WITHOUT_EFFECT = (
     *("log", "hold_out", "begin", "standing", "force", "each", "links", "reveal", "view"),
-    *("devices", "strategy", "population", "generations", "restarts", "std", "batch", "refine", "refine_steps", "seed"),
+    *("strategy", "population", "generations", "std", "refine_steps", "seed"),
 )
 """Settings on which no refit depends: a refit starts from the fit, wherever that was found. Logs count by content."""
 

@@ -11,7 +11,7 @@ PIPELINE = Pipeline(
     summary="a turntable on an ODrive: turn at a commanded speed",
     package=__name__,
     record=RecordConfig(duration_s=20.0, amplitude=10.0, low_hz=0.2, high_hz=3.0, gate=GATE),
-    identify=IdentifyConfig(population=16, generations=20, refine=1),
+    identify=IdentifyConfig(population=16, generations=20),
     train=TrainConfig(episode_s=2.0, ppo=PPOConfig(total_steps=200_000)),
     deploy=DeployConfig(episodes=3, duration_s=3.0, gate=GATE),
 )

@@ -28,7 +28,25 @@ _FRAMES = {
     "site": ("site_pos", "site_quat", "body_ipos", "body_iquat"),
 }
 """Fields of a position in a body; C ignores them if the position was compiled into the body's frame."""
-_MASSES = ("body_mass", "body_inertia")
+_FOLLOWED = frozenset(
+    {
+        "body_mass",
+        "body_inertia",
+        "body_ipos",
+        "body_iquat",
+        "body_pos",
+        "body_quat",
+        "jnt_pos",
+        "jnt_axis",
+        "qpos0",
+        "dof_armature",
+        "actuator_gear",
+        "tendon_stiffness",
+        "geom_size",
+    }
+)
+"""Fields that MuJoCo derives constants from (``mj_setConst``), among them the inertia of joints whose bodies are
+balanced: C takes it as compiled."""
 
 
 class Start(NamedTuple):
@@ -159,7 +177,7 @@ class Rollouts:
     Args:
         model: The ``MjModel``; it is copied.
         names: Fields that differ from copy to copy.
-        derives: Whether constants that follow from them are computed for each copy.
+        derives: Whether constants that follow are computed for each copy even if none of ``names`` asks for it.
         law: Sets controls, forces and fields before every step; unless it is steady, it costs a call of C for each.
 
     Raises:
@@ -174,9 +192,10 @@ class Rollouts:
         unknown = sorted(set(names) - batch.MODEL_FIELDS)
         if unknown:
             raise UsageError(f"C MuJoCo has no field {unknown[0]!r} that can differ from copy to copy")
-        self._make, self._substeps, self._names, self._derives = batch.Batch, substeps, names, derives
+        self._make, self._substeps, self._names = batch.Batch, substeps, names
+        self._derives = derives or bool(_FOLLOWED & set(names))
         self._law = law
-        self._model = _general(model, names, derives)
+        self._model = _general(model, names)
         self._threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._batch: PyTree = None
 
@@ -312,7 +331,7 @@ def _failing(count: int, call: Callable[[], object]) -> np.ndarray:
     return failed
 
 
-def _general(model: MjModel, names: tuple[str, ...], derives: bool) -> MjModel:
+def _general(model: MjModel, names: tuple[str, ...]) -> MjModel:
     """Return a copy of a model in which C takes no short cut past the fields that differ, and solves to the end."""
     model = copy.copy(model)
     # What MJX can afford is no limit here: on an arm that was made for one iteration, a hundred cost nothing more.
@@ -322,10 +341,10 @@ def _general(model: MjModel, names: tuple[str, ...], derives: bool) -> MjModel:
     for kind, fields in _FRAMES.items():
         if set(fields) & set(names):
             getattr(model, f"{kind}_sameframe")[:] = 0
-    frames = {*_FRAMES["body"], *(() if derives else _MASSES)}
-    if frames & set(names) and (moved := np.flatnonzero((model.body_simple > 0) & (model.body_dofnum > 0))).size:
+    moved = np.flatnonzero((model.body_simple > 0) & (model.body_dofnum > 0))
+    if set(_FRAMES["body"]) & set(names) and moved.size:
         body = mj.mj_id2name(model, mj.mjtObj.mjOBJ_BODY, int(moved[0]))
-        raise UsageError(f"C MuJoCo takes the inertia of body {body!r} as compiled, and masses or inertias differ")
+        raise UsageError(f"C MuJoCo takes the inertia of body {body!r} as compiled, and its frame differs")
     return model
 
 
