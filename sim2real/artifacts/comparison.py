@@ -1,20 +1,14 @@
-"""Several runs of one robot side by side, and a test for parameters that differ beyond chance."""
+"""Several runs of one robot side by side, and the parameters whose intervals do not overlap."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from scipy.stats import chi2
-
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Estimate, Identification
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.types import Json
-
-LEVEL = 0.01
-"""Chance that a comparison of runs of one unchanged robot names any parameter as different."""
 
 
 @dataclass(frozen=True)
@@ -29,20 +23,18 @@ class ComparedRun:
 
 @dataclass(frozen=True)
 class ComparedParameter:
-    """One parameter in all runs.
-
-    Attributes:
-        estimates: Of each run; None where the run's model has no such parameter.
-        p_value: Chance of estimates this far apart if the parameter is the same in all runs; None where fewer than two
-            runs have a standard error.
-        differs: Whether the estimates differ beyond chance, over all parameters together.
-    """
+    """One parameter in all runs; an estimate is None where the run's model has no such parameter."""
 
     name: str
     unit: str
     estimates: tuple[Estimate | None, ...]
-    p_value: float | None
-    differs: bool
+
+    @property
+    def overlap(self) -> bool | None:
+        """Whether the 95 % intervals of all runs overlap; None where fewer than two runs have one."""
+        ends = [(e.low95, e.high95) for e in self.estimates if e is not None]
+        known = [(low, high) for low, high in ends if low is not None and high is not None]
+        return max(low for low, _ in known) <= min(high for _, high in known) if len(known) > 1 else None
 
 
 @dataclass(frozen=True)
@@ -55,31 +47,29 @@ class Comparison(Shown):
     @staticmethod
     def of(runs: Sequence[ComparedRun]) -> Comparison:
         """Compare runs; a parameter takes part if at least two runs have it in the same unit."""
-        tables = [_by_name(run) for run in runs]
+        tables = [
+            {} if run.identification is None else {(e.name, e.unit): e for e in run.identification.parameters}
+            for run in runs
+        ]
         names = dict.fromkeys(key for table in tables for key in table)
         shared = [key for key in names if sum(key in table for table in tables) > 1]
-        estimates = [tuple(table.get(key) for table in tables) for key in shared]
-        p_values = [_homogeneity(row) for row in estimates]
-        differs = _holm(p_values)
-        parameters = zip(shared, estimates, p_values, differs, strict=True)
-        return Comparison(tuple(runs), tuple(ComparedParameter(*key, row, p, d) for key, row, p, d in parameters))
+        parameters = (ComparedParameter(*key, tuple(table.get(key) for table in tables)) for key in shared)
+        return Comparison(tuple(runs), tuple(parameters))
 
     @property
     def different(self) -> tuple[str, ...]:
-        """Names of the parameters that differ beyond chance."""
-        return tuple(p.name for p in self.parameters if p.differs)
+        """Names of the parameters whose intervals do not overlap."""
+        return tuple(p.name for p in self.parameters if p.overlap is False)
 
     def about(self) -> Mapping[str, Json]:
         """Return name -> value for a short representation."""
-        return {"runs": len(self.runs), "differ": ", ".join(self.different) or "no parameter"}
+        return {"runs": len(self.runs), "intervals apart": ", ".join(self.different) or "of no parameter"}
 
     def rows(self) -> ArtifactTable:
         """Return the table of parameters: estimate and half-width of the 95 % interval of each run."""
-        headers = ("parameter", "unit", *(run.name for run in self.runs), "differs beyond chance")
-        rows = [
-            [p.name, p.unit, *map(with_interval, p.estimates), "not tested" if p.p_value is None else _verdict(p)]
-            for p in self.parameters
-        ]
+        headers = ("parameter", "unit", *(run.name for run in self.runs), "intervals overlap")
+        words = {None: "", True: "yes", False: "no"}
+        rows = [[p.name, p.unit, *map(with_interval, p.estimates), words[p.overlap]] for p in self.parameters]
         return ArtifactTable(headers, rows)
 
     def figures(self) -> ArtifactTable:
@@ -94,45 +84,13 @@ def with_interval(estimate: Estimate | None) -> str:
     """Return an estimate with the half-width of its 95 % interval; a dash where the run has none."""
     if estimate is None:
         return "-"
-    if estimate.standard_error is None:
+    if estimate.low95 is None or estimate.high95 is None:
         return f"{estimate.estimate:.4g}"
-    return f"{estimate.estimate:.4g} ± {1.96 * estimate.standard_error:.2g}"
-
-
-def _by_name(run: ComparedRun) -> dict[tuple[str, str], Estimate]:
-    estimates = () if run.identification is None else run.identification.parameters
-    return {(e.name, e.unit): e for e in estimates}
-
-
-def _homogeneity(estimates: Sequence[Estimate | None]) -> float | None:
-    """Return the p-value of Cochran's Q: squared distances from the weighted mean, in standard errors."""
-    pairs = [(e.estimate, e.standard_error) for e in estimates if e is not None and e.standard_error]
-    if len(pairs) < 2:
-        return None
-    values, errors = np.array(pairs).T
-    weights = errors**-2.0
-    mean = np.average(values, weights=weights)
-    return float(chi2.sf((weights * (values - mean) ** 2).sum(), len(pairs) - 1))
-
-
-def _holm(p_values: Sequence[float | None]) -> list[bool]:
-    """Return which tests reject at ``LEVEL`` over all of them (Holm's step-down procedure)."""
-    tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
-    rejected = [False] * len(p_values)
-    for rank, (p, i) in enumerate(tested):
-        if p > LEVEL / (len(tested) - rank):
-            break
-        rejected[i] = True
-    return rejected
-
-
-def _verdict(parameter: ComparedParameter) -> str:
-    return f"{'yes' if parameter.differs else 'no'}, p = {parameter.p_value:.2g}"
+    return f"{estimate.estimate:.4g} ± {(estimate.high95 - estimate.low95) / 2:.2g}"
 
 
 def _figures_of(run: ComparedRun) -> dict[str, Json]:
     """Return name -> value of one run's verdicts, held-out errors and scores on the robot."""
-    # Figures of the identification, then those of the deployment.
     figures: dict[str, Json] = {"started": run.started}
     if (identification := run.identification) is not None:
         figures["identification"] = identification.verdict.status
@@ -143,6 +101,5 @@ def _figures_of(run: ComparedRun) -> dict[str, Json]:
             figures["deployment"] = deployment.advice.status
         figures["episodes"] = len(deployment.episodes)
         for gap in deployment.gap:
-            unit = f" [{gap.unit}]" if gap.unit else ""
-            figures[f"{gap.quantity}{unit}"] = gap.real
+            figures[f"{gap.quantity} [{gap.unit}]" if gap.unit else gap.quantity] = gap.real
     return figures

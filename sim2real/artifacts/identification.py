@@ -736,6 +736,11 @@ class Identification(Shown):
         return {p.name: p.estimate for p in self.parameters if p.kind != "derived"}
 
     @property
+    def intervals(self) -> dict[str, tuple[float | None, float | None]]:
+        """Parameter -> its 95 % interval; None where it is unknown."""
+        return {p.name: (p.low95, p.high95) for p in self.parameters}
+
+    @property
     def fields(self) -> list[str]:
         """The measured fields."""
         return [n.removesuffix("_measured") for n in self.samples if n.endswith("_measured")]

@@ -30,7 +30,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "compare": ConfigCommand(
         "parameters with intervals, errors and success of several runs side by side",
-        "stages.compare.stage", "stages.compare.config.CompareConfig",
+        "stages.compare", "stages.compare.CompareConfig",
         examples=("compare runs/NAME/MONDAY runs/NAME/FRIDAY",),
     ),
     "latency": PipelineStage(

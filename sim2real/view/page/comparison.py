@@ -18,11 +18,11 @@ _COLUMNS = 3
 def comparison_page(comparison: Comparison, path: Path) -> Path:
     """Write the page of a comparison and return its path."""
     different = ", ".join(comparison.different)
-    title = f"different beyond chance: {different}" if different else "no parameter differs beyond chance"
+    title = f"intervals that do not overlap: {different}" if different else "the intervals of all parameters overlap"
     banner = Banner("doubt" if different else "good", title)
     blocks: list[Block] = []
     if comparison.parameters:
-        caption = "Estimates with 95 % intervals. A parameter with an orange title differs beyond chance."
+        caption = "Estimates with 95 % intervals. Those of a parameter with an orange title do not overlap."
         wide, phone = (parameters_figure(comparison, f"comparison-{n}", n) for n in (_COLUMNS, 1))
         blocks.append(FigureBlock(wide, caption, phone=phone))
     blocks.append(TableBlock.of("Verdicts, errors and scores", comparison.figures()))
@@ -63,7 +63,7 @@ def _panel(axes: Axes, parameter: ComparedParameter) -> None:
         if estimate.low95 is not None and estimate.high95 is not None:
             axes.plot([scale * estimate.low95, scale * estimate.high95], [row, row], color=colour, lw=1.6)
         axes.plot(scale * estimate.estimate, row, color=colour, marker="o", ms=4.5)
-    axes.set_title(parameter.name, color=ORANGE if parameter.differs else INK)
+    axes.set_title(parameter.name, color=ORANGE if parameter.overlap is False else INK)
     axes.set_xlabel("" if unit == "1" else unit)
     axes.set_ylim(len(parameter.estimates) - 0.5, -0.5)
     axes.set_yticks([])
