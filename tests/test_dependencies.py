@@ -24,7 +24,7 @@ MAY_IMPORT = {
     },
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax_adapter", "sim2real.interop.gymnasium_adapter"},
-    "parquet": {"sim2real.log.importing.files.lerobot"},
+    "parquet": {"sim2real.log.importing.lerobot"},
     "tensorboard": {"sim2real.stages.train.tensorboard"},
     "unitree": {f"sim2real.hardware.unitree.{name}" for name in ("dds", "emulator", "messages")},
     "warp": set(),  # MJX imports Warp itself

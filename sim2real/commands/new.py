@@ -4,6 +4,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
+
 from sim2real.commands.config import NewConfig
 from sim2real.errors import UsageError
 from sim2real.log.importing.mapping import to_toml
@@ -97,7 +99,11 @@ def _described(config: NewConfig) -> tuple[RobotConfig, str]:
     flags = replace(config.robot, mjcf=config.model)
     if config.log is not None:
         model_robot = from_model.from_flags(flags, [config.log])
-        mapping = "" if model_robot.mapping is None else to_toml(replace(model_robot.mapping, pipeline=config.name))
+        mapping = (
+            ""
+            if model_robot.mapping is None
+            else to_toml(msgspec.structs.replace(model_robot.mapping, pipeline=config.name))
+        )
         return model_robot.description, mapping
     # Without a log, describe it by the kind of drive.
     joints = flags.joints or joints_of(read_model(Path(str(config.model))))

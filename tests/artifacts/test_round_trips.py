@@ -27,8 +27,14 @@ from sim2real.artifacts.run.manifest import read_manifest, write_manifest
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.log.importing.mapping import FieldMapping, ImportMapping, NodeMapping, load_mapping, to_toml
-from sim2real.log.toml_text import toml_value
+from sim2real.log.importing.mapping import (
+    FieldMapping,
+    ImportMapping,
+    NodeMapping,
+    load_mapping,
+    to_toml,
+    toml_value,
+)
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import RobotConfig
 from sim2real.stages.latency.result import Latency

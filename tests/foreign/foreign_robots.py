@@ -1,4 +1,4 @@
-"""Logs of robots that nobody here has seen, with what is right about them: signs, orders, units, delay, positions."""
+"""Logs of robots that nobody here has seen, with the truth about them: order, signs, units, delay, positions."""
 
 from __future__ import annotations
 
@@ -6,12 +6,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim2real.log.importing.files.foreign import open_foreign
-from sim2real.log.importing.importer import import_opened
-from sim2real.log.importing.proposal import propose
-from sim2real.log.importing.quantities import ImportHints
+from sim2real.log.importing.importer import import_table
+from sim2real.log.importing.propose import ImportHints, propose
+from sim2real.log.importing.readers import open_tables
 
-KINDS = ("sine", "triangle", "chirp", "gait", "multisine")
+KINDS = ("sine", "triangle", "chirp", "gait", "multisine", "jerk", "stairs")
+STYLES = {
+    "plain": ("q_{0}{1}", "goal_{0}{1}"),
+    "last": ("{0}_pos{1}", "{0}_cmd{1}"),
+    "dots": ("state.{0}.position{1}", "command.{0}.position{1}"),
+    "square": ("{0} position{1}", "{0} target{1}"),
+}
+SUFFIX = {"rad": "_rad", "deg": "_deg", "rev": "_turns", "counts": "_ticks", "percent": "_percent"}
+VENDOR = ("FR_0", "FR_1", "FR_2", "FL_0", "FL_1", "FL_2")
+MODEL = tuple(f"{leg}_{part}_joint" for leg in ("FL", "FR") for part in ("hip", "thigh", "calf"))
 
 
 def servo(t, goal, late_s=0.02, wn=25.0, damping=0.9):
@@ -44,17 +52,18 @@ def csv(path, columns, end=""):
     return path
 
 
+def proposed(path, **asked):
+    """Return the proposed mapping of a file, which may have open questions."""
+    (table,) = open_tables(path)
+    return propose(table, ImportHints("x", **asked))
+
+
 def imported(path, **asked):
-    """Return the episode that a file becomes without a mapping, and the proposal."""
-    file = open_foreign(path)
-    found = propose(file, ImportHints("x", **asked))
-    return import_opened(file, found.mapping), found
-
-
-def goal_scales(found):
-    """Return the scale of each joint's goal."""
-    own = found.mapping.nodes["actuator"].fields["goal"]
-    return np.broadcast_to(own.scale, (len(found.joints),))
+    """Return the episode that a file becomes without a mapping, and the proposal; no question may be open."""
+    (table,) = open_tables(path)
+    found = propose(table, ImportHints("x", **asked))
+    assert found.questions == {}
+    return import_table(table, found.mapping), found
 
 
 def wave(kind, rng):
@@ -70,6 +79,17 @@ def wave(kind, rng):
     if kind == "gait":
         second, at = rng.uniform(0.1, 0.5), rng.uniform(0, 2 * np.pi)
         return lambda t: 0.4 * (np.sin(2 * np.pi * f * t + phase) + second * np.sin(4 * np.pi * f * t + at))
+    if kind in ("jerk", "stairs"):
+        levels, dwell = rng.uniform(-0.5, 0.5, 40), rng.uniform(0.5, 1.5)
+
+        def between(t):
+            """From one level to the next in 60 % of a dwell: a minimum-jerk motion, or a fast one."""
+            k = np.clip(np.floor(t / dwell).astype(int), 0, 38)
+            share = np.clip((t / dwell - k) / (0.6 if kind == "jerk" else 0.08), 0, 1)
+            smooth = share**3 * (10 - 15 * share + 6 * share**2)
+            return np.where(t < 0, levels[0], levels[k] + (levels[k + 1] - levels[k]) * smooth)
+
+        return between
     tones, phases = rng.uniform(0.1, 2.5, 8), rng.uniform(0, 2 * np.pi, 8)
     return lambda t: 0.13 * np.sin(2 * np.pi * np.multiply.outer(t, tones) + phases).sum(axis=-1)
 
@@ -79,30 +99,30 @@ class Log:
     """A log as columns, and the truth about it.
 
     Attributes:
-        columns: Name -> values, or texts; what goes into the file.
+        columns: Name -> values; what goes into the file.
         kind: What moved the joints.
-        joints: Their names, in the order of the measured columns.
+        joints: Their names, in the order in which they must be imported.
+        asked: Joints of the robot, if they are known.
         sign: Of positions over commands, of each joint.
-        goals: Of each joint: the goal's source in the file.
         units: Unit of the positions and of the goals.
-        named: Whether columns have names of joints.
         late_s: Delay [s].
-        period_s: Time between samples [s].
-        position: Shape ``(N, joints)`` [rad].
+        position: Shape ``(N, joints)`` [rad], in the order of the joints.
+        goal: Shape ``(N, joints)`` [rad], with the sign that makes the position follow.
         dropped: Samples that must not be imported.
         marks: What else is odd about it.
     """
 
-    columns: dict
     kind: str
-    joints: tuple
-    sign: np.ndarray
-    goals: list
-    units: tuple
-    named: bool
     late_s: float
     period_s: float
-    position: np.ndarray
+    columns: dict = field(default_factory=dict)
+    joints: tuple = ()
+    asked: tuple = ()
+    sign: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    units: tuple = ()
+    named: bool = True
+    position: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    goal: np.ndarray = field(default_factory=lambda: np.zeros(0))
     dropped: set = field(default_factory=set)
     marks: list = field(default_factory=list)
 
@@ -111,78 +131,90 @@ def draw(seed):
     """Return a random log."""
     rng = np.random.default_rng(seed)
     kind, n = KINDS[seed % len(KINDS)], int(rng.integers(1, 6))
-    period_s, late_s = 1 / rng.choice([30.0, 50.0, 100.0, 200.0, 333.0]), rng.uniform(0, 0.3)
-    t = period_s * np.arange(int(rng.uniform(8, 16) / period_s))
+    vendor = rng.random() < 0.1
+    n = len(VENDOR) if vendor else n
+    log = Log(kind, rng.uniform(0, 0.3), 1 / rng.choice([30.0, 50.0, 100.0, 200.0, 333.0]))
+    t = log.period_s * np.arange(int(rng.uniform(8, 16) / log.period_s))
     shared = wave(kind, rng)
     waves = [shared if kind == "gait" or rng.random() < 0.2 else wave(kind, rng) for _ in range(n)]
     apart = rng.uniform(0, 0.5, n) if kind == "gait" else np.zeros(n)
-    # Without a level, the sign of a tone is open; the first thousand logs have levels.
-    size, mean = rng.uniform(0.5, 1.6, n), rng.uniform(-0.6, 0.6, n) * (seed < 1000 or rng.random() < 0.5)
-    turning = rng.random(n) < 0.15
+    # Without a level, the sign of a tone is open.
+    size, mean = rng.uniform(0.5, 1.6, n), rng.uniform(-0.6, 0.6, n) * (rng.random() < 0.7)
+    held = (rng.random(n) < 0.15) & (n > 1)
+    size = np.where(held, 0.0, size)
+    turning = (rng.random(n) < 0.1) & ~held & (kind != "stairs")
     onward = np.where(turning, rng.choice([-1, 1], n) * rng.uniform(0.4, 1.2, n), 0.0)
 
-    def motion(at):
+    def moved(at):
         return np.stack([size[i] * waves[i](at - apart[i]) + mean[i] + onward[i] * at for i in range(n)], axis=1)
 
-    sign = np.where(rng.random(n) < 0.3, -1.0, 1.0)
-    goal, q = motion(t), motion(t - late_s) + rng.choice([2e-4, 1e-3, 4e-3]) * rng.standard_normal((len(t), n))
-    log = Log({"t_s": t}, kind, (), sign, [], (), True, late_s, period_s, q)
-    log.position = q
-    written, commanded = q.copy(), goal * sign
+    log.sign = np.where(rng.random(n) < 0.3, -1.0, 1.0)
+    log.goal = moved(t)
+    log.position = moved(t - log.late_s) + rng.choice([2e-4, 1e-3, 4e-3]) * rng.standard_normal((len(t), n))
+    written, commanded = log.position.copy(), log.goal * log.sign
     if turning.any():
         log.marks.append("turns")
         low = rng.choice([-np.pi, 0.0])
-        written[:, turning], commanded[:, turning] = (
-            (x[:, turning] - low) % (2 * np.pi) + low for x in (written, commanded)
-        )
+        for x in (written, commanded):
+            x[:, turning] = (x[:, turning] - low) % (2 * np.pi) + low
     _spoil(log, written, rng)
-    _write(log, written, commanded, rng)
+    log.columns["t_s"] = t
+    _write(log, written, commanded, vendor, rng)
     return log
 
 
 def _spoil(log, written, rng):
     """Put glitches and missing numbers into what was measured."""
     n, joints = written.shape
-    if rng.random() < 0.3:
-        rows = rng.choice(np.arange(5, n - 5), 4, replace=False)
-        value, i = -np.pi, int(rng.integers(joints))
+    if rng.random() < 0.2:
+        rows, value, i = rng.choice(np.arange(5, n - 5), 4, replace=False), -np.pi, int(rng.integers(joints))
         # On a circle, what is close to half a turn on either side is no glitch.
         rows = [k for k in rows if np.abs((written[k, i] - value + np.pi) % (2 * np.pi) - np.pi) > 1.5]
         written[rows, i] = value
         log.dropped |= {int(k) for k in rows}
         log.marks.append("glitches")
-    if rng.random() < 0.3:
+    if rng.random() < 0.2:
         rows = rng.choice(n, 5, replace=False)
         written[rows, rng.integers(joints)] = np.nan
         log.dropped |= {int(k) for k in rows}
         log.marks.append("missing")
 
 
-def _write(log, written, commanded, rng):
+def _write(log, written, commanded, vendor, rng):
     n = written.shape[1]
-    log.units = tuple(rng.choice(["rad", "deg"], 2))
-    told = [rng.random() < 0.6 for _ in range(2)]
+    odd = rng.random() < 0.3
+    log.units = tuple(rng.choice(["rev", "counts", "percent"] if odd else ["rad", "deg"], 2))
+    log.units = log.units if rng.random() < 0.3 else (log.units[0],) * 2
+    told = [bool(rng.random() < 0.6) for _ in range(2)]
+    range_rad = rng.uniform(1.2, 3.0)
+    per_rad = {"rad": 1, "deg": 180 / np.pi, "rev": 0.5 / np.pi, "counts": 2048 / np.pi, "percent": 100 / range_rad}
+    written, commanded = (x * per_rad[u] for x, u in zip((written, commanded), log.units, strict=True))
     written, commanded = (
-        np.degrees(x) if u == "deg" else x for x, u in zip((written, commanded), log.units, strict=True)
+        np.round(x) if u == "counts" else x for x, u in zip((written, commanded), log.units, strict=True)
     )
-    suffix = [f"_{u}" if say else "" for u, say in zip(log.units, told, strict=True)]
-    names, log.named = [f"j{'abcdefgh'[i]}" for i in range(n)], bool(rng.random() < 0.6)
+    suffix = [SUFFIX[u] if say else "" for u, say in zip(log.units, told, strict=True)]
     order = rng.permutation(n)
+    log.named = bool(vendor or rng.random() < 0.6)
     if log.named:
-        log.columns |= {f"goal_{names[i]}{suffix[1]}": commanded[:, i] for i in order}
-        log.columns |= {f"q_{names[i]}{suffix[0]}": written[:, i] for i in range(n)}
-        log.goals = [f"goal_{names[i]}{suffix[1]}" for i in range(n)]
+        names = list(VENDOR) if vendor else [f"j{'abcdefgh'[i]}" for i in range(n)]
+        q, goal = STYLES[str(rng.choice(list(STYLES)))]
+        log.columns |= {goal.format(names[i], suffix[1]): commanded[:, i] for i in order}
+        log.columns |= {q.format(names[i], suffix[0]): written[:, i] for i in range(n)}
+        if vendor:
+            places = [VENDOR.index(f"{leg}_{k}") for leg in ("FL", "FR") for k in range(3)]
+            log.asked, log.joints = MODEL, MODEL
+            log.position, log.goal, log.sign = log.position[:, places], log.goal[:, places], log.sign[places]
+        else:
+            log.joints = tuple(names)
     else:
+        # The program that wrote them did so in one order, or, rarely, in two.
+        order = order if rng.random() < 0.5 else np.arange(n)
         log.columns |= {f"goal{suffix[1]}": commanded[:, order], f"q{suffix[0]}": written}
-        place = {int(i): k for k, i in enumerate(order)}
-        log.goals = [f"goal{suffix[1]}[:,{place[i]}]" for i in range(n)]
-    log.joints = tuple(names) if log.named else tuple(map(str, range(n)))
-    if rng.random() < 0.3:
-        log.columns["effort" if not log.named else f"effort_{names[0]}"] = np.full(len(written), np.nan)
-        log.marks.append("empty column")
+        log.joints = tuple(map(str, range(n)))
+    if rng.random() < 0.2:
+        log.columns["effort" if not log.named else "effort_ja"] = np.full(len(written), np.nan)
     if rng.random() < 0.2:
         log.columns["kd"] = np.zeros(len(written))
-        log.marks.append("kd 0")
 
 
 def save(log, folder):
@@ -193,3 +225,25 @@ def save(log, folder):
     rows = np.column_stack(list(log.columns.values()))
     np.savetxt(folder / "log.csv", rows, delimiter=",", header=",".join(log.columns), comments="", fmt="%.7f")
     return folder / "log.csv"
+
+
+def faults(log, episode, found):
+    """Return what is wrong about an import without a word; an empty list if it is right."""
+    wrong = []
+    kept = np.setdiff1d(np.arange(len(log.position)), sorted(log.dropped))
+    position, goal = episode.outputs["sensor"]["position"], episode.outputs["actuator"].get("goal")
+    if goal is None:
+        return [f"goals are {list(episode.outputs['actuator'])}"]
+    if len(position) != len(kept):
+        return [f"{len(position)} samples for {len(kept)}"]
+    off = position - log.position[kept]
+    off -= 2 * np.pi * np.round(np.median(off, axis=0) / (2 * np.pi))
+    if np.abs(off).max() > (2e-3 if "counts" in log.units else 1e-3):
+        wrong.append(f"positions off by {np.abs(off).max():.3g} rad")
+    for i, joint in enumerate(log.joints):
+        unproven = any(joint in line and "not checked" in line for line in found.evidence)
+        off = goal[:, i] - log.goal[:, i]
+        off -= 2 * np.pi * np.round(np.median(off) / (2 * np.pi))
+        if np.abs(off).max() > 2e-3 and not unproven:
+            wrong.append(f"goal of {joint} off by {np.abs(off).max():.3g} rad")
+    return wrong

@@ -51,10 +51,10 @@ def test_each_file_becomes_a_run_with_the_pipelines_mapping(workplace, capsys):
     np.testing.assert_array_equal(episode.steps["sensor"].start, foreign_files.STAMPS_US)
 
 
-def test_a_mapping_of_ones_own_a_format_a_range_and_a_name_for_the_log(workplace, capsys):
+def test_a_mapping_of_ones_own_a_range_and_a_name_for_the_log(workplace, capsys):
     (workplace / "one.npz").rename("one.dat")
     (workplace / "map.toml").write_text(foreign_files.TOML.replace("rig", "arm"))
-    flags = ["--mapping", "map.toml", "--format", "npz", "--samples", "10:20", "--out", "log.mcap"]
+    flags = ["--mapping", "map.toml", "--samples", "10:20", "--out", "log.mcap"]
     assert cli.main(["import", *flags, "one.dat"]) == 0
     assert "wrote log.mcap" in capsys.readouterr().out
     assert not Path("runs").exists()
@@ -67,12 +67,13 @@ def test_a_mapping_of_ones_own_a_format_a_range_and_a_name_for_the_log(workplace
     ("arguments", "named"),
     [
         ([], "import needs a file"),
-        (["one.npz"], "too few for a correlation"),
+        (["one.npz"], "write a mapping"),
         (["one.npz", "--pipeline", "no_such_robot"], "no_such_robot"),
-        (["one.npz", "--pipeline", "pendulum"], "no mapping file"),
+        (["one.npz", "--pipeline", "pendulum"], "hinge"),
         (["one.npz", "--mapping", "none.toml"], "none.toml"),
         (["none.npz", "--pipeline", "rig"], "none.npz"),
-        (["one.npz", "--pipeline", "rig", "--format", "bag"], "lerobot"),
+        (["one.npz", "--unit", "furlongs"], "counts:N"),
+        (["one.npz", "--episode", "3"], "no episodes"),
         (["one.npz", "--pipeline", "rig", "--samples", "10"], "A:B"),
         (["one.npz", "--pipeline", "rig", "--samples", "10:99"], "0:50"),
         (["one.npz", "two.npz", "--pipeline", "rig", "--out", "log.mcap"], "one by one"),
@@ -97,7 +98,7 @@ def test_help_says_all_flags_and_imports_nothing_heavy():
     assert lines[-1] == "[]"
     text = "\n".join(lines)
     assert "usage: sim2real import" in text
-    for flag in ("--mapping", "--pipeline", "--format", "--samples", "--out", "--runs", "FILE"):
+    for flag in ("--mapping", "--pipeline", "--unit", "--samples", "--out", "--runs", "FILE"):
         assert flag in text
 
 

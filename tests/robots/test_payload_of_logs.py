@@ -10,7 +10,7 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
-from sim2real.log.importing.signal_names import meaning
+from sim2real.log.importing.names import meaning
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 

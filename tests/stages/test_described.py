@@ -114,7 +114,7 @@ def test_gains_and_torque_that_is_switched_make_inputs(workplace, recorded):
 def test_an_imported_log_is_taken_as_it_is(workplace, capsys):
     assert cli.main(["import", "run.npz", "--mjcf", "robot.xml", "--out", "run.mcap"]) == 0
     out, err = capsys.readouterr()
-    assert "'q_rad' follows 'goal_rad'" in err
+    assert "positions follow their goals" in err
     assert "wrote run.import.toml" in out
     assert read_log("run.mcap").metadata["pipeline"] == "robot"
     found = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.mcap"])
@@ -205,7 +205,7 @@ def test_a_mapping_that_the_data_contradicts_is_refused(workplace, capsys, recor
     Path("wrong.toml").write_text(swapped)
     capsys.readouterr()
     assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap"]) == 2
-    assert "joint 0 follows the command of joint 1" in capsys.readouterr().err
+    assert "joint 0 follows the goal of joint 1" in capsys.readouterr().err
     assert not Path("wrong.mcap").exists()
     assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap", "--as-told"]) == 0
     with pytest.raises(UsageError, match="contradict"):

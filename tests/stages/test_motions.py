@@ -71,7 +71,7 @@ def test_an_episode_of_a_lerobot_data_set_is_a_motion(tmp_path):
     folder = tmp_path / "data" / "chunk-000"
     folder.mkdir(parents=True)
     (tmp_path / "meta").mkdir()
-    names = [f"{name}.pos" for name in SERVOS.names]
+    names = [f"{name}.pos_deg" for name in SERVOS.names]
     features = {key: {"dtype": "float32", "shape": [6], "names": names} for key in ("action", "observation.state")}
     info = {"codebase_version": "v2.1", "fps": 30, "robot_type": "so101_follower", "features": features}
     (tmp_path / "meta" / "info.json").write_text(json.dumps(info))

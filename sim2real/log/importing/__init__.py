@@ -1,1 +1,1 @@
-"""Files of other recorders as logs: the mapping of signals to joints, its evidence, and the importer."""
+"""Imports of other recorders' files: a table of signals and an explicit mapping become a log."""

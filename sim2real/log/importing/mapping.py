@@ -3,79 +3,128 @@
 from __future__ import annotations
 
 import difflib
+import json
 import math
+import re
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
+
+import msgspec
 
 from sim2real.errors import UsageError
-from sim2real.log.toml_text import toml_key, toml_value
 from sim2real.types import Json
 
 STAMP_UNITS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 """Unit of time stamps -> nanoseconds."""
 MAPPING = "import.toml"
 """The mapping file in a pipeline's folder."""
-_COMMANDING = "actuator"
-_POLICIES = {"missing": ("refuse", "drop"), "repeated": ("refuse", "first"), "implausible": ("refuse", "drop")}
-"""Key of a node's policy for unusable samples -> values; the first is the default."""
+_SI = {"deg": (math.pi / 180, "rad"), "rev": (2 * math.pi, "rad"), "mrad": (1e-3, "rad"), "mm": (1e-3, "m")}
+"""Unit that is converted -> factor and SI unit."""
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+_OPEN = re.compile(r"^#\s*([a-z_]+) = .*\?", re.MULTILINE)
 _HINT = "the guide 'Import' has a mapping file with every key"
 
 
-@dataclass(frozen=True)
-class FieldMapping:
+def in_si(unit: str) -> tuple[float, str]:
+    """Return factor and SI unit of a unit in a file: degrees, turns, mrad and mm, ``counts:N``, each also per second.
+
+    ``counts:4096`` are steps of an encoder with 4096 counts a turn. Other units stay as they are.
+    """
+    base, per, time = unit.partition("/")
+    factor, si = _SI.get(base, (1.0, base))
+    if match := re.fullmatch(r"counts:([1-9][0-9]*)", base):
+        factor, si = 2 * math.pi / int(match[1]), "rad"
+    return factor, f"{si}{per}{time}"
+
+
+class FieldMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """The source of a field of a node's output.
 
     Attributes:
-        source: Name of a signal in the file, as for ``ForeignFile.signal``; several signals are stacked.
-        unit: Unit of the field, after scaling.
+        source: Name of a signal in the file, or several, which are stacked.
+        unit: Unit of the field after scaling; degrees, turns and counts are converted to radians, mm to m.
         scale: The field is ``scale * signal + offset``; one number, or one for each column.
-        offset: See ``scale`` [the field's unit].
+        offset: See ``scale`` [the field's unit]; one number, or one for each column.
         shape: Shape of one sample; None: as in the file; ``(-1,)``: a vector, of a number one of length 1.
         column: Column of a two-dimensional signal; None: all columns.
         turn: A turn in the signal's unit, to count turns of angles that jump at its end; 0: no counting.
     """
 
-    source: tuple[str, ...]
+    source: str | tuple[str, ...]
     unit: str = ""
     scale: float | tuple[float, ...] = 1.0
-    offset: float = 0.0
+    offset: float | tuple[float, ...] = 0.0
     shape: tuple[int, ...] | None = None
     column: int | None = None
     turn: float = 0.0
 
+    def __post_init__(self) -> None:
+        if not self.sources or not all(self.sources):
+            raise ValueError("a field needs a source: the name of a signal, or a list of names")
+        for key in ("scale", "offset"):
+            value = getattr(self, key)
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not numbers or not all(map(math.isfinite, numbers)):
+                raise ValueError(f"{key} must be a finite number, or a list of them, got {value}")
+        if not 0.0 <= self.turn < math.inf:
+            raise ValueError(f"turn must be above 0, such as 360 for degrees, got {self.turn}")
+        if self.shape not in (None, (-1,)) and not all(n > 0 for n in self.shape or ()):
+            raise ValueError(f"shape must be whole numbers above 0, or [-1] for a vector, got {list(self.shape or ())}")
+        if not self.unit.isprintable():
+            raise ValueError(f"a unit stands on one line, got {self.unit!r}")
 
-@dataclass(frozen=True)
-class NodeMapping:
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The names of the signals."""
+        return (self.source,) if isinstance(self.source, str) else self.source
+
+    @property
+    def log_unit(self) -> str:
+        """Unit of the field in the log."""
+        return in_si(self.unit)[1]
+
+
+class NodeMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """The source of a node's messages.
 
     Attributes:
         fields: Field -> its source.
         rate_hz: Rate of generated time stamps [Hz], or the name of a signal with the rate; None: use ``stamps``.
         stamps: Signal with the recorded time stamps; None: use ``rate_hz``.
-        stamp_unit: Unit of the recorded stamps, one of ``STAMP_UNITS``.
-        order: Order of messages with equal stamps: those of nodes with a lower number are first.
-        missing: Policy for samples that lack a number: ``refuse``, or ``drop`` to skip them.
-        repeated: Policy for samples with the stamp of the one before: ``refuse``, or ``first`` to keep the first.
+        stamp_unit: Unit of the recorded stamps.
+        order: Order of messages with equal stamps: those of nodes with a lower number are first; None: commands
+            (of a node ``actuator``) come after samples, as they were computed from them.
+        missing: Policy for samples that lack a number.
+        repeated: Policy for samples with the stamp of the one before: ``first`` keeps the first.
         stamp_offset: Added to the recorded stamps, for a stream with its own clock [s].
-        implausible: Policy for samples whose positions leap away and back: ``refuse``, or ``drop``.
+        implausible: Policy for samples whose positions leap away and back.
     """
 
     fields: Mapping[str, FieldMapping]
     rate_hz: float | str | None = None
     stamps: str | None = None
-    stamp_unit: str = "s"
-    order: int = 0
-    missing: str = "refuse"
-    repeated: str = "refuse"
+    stamp_unit: Literal["s", "ms", "us", "ns"] = "s"
+    order: int | None = None
+    missing: Literal["refuse", "drop"] = "refuse"
+    repeated: Literal["refuse", "first"] = "refuse"
     stamp_offset: float = 0.0
-    implausible: str = "refuse"
+    implausible: Literal["refuse", "drop"] = "refuse"
+
+    def __post_init__(self) -> None:
+        if not self.fields:
+            raise ValueError("a node has fields: fields.NAME = { source = ... }")
+        if (self.rate_hz is None) == (self.stamps is None):
+            raise ValueError("a node has either 'stamps', which are recorded, or 'rate_hz', which generates them")
+        if isinstance(self.rate_hz, float):
+            positive(self.rate_hz, "rate_hz")
+        if not math.isfinite(self.stamp_offset) or (self.stamp_offset and self.stamps is None):
+            raise ValueError("stamp_offset is a finite number [s], added to recorded stamps")
 
 
-@dataclass(frozen=True)
-class ImportMapping:
+class ImportMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """The mapping of another recorder's file to a log.
 
     Attributes:
@@ -90,16 +139,18 @@ class ImportMapping:
 
     @property
     def units(self) -> dict[str, dict[str, str]]:
-        """Node -> field -> unit, for the fields that have one."""
-        return {n: {f: m.unit for f, m in node.fields.items() if m.unit} for n, node in self.nodes.items()}
+        """Node -> field -> unit in the log, for the fields that have one."""
+        return {n: {f: m.log_unit for f, m in node.fields.items() if m.unit} for n, node in self.nodes.items()}
 
     def of_joints(self) -> ImportMapping:
         """Return the mapping with a vector for each field, as joints have it."""
         nodes = {
-            name: replace(n, fields={k: replace(f, shape=f.shape or (-1,)) for k, f in n.fields.items()})
+            name: msgspec.structs.replace(
+                n, fields={k: msgspec.structs.replace(f, shape=f.shape or (-1,)) for k, f in n.fields.items()}
+            )
             for name, n in self.nodes.items()
         }
-        return replace(self, nodes=nodes)
+        return msgspec.structs.replace(self, nodes=nodes)
 
     def inputs(self, file: Path) -> dict[str, Path]:
         """Return the files that an import reads, by name, for the manifest."""
@@ -116,22 +167,31 @@ class ImportMapping:
             UsageError: When a key is unknown, missing or of the wrong type.
         """
         where = "the mapping" if path is None else str(path)
-        _check_keys(tables, ("pipeline", "nodes"), where)
-        # The pipeline of the document must agree with the given one.
-        named = _value(tables, "pipeline", str, where)
-        if named is None and pipeline is None:
+        document = _converted(tables, _Document, where)
+        if document.pipeline is None and pipeline is None:
             raise UsageError(f"{where} does not name the pipeline of the log", hint='add pipeline = "NAME"')
-        if named is not None and pipeline not in (None, named):
+        if document.pipeline is not None and pipeline not in (None, document.pipeline):
             raise UsageError(
-                f"{where} is for pipeline {named!r}, not for {pipeline!r}", hint="name the mapping with --mapping FILE"
+                f"{where} is for pipeline {document.pipeline!r}, not for {pipeline!r}",
+                hint="name the mapping with --mapping FILE",
             )
-        nodes = _value(tables, "nodes", dict, where) or {}
-        if not nodes:
+        if not document.nodes:
             raise UsageError(f"{where} has no nodes", hint="add a table [nodes.NAME] for each node; " + _HINT)
-        nodes_by_name = {
-            name: _node(name, _table(node, f"{where}: nodes.{name}"), where) for name, node in nodes.items()
-        }
-        return ImportMapping(str(named or pipeline), nodes_by_name, path)
+        nodes = {}
+        for name, table in document.nodes.items():
+            at, listed = f"{where}: nodes.{name}", table.get("fields")
+            fields = {
+                field: _converted(how, FieldMapping, f"{at}.fields.{field}")
+                for field, how in (listed.items() if isinstance(listed, dict) else ())
+            }
+            plain = {field: msgspec.to_builtins(how) for field, how in fields.items()}
+            nodes[name] = _converted(table | ({"fields": plain} if fields else {}), NodeMapping, at)
+        return ImportMapping(str(document.pipeline or pipeline), nodes, path)
+
+
+class _Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    pipeline: str | None = None
+    nodes: dict[str, dict[str, Json]] = {}
 
 
 def load_mapping(path: str | Path | None, pipeline: str | None = None, package: str | None = None) -> ImportMapping:
@@ -143,7 +203,7 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
         package: Name of the pipeline's package, which must be imported.
 
     Raises:
-        UsageError: When the file does not exist, is not TOML, or is no valid mapping.
+        UsageError: When the file does not exist, is not TOML, is no valid mapping, or has an open question.
     """
     if path is None and package is not None:
         path = Path(str(sys.modules[package].__file__)).with_name(MAPPING)
@@ -155,54 +215,21 @@ def load_mapping(path: str | Path | None, pipeline: str | None = None, package: 
     # Read the document, with errors that name the file.
     path = Path(path)
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        tables = tomllib.loads(text)
     except FileNotFoundError:
         raise UsageError(f"there is no mapping file {path}", hint=f"write one, or name another; {_HINT}") from None
     except OSError as error:
         raise UsageError(f"the mapping file {path} cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise UsageError(f"{path} is no TOML: {error}", hint=_HINT) from None
-    return ImportMapping.from_dict(tables, pipeline, path)
-
-
-def _node(name: str, table: Mapping[str, Json], document: str) -> NodeMapping:
-    where = f"{document}: nodes.{name}"
-    keys = ("fields", "rate_hz", "stamps", "stamp_unit", "order", *_POLICIES, "stamp_offset")
-    _check_keys(table, keys, where)
-    fields = _value(table, "fields", dict, where) or {}
-    if not fields:
-        raise UsageError(f"{where} has no fields", hint=f'add fields.NAME = {{ source = "..." }}; {_HINT}')
-    rate_hz = _value(table, "rate_hz", (int, float, str), where)
-    stamps = _value(table, "stamps", str, where)
-    if (rate_hz is None) == (stamps is None):
+    if question := _OPEN.search(text):
+        line = text.count("\n", 0, question.start()) + 1
         raise UsageError(
-            f"{where} needs either 'stamps' or 'rate_hz'" + (", not both" if stamps is not None else ""),
-            hint="stamps keeps the recorded stamps; rate_hz generates stamps, and marks them as generated",
+            f"{path} has an open question in line {line}: {text.splitlines()[line - 1].lstrip('# ')}",
+            hint=f"put the answer in place of the line, such as {question[1]} = ...",
         )
-    if isinstance(rate_hz, int | float):
-        rate_hz = positive(float(rate_hz), f"{where}: rate_hz")
-    unit = _value(table, "stamp_unit", str, where) or "s"
-    if unit not in STAMP_UNITS:
-        raise UsageError(f"{where}: unknown stamp_unit {unit!r}. Available: {', '.join(STAMP_UNITS)}", hint=_HINT)
-    policies = {}
-    for key, available in _POLICIES.items():
-        policies[key] = _value(table, key, str, where) or "refuse"
-        if policies[key] not in available:
-            raise UsageError(f"{where}: unknown {key} {policies[key]!r}. Available: {', '.join(available)}", hint=_HINT)
-    late_s = float(_value(table, "stamp_offset", (int, float), where) or 0.0)
-    if not math.isfinite(late_s) or (late_s and stamps is None):
-        raise UsageError(f"{where}: stamp_offset is a finite number [s], added to recorded stamps", hint=_HINT)
-    # Commands come after samples with the same stamp, as they were computed from them.
-    order = _value(table, "order", int, where)
-    return NodeMapping(
-        fields={f: _field(_table(v, f"{where}.fields.{f}"), f"{where}.fields.{f}") for f, v in fields.items()},
-        rate_hz=rate_hz,
-        stamps=stamps,
-        stamp_unit=unit,
-        order=int(name == _COMMANDING) if order is None else order,
-        stamp_offset=late_s,
-        **policies,
-    )
+    return ImportMapping.from_dict(tables, pipeline, path)
 
 
 def positive(value: float, where: str) -> float:
@@ -216,94 +243,86 @@ def positive(value: float, where: str) -> float:
     return value
 
 
-def _field(table: Mapping[str, Json], where: str) -> FieldMapping:
-    # Read the sources.
-    _check_keys(table, ("source", "unit", "scale", "offset", "shape", "column", "turn"), where)
-    source = _value(table, "source", (str, list), where)
-    sources = [source] if isinstance(source, str) else source or []
-    if not sources or not all(isinstance(s, str) and s for s in sources):
-        raise UsageError(f"{where} needs a source: the name of a signal, or a list of names", hint=_HINT)
-    # Check the numbers of scale, offset, turn and shape.
-    scale, offset = _value(table, "scale", (int, float, list), where), _value(table, "offset", (int, float), where)
-    scales = scale if isinstance(scale, list) else [1.0 if scale is None else scale]
-    for key, numbers in (("scale", scales), ("offset", [offset or 0.0])):
-        if not numbers or not all(type(n) in (int, float) and math.isfinite(n) for n in numbers):
+def _converted(table: object, kind: type, where: str):  # noqa: ANN202 - an instance of kind
+    try:
+        return msgspec.convert(table, kind)
+    except msgspec.ValidationError as error:
+        text, hint = str(error), _HINT
+        if match := re.search(r"unknown field `(\w+)`", text):
+            keys = list(kind.__struct_fields__)
+            close = difflib.get_close_matches(match[1], keys, n=1)
+            text, hint = f"{text}. Available: {', '.join(keys)}", f"did you mean {close[0]}?" if close else _HINT
+        raise UsageError(f"{where}: {text}", hint=hint) from None
+
+
+def to_toml(
+    mapping: ImportMapping,
+    comments: Sequence[str] = (),
+    reasons: Mapping[tuple[str, str, str], str] | None = None,
+    questions: Mapping[tuple[str, str, str], str] | None = None,
+) -> str:
+    """Return a mapping as the text of a mapping file.
+
+    Args:
+        comments: Lines at the beginning.
+        reasons: (node, field or empty, key) -> evidence for the line of the key.
+        questions: (node, field or empty, key) -> the question, which stands in place of the line of the key.
+    """
+    reasons, questions = reasons or {}, questions or {}
+    lines = [*(f"# {part}" for line in comments for part in _printable(line))]
+    lines.append(f"pipeline = {toml_value(mapping.pipeline)}")
+
+    def write(node: str, field: str, table: Mapping[str, Json]) -> None:
+        keys = dict.fromkeys([*table, *(k for n, f, k in questions if (n, f) == (node, field))])
+        for key in keys:
+            at = node, field, key
+            if at in questions:
+                text = " ".join(_printable(questions[at]))
+                lines.append(f"# {key} = {text}")
+            else:
+                reason = f"  # {' '.join(_printable(reasons[at]))}" if at in reasons else ""
+                lines.append(f"{key} = {toml_value(table[key])}{reason}")
+
+    for name, node in mapping.nodes.items():
+        lines += ["", f"[nodes.{toml_key(name)}]"]
+        write(name, "", {k: v for k, v in msgspec.to_builtins(node).items() if k != "fields"})
+        for field, how in node.fields.items():
+            lines += ["", f"[nodes.{toml_key(name)}.fields.{toml_key(field)}]"]
+            write(name, field, msgspec.to_builtins(how))
+    return "\n".join(lines) + "\n"
+
+
+def toml_value(value: object) -> str:
+    """Return a text, a number, a boolean or a list of them as TOML writes it.
+
+    Raises:
+        UsageError: When it is of another type, or a text has half a character, which names of files can have.
+    """
+    if isinstance(value, str):
+        try:
+            value.encode()
+        except UnicodeEncodeError:
             raise UsageError(
-                f"{where}: {key} must be a finite number, got {scale if key == 'scale' else offset}", hint=_HINT
-            )
-    turn = float(_value(table, "turn", (int, float), where) or 0.0)
-    if not 0.0 <= turn < math.inf:
-        raise UsageError(f"{where}: turn must be above 0, such as 360 for degrees, got {turn}", hint=_HINT)
-    shape = _value(table, "shape", list, where)
-    if shape not in (None, [-1]) and not all(type(n) is int and n > 0 for n in shape):
-        raise UsageError(
-            f"{where}: shape must be a list of whole numbers above 0, or [-1] for a vector, got {shape}", hint=_HINT
-        )
-    unit = _value(table, "unit", str, where) or ""
-    if not unit.isprintable():
-        raise UsageError(f"{where}: a unit stands on one line, got {unit!r}", hint=_HINT)
-    return FieldMapping(
-        source=tuple(sources),
-        unit=unit,
-        scale=tuple(map(float, scales)) if isinstance(scale, list) else float(scales[0]),
-        offset=float(offset or 0.0),
-        shape=None if shape is None else tuple(shape),
-        column=_value(table, "column", int, where),
-        turn=turn,
-    )
+                f"{value!r} cannot be written: it has bytes that are no text", hint="rename the file or joint"
+            ) from None
+        # TOML has the escapes of JSON, and needs one for DEL.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    raise UsageError(f"{value!r} has no form in TOML")
 
 
-def _table(value: object, where: str) -> Mapping[str, Json]:
-    if not isinstance(value, Mapping):
-        raise UsageError(f"{where} must be a table, got {value!r}", hint=_HINT)
-    return value
-
-
-def _value(table: Mapping[str, Json], key: str, kind: type | tuple[type, ...], where: str) -> Json:
-    """Return a key's value, after checking its type; None if there is no such key."""
-    value = table.get(key)
-    # A boolean counts as an int in Python.
-    if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
-        raise UsageError(f"{where}: {key} has the wrong kind: {value!r}", hint=_HINT)
-    return value
-
-
-def _check_keys(table: Mapping[str, Json], keys: tuple[str, ...], where: str) -> None:
-    for key in table:
-        if key not in keys:
-            close = difflib.get_close_matches(key, keys, n=1)
-            raise UsageError(
-                f"{where} has an unknown key {key!r}. Available: {', '.join(keys)}",
-                hint=f"did you mean {close[0]}?" if close else _HINT,
-            )
+def toml_key(key: str) -> str:
+    """Return a part of a key, quoted if TOML needs quotes."""
+    return key if _BARE.fullmatch(key) else toml_value(key)
 
 
 def _printable(text: str) -> list[str]:
     """Return the lines of a comment without characters that TOML refuses."""
     return ["".join(c if c.isprintable() else "?" for c in line) for line in text.splitlines() or [""]]
-
-
-def to_toml(mapping: ImportMapping, comments: Sequence[str] = ()) -> str:
-    """Return a mapping as the text of a mapping file."""
-    lines = [
-        *(f"# {part}" for line in comments for part in _printable(line)),
-        f"pipeline = {toml_value(mapping.pipeline)}",
-    ]
-    # Write only the keys that differ from their defaults.
-    for name, node in mapping.nodes.items():
-        keys: dict[str, Json] = {"stamps": node.stamps} if node.stamps is not None else {"rate_hz": node.rate_hz}
-        keys |= {"stamp_unit": node.stamp_unit} if node.stamps is not None and node.stamp_unit != "s" else {}
-        keys |= {"order": node.order} if node.order != int(name == _COMMANDING) else {}
-        keys |= {k: v for k in _POLICIES if (v := getattr(node, k)) != "refuse"}
-        keys |= {"stamp_offset": node.stamp_offset} if node.stamp_offset else {}
-        lines += ["", f"[nodes.{toml_key(name)}]", *(f"{key} = {toml_value(value)}" for key, value in keys.items())]
-        for field, how in node.fields.items():
-            parts: dict[str, Json] = {"source": how.source[0] if len(how.source) == 1 else list(how.source)}
-            parts |= {"unit": how.unit} if how.unit else {}
-            parts |= {
-                k: v for k, plain in (("scale", 1.0), ("offset", 0.0), ("turn", 0.0)) if (v := getattr(how, k)) != plain
-            }
-            parts |= {k: v for k in ("shape", "column") if (v := getattr(how, k)) is not None}
-            inside = ", ".join(f"{key} = {toml_value(value)}" for key, value in parts.items())
-            lines.append(f"fields.{toml_key(field)} = {{ {inside} }}")
-    return "\n".join(lines) + "\n"

@@ -17,7 +17,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.log.toml_text import toml_value
+from sim2real.log.importing.mapping import toml_value
 from sim2real.robots.from_model.doubts import beyond_ranges, check_payload, open_loops
 from sim2real.robots.from_model.encoders import EncoderParams, Encoders
 from sim2real.robots.from_model.holding import Holding

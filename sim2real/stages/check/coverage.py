@@ -12,7 +12,7 @@ from sim2real import pytree
 from sim2real.artifacts.summary import ArtifactTable
 from sim2real.graph.episode import Episode
 from sim2real.identify.model import Channel, IdentifiableModel, position_of
-from sim2real.log.importing.signal_names import about_torque
+from sim2real.log.importing.names import about_torque
 from sim2real.log.schema import unit_of
 
 _GAP = 2.5

@@ -8,12 +8,9 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.graph.episode import TICKS_PER_S
-from sim2real.log.importing.files.foreign import open_foreign
-from sim2real.log.importing.importer import import_opened
-from sim2real.log.importing.positions import radian
-from sim2real.log.importing.quantities import ImportHints
-from sim2real.log.importing.signal_names import same_joint
-from sim2real.log.importing.signals import Signal, collect, find_stamps
+from sim2real.log.importing.importer import import_file
+from sim2real.log.importing.propose import joint_motion
+from sim2real.log.importing.readers import open_tables
 from sim2real.log.reader import read_log
 from sim2real.robots.contract import Robot
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -54,11 +51,11 @@ def read_motion(path: Path, pipeline: Pipeline, robot: Robot, names: Sequence[st
     if path.suffix == ".mcap":
         motion = _of_log(path, robot)
     elif (mapping := pipeline.mapping_of(path)) is not None:
-        episode = import_opened(open_foreign(path), mapping)
+        episode = import_file(path, mapping)
         rows = episode.outputs[robot.roles.actuator][robot.drive.command]
         motion = FileMotion(episode.steps[robot.roles.actuator].begun_s, rows, f"{robot.drive.command} of {path.name}")
     else:
-        motion = _of_columns(path, robot, names)
+        motion = FileMotion(*joint_motion(open_tables(path)[0], names, robot.units[robot.drive.command]))
     return _whole(motion, path, len(names))
 
 
@@ -78,42 +75,6 @@ def _of_log(path: Path, robot: Robot) -> FileMotion:
             hint="is it a log of this robot? Measured positions are a motion only for position-controlled joints",
         )
     return FileMotion(episode.steps[roles.sensor].begun_s, measured, f"{field} of {path.name}")
-
-
-def _of_columns(path: Path, robot: Robot, names: Sequence[str]) -> FileMotion:
-    """Return the columns that have the names of the robot's commands: goals if there are some, otherwise positions."""
-    file = open_foreign(path)
-    signals, _ = collect(file)
-    motions = [(s, order) for s in signals if (order := _order(s, names)) is not None]
-    motions.sort(key=lambda s: (s[0].meaning.side != "command", s[0].meaning.quantity not in ("position", "")))
-    if not motions:
-        raise UsageError(
-            f"{path} has no columns for {', '.join(names)}. Columns: {', '.join(file.keys[:30]) or 'none'}",
-            hint=f"name them by joint, quantity and unit, such as {names[0]}_goal_rad, and the time t_s",
-        )
-    signal, order = motions[0]
-    side = "command" if signal.meaning.side == "command" else "measured"
-    stamps = find_stamps(signals, signal, side, str(path), None)
-    rows = np.flatnonzero(np.isfinite(stamps.t_s) & np.isfinite(signal.values[:, order]).all(axis=1))
-    values, t_s = signal.values[rows][:, order], stamps.t_s[rows]
-    if len(rows) < 2:
-        raise UsageError(f"{signal.name!r} in {path} has no rows that hold numbers for all joints")
-    scale, reason = 1.0, ""
-    if robot.units[robot.drive.command] == "rad":
-        hints = ImportHints("", joints=tuple(names))
-        scale, reason = radian(signal, values, t_s, hints, str(path), [], [])
-        reason = f"; {'radians' if scale == 1.0 else 'degrees'}, {reason}"
-    return FileMotion(t_s, values / scale, f"{signal.name} of {path.name}{reason}")
-
-
-def _order(signal: Signal, names: Sequence[str]) -> list[int] | None:
-    """Return the column of each name; None if the signal is no motion of these joints."""
-    if signal.values.ndim != 2 or signal.meaning.quantity not in ("position", ""):
-        return None
-    order = [next((i for i, label in enumerate(signal.labels) if same_joint(label, n)), None) for n in names]
-    if len(names) == 1 and signal.width == 1 and signal.meaning.side == "command":
-        return [0]
-    return None if None in order else [i for i in order if i is not None]
 
 
 def _whole(motion: FileMotion, path: Path, commands: int) -> FileMotion:

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
@@ -18,22 +18,26 @@ class ImportConfig:
     """Files of other recorders: npz, JSON, CSV, MCAP or the folder of a ROS 2 bag, or a LeRobot data set."""
     mapping: Path | None = None
     """TOML file that maps signals to fields; default: the pipeline's import.toml, or one is proposed."""
+    pipeline: Annotated[str | None, arg(aliases=("--like",))] = None
+    """Pipeline whose robot was recorded: its joints, and the pipeline of the logs; default: the mapping's, or the
+    model's name."""
     mjcf: Path | None = None
     """Model of the robot (MJCF or URDF), for the names and ranges of its joints."""
     joints: tuple[str, ...] = ()
-    """Joints that were recorded, in the order of the columns; default: all of the model's, in its order."""
+    """Joints that were recorded, by their names in the file, or in the order of columns without names."""
+    unit: str | None = None
+    """Unit of positions and goals in the file, where their names have none: rad, deg, rev, mrad, m, mm, counts:N (N a
+    turn), or hundredths of LeRobot's calibrated ranges."""
+    calibration: Path | None = None
+    """LeRobot's calibration of the arm, as lerobot-calibrate writes it."""
     rate_hz: float | None = None
     """Samples per second, where a file has no time stamps [Hz]."""
     together: bool = False
     """All files are of one recording: a log of all of them instead of one for each."""
     as_told: bool = False
-    """Keep names, order and signs of the file or the mapping, even if the data contradicts them or is ambiguous."""
-    pipeline: str | None = None
-    """Pipeline that the logs are for; default: the one that the mapping names, or the model's name."""
-    format: Literal["npz", "json", "csv", "lerobot", "mcap"] | None = None
-    """Format of the files; default: by their suffixes."""
+    """Keep order, signs and units of the file or the mapping, even if the data contradict them or fit others."""
     episode: int | None = None
-    """Episode of a LeRobot data set; default: the only one."""
+    """Episode of a LeRobot data set; default: all."""
     samples: Annotated[str | None, arg(metavar="A:B")] = None
     """Take the samples from A to just before B, counted from 0; default: all."""
     out: Path | None = None
@@ -49,6 +53,13 @@ class ImportConfig:
             )
         if self.out is not None and len(self.files) > 1 and not self.together:
             raise UsageError(f"out names one log, but there are {len(self.files)} files", hint="import them one by one")
+        if self.unit is not None and not re.fullmatch(
+            r"rad|deg|rev|mrad|m|mm|counts:[1-9][0-9]*|hundredths", self.unit
+        ):
+            raise UsageError(
+                f"unknown unit {self.unit!r}. Available: rad, deg, rev, mrad, m, mm, counts:N, hundredths",
+                hint="counts:4096 for an encoder with 4096 counts a turn",
+            )
 
     @property
     def sources(self) -> tuple[Path, ...]:

@@ -12,11 +12,10 @@ import numpy as np
 from sim2real.artifacts.identification import Identification
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
-from sim2real.log.importing import importer
-from sim2real.log.importing.files import bags
-from sim2real.log.importing.files.foreign import open_foreign
+from sim2real.log.importing.bags import is_ours
+from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.mapping import MAPPING, ImportMapping, load_mapping, to_toml
-from sim2real.log.importing.proposal import pipeline_name
+from sim2real.log.importing.readers import Table, open_tables
 from sim2real.log.reader import read_log
 from sim2real.robots.from_model import model_file
 from sim2real.robots.from_model.mjcf import joints_of, read_model, read_spec
@@ -65,7 +64,7 @@ class DescribedPipeline(Pipeline):
 
     def mapping_of(self, path: Path) -> ImportMapping | None:
         """Return the mapping of a file of another recorder; None of a log of ours."""
-        return None if path.suffix == ".mcap" and bags.is_ours(path) else self.mapping
+        return None if is_ours(path) else self.mapping
 
     def reading(self, logs: Sequence[str], mapping: ImportMapping | None = None) -> DescribedPipeline:
         """Return the pipeline with the mapping that it needs to read logs of another recorder.
@@ -74,11 +73,9 @@ class DescribedPipeline(Pipeline):
             mapping: Their mapping; None: one is proposed.
         """
         first = Path(logs[0])
-        if mapping is None and not (first.suffix == ".mcap" and bags.is_ours(first)):
-            description = import_logs_stage.description_of_model(
-                self.description.model, self.name, self.description.joints
-            )
-            mapping, _ = import_logs_stage.proposed(open_foreign(first), description)
+        if mapping is None and not is_ours(first):
+            hints = import_logs_stage.hints_of_model(self.description.model, self.name, self.description.joints)
+            mapping, _ = import_logs_stage.proposed(_table(first), hints)
         return replace(self, mapping=mapping)
 
     def texts(self) -> Mapping[str, str]:
@@ -100,17 +97,20 @@ def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
         )
     # A log of this package needs no mapping; any other file has one, or one is proposed.
     model, first = read_model(flags.mjcf), Path(logs[0])
-    name = pipeline_name(flags.mjcf)
-    if first.suffix == ".mcap" and bags.is_ours(first):
+    name = import_logs_stage.pipeline_name(flags.mjcf)
+    if is_ours(first):
         mapping, episode = None, read_log(first)
         name = str(episode.metadata.get("pipeline") or name)
     else:
         mapping = load_mapping(flags.mapping, name).of_joints() if flags.mapping else None
         if mapping is None:
-            description = import_logs_stage.description_of_model(flags.mjcf, name, flags.joints, flags.rate_hz)
-            mapping, _ = import_logs_stage.proposed(open_foreign(first), replace(description, as_told=flags.as_told))
-        episode = importer.import_file(first, mapping)
-        import_logs_stage.refuse_contradictions(first, episode, flags.as_told)
+            more = {"as_told": flags.as_told, "unit": flags.unit or ""}
+            hints = import_logs_stage.hints_of_model(flags.mjcf, name, flags.joints, flags.rate_hz, **more)
+            mapping, _ = import_logs_stage.proposed(_table(first), hints)
+            episode = import_table(_table(first), mapping)
+        else:
+            episode = import_table(_table(first), mapping)
+            import_logs_stage.refuse_contradictions(first, episode, flags.as_told)
     # Describe the robot by the first log.
     description = _description(flags, model, episode)
     note_held(description)
@@ -118,6 +118,13 @@ def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
     return DescribedPipeline(
         name, summary, "", identify=MODEL_IDENTIFY, description=description, mapping=mapping, flag_words=_words(flags)
     )
+
+
+def _table(path: Path) -> Table:
+    tables = open_tables(path)
+    if len(tables) > 1:
+        raise UsageError(f"{path} holds {len(tables)} episodes", hint=f"sim2real import {path} makes logs of them")
+    return tables[0]
 
 
 def note_held(description: RobotConfig) -> None:

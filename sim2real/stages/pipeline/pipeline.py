@@ -93,9 +93,10 @@ class Pipeline:
 
     def mapping_of(self, path: Path) -> ImportMapping | None:
         """Return the mapping with which a file of another recorder is read; None: it is a log, or there is none."""
+        from sim2real.log.importing.bags import is_ours
         from sim2real.log.importing.mapping import load_mapping
 
-        if path.suffix == ".mcap" or not path.is_file():
+        if not path.is_file() or is_ours(path):
             return None
         file = self.folder / "import.toml"
         return load_mapping(file) if file.is_file() else None

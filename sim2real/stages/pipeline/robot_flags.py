@@ -24,6 +24,8 @@ class RobotFlags:
     """Mapping of the log, if it is of another recorder; default: one is proposed."""
     rate_hz: float | None = None
     """Samples per second, where the log has no time stamps [Hz]."""
+    unit: str | None = None
+    """Unit of positions and goals in the log, where names have none: rad, deg, rev, mrad or counts:N (N a turn)."""
     velocity: bool = False
     """Compare measured velocities, too."""
     step_s: float = 0.0

@@ -1,7 +1,7 @@
 """The meaning of a signal's name in a file of another recorder: side, quantity, unit and joint."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sim2real.types import Json
@@ -35,34 +35,36 @@ _UNITS = {
     "ms": "ms msec millis milliseconds",
     "us": "us usec micros microseconds",
     "ns": "ns nsec nanos nanoseconds nanosec",
-    "raw": "raw counts ticks",
-    "rev": "rev revs revolution revolutions turns rotations",
+    "counts": "raw count counts tick ticks",
+    "rev": "rev revs revolution revolutions turn turns rotations",
     "mrad": "mrad milliradians",
     "mm": "mm millimeters millimetres",
-    "percent": "percent pct normalized normalised",
+    "m": "m meters metres",
+    "percent": "percent pct normalized normalised hundredths",
 }
-OTHER_UNITS = ("rev", "mrad", "mm", "percent")
-"""Units that need a mapping with a scale."""
 _WEAK_WORDS = {"state", "states"}
 _SIDE = {word: side for side, listed in _SIDES.items() for word in listed.split()}
 _QUANTITY = {word: quantity for quantity, listed in _QUANTITIES.items() for word in listed.split()}
 _UNIT = {word: unit for unit, listed in _UNITS.items() for word in listed.split()}
 # Words without meaning: parts of messages, and names of lists of records.
-_FILLERS = {
-    "data",
-    "entries",
-    "msg",
-    "log",
-    "values",
-    "value",
-    "points",
-    "motor",
-    "motors",
-    "per",
-    "joint",
-    "joints",
-    "header",
-}
+_FILLERS = set(
+    [
+        "data",
+        "entries",
+        "msg",
+        "log",
+        "values",
+        "value",
+        "points",
+        "motor",
+        "motors",
+        "per",
+        "joint",
+        "joints",
+        "header",
+        "field",
+    ]
+)
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 
 
@@ -74,8 +76,7 @@ class Meaning:
         side: ``command`` or ``measured``.
         quantity: ``stamp``, ``position``, ``velocity``, ``torque``, ``duty``, ``voltage``, ``kp``, ``kd``,
             ``enabled``, ``rate``, ``period``, or ``error`` (a difference of two signals).
-        unit: ``rad``, ``deg``, ``s``, ``ms``, ``us``, ``ns``, ``raw``, or one of
-            ``OTHER_UNITS``.
+        unit: ``rad``, ``deg``, ``rev``, ``mrad``, ``m``, ``mm``, ``counts``, ``percent``, ``s``, ``ms``, ``us``, ``ns``.
         label: The remaining words, which name the joint.
     """
 
@@ -89,10 +90,14 @@ def meaning(name: str) -> Meaning:
     """Return the meaning of a name; ``cmd_deg/FL_hip`` is a command in degrees, of joint ``fl_hip``."""
     quantity = unit = ""
     rest = []
-    words = [word.lower() for word in _WORDS.findall(name)]
+    words = [
+        word.lower() for word in _WORDS.findall(name.replace("%", " percent ").replace("\N{DEGREE SIGN}", " deg "))
+    ]
+    if name.startswith("%time"):
+        words = words[1:]
     for place, word in enumerate(words):
         # A letter is a unit only after another word, as in `t_s`; `s` alone is a name.
-        known_unit = _UNIT.get(word, "") if place else ""
+        known_unit = _UNIT.get(word, "") if place and (word != "m" or place == len(words) - 1) else ""
         if word in _SIDE:
             continue
         if word in _QUANTITY and not (quantity == "stamp" and known_unit):
@@ -131,18 +136,91 @@ def about_torque(mapping: Mapping[str, Mapping[str, Json]]) -> list[str]:
         mapping: Node -> its mapping, as in the metadata of an imported log.
     """
     fields = [node["fields"].get("torque") for node in mapping.values()]
-    sources = [name for field in fields if field for name in field["source"] if meaning(name).side != "command"]
+    listed = [[f["source"]] if isinstance(f["source"], str) else f["source"] for f in fields if f]
+    sources = [name for names in listed for name in names if meaning(name).side != "command"]
     if not sources:
         return []
-    listed = ", ".join(f"'{name}'" for name in sources[:3]) + (" ..." if len(sources) > 3 else "")
+    shown = ", ".join(f"'{name}'" for name in sources[:3]) + (" ..." if len(sources) > 3 else "")
     return [
-        f"{listed} is taken as the commanded torque, although its name does not mark a command: a measured joint "
+        f"{shown} is taken as the commanded torque, although its name does not mark a command: a measured joint "
         "torque is no command, as the robot's controller makes it from goals that the model then lacks; import the "
         "goals, or name a commanded torque cmd_torque"
     ]
 
 
+def is_unit(text: str) -> bool:
+    """Return whether a text is a unit, such as ``rad/s``, ``[deg]`` or ``N m``."""
+    words = [w.lower() for w in re.findall(r"[A-Za-z%]+", text)]
+    return bool(words) and all(w in _UNIT or w in ("n", "m", "nm", "a", "v", "%", "kg", "per", "mm") for w in words)
+
+
+def is_number(label: str) -> bool:
+    """Return whether a label is the number of a joint, not its name: ``3``, or ``m_3``."""
+    return bool(re.fullmatch(r"([a-z]{1,2}_?)?\d+", label))
+
+
 def same_joint(label: str, joint: str) -> bool:
     """Return whether a column's label is the name of a model's joint, as ``fl_hip`` is of ``FL_hip_joint``."""
     words = [w.lower() for w in _WORDS.findall(joint)]
-    return bool(label) and label in ("_".join(words), "_".join(w for w in words if w not in _FILLERS))
+    named = meaning(joint).label
+    return bool(label) and label in ("_".join(words), "_".join(w for w in words if w not in _FILLERS), named)
+
+
+def columns_of(joints: Sequence[str], labels: Sequence[str]) -> tuple[list[int], str] | None:
+    """Return the column of each joint of a robot by the labels of columns, and how they match; None if they do not.
+
+    Names match as they are, or by leg and part: a vendor's ``FR_0`` is the first joint of the front right leg,
+    ``LF_HAA`` the hip of the front left one.
+    """
+    exact = [[i for i, label in enumerate(labels) if same_joint(label, joint)] for joint in joints]
+    if all(len(found) == 1 for found in exact):
+        return [found[0] for found in exact], "by name"
+    legs = _by_leg(joints), _by_leg(labels)
+    if legs[0] is None or legs[1] is None or len(set(legs[0])) < len(joints) or len(set(legs[1])) < len(labels):
+        return None
+    if not set(legs[0]) <= set(legs[1]):
+        return None
+    return [legs[1].index(at) for at in legs[0]], "by leg and part"
+
+
+def _by_leg(names: Sequence[str]) -> list[tuple[str, int]] | None:
+    """Return leg and number of the part, 0 for the hip, of each name; None if one has no leg or no part."""
+    found: list[tuple[str, int]] = []
+    numbered: list[bool] = []
+    for name in names:
+        words = [w.lower() for w in _WORDS.findall(name)]
+        text = "".join(
+            _LEG_WORDS.get(w) or w for w in words if w not in _FILLERS and w not in ("leg", "joint", "motor")
+        )
+        match = re.match(r"(fl|fr|rl|rr|lf|rf|lh|rh|hl|hr|lr|lb|rb|bl|br)_?(.+)$", text)
+        if match is None:
+            return None
+        leg, part = _LEGS[match[1]], match[2].lstrip("_")
+        number = int(part) if part.isdigit() else _PART.get(part)
+        if number is None:
+            return None
+        numbered.append(part.isdigit())
+        found.append((leg, number))
+    if any(numbered) and not all(numbered):
+        return None
+    # Numbers count from 0 or from 1, in each leg alike.
+    low = min((n for _, n in found), default=0)
+    if any(numbered) and (
+        low not in (0, 1) or len({leg for leg, _ in found}) * len({n for _, n in found}) != len(found)
+    ):
+        return None
+    return [(leg, n - low if numbered[0] else n) for leg, n in found]
+
+
+_LEG_WORDS = {"front": "f", "fore": "f", "rear": "r", "hind": "r", "back": "r", "left": "l", "right": "r"}
+_LEGS = {
+    "fl": "fl", "fr": "fr", "rl": "rl", "rr": "rr", "lf": "fl", "rf": "fr", "lh": "rl", "rh": "rr",
+    "hl": "rl", "hr": "rr",
+    "lr": "rl", "lb": "rl", "rb": "rr", "bl": "rl", "br": "rr",
+}  # fmt: skip
+_PART = {
+    word: number
+    for number, words in enumerate(("hip haa abad abduction abduct hipx hx coxa", "thigh hfe upper hipy hy femur",
+                                    "calf kfe knee lower shank kn tibia"))
+    for word in words.split()
+}  # fmt: skip

@@ -1,1 +1,0 @@
-"""Readers of other recorders' files: tables, arrays, ROS bags, LeRobot data sets."""

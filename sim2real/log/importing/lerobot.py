@@ -1,0 +1,198 @@
+"""Reads LeRobot data sets (Parquet, v2 and v3) and plain Parquet files; units by LeRobot's calibration."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.installation import with_extra
+from sim2real.log.importing.readers import Table
+
+INFO = Path("meta") / "info.json"
+_COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+_COUNTS = 4096
+_WHOLE = "download the data set again, or check the file"
+UNITS = ("deg", "hundredths")
+"""What LeRobot writes: degrees, or hundredths of each joint's calibrated range, -100 to 100, a gripper 0 to 100."""
+
+
+def read_lerobot(path: Path, episode: int | None = None) -> list[Table]:
+    """Return a table for each episode of a data set, or one of a plain Parquet file.
+
+    Args:
+        path: The data set's folder, or a Parquet file.
+        episode: Number of the episode; None: all.
+
+    Raises:
+        UsageError: When the files are no Parquet, or lack the episode.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise UsageError(f"{path} is a Parquet file, which needs pyarrow", hint=with_extra("parquet")) from None
+    root = path if path.is_dir() else next((p for p in path.absolute().parents[:4] if (p / INFO).is_file()), None)
+    info = _info(root / INFO) if root else {}
+    files = sorted((path / "data").glob("**/*.parquet")) if path.is_dir() else [path]
+    if not files:
+        raise UsageError(f"{path} has no data/chunk-*/*.parquet", hint="download the data set's folder `data`, too")
+    notes: list[str] = []
+    try:
+        parts = [_columns(pyarrow.parquet.ParquetFile(file), notes) for file in files]
+    except (pyarrow.ArrowException, OSError, ValueError) as error:
+        raise UsageError(f"{path} is no Parquet file, or is cut off: {error}", hint=_WHOLE) from None
+    rows = {
+        name: parts[0][name] if len(parts) == 1 else np.concatenate([part[name] for part in parts])
+        for name in parts[0]
+        if all(name in part for part in parts)
+    }
+    names = _names(info)
+    if "episode_index" not in rows:
+        if episode is not None:
+            raise UsageError(f"{path} has no episode_index, so it holds no episodes", hint="remove --episode")
+        return [_table(path, files, rows, names, notes, info, 0, len(next(iter(rows.values()), [])))]
+    numbers = rows["episode_index"].astype(int)
+    found = np.unique(numbers)
+    if episode is not None and episode not in found:
+        listed = f"{found[0]} to {found[-1]}" if len(found) > 1 else ", ".join(map(str, found)) or "none"
+        raise UsageError(f"{path} has no episode {episode}. Available: {listed}", hint="choose another --episode")
+    tables = []
+    for number in found if episode is None else [episode]:
+        at = np.flatnonzero(numbers == number)
+        chosen = {name: values[at] for name, values in rows.items()}
+        tables.append(_table(path, files, chosen, names, notes, info, int(number), len(at)))
+    return tables
+
+
+def _table(
+    path: Path, files: Sequence[Path], rows: Mapping[str, np.ndarray], names: Mapping[str, list[str]],
+    notes: Sequence[str], info: Mapping[str, Any], episode: int, count: int,
+) -> Table:  # fmt: skip
+    table = Table(files[0], "lerobot", notes=list(dict.fromkeys(notes)), beside=tuple(files[1:]))
+    is_set = bool(info) or "observation.state" in rows
+    table.robot = str(info.get("robot_type") or "an unknown robot") if is_set else ""
+    for name, values in rows.items():
+        if name not in _COUNTERS or not is_set:
+            table.add(name, values)
+    table.names = {name: listed for name, listed in names.items() if name in table.columns}
+    # Stamps that are frame_index / fps are no measurement.
+    fps, stamps = info.get("fps"), table.columns.get("timestamp")
+    if fps and stamps is not None and len(stamps):
+        frames = np.asarray(rows.get("frame_index", np.arange(count)), float)
+        rounding = float(np.spacing(np.float32(np.abs(stamps).max())))
+        if (np.abs(stamps - frames / fps) <= 1e-3 / fps + rounding).all():
+            table.nominal.add("timestamp")
+            table.notes.append(f"'timestamp' is frame_index / fps: nominal times at {fps:g} Hz, not measured ones")
+    if fps:
+        table.columns["fps"] = np.asarray(fps, np.float64)
+    if is_set and episode:
+        table.notes.append(f"episode {episode}")
+    return table
+
+
+def _columns(file: Any, notes: list[str]) -> dict[str, np.ndarray]:
+    """Return the columns of a file that hold numbers, or lists of them."""
+    import pyarrow.types as is_
+
+    columns: dict[str, np.ndarray] = {}
+    for name in file.schema_arrow.names:
+        kind = file.schema_arrow.field(name).type
+        inner, levels = kind, 1
+        while is_.is_list(inner) or is_.is_large_list(inner) or is_.is_fixed_size_list(inner):
+            inner, levels = inner.value_type, levels + 1
+        number = is_.is_integer(inner) or is_.is_floating(inner) or is_.is_boolean(inner) or is_.is_temporal(inner)
+        if levels > 2 or not (number or is_.is_string(inner)):
+            notes.append(f"skipped: {name!r} holds {inner}" + (f" in {levels} dimensions" if levels > 2 else ""))
+            continue
+        column = file.read(columns=[name]).column(0)
+        if levels == 1:
+            columns[name] = column.to_numpy()
+            continue
+        lists = column.to_pylist() if column.null_count else [np.asarray(part) for part in column.to_numpy()]
+        if len({len(part) for part in lists if part is not None}) == 1 and not column.null_count:
+            columns[name] = np.stack(lists)
+        else:
+            notes.append(f"skipped: {name!r} has lists of different lengths")
+    return columns
+
+
+def _info(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise UsageError(f"{path} is no JSON: {error}", hint=_WHOLE) from None
+    if not isinstance(document, dict):
+        raise UsageError(f"{path} holds no object", hint=_WHOLE)
+    fps = document.get("fps")
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < math.inf:
+        document.pop("fps", None)
+    return document
+
+
+def _names(info: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return column -> names of its entries in ``info.json``."""
+    found = {}
+    features = info.get("features")
+    for key, feature in features.items() if isinstance(features, dict) else ():
+        names = feature.get("names") if isinstance(feature, dict) else None
+        names = next(iter(names.values())) if isinstance(names, dict) and len(names) == 1 else names
+        if isinstance(names, list) and all(isinstance(n, str) for n in names):
+            found[key] = names
+    return found
+
+
+def writes_hundredths(robot: str, names: Sequence[str]) -> bool:
+    """Return whether LeRobot's unit of a robot's joints may be hundredths of a range: of its own arms, ``NAME.pos``."""
+    own = ("so100", "so101", "so_", "bi_so", "koch", "bi_koch", "lekiwi", "moss", "omx", "hope_jr")
+    return bool(robot) and (robot.startswith(own) or any(name.endswith(".pos") for name in names))
+
+
+def is_gripper(name: str) -> bool:
+    """Return whether a joint is a gripper, which LeRobot writes as 0 to 100 also beside an arm in degrees."""
+    return any(word in name.lower() for word in ("gripper", "jaw"))
+
+
+def conversion(calibration: Path, joints: Sequence[str], unit: str) -> tuple[list[float], list[float]]:
+    """Return scale and offset of each joint [rad]: 0 is the middle of the calibrated range.
+
+    Args:
+        calibration: LeRobot's file, as ``lerobot-calibrate`` writes it.
+        joints: Names of the joints, as in the file.
+        unit: ``deg`` or ``hundredths``; a gripper is in hundredths from 0 to 100 with both.
+
+    Raises:
+        UsageError: When the file is no calibration, or lacks a joint.
+    """
+    try:
+        entries = json.loads(calibration.read_bytes())
+        ranges = {
+            n: (int(e["range_min"]), int(e["range_max"]), int(e.get("drive_mode", 0))) for n, e in entries.items()
+        }
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise UsageError(
+            f"{calibration} is no calibration of LeRobot: {error!r}", hint="lerobot-calibrate writes one"
+        ) from None
+    scales, offsets = [], []
+    for joint in joints:
+        if joint not in ranges:
+            raise UsageError(
+                f"{calibration} has no {joint!r}. Available: {', '.join(ranges)}", hint="name its own file"
+            )
+        low, high, mirrored = ranges[joint]
+        half = (high - low) / 2 * 2 * math.pi / _COUNTS
+        if is_gripper(joint):
+            scales.append(half / 50)
+            offsets.append(-half)
+        elif unit == "hundredths":
+            scales.append(half / 100)  # LeRobot mirrors hundredths itself
+            offsets.append(0.0)
+        else:
+            scales.append((-1 if mirrored else 1) * (_COUNTS - 1) / 360 * 2 * math.pi / _COUNTS)
+            offsets.append(0.0)
+    return scales, offsets

@@ -1,0 +1,466 @@
+"""Reads the files of other recorders as tables: npz, JSON and CSV here, bags and LeRobot data sets beside."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import json
+import re
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.errors import UsageError
+from sim2real.log.importing.names import is_unit
+from sim2real.types import Json
+
+_COLUMNS = re.compile(r"(.+)\[\s*:\s*,\s*(-?\d+|-?\d*\s*:\s*-?\d*)\s*\]")
+_NULL = frozenset(("", "nan", "null", "none", "n/a", "na", "nil", "-", "--", "?"))
+_BOOL = {"true": 1.0, "false": 0.0}
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d\d:\d\d(:\d\d(\.\d+)?)?(Z|[+-]\d\d:?\d\d)?")
+_WHOLE = "check that the file is complete"
+_DAMAGED = (OSError, ValueError, EOFError, LookupError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_OTHERS = (
+    (
+        b"SQLite format 3\0",
+        "a SQLite bag (.db3)",
+        "ros2 bag convert -i BAG -o out.yaml, with storage_id: mcap in out.yaml",
+    ),
+    (b"#ROSBAG V", "a ROS 1 bag", "rosbags-convert --src run.bag --dst run --dst-storage mcap (pip install rosbags)"),
+    (b"\x28\xb5\x2f\xfd", "compressed by zstd", "zstd -d FILE"),
+    (b"\x1f\x8b", "compressed by gzip", "gunzip FILE"),
+    (b"\x89HDF", "HDF5", "h5py: np.savez('run.npz', **{k: f[k][()] for k in f})"),
+    (b"MATLAB 5.0", "a MATLAB file", "scipy: np.savez('run.npz', **scipy.io.loadmat(FILE))"),
+    (b"ULog\x01", "a PX4 log", "ulog2csv FILE (pip install pyulog)"),
+    (b"\x93NUMPY", "a single array without names", "numpy: np.savez('run.npz', t_s=..., q_rad=..., goal_rad=...)"),
+    (b"ARROW1", "an Arrow file", "pandas: pd.read_feather(FILE).to_csv('run.csv', index=False)"),
+    (b"\x80\x04", "a Python pickle, which could run code", "np.savez in the program that wrote it"),
+    (b"\x80\x05", "a Python pickle, which could run code", "np.savez in the program that wrote it"),
+)
+"""First bytes -> what the file is, and the command that converts it."""
+
+
+@dataclass
+class Table:
+    """The signals of a recording.
+
+    Attributes:
+        path: The file or folder.
+        format: ``npz``, ``json``, ``csv``, ``mcap`` or ``lerobot``.
+        columns: Name -> values, shape ``(N, ...)``, or ``()`` for a constant: float64, float32 or int64.
+        words: Name -> texts of a signal of words.
+        names: Signal of two dimensions -> names of its columns.
+        broken: Name -> why the signal cannot be read.
+        notes: Sentences on what was left out.
+        nominal: Stamps that are computed from a rate.
+        robot: Robot type of a LeRobot data set.
+        beside: Further files of the same recording.
+    """
+
+    path: Path
+    format: str
+    columns: dict[str, np.ndarray] = field(default_factory=dict)
+    words: dict[str, list[str]] = field(default_factory=dict)
+    names: dict[str, list[str]] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    nominal: set[str] = field(default_factory=set)
+    robot: str = ""
+    beside: tuple[Path, ...] = ()
+
+    @property
+    def keys(self) -> list[str]:
+        """Names of all signals."""
+        return [*self.columns, *self.words, *self.broken]
+
+    def add(self, name: str, raw: object) -> None:
+        """Add a signal: an array of numbers, dates or words."""
+        try:
+            values = np.asarray(raw)
+            if values.dtype == object:
+                values = np.asarray(raw, np.float64)  # JSON has None for a missing number
+        except (TypeError, ValueError, OverflowError):
+            flat = raw if isinstance(raw, list | np.ndarray) else [raw]
+            if all(v is None or isinstance(v, str) for v in flat):
+                self._add_texts(name, ["" if v is None else str(v) for v in flat])
+            else:
+                self.broken[name] = "its samples are not numbers of one shape"
+            return
+        kind = values.dtype.kind
+        if kind == "U" and values.ndim <= 1:
+            self._add_texts(name, [str(v) for v in np.atleast_1d(values)])
+        elif kind in "Mm":
+            nanoseconds = values.astype(f"{kind}8[ns]").astype(np.int64)
+            self.columns[name] = (
+                np.where(np.isnat(values), np.nan, nanoseconds) if np.isnat(values).any() else nanoseconds
+            )
+        elif kind in "iu" and not (values.size and values.max() > np.iinfo(np.int64).max):
+            self.columns[name] = values.astype(np.int64)  # exact, as float64 would round stamps in nanoseconds
+        elif kind in "fiub":
+            self.columns[name] = values if values.dtype == np.float32 else values.astype(np.float64)
+        else:
+            self.broken[name] = f"it holds no numbers, but {values.dtype}"
+
+    def _add_texts(self, name: str, texts: list[str]) -> None:
+        column = numbers(texts)
+        if isinstance(column, str):
+            self.broken[name] = column
+        elif column is None:
+            self.words[name] = texts
+        else:
+            self.columns[name] = column
+
+    def signal(self, source: str, column: int | None = None) -> np.ndarray:
+        """Return a signal.
+
+        Args:
+            source: Its name; ``[:,0]`` or ``[:,1:3]`` after the name selects columns.
+            column: Column of a two-dimensional signal; None: all columns.
+
+        Raises:
+            UsageError: When the signal or column does not exist, or holds other values than numbers.
+        """
+        name, chosen = source, column
+        if source not in self.columns and (match := _COLUMNS.fullmatch(source)):
+            name, text = match[1], match[2]
+            parts = [int(part) if part.strip() else None for part in text.split(":")]
+            chosen = slice(*parts) if len(parts) > 1 else parts[0]
+        if name not in self.columns:
+            if name in self.broken or name in self.words:
+                raise UsageError(
+                    f"{name!r} in {self.path} cannot be read: {self.broken.get(name, 'it holds words')}",
+                    hint="correct the file, or choose another source in the mapping",
+                )
+            close = difflib.get_close_matches(name, self.columns, n=1)
+            raise UsageError(
+                f"{self.path} has no {name!r}. Available: {', '.join(self.keys[:100]) or 'nothing'}",
+                hint=f"did you mean {close[0]}?" if close else "correct the source in the mapping",
+            )
+        values = self.columns[name]
+        try:
+            return values if chosen is None else values[:, chosen]
+        except IndexError:
+            raise UsageError(
+                f"{name!r} in {self.path} has the shape {values.shape}, which has no column {chosen}",
+                hint="columns are counted from 0",
+            ) from None
+
+
+def open_tables(path: Path, episode: int | None = None) -> list[Table]:
+    """Read a file of another recorder, the folder of a ROS 2 bag, or that of a LeRobot data set.
+
+    Args:
+        episode: Number of an episode of a LeRobot data set; None: all of them.
+
+    Returns:
+        One table; of a LeRobot data set one for each episode.
+
+    Raises:
+        UsageError: When the file does not exist, or its content cannot be read; a container is named with the command
+            that converts it.
+    """
+    from sim2real.log.importing import bags, lerobot  # imported late: they need their packages
+
+    if path.is_dir() and (path / lerobot.INFO).is_file():
+        return lerobot.read_lerobot(path, episode)
+    if path.is_dir():
+        return [bags.read_bag(path)]
+    if not path.is_file():
+        why = "it is a pipe or a device" if path.exists() else "there is no such file"
+        raise UsageError(f"cannot read {path}: {why}", hint="check its name")
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(1 << 12)
+    except OSError as error:
+        raise UsageError(f"cannot read {path}: {error.strerror}", hint="check its name") from None
+    if head[:4] == b"PAR1":
+        return lerobot.read_lerobot(path, episode)
+    if episode is not None:
+        raise UsageError(f"{path} is no data set of LeRobot: it has no episodes", hint="remove --episode")
+    return [bags.read_bag(path) if head[:5] == b"\x89MCAP" else _read_one(path, head)]
+
+
+def refuse_container(path: Path, head: bytes) -> None:
+    """Raise an error for a container of another kind, which names the command that converts it."""
+    for magic, what, command in _OTHERS:
+        if head.startswith(magic):
+            raise UsageError(f"{path} is {what}, which import does not read", hint=f"convert it: {command}")
+
+
+def _read_one(path: Path, head: bytes) -> Table:
+    refuse_container(path, head)
+    if not head:
+        raise UsageError(f"{path} is empty", hint=_WHOLE)
+    if head[:2] == b"PK":
+        return _read_npz(path)
+    if b"\0" in head:
+        what = (
+            "UTF-16 text"
+            if head[:2] in (b"\xff\xfe", b"\xfe\xff") or head[1::2].count(0) > len(head) // 4
+            else "binary"
+        )
+        raise UsageError(
+            f"{path} is {what}, which import does not read", hint="save it as UTF-8 CSV, JSON, npz, Parquet or MCAP"
+        )
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    return _read_json(path, text) if text.lstrip()[:1] in ("{", "[") else _read_csv(path, text)
+
+
+def _read_npz(path: Path) -> Table:
+    table = Table(path, "npz")
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            for name in arrays.files:
+                try:
+                    values = arrays[name]
+                except _DAMAGED as error:
+                    pickled = "it holds Python objects, which are never loaded"
+                    table.broken[name] = pickled if "pickle" in str(error) else f"it is damaged ({error})"
+                    continue
+                if values.dtype.names:
+                    for column in values.dtype.names:
+                        table.add(f"{name}.{column}", values[column])
+                else:
+                    table.add(name, values)
+    except _DAMAGED as error:
+        raise UsageError(f"{path} is no npz, or is cut off: {error}", hint=_WHOLE) from None
+    return table
+
+
+def _read_json(path: Path, text: str) -> Table:
+    table = Table(path, "json")
+    try:
+        try:
+            document: Json = json.loads(text)
+        except json.JSONDecodeError:
+            document = [json.loads(line) for line in text.splitlines() if line.strip()]  # an object on each line
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"{path} is no JSON, or is cut off: {error}", hint=_WHOLE) from None
+    if isinstance(document, list):
+        document = {"": document}
+    try:
+        for name, value in _leaves(document, path):
+            table.add(name, value)
+    except RecursionError:
+        raise UsageError(f"{path} is nested too deeply", hint=_WHOLE) from None
+    if not table.keys:
+        raise UsageError(f"{path} holds no signals", hint=_WHOLE)
+    return table
+
+
+def _leaves(value: Json, path: Path, trail: str = "") -> Iterator[tuple[str, Json]]:
+    """Yield path and value of all leaves; a list of objects has the paths of its objects, after ``[]``."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _leaves(item, path, f"{trail}.{key}".lstrip("."))
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        rows = [dict(_leaves(item, path)) if isinstance(item, dict) else {} for item in value]
+        for key in rows[0]:
+            missing = next((i for i, row in enumerate(rows) if key not in row), None)
+            if missing is not None:
+                raise UsageError(
+                    f"element {missing} of {trail or 'the list'} in {path} has no {key!r}, unlike those before it",
+                    hint=_WHOLE,
+                )
+            yield f"{trail}[].{key}", [row[key] for row in rows]
+    elif trail:
+        yield trail, value
+
+
+def _read_csv(path: Path, text: str) -> Table:
+    """Read a text with separators: the line before the first numbers has the names, also if it is a comment."""
+    table = Table(path, "csv")
+    lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    if lines and re.fullmatch(r"sep=.", lines[0][1].strip()):
+        lines = lines[1:]
+    body = [(i, line) for i, line in lines if not _is_comment(line)]
+    separator = _separator([line for _, line in body[:50]])
+    rows = [(i, _cells(line, separator)) for i, line in body]
+    counts = Counter(len(cells) for _, cells in rows)
+    width = counts.most_common(1)[0][0] if counts else 0
+    # The data begin with the first row of the usual width that holds a number.
+    first = next((k for k, (_, c) in enumerate(rows) if len(c) == width and any(map(_is_number, c))), None)
+    if first is None:
+        raise UsageError(f"{path} holds no line of numbers", hint="it needs a line of names, then lines of numbers")
+    begin, data = rows[first][0], rows[first:]
+    names, first_line = _header(path, lines, rows[:first], data, separator, width)
+    if names is None:
+        names = [str(i) for i in range(width)]
+        table.notes.append(f"{path.name} has no line of names: its columns are numbered from 0")
+    elif skipped := [i for i, _ in lines if i < first_line]:
+        table.notes.append(f"skipped: {len(skipped)} lines before the names in line {first_line}")
+    if len(data) > 1 and (len(data[-1][1]) < width or not text.endswith(("\n", "\r"))):
+        # A number that was cut is another number.
+        table.notes.append(f"the last line of {path.name} has no end: it is left out")
+        data = data[:-1]
+    if wrong := next(((i, cells) for i, cells in data if len(cells) != width), None):
+        raise UsageError(f"line {wrong[0]} of {path} has {len(wrong[1])} cells, line {begin} has {width}", hint=_WHOLE)
+    columns = list(zip(*(cells for _, cells in data), strict=True))
+    if len(names) > 1 and not names[-1] and not any(columns[-1]):  # each line ends with a separator
+        names, columns = names[:-1], columns[:-1]
+    names = [name or f"column {i}" for i, name in enumerate(names)]
+    if len(set(names)) < len(names):
+        twice = next(name for name, n in Counter(names).items() if n > 1)
+        raise UsageError(f"more than one column of {path} is named {twice!r}", hint="rename one of them")
+    comma = separator != "," and any(re.fullmatch(r"[-+]?\d+,\d+(e[-+]?\d+)?", c.strip()) for c in rows[first][1])
+    for name, cells in zip(names, columns, strict=True):
+        texts = [c.replace(",", ".") for c in cells] if comma else list(cells)
+        column = numbers(texts)
+        if isinstance(column, str):
+            line = next(i for (i, _), c in zip(data, texts, strict=True) if c == column)
+            table.broken[name] = f"line {line} has the word {column!r} among its numbers"
+        elif column is None:
+            table.words[name] = texts
+        else:
+            table.columns[name] = column
+    return table
+
+
+def _header(
+    path: Path,
+    lines: Sequence[tuple[int, str]],
+    before: Sequence[tuple[int, list[str]]],
+    data: Sequence[tuple[int, list[str]]],
+    separator: str | None,
+    width: int,
+) -> tuple[list[str] | None, int]:
+    """Return the names of the columns, None without any, and the number of their line."""
+    begin, first = data[0]
+    # A first row of numbers with a word in it is either: refuse it, unless words also follow below.
+    words = [i for i, cell in enumerate(first) if not _is_number(cell) and cell.strip().lower() not in _NULL]
+    below = [cells for _, cells in data[1:20] if len(cells) == width]
+    odd = [i for i in words if below and all(_is_number(cells[i]) for cells in below)]
+    if odd:
+        raise UsageError(
+            f"line {begin} of {path} mixes numbers with {first[odd[0]].strip()!r}, below which numbers follow: it may "
+            "be the names of the columns or a damaged sample",
+            hint="give each column a name in the first line, or remove the line",
+        )
+    above = [(i, line) for i, line in lines if i < begin]
+    units: list[str] = []
+    for i, line in reversed(above):
+        text = re.sub(r"^\s*(#|%|//)+\s*", "", line)
+        cells = [c.strip() for c in _cells(text, separator)]
+        if separator not in (None, ",") and len(cells) != width:
+            cells = [c.strip() for c in _cells(text, ",")]
+        if len(cells) != width or not any(cells):
+            # A line of another width is text, and above it there are no names.
+            if not _is_comment(line):
+                break
+            continue
+        if not units and all(not c or is_unit(c) for c in cells) and len(above) > 1:
+            units = cells
+            continue
+        return [
+            f"{name} [{unit}]" if unit else name for name, unit in zip(cells, units or [""] * width, strict=True)
+        ], i
+    if units:
+        return units, begin
+    if before:
+        raise UsageError(
+            f"line {before[-1][0]} of {path} has {len(before[-1][1])} cells for {width} columns of numbers: it names "
+            "other ones", hint="give each column a name in the line before the numbers"
+        )  # fmt: skip
+    if width > 1 and [c.strip() for c in first] in ([str(i) for i in range(width)], ["", *map(str, range(width - 1))]):
+        raise UsageError(
+            f"line {begin} of {path} counts its columns: it may be the names of the columns or a sample",
+            hint="give each column a name in the first line, such as t_s, q_rad, goal_rad",
+        )
+    return None, begin
+
+
+def numbers(texts: Sequence[str]) -> np.ndarray | str | None:
+    """Return texts as numbers, dates as nanoseconds since 1970; a word among numbers; None for words alone."""
+    try:
+        return np.array([int(t) for t in texts], np.int64)
+    except (ValueError, OverflowError):
+        pass
+    try:
+        return np.array([float(t) for t in texts])
+    except ValueError:
+        pass
+    stripped = [t.strip().lower() for t in texts]
+    if _DATE.fullmatch(next((t.strip() for t in texts if t.strip().lower() not in _NULL), "")):
+        return _dates(texts)
+    values, words = np.full(len(texts), np.nan), []
+    for i, t in enumerate(stripped):
+        if t in _BOOL:
+            values[i] = _BOOL[t]
+        elif t not in _NULL:
+            try:
+                values[i] = float(t)
+            except ValueError:
+                words.append(texts[i])
+    if not words:
+        return values
+    return words[0] if np.isfinite(values).any() else None
+
+
+def _dates(texts: Sequence[str]) -> np.ndarray | str:
+    """Return dates as nanoseconds since 1970; without a zone they are in UTC."""
+    moments = []
+    for text in texts:
+        whole = text.strip() if "-" in text[:5] else f"1970-01-01T{text.strip()}"
+        try:
+            moment = datetime.fromisoformat(re.sub(r"(\.\d{6})\d+", r"\1", whole))
+        except ValueError:
+            return text
+        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+        since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+        moments.append(((since.days * 86400 + since.seconds) * 1_000_000 + since.microseconds) * 1000)
+    return np.array(moments, np.int64)
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(("#", "%", "//"))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return np.isfinite(float(cell.strip().replace(",", ".")))
+    except ValueError:
+        return False
+
+
+def _separator(lines: Sequence[str]) -> str | None:
+    """Return the separator that splits most lines alike; None: blanks."""
+    best: tuple[int, str | None] = (0, None)
+    for separator in (";", "\t", "|", ","):
+        counts = Counter(len(_cells(line, separator)) for line in lines)
+        (width, times), *_ = counts.most_common(1) or [(1, 0)]
+        if width > 1 and times > best[0]:
+            best = times, separator
+    return best[1] if best[0] > len(lines) // 2 else None
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return line.split()
+    return next(csv.reader(io.StringIO(line), delimiter=separator, skipinitialspace=True), [])
+
+
+def joined(tables: Sequence[Table]) -> Table:
+    """Return several files of one recording as one, whose signals are named ``STEM/NAME``.
+
+    Raises:
+        UsageError: When two files have the same name.
+    """
+    if len({t.path.stem for t in tables}) < len(tables):
+        raise UsageError(
+            "the files of one log need different names, which are part of the signals' names", hint="rename one"
+        )
+    whole = Table(tables[0].path, tables[0].format, robot=tables[0].robot)
+    for table in tables:
+        for part in ("columns", "words", "names", "broken"):
+            getattr(whole, part).update({f"{table.path.stem}/{k}": v for k, v in getattr(table, part).items()})
+        whole.nominal |= {f"{table.path.stem}/{name}" for name in table.nominal}
+        whole.notes += table.notes
+    whole.beside = tuple(path for t in tables for path in (t.path, *t.beside))[1:]
+    return whole

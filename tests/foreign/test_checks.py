@@ -1,0 +1,144 @@
+"""What data can refuse: goals and positions that contradict a mapping, each a recording with one fault."""
+
+import numpy as np
+import pytest
+from foreign_robots import motion, servo
+
+from sim2real.log.importing import checks
+
+T, GOAL, Q = motion(20.0, joints=3)
+NAMES = ("a", "b", "c")
+
+
+def findings(goal=GOAL, q=Q, t_goal=T, t_q=T, by_name=True):
+    """Return kind, joint and weight of what the check finds, apart from notes."""
+    found = checks.check((t_goal, t_q), goal, q, NAMES, by_name)
+    return [(f.kind, f.joint, f.weight) for f in found if f.weight != "note"]
+
+
+@pytest.mark.parametrize("by_name", [True, False])
+def test_a_right_recording_has_no_finding(by_name):
+    assert findings(by_name=by_name) == []
+
+
+def test_joints_that_follow_other_goals_are_refused():
+    assert findings(GOAL[:, [1, 0, 2]]) == [("order", 0, "refuse"), ("order", 1, "refuse")]
+
+
+def test_goals_that_cannot_be_told_apart_are_asked_only_without_names():
+    """Each joint moves by the same sine, at another phase."""
+    goal = np.stack([0.4 * np.sin(9 * T + phase) for phase in (0.0, 0.5, 1.0)], axis=1)
+    q = np.stack([servo(T, column) for column in goal.T], axis=1)
+    assert {weight for kind, _, weight in findings(goal, q, by_name=False) if kind == "order"} == {"ask"}
+    assert [f for f in findings(goal, q) if f[0] == "order"] == []
+
+
+def test_a_joint_that_moves_against_its_goal_is_refused():
+    assert findings(GOAL * [1, -1, 1]) == [("sign", 1, "refuse")]
+
+
+def test_the_sign_of_a_tone_is_asked_and_its_level_answers():
+    """A sine of 3 Hz that is half a period later is its opposite."""
+    goal = 0.4 * np.sin(2 * np.pi * 3.0 * T[:, None] + np.arange(3))
+    q = np.stack([servo(T, column, wn=120.0) for column in goal.T], axis=1)
+    assert {f[0] for f in findings(goal, q)} == {"sign"}
+    assert findings(goal + 0.5, q + 0.5) == []
+
+
+@pytest.mark.parametrize("slope", [0.25, 3.0, 57.3, 0.0175])
+def test_a_slope_that_no_servo_has_is_refused(slope):
+    assert findings(q=Q * [1, 1, slope]) [0][:1] + findings(q=Q * [1, 1, slope])[0][2:] in (
+        ("slope", "refuse"), ("scale", "refuse"),
+    )  # fmt: skip
+
+
+def test_one_column_in_another_unit_is_refused():
+    """Both sides of a gripper are in percent."""
+    scale = np.array([1, 1, 57.3])
+    assert findings(GOAL * scale, Q * scale) == [("scale", 2, "refuse")]
+
+
+def test_positions_that_move_before_their_goals_are_refused():
+    assert {f[0] for f in findings(np.roll(GOAL, 60, axis=0))} <= {"lag", "follows"}
+    assert ("lag", 0, "refuse") in findings(np.roll(GOAL, 60, axis=0))
+
+
+@pytest.mark.parametrize("shift", [0, 1, -3, 40])
+def test_goals_that_are_copies_are_refused(shift):
+    assert {f[0] for f in findings(np.roll(Q, shift, axis=0))} == {"copy"}
+
+
+@pytest.mark.parametrize("rate", [0.98, 1.005])
+def test_a_clock_of_another_rate_is_refused(rate):
+    assert ("clock", -1, "refuse") in findings(t_q=T * rate)
+
+
+@pytest.mark.parametrize("side", ["reading", "goal"])
+@pytest.mark.parametrize("size", [0.05, -0.3])
+def test_a_zero_that_steps_is_named_with_its_time(side, size):
+    step = size * (T >= 9.0)[:, None] * np.array([0, 1, 0])
+    goal, q = (GOAL, Q + step) if side == "reading" else (GOAL + step, Q)
+    (found,) = [f for f in checks.check((T, T), goal, q, NAMES) if f.kind == "zero"]
+    assert found.joint == 1
+    assert found.weight == ("refuse" if side == "reading" else "warn")
+    assert "9.0" in found.text
+
+
+def test_an_offset_at_rest_is_said():
+    assert findings(q=Q + [0, 0, 0.12]) == [("zero", 2, "warn")]
+
+
+def test_commands_that_are_too_slow_for_the_motion_are_said():
+    t = np.arange(0, 20, 0.004)
+    rng = np.random.default_rng(0)
+    goal = 0.08 * np.sin(2 * np.pi * np.outer(t, rng.uniform(0.2, 12, 10)) + rng.uniform(0, 6, 10)).sum(axis=1)
+    q = servo(t, goal, wn=60.0)
+    found = checks.check((t[::25], t), goal[::25, None], q[:, None], ("a",))
+    assert "rate" in {f.kind for f in found} or {f.weight for f in found} & {"warn", "ask", "refuse"}
+    found = checks._rates((t[::25], t), goal[::25, None], q[:, None], [0])
+    assert [f.kind for f in found] == ["rate"]
+    assert checks._rates((t[::2], t), goal[::2, None], q[:, None], [0]) == []
+
+
+def test_a_joint_that_rests_is_said_and_one_held_elsewhere_is_asked():
+    rest = np.array([1, 0, 1])
+    assert findings(GOAL * rest, Q * rest) == [("still", 1, "warn")]
+    away = np.array([0, 1.0, 0])
+    assert findings(GOAL * rest + away, Q * rest - away) == [("sign", 1, "ask")]
+
+
+@pytest.mark.parametrize(
+    ("counts", "modulus"),
+    [
+        (lambda q: q % (1 << 16), 1 << 16),
+        (lambda q: q % (1 << 32), 1 << 32),
+        (lambda q: np.where(q < 0, (1 << 15) - q, q), 1 << 15),
+        (lambda q: np.where(q < 0, (1 << 31) - q, q), 1 << 31),
+    ],
+)
+def test_signed_counts_that_were_read_as_unsigned_are_found(counts, modulus):
+    q = np.round(800 * np.sin(T))
+    assert checks.unsigned(counts(q)) == modulus
+    assert checks.unsigned(q) is None
+    assert checks.unsigned(q + 2048) is None
+
+
+@pytest.mark.parametrize(("low", "unit"), [(-np.pi, 2 * np.pi), (0.0, 360.0)])
+def test_turns_are_counted(low, unit):
+    angle = (0.8 * T + np.sin(T))[:, None] * unit / (2 * np.pi)
+    written = (angle - low) % unit + low
+    counted = checks.counted(written, unit)
+    np.testing.assert_allclose(counted - counted[0], angle - angle[0], atol=1e-9)
+    assert checks.turns(written, unit).all()
+    assert not checks.turns(angle % (2 * unit), unit).any()
+
+
+def test_leaps_away_and_back_are_found_and_others_kept():
+    q = Q.copy()
+    q[[300, 301, 900], 1] = -3.0
+    found = checks.glitches(T, q)
+    assert np.argwhere(found).tolist() == [[300, 1], [301, 1], [900, 1]]
+    assert checks.leap(T, Q) is None
+    q = Q + 2.0 * (T > 5.0)[:, None] * np.array([0, 0, 1])
+    assert not checks.glitches(T, q).any()
+    assert checks.leap(T, q)[1:] == (2, pytest.approx(2.0, abs=0.05))

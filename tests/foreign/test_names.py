@@ -1,0 +1,245 @@
+"""What names propose, what they leave open, and how an answer in the file closes a question."""
+
+import re
+
+import numpy as np
+import pytest
+from foreign_robots import MODEL, VENDOR, csv, draw, faults, imported, motion, proposed, save
+
+from sim2real import cli
+from sim2real.errors import UsageError
+from sim2real.log import load_mapping, read_log
+from sim2real.log.importing.importer import import_table
+from sim2real.log.importing.names import columns_of, is_unit, meaning
+from sim2real.log.importing.readers import open_tables
+
+T, GOAL, Q = motion(10.0)
+
+
+def table(path, goal="goal_{}_rad", q="q_{}_rad", stamps="t_s", factor=1.0, **more):
+    """Write joints a and b by patterns of names."""
+    columns = {stamps: T}
+    columns |= {goal.format(j): factor * GOAL[:, i] for i, j in enumerate("ab")}
+    columns |= {q.format(j): factor * Q[:, i] for i, j in enumerate("ab")}
+    return csv(path / "run.csv", columns | more)
+
+
+@pytest.mark.parametrize(
+    ("goal", "q", "factor"),
+    [
+        ("goal_{}_rad", "q_{}_rad", 1.0),
+        ("{}_cmd_rad", "{}_pos_rad", 1.0),
+        ("q_des_{} [deg]", "q_{} [deg]", 180 / np.pi),
+        ("target.{} (degrees)", "position.{} (degrees)", 180 / np.pi),
+        ("action.{}.pos_rad", "observation.{}.pos_rad", 1.0),
+        ("command/{}/position_turns", "state/{}/position_turns", 0.5 / np.pi),
+        ("joint_command.position.{}", "joint_states.position.{}", 1.0),
+        ("ctrl_{}_rad", "qpos_{}", 1.0),
+        ("desired_{}_deg", "actual_angle_{}_deg", 180 / np.pi),
+    ],
+)
+def test_ordinary_names_are_right_at_once(tmp_path, goal, q, factor):
+    episode, found = imported(table(tmp_path, goal, q, factor=factor))
+    np.testing.assert_allclose(episode.outputs["sensor"]["position"], Q, atol=2e-5)
+    np.testing.assert_allclose(episode.outputs["actuator"]["goal"], GOAL, atol=2e-5)
+    assert found.joints == ("a", "b")
+    assert episode.units["sensor"]["position"] == "rad"
+
+
+@pytest.mark.parametrize("degrees", [0.9, 20.0, 500.0])
+def test_a_unit_that_no_name_has_is_asked_however_small_or_large_the_motion(tmp_path, degrees):
+    path = table(tmp_path, "goal_{}", "q_{}", factor=degrees)
+    assert {key for _, _, key in proposed(path).questions} == {"unit"}
+    episode, _ = imported(path, unit="deg")
+    np.testing.assert_allclose(episode.outputs["sensor"]["position"], np.radians(degrees * Q), atol=1e-6)
+
+
+@pytest.mark.parametrize("known", ["goal", "velocity", "turn", "range"])
+def test_the_unit_of_a_column_may_follow_from_another_one(tmp_path, known):
+    asked = {}
+    if known == "goal":
+        path = table(tmp_path, "goal_{}_rad", "q_{}")
+    elif known == "velocity":
+        path = table(
+            tmp_path, "goal_{}", "q_{}", dq_a_rad_s=np.gradient(Q[:, 0], T), dq_b_rad_s=np.gradient(Q[:, 1], T)
+        )
+    elif known == "turn":
+        angle = np.stack([0.9 * T + GOAL[:, 0], 0.9 * T + Q[:, 0]], axis=1)
+        path = csv(
+            tmp_path / "run.csv", {"t_s": T, "goal_a": angle[:, 0] % (2 * np.pi), "q_a": angle[:, 1] % (2 * np.pi)}
+        )
+    else:
+        path = table(tmp_path, "goal_{}", "q_{}", factor=1.0)
+        columns = {"t_s": T, "goal_a": GOAL[:, 0] - 1.5, "q_a": Q[:, 0] - 1.5}
+        path = csv(tmp_path / "run.csv", columns)
+        asked = {"joints": ("a",), "ranges": np.array([[-2.7, -0.5]])}
+    assert proposed(path, **asked).mapping.nodes["sensor"].fields["position"].unit == "rad"
+
+
+@pytest.mark.parametrize("suffix", ["_ticks", "_percent"])
+def test_counts_and_percent_are_asked(tmp_path, suffix):
+    path = table(tmp_path, f"goal_{{}}{suffix}", f"q_{{}}{suffix}", factor=2048 / np.pi)
+    assert {key for _, _, key in proposed(path).questions} == {"unit"}
+    episode, _ = imported(path, unit="counts:4096")
+    np.testing.assert_allclose(episode.outputs["sensor"]["position"], Q, atol=1e-5)
+
+
+def test_a_question_stands_in_the_file_and_an_edited_line_answers_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    table(tmp_path, "goal_{}", "q_{}", factor=180 / np.pi)
+    assert cli.main(["import", "run.csv"]) == 2
+    error = capsys.readouterr().err
+    assert "run.import.toml" in error
+    assert not (tmp_path / "runs").exists()
+    with pytest.raises(UsageError, match="open question"):
+        load_mapping("run.import.toml")
+    text = (tmp_path / "run.import.toml").read_text()
+    assert len(re.findall(r"^# unit = .*\?", text, re.MULTILINE)) == 2
+    (tmp_path / "run.import.toml").write_text(re.sub(r"^# unit = .*\?.*$", 'unit = "deg"', text, flags=re.MULTILINE))
+    assert cli.main(["import", "run.csv", "--mapping", "run.import.toml", "--out", "log.mcap"]) == 0
+    np.testing.assert_allclose(read_log("log.mcap").outputs["sensor"]["position"], Q, atol=1e-5)
+    assert cli.main(["import", "run.csv"]) == 2, "an edited file is not overwritten"
+    assert 'unit = "deg"' in (tmp_path / "run.import.toml").read_text()
+    assert cli.main(["import", "run.csv", "--unit", "deg", "--out", "other.mcap"]) == 0
+
+
+@pytest.mark.parametrize("seed", range(0, 42, 7))
+def test_true_answers_make_a_drawn_log_right(tmp_path, seed):
+    """Signs and units of random robots, as a user would write them into the file."""
+    log = draw(seed)
+    while "percent" in log.units or not log.named or log.asked:
+        seed += 100
+        log = draw(seed)
+    path = save(log, tmp_path)
+    try:
+        found = proposed(path)
+    except UsageError:
+        return
+    text = found.toml("log.csv")
+    units = {"counts": "counts:4096"}
+    for node, unit in (("sensor", log.units[0]), ("actuator", log.units[1])):
+        head, mark, tail = text.partition(f"[nodes.{node}.fields.")
+        tail = re.sub(r"^# unit = .*$", f'unit = "{units.get(unit, unit)}"', tail, count=1, flags=re.MULTILINE)
+        text = head + mark + re.sub(r"^# scale = .*$", f"scale = {log.sign.tolist()}", tail, flags=re.MULTILINE)
+    (tmp_path / "m.toml").write_text(text)
+    mapping = load_mapping(tmp_path / "m.toml")
+    found.evidence += [f"{j} not checked" for j in log.joints if not any("scale" in key for key in found.questions)]
+    assert [f for f in faults(log, import_table(open_tables(path)[0], mapping), found) if "positions" in f] == []
+
+
+def test_a_vendors_names_are_matched_by_leg_and_number(tmp_path):
+    t, goal, q = motion(10.0, joints=6)
+    np.savez(tmp_path / "run.npz", t_s=t, q_des_rad=goal, q_rad=q, joint_names=np.array(VENDOR))
+    episode, found = imported(tmp_path / "run.npz", joints=MODEL)
+    np.testing.assert_allclose(episode.outputs["sensor"]["position"], q[:, [3, 4, 5, 0, 1, 2]])
+    np.testing.assert_allclose(episode.outputs["actuator"]["goal"], goal[:, [3, 4, 5, 0, 1, 2]])
+    assert any("fl_0 is FL_hip_joint" in line for line in found.evidence)
+
+
+@pytest.mark.parametrize(
+    ("labels", "joints", "places"),
+    [
+        (("LF_HAA", "LF_HFE", "LF_KFE"), ("FL_hip", "FL_thigh", "FL_calf"), [0, 1, 2]),
+        (("FR1", "FR2", "FL1", "FL2"), ("FL_hip", "FL_thigh", "FR_hip", "FR_thigh"), [2, 3, 0, 1]),
+        (("front_left_knee", "front_left_hip"), ("FL_hip_joint", "FL_calf_joint"), [1, 0]),
+        (("b", "a"), ("a_joint", "b_joint"), [1, 0]),
+        (("FR_0", "FL_0", "RR_0"), ("FL_hip", "FL_thigh", "FL_calf"), None),
+        (("x", "y"), ("a", "b"), None),
+        (("FR_0", "FR_2"), ("FR_hip", "FR_thigh"), None),
+    ],
+)
+def test_names_match_or_they_do_not(labels, joints, places):
+    found = columns_of(joints, tuple(x.lower() for x in labels))
+    assert (found and found[0]) == places
+
+
+@pytest.mark.parametrize("nameless", [False, True])
+def test_names_that_exist_and_do_not_match_are_never_no_names(tmp_path, nameless):
+    names = {} if nameless else {"joint_names": np.array(["left", "right"])}
+    np.savez(tmp_path / "run.npz", t_s=T, goal_rad=GOAL, q_rad=Q, **names)
+    if nameless:
+        _, found = imported(tmp_path / "run.npz", joints=("hip", "knee"))
+        assert any("order is assumed" in line for line in found.evidence)
+        return
+    with pytest.raises(UsageError, match=r"left, right.*hip, knee"):
+        proposed(tmp_path / "run.npz", joints=("hip", "knee"))
+
+
+def test_goals_and_positions_of_other_joints_are_refused(tmp_path):
+    columns = {"t_s": T, "goal_a_rad": GOAL[:, 0], "goal_b_rad": GOAL[:, 1], "q_a_rad": Q[:, 0], "q_c_rad": Q[:, 1]}
+    with pytest.raises(UsageError, match=r"a, b.*a, c"):
+        proposed(csv(tmp_path / "run.csv", columns))
+
+
+def test_columns_in_another_order_without_names_are_asked(tmp_path):
+    np.savez(tmp_path / "run.npz", t_s=T, goal_rad=GOAL[:, ::-1], q_rad=Q)
+    assert set(proposed(tmp_path / "run.npz").questions) == {("actuator", "goal", "source")}
+    assert proposed(tmp_path / "run.npz", as_told=True).questions == {}
+
+
+def test_a_sign_is_asked_and_told_by_the_file(tmp_path):
+    np.savez(tmp_path / "run.npz", t_s=T, goal_rad=GOAL * [1, -1], q_rad=Q)
+    assert "[1.0, -1.0]" in proposed(tmp_path / "run.npz").questions["actuator", "goal", "scale"]
+
+
+def test_one_column_of_another_scale_is_refused_by_name(tmp_path):
+    names = np.array(["arm", "finger"])
+    np.savez(tmp_path / "run.npz", time=T, ctrl=GOAL * [1, 255], qpos=Q * [1, 0.04], joint_names=names)
+    with pytest.raises(UsageError, match="finger"):
+        proposed(tmp_path / "run.npz")
+    _, found = imported(tmp_path / "run.npz", joints=("arm",))
+    assert found.joints == ("arm",)
+
+
+def test_stamps_units_and_rates(tmp_path):
+    for name, factor, unit in (("t_ms", 1e3, "ms"), ("time", 1e9, "ns"), ("timestamp", 1e6, "us")):
+        columns = {name: np.round(1.7e9 * factor + T * factor), "goal_a_rad": GOAL[:, 0], "q_a_rad": Q[:, 0]}
+        _, found = imported(csv(tmp_path / "run.csv", columns))
+        assert found.mapping.nodes["sensor"].stamp_unit == unit
+    path = csv(tmp_path / "run.csv", {"goal_a_rad": GOAL[:, 0], "q_a_rad": Q[:, 0]})
+    assert set(proposed(path).questions) == {("actuator", "", "rate_hz"), ("sensor", "", "rate_hz")}
+    assert imported(path, rate_hz=200.0)[0].metadata["stamps"] == {"actuator": "generated", "sensor": "generated"}
+
+
+def test_gains_torque_switches_and_velocities_go_along(tmp_path):
+    on = (T > 1.0).astype(float)
+    rate = np.gradient(Q, T, axis=0)
+    _, found = imported(
+        table(
+            tmp_path, kp=np.full(len(T), 8.0), kd=0 * T, torque_enable=on, dq_a_rad_s=rate[:, 0], dq_b_rad_s=rate[:, 1]
+        )
+    )
+    assert set(found.mapping.nodes["actuator"].fields) == {"goal", "kp", "enabled"}
+    assert found.mapping.nodes["sensor"].fields["velocity"].unit == "rad/s"
+    assert any("'kd'" in line for line in found.evidence)
+
+
+def test_which_of_two_commands_is_asked(tmp_path):
+    other = {"command_a_rad": GOAL[::-1, 0], "command_b_rad": GOAL[::-1, 1]}
+    path = table(tmp_path)
+    episode = csv(path, {"t_s": T, "goal_rad": GOAL[:, 0], "target_rad": GOAL[::-1, 0], "q_rad": Q[:, 0], **other})
+    assert ("actuator", "goal", "source") in proposed(episode).questions
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("cmd_deg/FL_hip", ("command", "", "deg", "fl_hip")),
+        ("observation.state", ("measured", "", "", "")),
+        ("/controller_state.reference.positions", ("command", "position", "", "controller")),
+        ("dq_rad_s", ("", "velocity", "rad", "")),
+        ("field.header.stamp", ("", "stamp", "", "")),
+        ("shoulder.pos", ("", "position", "", "shoulder")),
+        ("hip position [deg]", ("", "position", "deg", "hip")),
+        ("grip [%]", ("", "", "percent", "grip")),
+    ],
+)
+def test_meanings(name, found):
+    m = meaning(name)
+    assert (m.side, m.quantity, m.unit, m.label) == found
+
+
+def test_units_of_a_second_line():
+    assert is_unit("[rad/s]")
+    assert not is_unit("speed")
+    assert not is_unit("")
