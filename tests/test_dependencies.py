@@ -14,6 +14,7 @@ PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-
 EXTRAS = {name: packages for name, packages in PROJECT["optional-dependencies"].items() if name not in ("dev", "bench")}
 """Extras for users; ``dev`` and ``bench`` are for the tests and the scripts."""
 IMPORTED_AS = {
+    "mcap-ros2-support": "mcap_ros2",
     "dm-control": "dm_control", "dm-env": "dm_env", "dynamixel-sdk": "dynamixel_sdk", "mujoco-mjx": "mujoco.mjx",
     "pyserial": "serial", "rerun-sdk": "rerun", "scikit-learn": "sklearn",
 }  # fmt: skip

@@ -85,7 +85,7 @@ def test_a_zero_that_steps_is_named_with_its_time(side, size):
 
 
 def test_an_offset_at_rest_is_said():
-    assert findings(q=Q + [0, 0, 0.12]) == [("zero", 2, "warn")]
+    assert findings(q=Q + np.array([0, 0, 0.12])) == [("zero", 2, "warn")]
 
 
 def test_commands_that_are_too_slow_for_the_motion_are_said():

@@ -1,5 +1,6 @@
 """Bags of other people's robots: each row is a bag, and beside it what the import must make of it."""
 
+import contextlib
 import gzip
 import json
 import struct
@@ -179,10 +180,8 @@ def test_bytes_changed_at_random_are_read_or_refused(tmp_path, seed):
     for _ in range(int(rng.choice((1, 3, 30)))):
         data[rng.integers(8, len(data))] = rng.integers(256)
     (tmp_path / "y.mcap").write_bytes(data)
-    try:
-        open_tables(tmp_path / "y.mcap")
-    except UsageError as error:
-        assert error.hint
+    with contextlib.suppress(UsageError):
+        assert open_tables(tmp_path / "y.mcap")[0].columns
 
 
 def test_our_own_log_needs_no_import(tmp_path, capsys):

@@ -76,7 +76,8 @@ class Meaning:
         side: ``command`` or ``measured``.
         quantity: ``stamp``, ``position``, ``velocity``, ``torque``, ``duty``, ``voltage``, ``kp``, ``kd``,
             ``enabled``, ``rate``, ``period``, or ``error`` (a difference of two signals).
-        unit: ``rad``, ``deg``, ``rev``, ``mrad``, ``m``, ``mm``, ``counts``, ``percent``, ``s``, ``ms``, ``us``, ``ns``.
+        unit: ``rad``, ``deg``, ``rev``, ``mrad``, ``m``, ``mm``, ``counts``, ``percent``, ``s``, ``ms``, ``us``, or
+            ``ns``.
         label: The remaining words, which name the joint.
     """
 
