@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
-import select
-import termios
 import threading
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,9 +11,10 @@ from functools import reduce
 from operator import xor
 
 import numpy as np
-import serial
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.bus.port import Port, open_port
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.device import Alone, CommandKind, Counters, Device, Reading, Transaction, WithoutHost
 
 SPEED = CommandKind("speeds", "rad/s", stale="zero")
@@ -92,7 +89,7 @@ class ODrive(Device):
         if tuple(ids) != (0,):
             raise UsageError(f"axes {list(ids)}: this driver knows axis 0 alone")
         self._port, self._loop, self._baud_rate, self._silence_s = port, drive, baud_rate, silence_s
-        self._serial: serial.Serial | None = None
+        self._line: Port | None = None
         self._lock = threading.Lock()
         self._halted = self._withheld = self._on = False
         self._speed = np.zeros(1)
@@ -115,6 +112,11 @@ class ODrive(Device):
     def silence_s(self) -> float:
         """Time without a command after which the board takes the torque off [s]."""
         return self._silence_s
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the port: all waiting and all stamps are on it."""
+        return SYSTEM_CLOCK if self._line is None else self._line.clock
 
     @property
     def measures(self) -> dict[str, str]:
@@ -142,10 +144,7 @@ class ODrive(Device):
 
     def open(self) -> None:
         """Open the port, find the board, take the torque off, and write the settings."""
-        try:
-            self._serial = serial.Serial(self._port, self._baud_rate, timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:
-            raise HardwareLost(f"the port {self._port} cannot be opened: {error}") from error
+        self._line = open_port(self._port, self._baud_rate)
         self._halted = self._withheld = self._on = False
         try:
             self.disable()
@@ -230,45 +229,46 @@ class ODrive(Device):
         the other.
         """
         self._halted = True
-        port = self._serial
-        if port is not None and port.is_open:
-            with suppress(OSError, TypeError):  # closed meanwhile
+        line = self._line
+        if line is not None:
+            with suppress(OSError):  # gone, or closed meanwhile
                 for _ in range(3):
-                    os.write(port.fileno(), _OFF)
+                    line.write(_OFF)
 
     def close(self) -> None:
         """Take the torque off, if the board still listens, and close the port."""
-        port = self._serial
-        if port is None or not port.is_open:
+        line = self._line
+        if line is None:
             return
         self.make_safe()
         with suppress(HardwareLost, SafetyStop):
             self.disable()
-        with self._lock:
-            port.close()
+        with self._lock, suppress(OSError):
+            self._line = None
+            line.close()
 
     # -- lines and answers
 
     def _tell(self, text: str) -> Transaction:
         """Send a line without an answer."""
-        asked_ns = time.monotonic_ns()
+        asked_ns = self.clock.now_ns()
         with self._lock:
-            sent_ns, _ = self._send(text)
+            line, sent_ns = self._send(text)
             self._answers += 1
-            return Transaction(sent_ns, sent_ns - asked_ns, time.monotonic_ns() - sent_ns, 0)
+            return Transaction(sent_ns, sent_ns - asked_ns, line.clock.now_ns() - sent_ns, 0)
 
     def _ask(self, text: str, count: int) -> tuple[list[float], Transaction]:
         """Ask until an answer has this many numbers."""
-        asked_ns = time.monotonic_ns()
+        asked_ns = self.clock.now_ns()
         with self._lock:
-            began_ns = time.monotonic_ns()
+            began_ns = self.clock.now_ns()
             for losses in range(_LOSSES):
-                sent_ns, fd = self._send(text)
-                line = self._receive(fd, sent_ns)
-                now_ns = time.monotonic_ns()
-                numbers = _numbers(unframed(line))
+                line, sent_ns = self._send(text)
+                heard = self._receive(line, sent_ns)
+                now_ns = line.clock.now_ns()
+                numbers = _numbers(unframed(heard))
                 if len(numbers) == count:
-                    wire_ns = 1e10 * (len(framed(text)) + len(line)) / self._baud_rate
+                    wire_ns = 1e10 * (len(framed(text)) + len(heard)) / self._baud_rate
                     late_ns = max(0, round(now_ns - sent_ns - wire_ns))
                     self._answers += 1
                     self._late += late_ns > 1e9 * _LATE_S
@@ -276,30 +276,30 @@ class ODrive(Device):
                     return numbers, Transaction(sent_ns, began_ns - asked_ns, now_ns - began_ns, losses, late_ns)
                 self._losses += 1
                 # Answers have no numbers: one that comes too late must not pass for that to the next question.
-                time.sleep(_ANSWER_S)
+                line.clock.sleep(_ANSWER_S)
         raise HardwareLost(f"no answer to {text!r} on {self._port}, {_LOSSES} times", hint="check power and cable")
 
-    def _send(self, text: str) -> tuple[int, int]:
-        """Forget what has come, send a line, and return when [ns], and the port's file descriptor."""
-        port = self._serial
-        if port is None or not port.is_open:
+    def _send(self, text: str) -> tuple[Port, int]:
+        """Forget what has come, send a line, and return the port and when that was [ns]."""
+        line = self._line
+        if line is None:
             raise HardwareLost(f"the ODrive on {self._port} is not open", hint="call open first")
         try:
-            port.reset_input_buffer()
-            sent_ns = time.monotonic_ns()
-            os.write(port.fileno(), framed(text))
-        except (OSError, termios.error) as error:
+            line.flush()
+            sent_ns = line.clock.now_ns()
+            line.write(framed(text))
+        except OSError as error:
             raise HardwareLost(f"{self._port} failed: {error}") from error
-        return sent_ns, port.fileno()
+        return line, sent_ns
 
-    def _receive(self, fd: int, sent_ns: int) -> bytes:
+    def _receive(self, line: Port, sent_ns: int) -> bytes:
         """Return what comes up to the end of a line; less if that is late."""
         end_ns, heard = sent_ns + round(1e9 * _ANSWER_S), b""
-        while not heard.endswith(b"\n") and (left_ns := end_ns - time.monotonic_ns()) > 0:
-            if select.select([fd], [], [], 1e-9 * left_ns)[0]:
-                if not (came := os.read(fd, 4096)):
-                    raise HardwareLost(f"{self._port} is gone", hint="was it unplugged?")
+        try:
+            while not heard.endswith(b"\n") and (came := line.read(end_ns)):
                 heard += came
+        except OSError as error:
+            raise HardwareLost(f"{self._port} failed: {error}") from error
         return heard
 
     def _read(self, name: str) -> float:
@@ -312,9 +312,9 @@ class ODrive(Device):
             raise HardwareLost(f"the ODrive does not keep its settings: {name} is {found}, not {value}")
 
     def _await(self, state: int) -> None:
-        end = time.monotonic() + _CHANGE_S
+        end_ns = self.clock.now_ns() + round(1e9 * _CHANGE_S)
         while self._read(STATE) != state:
-            if time.monotonic() > end:
+            if self.clock.now_ns() > end_ns:
                 self._require_no_error()
                 raise HardwareLost(f"axis 0 does not reach state {state}", hint="is it calibrated?")
 

@@ -151,14 +151,4 @@ class ODriveEmulation(BusEmulation):
     """Settings of an emulated ODrive on a serial line."""
 
     baud_rate: int = 115_200
-
-    def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
-        """Return the board with these settings.
-
-        Args:
-            plant: The mechanism.
-            truth: Log of true states and latencies.
-            send: Called with an answer's bytes.
-            start_ns: Time 0 of the plant [ns].
-        """
-        return Board(plant, self, truth, send, start_ns)
+    bus_type = Board
