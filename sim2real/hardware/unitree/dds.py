@@ -5,11 +5,15 @@ from __future__ import annotations
 import ipaddress
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Self
 from xml.sax.saxutils import quoteattr
 
 from sim2real.errors import HardwareLost, UsageError
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
+from sim2real.hardware.safety.guardian import Guardian, Process
+from sim2real.hardware.unitree.legs import LegDrive
 from sim2real.hardware.unitree.messages import COMMAND_TOPIC, STATE_TOPIC, LowCmd, LowState
 from sim2real.installation import with_extra
 
@@ -112,6 +116,7 @@ class DdsLink:
 
     def __init__(self, address: Address, mark: str) -> None:
         self.address, self._mark = address, mark.encode()
+        self.clock: Clock = SYSTEM_CLOCK
         self._reading = threading.Lock()
         self._writers: dict[object, str] = {}
         self._entities: _Entities | None = None
@@ -172,6 +177,12 @@ class DdsLink:
                     self._writers[sample.key] = data.decode(errors="replace") or f"program {sample.participant_key}"
         return list(self._writers.values())
 
+    def guardian(self, drive: LegDrive, silence_s: float, settle_s: float) -> Guardian:
+        """Return a guardian in a process of its own, with a writer of its own; arguments as in `Guardian`."""
+        program = ("-P", "-m", "sim2real.hardware.unitree.guardian_process")
+        arguments = [str(self.address), self._mark.decode(), repr(drive.damping), repr(drive.lie_s)]
+        return Guardian(lambda longest_s: Process(program, longest_s, arguments), silence_s, settle_s)
+
     def close(self) -> None:
         """Leave the domain. May be called twice."""
         with self._reading:
@@ -186,6 +197,16 @@ class DdsLink:
         return HardwareLost(
             f"the robot on {self.address} {what}: {error.msg}", hint="does the network interface exist, and is it up?"
         )
+
+
+EMULATED: Final[dict[Address, Callable[[str], DdsLink]]] = {}
+"""Address -> connects, with a mark, to an emulated robot in this process: `unitree.virtual`."""
+
+
+def connect(address: Address, mark: str) -> DdsLink:
+    """Return an open connection; see `DdsLink`."""
+    emulated = EMULATED.get(address)
+    return DdsLink(address, mark) if emulated is None else emulated(mark)
 
 
 class _Entities:

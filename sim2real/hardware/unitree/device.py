@@ -1,7 +1,6 @@
 """A Go2's legs as a device, over its low-level interface."""
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
@@ -175,7 +174,7 @@ class UnitreeLegs(GuardedLegs, Device):
         Raises:
             SafetyStop: A value is not finite or beyond the reach, or the torque is off.
         """
-        called_ns = time.monotonic_ns()
+        called_ns = self.clock.now_ns()
         self._require_possible(values)
         begin_ns, transfer_ns = self.publish(self._message(values))
         return Transaction(begin_ns, begin_ns - called_ns, transfer_ns, 0)

@@ -18,7 +18,7 @@ import socket
 import sys
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from sim2real.errors import HardwareLost
@@ -30,7 +30,6 @@ from sim2real.hardware.unitree.emulation import STATE_HZ, EmulatedLegs, UnitreeE
 from sim2real.hardware.unitree.messages import COMMAND_TOPIC, STATE_TOPIC, LowCmd, LowState
 
 if TYPE_CHECKING:
-    from cyclonedds.pub import DataWriter
     from cyclonedds.sub import DataReader
 
 _POLL_NS: Final = 1_000_000
@@ -71,18 +70,24 @@ def _run(options: argparse.Namespace, config: UnitreeEmulation, stop: StopFlag) 
         ready = {"port": str(address), "pid": os.getpid(), "truth": str(options.truth.resolve())}
         print(json.dumps(ready), flush=True)
         parent_fd = sys.stdin.fileno() if options.until_stdin_closes else None
-        _serve(legs, config, reader, _Sender(writer, config, truth), truth, start_ns, stop, parent_fd)
+        _serve(legs, config, reader, Sender(writer.write, config, truth), truth, start_ns, stop, parent_fd)
     finally:
         truth.close()
         del writer, reader, participant, network
         lock.close()
 
 
-class _Sender:
+class Sender:
     """Sends states, with the faults of the settings."""
 
-    def __init__(self, writer: DataWriter, config: UnitreeEmulation, truth: TruthLog) -> None:
-        self._writer, self._config, self._truth = writer, config, truth
+    def __init__(
+        self,
+        write: Callable[[LowState], object],
+        config: UnitreeEmulation,
+        truth: TruthLog,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._write, self._config, self._truth, self._now_ns = write, config, truth, now_ns
         self._random = random.Random(config.seed)
         self._waiting: deque[tuple[LowState, int]] = deque()
         self._held_ns = 0
@@ -102,8 +107,8 @@ class _Sender:
                 state.record["crc"] ^= 1
             lost = chance() < config.reply_loss
             if not lost:
-                self._writer.write(state)
-            done_ns, sampled_ns = time.monotonic_ns(), state_ns - round(1e9 * config.sensing_latency_s)
+                self._write(state)
+            done_ns, sampled_ns = self._now_ns(), state_ns - round(1e9 * config.sensing_latency_s)
             kind = Kind.LOSS if lost else Kind.SAMPLE
             self._truth.write(kind, 0, state_ns, sampled_ns, done_ns, done_ns - state_ns)
 
@@ -112,7 +117,7 @@ def _serve(
     legs: EmulatedLegs,
     config: UnitreeEmulation,
     reader: DataReader,
-    sender: _Sender,
+    sender: Sender,
     truth: TruthLog,
     start_ns: int,
     stop: StopFlag,

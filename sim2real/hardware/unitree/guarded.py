@@ -4,16 +4,16 @@ import atexit
 import logging
 import os
 import threading
-import time
 import uuid
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.device import Counters
-from sim2real.hardware.safety.guardian import Guardian, Process
-from sim2real.hardware.unitree.dds import LEASE_S, Address, DdsLink
+from sim2real.hardware.safety.guardian import Guardian
+from sim2real.hardware.unitree.dds import LEASE_S, Address, DdsLink, connect
 from sim2real.hardware.unitree.legs import NAMES, LegDrive
 from sim2real.hardware.unitree.messages import COMMAND_TOPIC, LowCmd
 from sim2real.hardware.unitree.sit_down import motors_on, sit_down
@@ -27,7 +27,6 @@ _CONFIRM_S: Final = 1.0
 """Longest time in which motors confirm that they are on, or off [s]."""
 _SETTLE_S: Final = 1.5
 """Longest time in which the guardian takes the torque off once the legs have damped [s]."""
-_PROGRAM: Final = ("-P", "-m", "sim2real.hardware.unitree.guardian_process")
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,7 @@ class GuardedLegs:
 
     def __init__(self, address: Address, drive: LegDrive, silence_s: float, max_silence_s: float) -> None:
         self.address, self.drive = address, drive
+        self._clock: Clock = SYSTEM_CLOCK
         self.armed = self.halted = self.withheld = False
         self.refused = 0
         self._silence_s, self._max_silence_s = silence_s, max_silence_s
@@ -63,6 +63,11 @@ class GuardedLegs:
         self._on = self._leaving = False
         self._published = 0
         self._commanding = threading.Lock()
+
+    @property
+    def clock(self) -> Clock:
+        """The clock of the connection; before it is open, the machine's."""
+        return self._clock
 
     @property
     def session(self) -> _Session:
@@ -92,19 +97,20 @@ class GuardedLegs:
         self.armed = self.halted = self.withheld = self._on = self._leaving = False
         self._published = self.refused = 0
         mark = f"sim2real {uuid.uuid4().hex[:8]} of process {os.getpid()}"
-        robot = DdsLink(self.address, mark)
+        robot = connect(self.address, mark)
+        self._clock = robot.clock
         try:
             # States must come, and no other writer may command the motors.
             stream = StateStream(robot, self._max_silence_s)
             state = stream.begin(_OPEN_S)
             # Motors that are on have a program, perhaps one that is not discovered yet: to damp would lay it down.
-            end_s = time.monotonic() + (_DISCOVERY_S if motors_on(state) else 0.0)
-            while not robot.other_writers() and time.monotonic() < end_s:
-                time.sleep(0.05)
+            end_s = self._now_s() + (_DISCOVERY_S if motors_on(state) else 0.0)
+            while not robot.other_writers() and self._now_s() < end_s:
+                self.clock.sleep(0.05)
             # A program that was killed is a writer until its lease is over.
-            end_s = time.monotonic() + LEASE_S + 1.0
-            while robot.other_writers() and time.monotonic() < end_s:
-                time.sleep(0.05)
+            end_s = self._now_s() + LEASE_S + 1.0
+            while robot.other_writers() and self._now_s() < end_s:
+                self.clock.sleep(0.05)
             _require_alone(robot, HardwareLost)
             # A program that was killed without a guardian may have left the motors on.
             if motors_on(state) and (failure := sit_down(robot, self.drive, _CONFIRM_S)):
@@ -129,15 +135,12 @@ class GuardedLegs:
             return
         # The guardian watches before the first command.
         if self._guardian is None:
-            arguments = [str(self.address), session.mark, repr(self.drive.damping), repr(self.drive.lie_s)]
-            self._guardian = Guardian(
-                lambda longest_s: Process(_PROGRAM, longest_s, arguments), self._silence_s, self.drive.lie_s + _SETTLE_S
-            )
+            self._guardian = session.robot.guardian(self.drive, self._silence_s, self.drive.lie_s + _SETTLE_S)
         _require_alone(session.robot, SafetyStop)
         self._guardian.arm()
         # Commands may be lost, so each state is answered with one until all motors are on.
         with self._commanding:
-            self._on, end_s = True, time.monotonic() + _CONFIRM_S
+            self._on, end_s = True, self._now_s() + _CONFIRM_S
             try:
                 while not self.halted:
                     session.robot.write(message)
@@ -145,7 +148,7 @@ class GuardedLegs:
                     if not off:
                         self.armed = True
                         break
-                    if time.monotonic() > end_s:
+                    if self._now_s() > end_s:
                         raise HardwareLost(
                             f"{', '.join(sorted(off))} did not switch on for {_CONFIRM_S:g} s",
                             hint="look at the robot's temperatures and battery",
@@ -161,7 +164,7 @@ class GuardedLegs:
             SafetyStop: Torque is off, or the guardian has taken over.
         """
         with self._commanding:
-            begin_ns = time.monotonic_ns()
+            begin_ns = self.clock.now_ns()
             if self.halted or not (self.armed or self.withheld):
                 raise SafetyStop("no command is sent: the torque is off", hint="enable it, or open the robot again")
             if self.withheld:
@@ -171,7 +174,7 @@ class GuardedLegs:
                 self.session.robot.write(message)
                 self._stop_if_halted()
             self._published += 1
-            return begin_ns, time.monotonic_ns() - begin_ns
+            return begin_ns, self.clock.now_ns() - begin_ns
 
     def beat(self) -> None:
         """Give the guardian a sign of life; raise SafetyStop if it has taken over, or has died."""
@@ -243,6 +246,9 @@ class GuardedLegs:
             failure = f"{type(error).__name__}: {error}"
         self._on = bool(failure)
         return failure
+
+    def _now_s(self) -> float:
+        return 1e-9 * self.clock.now_ns()
 
     def _stop_if_halted(self) -> None:
         """Damp again after `make_safe`, as a command may have followed it."""

@@ -25,6 +25,10 @@ class LegGuard(Guard):
     def __init__(self, robot: DdsLink, drive: LegDrive) -> None:
         self._robot, self._drive = robot, drive
 
+    def now_s(self) -> float:
+        """Return the time of the robot [s]."""
+        return 1e-9 * self._robot.clock.now_ns()
+
     def take_torque_off(self) -> str:
         """Let the motors damp until the robot lies, then take their torque off."""
         try:

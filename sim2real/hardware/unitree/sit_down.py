@@ -1,6 +1,5 @@
 """The safe way out of a robot on legs: its motors damp until it lies, then the torque goes off."""
 
-import time
 from collections.abc import Callable
 from typing import Final
 
@@ -39,8 +38,8 @@ def sit_down(robot: DdsLink, drive: LegDrive, give_up_s: float, alive: Callable[
     if state is None or motors_on(state):
         _damp(robot, drive, alive)
     # Take the torque off.
-    command, begin_s, confirmed = off(), time.monotonic(), False
-    while (passed_s := time.monotonic() - begin_s) < give_up_s:
+    command, begin_s, confirmed = off(), _now_s(robot), False
+    while (passed_s := _now_s(robot) - begin_s) < give_up_s:
         if confirmed and passed_s >= _HELD_S:
             return ""
         robot.write(command)
@@ -59,8 +58,8 @@ def motors_on(state: LowState) -> list[str]:
 
 
 def _damp(robot: DdsLink, drive: LegDrive, alive: Callable[[], None]) -> None:
-    command, begin_s, still_s = drive.damp(), time.monotonic(), None
-    while (now_s := time.monotonic()) - begin_s < drive.lie_s:
+    command, begin_s, still_s = drive.damp(), _now_s(robot), None
+    while (now_s := _now_s(robot)) - begin_s < drive.lie_s:
         robot.write(command)
         alive()
         state = _state(robot, _PERIOD_S)
@@ -75,9 +74,13 @@ def _damp(robot: DdsLink, drive: LegDrive, alive: Callable[[], None]) -> None:
 
 def _state(robot: DdsLink, timeout_s: float) -> LowState | None:
     """Return the next state that is intact, or None after the timeout."""
-    end_s = time.monotonic() + timeout_s
-    while (left_s := end_s - time.monotonic()) > 0.0:
+    end_s = _now_s(robot) + timeout_s
+    while (left_s := end_s - _now_s(robot)) > 0.0:
         state = robot.next_state(left_s)
         if state is not None and state.intact:
             return state
     return None
+
+
+def _now_s(robot: DdsLink) -> float:
+    return 1e-9 * robot.clock.now_ns()

@@ -1,7 +1,6 @@
 """The stream of states of a robot that sends them without a request: the first after a call, and counts of losses."""
 
 import threading
-import time
 from array import array
 from typing import Final
 
@@ -31,6 +30,7 @@ class StateStream:
 
     def __init__(self, robot: DdsLink, max_silence_s: float) -> None:
         self._robot, self._max_silence_s = robot, max_silence_s
+        self._clock = robot.clock
         self._lock = threading.Lock()
         self._step = 1
         self._tick: int | None = None
@@ -41,9 +41,9 @@ class StateStream:
     def begin(self, timeout_s: float) -> LowState:
         """Wait for the first states, learn by how much the tick grows, and return the newest state."""
         with self._lock:
-            states, damaged, end_s = [], 0, time.monotonic() + timeout_s
+            states, damaged, end_s = [], 0, self._now_s() + timeout_s
             while len(states) < _LEARNT:
-                left_s = end_s - time.monotonic()
+                left_s = end_s - self._now_s()
                 state = self._robot.next_state(left_s) if left_s > 0.0 else None
                 if state is None:
                     raise self._silent(timeout_s, damaged)
@@ -51,20 +51,20 @@ class StateStream:
                 damaged += not state.intact
             ticks = np.array([state.record["tick"] for state in states], np.int64)
             self._step = max(1, round(float(np.median(np.diff(ticks)))))
-            self._tick, self._taken_s = int(ticks[-1]), time.monotonic()
+            self._tick, self._taken_s = int(ticks[-1]), self._now_s()
             return states[-1]
 
     def next(self) -> tuple[LowState, Transaction]:
         """Return the first state that arrives after the call, and its times; raise HardwareLost if none does."""
-        called_ns = time.monotonic_ns()
+        called_ns = self._clock.now_ns()
         with self._lock:
             # The states that came before are older than the step that reads them.
-            begin_ns = time.monotonic_ns()
+            begin_ns = self._clock.now_ns()
             while (old := self._robot.next_state(0.0)) is not None:
                 self._is_next(old)
-            lost, damaged, end_s = self._lost, 0, time.monotonic() + self._max_silence_s
+            lost, damaged, end_s = self._lost, 0, self._now_s() + self._max_silence_s
             while True:
-                left_s = end_s - time.monotonic()
+                left_s = end_s - self._now_s()
                 state = self._robot.next_state(left_s) if left_s > 0.0 else None
                 if state is None:
                     raise self._silent(self._max_silence_s, damaged)
@@ -72,7 +72,7 @@ class StateStream:
                     break
                 damaged += not state.intact
             # Count it.
-            arrived_ns = time.monotonic_ns()
+            arrived_ns = self._clock.now_ns()
             retries, waited_s = self._lost - lost, 1e-9 * (arrived_ns - begin_ns)
             late_s = max(0.0, waited_s - PERIOD_S * (1 + retries))
             self._late += retries == 0 and waited_s > _LATE_S
@@ -91,7 +91,7 @@ class StateStream:
         """Note a state; return whether it is intact and newer than the one before."""
         if not state.intact:
             return False
-        tick, now_s = int(state.record["tick"]), time.monotonic()
+        tick, now_s = int(state.record["tick"]), self._now_s()
         # The counter of 32 bits starts again at 0.
         ahead = (tick - (self._tick or 0) + 2**31) % 2**32 - 2**31
         if ahead <= 0:
@@ -102,6 +102,9 @@ class StateStream:
             self._lost += max(0, round(ahead / self._step) - 1)
         self._tick, self._taken_s = tick, now_s
         return True
+
+    def _now_s(self) -> float:
+        return 1e-9 * self._clock.now_ns()
 
     def _silent(self, time_s: float, damaged: int) -> HardwareLost:
         if damaged:
