@@ -3,6 +3,7 @@
 import functools
 import importlib.util
 import os
+import re
 from pathlib import Path
 
 from sim2real.errors import UsageError
@@ -29,8 +30,15 @@ def has_jax() -> bool:
 
 
 def with_extra(extra: str) -> str:
-    """Return the command that installs an extra beside the installed distribution."""
-    return f"pip install '{ROBOT if version(ROBOT) else WHOLE}[{extra}]'"
+    """Return the command that installs the packages of an extra.
+
+    It names these packages, not this distribution, whose name is not registered on any index: a stranger may take it.
+    """
+    from importlib import metadata
+
+    of_extra = re.compile(rf"""extra == ['"]{re.escape(extra)}['"]""")
+    required = metadata.requires(ROBOT if version(ROBOT) else WHOLE) or []
+    return " ".join(["pip install", *(f"'{r.partition(';')[0].strip()}'" for r in required if of_extra.search(r))])
 
 
 def require_one(folder: Path = Path(__file__).parents[1]) -> None:

@@ -1,5 +1,6 @@
 """The two distributions: one at a time, the same packages of the same versions, and numbers drawn without JAX."""
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -9,6 +10,7 @@ import pytest
 
 from sim2real import installation
 from sim2real.errors import NotInstalled, UsageError
+from sim2real.installation import with_extra
 from sim2real.later import Later
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -61,3 +63,13 @@ def test_an_absent_package_is_named_and_any_other_error_is_its_own(monkeypatch):
         _ = Later("evosax.absent").anything
     with pytest.raises(ModuleNotFoundError, match="no_such_package"):
         _ = Later("no_such_package").anything
+
+
+def test_no_page_and_no_hint_installs_a_package_of_this_name():
+    """The name is not registered: an index may serve a stranger's package under it."""
+    places = ("README.md", "docs/**/*.md", "sim2real/**/*.py", "scripts/**/*.py")
+    unsafe = re.compile(r"pip install [^\n`]*['\" ]sim2real(-robot)?['\"\[ `\n]")
+    found = [str(p) for place in places for p in ROOT.glob(place) if unsafe.search(p.read_text())]
+    assert found == []
+    assert "rerun-sdk" in with_extra("view")
+    assert with_extra("interop").count("'") == 4

@@ -322,7 +322,7 @@ def warp(sizes: Sequence[int] | None, repeats: int, length: int) -> list[Row]:
     import jax
 
     if importlib.util.find_spec("warp") is None:
-        print('MuJoCo Warp is not installed, its rows are missing: pip install "sim2real[warp]"', file=sys.stderr)
+        print('MuJoCo Warp is not installed, its rows are missing: pip install ".[warp]"', file=sys.stderr)
         return []
     sizes = sizes or ((8,) if jax.default_backend() == "cpu" else (4096, 8192, 32768))
     return [r for copies in sizes for r in compared(copies, repeats, length)]

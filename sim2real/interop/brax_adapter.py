@@ -12,6 +12,7 @@ import numpy as np
 
 from sim2real.composer.physics.mjx.environment import MjxEnvironment
 from sim2real.errors import Sim2RealError
+from sim2real.installation import with_extra
 from sim2real.interop.composed_task import PureTask
 from sim2real.interop.environment import RobotEnvironment
 from sim2real.interop.pure_environment import PureEnvironment, Transition
@@ -21,7 +22,7 @@ try:
     from brax.envs.base import State as BraxState
 except ImportError as error:
     raise Sim2RealError(
-        "environments for brax need brax, which is not installed", hint="pip install 'sim2real[interop]'"
+        "environments for brax need brax, which is not installed", hint=with_extra("interop")
     ) from error
 
 if TYPE_CHECKING:

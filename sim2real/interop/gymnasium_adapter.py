@@ -15,6 +15,7 @@ from dm_env import specs
 from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.installation import with_extra
 from sim2real.interop.composed_task import PureTask
 from sim2real.interop.environment import Copy, RobotEnvironment
 from sim2real.interop.pure_environment import PureEnvironment, Transition
@@ -25,7 +26,7 @@ try:
     from gymnasium.vector import AutoresetMode, VectorEnv
 except ImportError as error:
     raise Sim2RealError(
-        "environments for gymnasium need gymnasium, which is not installed", hint="pip install 'sim2real[interop]'"
+        "environments for gymnasium need gymnasium, which is not installed", hint=with_extra("interop")
     ) from error
 
 if TYPE_CHECKING:

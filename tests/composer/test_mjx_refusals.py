@@ -213,7 +213,7 @@ def test_actions_of_a_task_s_own_and_after_compile():
     assert environment.mjx_model.opt.gravity.tolist() == [0, 0, -1]
     after = jax.eval_shape(environment.step, jax.eval_shape(environment.reset, jax.random.key(0)), jnp.zeros(3))
     assert after.data.ctrl.shape == (1,)
-    pytest.importorskip("gymnasium", reason="the vector environment: pip install 'sim2real[interop]'")
+    pytest.importorskip("gymnasium", reason="the vector environment: the extra interop")
     with pytest.raises(
         UsageError, match=r"Steered shows its policy nothing: no observable is enabled\. There are: none"
     ):

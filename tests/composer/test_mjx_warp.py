@@ -19,7 +19,7 @@ from sim2real.runtime.compilation.compiled import CompiledGraph
 
 pytestmark = pytest.mark.night  # compiles kernels; starting without them is tested in test_warp_start.py
 STEPS, SUBSTEPS = 50, 2
-MISSING = 'Warp is not installed: pip install "sim2real[warp]"'
+MISSING = "Warp is not installed: the extra warp"
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-pytest.importorskip("gymnasium", reason="pip install 'sim2real[interop]'")
+pytest.importorskip("gymnasium", reason="the extra interop")
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.interop import baselines_env, vector_env

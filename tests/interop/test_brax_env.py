@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-pytest.importorskip("brax", reason="pip install 'sim2real[interop]'")
+pytest.importorskip("brax", reason="the extra interop")
 from brax.envs.wrappers.training import wrap
 
 from sim2real.interop import brax_env

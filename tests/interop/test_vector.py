@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-gymnasium = pytest.importorskip("gymnasium", reason="pip install 'sim2real[interop]'")
+gymnasium = pytest.importorskip("gymnasium", reason="the extra interop")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
 

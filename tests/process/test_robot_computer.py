@@ -109,4 +109,4 @@ def test_the_distribution_is_small_and_works(tmp_path_factory, tmp_path, resting
     assert not [name for name in ("jax", "brax", "scipy", "onnx", "matplotlib") if (packages / name).exists()]
     assert_works(command, tmp_path, *resting)
     code, said = call(command, tmp_path, "view", resting[0])
-    assert (code, "pip install 'sim2real-robot[view]'" in said) == (errors.ERROR, True)
+    assert (code, "pip install 'rerun-sdk" in said) == (errors.ERROR, True)

@@ -107,7 +107,7 @@ def test_the_arm_moves_alike_on_c_and_on_mjx(arm):
 @pytest.mark.night
 def test_other_learners_see_the_joints_and_get_bounds_for_the_goals():
     """A composed task of servos, without its graph, for brax and gymnasium: what it shows, and what it may be told."""
-    pytest.importorskip("gymnasium", reason="pip install 'sim2real[interop]'")
+    pytest.importorskip("gymnasium", reason="the extra interop")
     task = load_pipeline("arm").load().model.make_task()
     with pytest.raises(UsageError, match=r"Reach shows its policy nothing: no observable is enabled\. There are: '"):
         composer.MjxVectorEnv(composer.MjxEnvironment(task), 2)

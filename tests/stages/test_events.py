@@ -36,6 +36,6 @@ def test_each_policy_has_its_curves(tmp_path):
 
 def test_without_tensorboardx_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    needed = r"need tensorboardX[\s\S]*hint: pip install 'sim2real\[tensorboard\]'"
+    needed = r"need tensorboardX[\s\S]*hint: pip install 'tensorboard"
     with pytest.raises(Sim2RealError, match=needed), event_files(tmp_path, ["seed 0"]):
         pass

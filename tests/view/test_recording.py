@@ -155,7 +155,7 @@ def test_without_the_viewer_the_error_names_the_extra(run, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", no_rerun)
     with pytest.raises(Sim2RealError, match="not installed") as caught:
         view(run, run / "run.rrd")
-    assert caught.value.hint == "pip install 'sim2real[view]'"
+    assert "rerun-sdk" in caught.value.hint
 
 
 def test_a_place_that_cannot_be_written_is_named(run):

@@ -89,7 +89,7 @@ def test_what_mjx_would_do_otherwise_is_refused(model, rate, match):
 @pytest.mark.night
 def test_the_same_graph_runs_on_warp():
     """Started in one program and run in another, which gives every copy a model of its own."""
-    pytest.importorskip("warp", reason='Warp is not installed: pip install "sim2real[warp]"')
+    pytest.importorskip("warp", reason="Warp is not installed: the extra warp")
 
     def play(impl):
         world = MjxWorld("world", 100.0, arm(), impl=impl)

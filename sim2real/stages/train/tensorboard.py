@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from sim2real.artifacts.progress import write_progress
 from sim2real.artifacts.run.run_folder import OpenStage
 from sim2real.errors import Sim2RealError
+from sim2real.installation import with_extra
 from sim2real.stages.live.viewer import live_view
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.show import Watch
@@ -68,6 +69,6 @@ def _import_writer() -> type[SummaryWriter]:
     except ImportError as error:
         raise Sim2RealError(
             "files for TensorBoard need tensorboardX, which is not installed",
-            hint="pip install 'sim2real[tensorboard]'",
+            hint=with_extra("tensorboard"),
         ) from error
     return SummaryWriter

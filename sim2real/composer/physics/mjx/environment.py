@@ -87,7 +87,7 @@ class MjxEnvironment:
         strip_singleton_obs_buffer_dim: Leave the first axis out of observations whose buffer holds one sample.
         max_reset_attempts: How often the initial state is drawn when hooks call ``physics.fail``.
         legacy_step: After a step, also compute positions and velocities of the new state.
-        impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, from the extra ``sim2real[warp]``. It computes in single precision
+        impl: ``"jax"``, or ``"warp"``: MuJoCo Warp, from the extra ``warp``. It computes in single precision
             and has no derivatives.
         nconmax: On Warp: contacts that there is room for, times the number of copies, which share it; default: a guess.
         njmax: On Warp: rows of constraints that there is room for in each copy; default: a guess. Where it is too small

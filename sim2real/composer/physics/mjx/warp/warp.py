@@ -11,6 +11,7 @@ from mujoco import mjx
 
 from sim2real.composer.physics.mjx.stepping import with_fields
 from sim2real.errors import UsageError
+from sim2real.installation import with_extra
 
 if TYPE_CHECKING:
     from sim2real.composer.types import MjModel
@@ -112,7 +113,7 @@ def find_device() -> Any:
     from mujoco.mjx import warp as mjx_warp
 
     if not mjx_warp.WARP_INSTALLED or mjx_warp.mujoco_warp is None:
-        raise UsageError('impl="warp": Warp is not installed', hint='pip install "sim2real[warp]"')
+        raise UsageError('impl="warp": Warp is not installed', hint=with_extra("warp"))
     config: Any = jax.config  # read() refuses an option that a context may change
     device: Any = config.jax_default_device or jax.devices()[0]
     device = jax.devices(device)[0] if isinstance(device, str) else device
