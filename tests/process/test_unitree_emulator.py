@@ -12,12 +12,15 @@ from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.hardware.emulation.truth import Kind
 
 pytest.importorskip("cyclonedds")
+from sim2real.errors import HardwareLost
+from sim2real.hardware.unitree import guarded
 from sim2real.hardware.unitree.dds import Address, DdsLink
+from sim2real.hardware.unitree.device import UnitreeLegs
 from sim2real.hardware.unitree.emulation import UnitreeEmulation
 
 pytestmark = pytest.mark.process
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 BODY = "pipelines.go2.plant:Go2Body"
 VERSION = "1.0.1"
 
@@ -72,3 +75,9 @@ def test_a_robot_starts_in_a_domain_without_programs():
             link.close()
     finally:
         left_behind.close()
+
+
+def test_a_robot_that_is_not_there_is_lost(monkeypatch):
+    monkeypatch.setattr(guarded, "_OPEN_S", 0.2)
+    with pytest.raises(HardwareLost, match="has sent no state"):
+        UnitreeLegs("lo:9").open()
