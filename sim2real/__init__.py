@@ -42,7 +42,7 @@ _NAMES_OF_MODULE = {
     "sim2real.runtime.compilation.compiled": ("CompiledGraph",),
     "sim2real.stages.check.stage": ("check",),
     "sim2real.stages.deploy.stage": ("deploy",),
-    "sim2real.commands.export.model": ("export",),
+    "sim2real.commands.export.identified": ("export",),
     "sim2real.commands.functions": ("report", "run"),
     "sim2real.stages.identify.stage": ("identify",),
     "sim2real.stages.pipeline.pipeline": ("Pipeline", "load_pipeline"),

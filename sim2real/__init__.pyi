@@ -6,7 +6,7 @@ from sim2real.artifacts.deployment import Deployment as Deployment
 from sim2real.artifacts.identification import Identification as Identification
 from sim2real.artifacts.recording import Recording as Recording
 from sim2real.artifacts.timing import Timing as Timing
-from sim2real.commands.export.model import export as export
+from sim2real.commands.export.identified import export as export
 from sim2real.commands.functions import report as report
 from sim2real.commands.functions import run as run
 from sim2real.errors import DeadlineExceeded as DeadlineExceeded

@@ -112,10 +112,14 @@ class CommandGroup:
     actions: Mapping[str, ConfigCommand]
 
     def __call__(self, command: str, arguments: list[str]) -> None:
-        """Run the action that the first argument names; ``--help`` alone shows the first action."""
+        """Run the action that the first argument names; ``--help`` alone lists the actions."""
         action, *rest = arguments or [""]
         if action in ("-h", "--help"):
-            action, rest = next(iter(self.actions)), ["--help"]
+            print(f"usage: sim2real {command} ACTION\n\nActions:")
+            for name, kind in self.actions.items():
+                print(f"  sim2real {command} {name} {kind.help}\n      {summary_of(load(kind.config)())}")
+            print(f"\nsim2real {command} ACTION --help lists its flags.")
+            return
         if action not in self.actions:
             problem = f"there is no `{command} {action}`" if action else f"{command} needs an action"
             raise UsageError(

@@ -54,7 +54,7 @@ COMMANDS: dict[str, Command] = {
         {
             "identified": ConfigCommand(
                 "RUN|PIPELINE|FILE --to mjcf|mjlab|isaaclab|json|card",
-                "commands.export.model", "commands.config.ExportConfig",
+                "commands.export.identified", "commands.config.ExportConfig",
                 examples=(
                     "export identified pendulum --to json",
                     "export identified runs/arm/TIME --to mjcf --out arm.xml",

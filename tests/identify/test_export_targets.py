@@ -7,9 +7,8 @@ import mujoco
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.identify.export.isaaclab import isaaclab_source
 from sim2real.identify.export.mjcf import Late, late_mjcf
-from sim2real.identify.export.mjlab import mjlab_source
+from sim2real.identify.export.targets import isaaclab_source, mjlab_source
 from sim2real.identify.export.terms import Delays, Term, Terms
 
 NAMES = ("arm/pan/joint", "tilt.joint")

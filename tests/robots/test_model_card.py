@@ -15,7 +15,7 @@ import pytest
 from sim2real import cli, errors
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Link, Ranged
 from sim2real.artifacts.posterior import Posterior
-from sim2real.commands.export.card import facts_of, write_model_card
+from sim2real.commands.export.identified import facts_of, write_model_card
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.problem import Problem

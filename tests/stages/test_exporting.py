@@ -12,7 +12,7 @@ from sim2real.artifacts.identification import Estimate, Identification, Judgemen
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run import run_folder
 from sim2real.commands.config import ExportConfig
-from sim2real.commands.export import model as export_model
+from sim2real.commands.export import identified as export_model
 from sim2real.identify.export import terms
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -135,3 +135,15 @@ def test_an_identification_without_intervals_is_refused(arm, here, capsys, statu
 def test_what_is_not_there_is_said(here, capsys, arguments, words):
     assert cli.main(["export", *arguments]) in (errors.USAGE, errors.ERROR)
     assert words in capsys.readouterr().err
+
+
+def test_help_lists_both_kinds_of_export(capsys):
+    assert cli.main(["export", "--help"]) == 0
+    said = capsys.readouterr().out
+    assert {"identified", "policy"} <= set(said.split())
+
+
+def test_parameters_of_a_world_that_is_not_installed_are_refused(arm, here, capsys):
+    file = save(replace(arm, world="nowhere"), here / "found")
+    assert cli.main(["export", "identified", str(file)]) == errors.USAGE
+    assert "nowhere" in capsys.readouterr().err

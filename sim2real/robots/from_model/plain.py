@@ -9,7 +9,7 @@ import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
-from sim2real.identify.export.card.plain import PlainSimulation, converged
+from sim2real.identify.export.plain import PlainSimulation, converged
 from sim2real.robots.from_model.mjcf import copy_back, driven_spec
 from sim2real.types import Json
 from sim2real.worlds.drive_terms import DriveTerms

@@ -12,7 +12,7 @@ import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
-from sim2real.identify.export.card.plain import PlainSimulation, converged
+from sim2real.identify.export.plain import PlainSimulation, converged
 from sim2real.identify.parameters import Parameter
 from sim2real.later import at_once, jnp
 from sim2real.robots.contract import RobotModel

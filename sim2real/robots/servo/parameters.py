@@ -13,7 +13,7 @@ import numpy as np
 
 from sim2real.arrays import beside_damping
 from sim2real.composer.models.mjcf.translate import mj
-from sim2real.identify.export.card.plain import converged
+from sim2real.identify.export.plain import converged
 from sim2real.identify.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.robots.servo.datasheet import DataSheet

@@ -1,0 +1,234 @@
+"""``sim2real export identified``: the estimates as a model of another simulator, as JSON, or as a model card."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sim2real.artifacts.files import write_json
+from sim2real.artifacts.identification import PARAMETERS, UNFINISHED, Identification
+from sim2real.artifacts.run.manifest import sha256
+from sim2real.artifacts.run.run_folder import newest, pipeline_of
+from sim2real.commands.config import ExportConfig
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.identify.export.card import differing, write_card
+from sim2real.identify.export.document import json_document
+from sim2real.identify.export.mjcf import Late, late_mjcf
+from sim2real.identify.export.targets import isaaclab_source, mjlab_source
+from sim2real.identify.export.terms import Terms, find_delays, find_terms, values_of
+from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.parameters import ParameterTable
+from sim2real.installation import version
+from sim2real.log.reader import read_log
+from sim2real.robots.contract import RecordedRobot
+from sim2real.stages.pipeline import python_arguments
+from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
+from sim2real.stages.pipeline.from_model import pipeline_beside
+from sim2real.stages.pipeline.pipeline import Pipeline, available
+from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyPath, identification_of
+from sim2real.stages.terminal.console import note, wrote
+from sim2real.stages.validate.stage import identified_robot
+from sim2real.types import Json
+
+FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json",
+          "card": "card"}  # fmt: skip
+_PLAIN = {"gain", "stiffness", "damping", "viscous", "coulomb", "armature", "gravity", "delay"}
+"""Leaves of parameters that have a counterpart in MuJoCo's joints and drives."""
+_SESSION: tuple[str, ...] = ("firmware", "voltage", "temperature")
+"""Facts about the hardware that a log may hold, in its metadata or as a measurement."""
+
+
+def run(config: ExportConfig) -> Path:
+    """Write the file, print the parameters that it lacks, and return its path.
+
+    Raises:
+        UsageError: There is no identification, it was interrupted, or the target cannot hold the robot's model.
+    """
+    file = find_parameters(config)
+    identification = Identification.load(file)
+    out = config.out or Path(f"{identification.pipeline}_{FILES[config.to]}")
+    pipeline = pipeline_beside(file, identification)
+    _export(identification, pipeline, config.to, out, str(file), file.resolve().parent.parent)
+    wrote(out)
+    return out
+
+
+def export(
+    robot: RecordedRobot | Pipeline | str,
+    identification: AnyIdentification,
+    out: AnyPath,
+    to: Literal["mjcf", "mjlab", "isaaclab", "json", "card"] = "mjcf",
+) -> Path:
+    """Write the estimates as a model of another simulator.
+
+    Args:
+        robot: The robot, its pipeline, or the pipeline's name.
+        identification: The identification, or its folder.
+        to: ``mjcf``, ``mjlab``, ``isaaclab``, ``json``, or ``card``, which is a folder.
+
+    Raises:
+        UsageError: The identification was interrupted or is of another robot, or the target cannot hold the model.
+    """
+    pipeline, document, out = python_arguments.pipeline_of(robot), identification_of(identification), Path(out)
+    if to not in FILES:
+        raise UsageError(f"cannot export to {to!r}. Available: {', '.join(FILES)}")
+    if document.pipeline != pipeline.name:
+        raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {pipeline.name!r}")
+    in_memory = isinstance(identification, Identification)
+    where, run_dir = ("memory", None) if in_memory else (str(identification), Path(identification).resolve().parent)
+    _export(document, pipeline, to, out, where, run_dir)
+    return out
+
+
+def _export(
+    identification: Identification, pipeline: Pipeline, to: str, out: Path, where: str, run_dir: Path | None
+) -> None:
+    """Write one file, or the folder of a card.
+
+    Args:
+        run_dir: Folder of the run, in which a card looks for the log.
+    """
+    if identification.posterior is None:
+        ended = UNFINISHED.get(identification.verdict.status, "has no intervals")
+        raise UsageError(
+            f"the identification in {where} {ended}: its estimates may be far off",
+            hint=identification.verdict.next or f"sim2real identify {identification.pipeline}",
+        )
+    # Describe the source at the head of the file.
+    robot, fitting = identified_robot(identification, pipeline)
+    model, status = robot.identifiable(fitting.max_delay_s), identification.verdict.status
+    log = [("log", f"{log.path} {log.sha256}") for log in identification.logs[:1]]
+    about = [("pipeline", identification.pipeline), ("verdict", status), *log, ("sim2real", version())]
+    if status != "accepted":
+        note(f"verdict: {status}; the file contains the verdict, too")
+    # Put the estimates into the robot's model; optional terms that were not identified are switched off.
+    off, sides = {p.name: p.nominal for p in model.parameters}, {p.name: p.side for p in model.parameters}
+    text = robot.identified_mjcf({**off, **values_of(identification)})
+    terms = None if text is None else find_terms(identification, lambda values: _text(robot, {**off, **values}), sides)
+    # Write the format: JSON and a card need no model, the others need one.
+    if to == "json":
+        write_json(out, json_document(identification, terms, find_delays(identification, sides), about))
+        return
+    if to == "card":
+        write_model_card(out, identification, robot, model, terms, about, run_dir)
+        return
+    if text is None or terms is None:
+        raise _no_model(identification, model.parameters, to)
+    if terms.unexpressed:
+        note(f"not expressed in {to}: {', '.join(terms.unexpressed)}")
+        about = [*about, ("not expressed", ", ".join(terms.unexpressed))]
+    if to == "mjcf":
+        content = late_mjcf(text, terms, Late(robot.export_lead_s, robot.profile_rad_s), about)
+    else:
+        title = f"Actuators and randomisation of {identification.pipeline!r}, as sim2real identified them."
+        content = (mjlab_source if to == "mjlab" else isaaclab_source)(terms, title, about)
+    out.write_text(content, encoding="utf-8")
+
+
+def write_model_card(
+    folder: Path,
+    identification: Identification,
+    robot: RecordedRobot,
+    model: IdentifiableModel,
+    terms: Terms | None,
+    about: Sequence[tuple[str, str]],
+    run_dir: Path | None,
+) -> None:
+    """Write the card of an identification, and a note for each figure that plain MuJoCo misses.
+
+    Args:
+        run_dir: Folder of the run, in which the log lies; None: the card has no facts about the hardware.
+
+    Raises:
+        UsageError: The folder has files of something else.
+    """
+    if folder.is_file() or (folder.is_dir() and any(folder.iterdir()) and not (folder / "card.json").is_file()):
+        raise UsageError(f"{folder} is there and holds no model card", hint="name another folder with --out")
+    plain = robot.plain_simulation({p.name: p.nominal for p in model.parameters} | values_of(identification))
+    about = [row for row in about if row[0] != "log"]  # a path of the own machine is no part of a card
+    delays = find_delays(identification, {p.name: p.side for p in model.parameters})
+    session = _session(identification, robot.roles.sensor, run_dir)
+    card, signals = write_card(folder, identification, model, plain, terms, delays, about, session)
+    for sentence in [*card["notes"], *differing(folder)]:
+        note(sentence)
+    from sim2real.view.page.model_card import model_card_page  # matplotlib and jinja2 take 0.5 s to import
+
+    model_card_page(card, signals, folder, identification.links)
+
+
+def _session(identification: Identification, sensor: str, run_dir: Path | None) -> dict[str, str]:
+    """Return firmware, supply voltage and temperature in the first log, as text."""
+    source = identification.logs[0] if identification.logs else None
+    path = run_dir / source.path if source is not None and run_dir is not None else None
+    if source is None or path is None or not path.is_file() or sha256(path) != source.sha256:
+        return dict.fromkeys(_SESSION, "the log is not beside the identification")
+    return facts_of(read_log(path), sensor) if path.suffix == ".mcap" else dict.fromkeys(_SESSION, "not recorded")
+
+
+def facts_of(episode: Episode, sensor: str) -> dict[str, str]:
+    """Return firmware, supply voltage and temperature in a log, as text, from its metadata and measurements."""
+    facts: dict[str, str] = dict.fromkeys(_SESSION, "not recorded")
+    hardware = episode.metadata.get("hardware")
+    facts |= {n: _of_motors(v) for n, v in hardware.items()} if isinstance(hardware, dict) else {}
+    # A measurement is better than the value at the begin of the recording, and has its place.
+    for name, rows in episode.outputs.get(sensor, {}).items():
+        for fact in _SESSION:
+            if rows.size and fact in name:
+                unit = episode.units.get(sensor, {}).get(name, "")
+                facts.pop(fact, None)
+                facts[name] = f"{np.min(rows):.4g} to {np.max(rows):.4g} {unit}".rstrip()
+    return facts
+
+
+def _of_motors(values: Json) -> str:
+    """Return a fact of each motor as text: one value, or each value with its motors."""
+    if not isinstance(values, dict):
+        return str(values)
+    motors: dict[str, list[str]] = {}
+    for motor, value in values.items():
+        motors.setdefault(str(value), []).append(motor)
+    if len(motors) == 1 and len(values) > 1:
+        return f"{next(iter(motors))}, all motors"
+    return "; ".join(f"{value}: {', '.join(names)}" for value, names in motors.items())
+
+
+def _text(robot: RecordedRobot, values: Mapping[str, float]) -> str:
+    text = robot.identified_mjcf(values)
+    if text is None:
+        raise UsageError(f"robot {type(robot).__name__} has a MuJoCo model for some values and none for others")
+    return text
+
+
+def _no_model(identification: Identification, table: ParameterTable, to: str) -> UsageError:
+    """Return the error for a robot whose world is not MuJoCo's: it names what an MJCF would lack."""
+    leaves = {p.name: str(p.leaf).rpartition(".")[2].partition("[")[0] for p in table if p.leaf}
+    lost = [p.name for p in identification.parameters if leaves.get(p.name.partition("@")[0], "delay") not in _PLAIN]
+    return UsageError(
+        f"the world of pipeline {identification.pipeline!r} is not MuJoCo's, so there is no model to export to "
+        f"{to}. Joints and drives of MuJoCo's have nothing for: {', '.join(lost) or 'its equations of motion'}",
+        hint="--to json has all parameters, their intervals and the posterior",
+    )
+
+
+def find_parameters(config: ExportConfig) -> Path:
+    """Return the file of the identification that the configuration names."""
+    source = config.source
+    if source is None:
+        raise UsageError(
+            f"export needs a run folder, a pipeline or a {PARAMETERS}. Pipelines: {', '.join(sorted(available()))}",
+            hint="sim2real export identified PIPELINE --to mjcf",
+        )
+    # A file or a stage folder, then a pipeline's name, then a run.
+    path = Path(source)
+    if path.is_file():
+        return path
+    if (path / PARAMETERS).is_file():
+        return path / PARAMETERS
+    if source in available():
+        return warn_of_stale(newest(config.runs, source, "identify")).output("parameters")
+    run_dir = find_run(config.runs, source)
+    return warn_of_stale(newest(config.runs, pipeline_of(run_dir), "identify", run_dir)).output("parameters")
