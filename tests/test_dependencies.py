@@ -136,20 +136,6 @@ def test_developers_have_every_extra_but_two(extra):
     assert re.search(rf"sim2real\[[^]]*\b{extra}\b", str(PROJECT["optional-dependencies"]["dev"]))
 
 
-@pytest.mark.parametrize(
-    ("source", "names"),
-    [
-        ("import a.b", {"a.b"}),
-        ("def f():\n    from a import b", {"a", "a.b"}),
-        ("from . import c", {"p.q", "p.q.c"}),
-        ("from ..d import e", {"p.d", "p.d.e"}),
-        ("if TYPE_CHECKING:\n    import a\nelse:\n    import b", {"b"}),
-    ],
-)
-def test_every_kind_of_import_is_followed(source, names):
-    assert imports(source, "p.q") == names
-
-
 def test_mujoco_and_mjx_are_of_one_release():
     """MJX asks for "at least" its own MuJoCo: without the pin pip pairs it with a later one that it does not know."""
     pins = {r.split("==")[1] for r in PROJECT["dependencies"] if r.startswith("mujoco")}

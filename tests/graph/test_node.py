@@ -52,18 +52,6 @@ def test_only_nodes_can_be_connected():
         BaseNode("b", 1).connect("p")
 
 
-def test_a_taken_name_is_refused_with_a_way_out():
-    a, b = BaseNode("a", 10), BaseNode("b", 10)
-    first = b.connect(a)
-    with pytest.raises(UsageError, match=r"has an input .a. already\. Inputs: a") as error:
-        b.connect(a)
-    assert "name='other'" in (error.value.hint or "")
-    second = b.connect(a, name="other", window=3, skip=True)
-    assert b.inputs == {"a": first, "other": second}
-    assert a.outputs == [first, second]
-    assert repr(second) == "Connection('a' -> 'b', name='other')"
-
-
 def test_options_may_be_given_by_value_and_unknown_ones_are_refused():
     assert BaseNode("n", 1, scheduling="phase").scheduling is Scheduling.PHASE
     assert BaseNode("b", 1).connect(BaseNode("a", 1), jitter="buffer").jitter is Jitter.BUFFER

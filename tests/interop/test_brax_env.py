@@ -30,13 +30,6 @@ def played(pendulum):
     return env, np.asarray(first), jax.tree.map(np.asarray, rows)
 
 
-@pytest.mark.night
-def test_its_sizes_and_its_period(played):
-    env, first, _ = played
-    assert (env.observation_size, env.action_size, env.dt, env.max_episode_length) == (19, 1, 0.02, 24)
-    assert first.shape == (2, 19)
-
-
 def test_brax_sees_a_time_limit_as_a_truncation(played):
     rows = played[2]
     assert [np.flatnonzero(rows["done"][:, i]).tolist() for i in range(2)] == [[23, 47]] * 2

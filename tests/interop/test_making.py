@@ -1,13 +1,11 @@
 """From a pipeline, a robot or a run to an environment: what is taken, and what is refused."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import sim2real
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.interop import making, robot_environment
+from sim2real.interop import robot_environment
 
 
 def delays(made):
@@ -36,15 +34,6 @@ def test_what_does_not_exist_is_named(tmp_path):
         robot_environment("pendulun", runs=tmp_path)
     with pytest.raises(Sim2RealError, match="identify"):
         robot_environment("pendulum", runs=tmp_path)
-
-
-def test_the_package_has_it_without_an_import():
-    assert sim2real.interop.robot_environment is robot_environment
-
-
-def test_no_module_hides_a_function():
-    folder = Path(sim2real.interop.__file__).parent
-    assert not {path.stem for path in folder.glob("*.py")} & set(vars(making))
 
 
 def test_a_robot_that_shows_more_than_it_names_is_refused(pendulum):

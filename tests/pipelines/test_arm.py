@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim2real import cli, composer
+from sim2real import composer
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("arm")
@@ -133,12 +133,6 @@ def test_the_score_of_an_arm_that_passes_by():
     assert score["first_reached_s"] == pytest.approx(2.0)
 
 
-def test_the_score_of_an_arm_that_never_comes_near():
-    score = ROBOT.task.score(*trajectory(np.zeros((401, 3)), TASK.tip_of(np, np.array([1.0, 1.0, 1.0]))))
-    assert (score["success"], score["reached"]) == (0.0, 0.0)
-    assert np.isnan(score["first_reached_s"])
-
-
 def test_a_task_that_draws_its_target_draws_one_that_can_be_reached():
     env = composer.Environment(TASK.Reach(), random_state=0)
     targets = []
@@ -151,24 +145,3 @@ def test_a_task_that_draws_its_target_draws_one_that_can_be_reached():
     distance = env.physics.variables["distance"]
     expected = np.exp(-((distance / 0.1) ** 2)) + np.exp(-((distance / 0.02) ** 2)) - 2 * distance
     assert reward == pytest.approx(expected)
-
-
-def test_the_command_line_tells_about_it(capsys, tmp_path):
-    assert cli.main(["info", "arm", "--runs", str(tmp_path), "--verbose"]) == 0
-    said = capsys.readouterr().out
-    assert "three-joint arm" in said
-    assert "skip" in said
-    assert PIPELINE.identify.skip_s == 0.3
-
-
-def test_what_was_found_is_written_as_mjcf():
-    found = {"gain": 2.8, "damping": 0.25, "armature": 0.0056, "sensor_delay": 0.01}
-    found |= {f"friction_{joint}": 0.03 + 0.01 * i for i, joint in enumerate(ROBOT.drive.servos.joints)}
-    model = mujoco.MjModel.from_xml_string(ROBOT.identified_mjcf(found))
-    np.testing.assert_allclose(model.actuator_gainprm[:, 0], 2.8)
-    np.testing.assert_allclose(model.actuator_biasprm[:, 1], -2.8)
-    np.testing.assert_allclose(model.actuator_forcerange[:, 1], 2.8 * ROBOT.drive.servos.sheet.full_rad, rtol=1e-5)
-    np.testing.assert_allclose(model.dof_damping, 0.25)
-    added = 0.5 * model.opt.timestep * 0.25  # MuJoCo's implicit step adds it
-    np.testing.assert_allclose(model.dof_armature, 0.0056 - added, rtol=1e-5)
-    np.testing.assert_allclose(model.dof_frictionloss, [0.03, 0.04, 0.05])

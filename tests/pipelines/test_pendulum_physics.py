@@ -86,13 +86,6 @@ def test_the_end_of_a_motion_has_the_derivative_that_differences_give():
     assert abs(slope) > 1e-4
 
 
-def test_groups_and_back():
-    values = {"gain": 21.0, "gravity": 110.0, "damping": 0.8, "friction": 8.0}
-    back = MODEL.groups(MODEL.from_groups(values, [np.pi, 0.0]))
-    for name, value in values.items():
-        assert float(back[name]) == pytest.approx(value, rel=1e-5)
-
-
 def released(plant, th, thdot=0.0):
     plant.data.qpos[0], plant.data.qvel[0] = th, thdot
     return plant
@@ -165,13 +158,3 @@ def test_the_motor_brakes_only_while_torque_is_on():
     fast.command(1, OFF, 0.0)
     lost = [energy(p, trajectory(p, 1.0))[[0, -1]] @ [1, -1] for p in (slow, fast)]
     assert lost[0] > 20 * abs(lost[1])
-
-
-def test_the_plant_starts_hanging_and_says_what_it_is():
-    plant = PLANT.PendulumPlant()
-    assert plant.state() == {"th": np.pi, "thdot": 0.0, "voltage": 0.0}
-    nominal = {n: float(v) for n, v in MODEL.groups(MODEL.nominal_params()).items()}
-    truth = plant.truth()
-    assert truth["gain"] / nominal["gain"] == pytest.approx(0.9 / 1.15, rel=1e-5)
-    assert truth["gravity"] / nominal["gravity"] == pytest.approx(1 / 1.15, rel=1e-5)
-    assert truth["friction"] / nominal["friction"] == pytest.approx(1.6 / 1.15, rel=1e-5)

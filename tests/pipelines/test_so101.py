@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim2real import cli, composer
+from sim2real import composer
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers
 from sim2real.robots.gate_limits import GateLimits
@@ -132,14 +132,6 @@ def test_parameters_stand_where_c_keeps_them(env):
         setattr(physics.bind(elements), attribute, before[name])
 
 
-def test_what_was_found_is_written_as_mjcf():
-    found = {**ROBOT.nominal(), "gain": 6.0, "damping_wrist_roll": 0.4, "saturation_gripper": 0.07}
-    model = mujoco.MjModel.from_xml_string(ROBOT.identified_mjcf(found))
-    np.testing.assert_allclose(model.actuator_gainprm[:, 0], 6.0)
-    np.testing.assert_allclose(model.dof_damping, [0.6] * 4 + [0.4, 0.6])
-    np.testing.assert_allclose(model.actuator_forcerange[5], [-0.42, 0.42], rtol=1e-6)
-
-
 def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
     """P gain of 16, 0.166 duty per radian and count of P: 30 kg cm at 0.377 rad."""
     sheet = ROBOT.drive.servos.sheet
@@ -240,8 +232,3 @@ def test_the_calibration_is_the_embedded_arms():
         low, high = joint.range_rad
         i = ROBOT.drive.servos.joints.index(joint.name)
         assert low < LOW[i] < HIGH[i] < high
-
-
-def test_the_command_line_tells_about_it(capsys, tmp_path):
-    assert cli.main(["info", "so101", "--runs", str(tmp_path)]) == 0
-    assert "six Feetech servos" in capsys.readouterr().out

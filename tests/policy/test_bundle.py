@@ -106,19 +106,6 @@ def test_contract_and_weights_survive(bundle, contract, weights):
     assert all(np.array_equal(again[name], weights[name]) for name in weights)
 
 
-def test_json_says_what_the_policy_was_made_for(bundle, weights):
-    about = json.loads((bundle / "policy.json").read_text())
-    assert about["format_version"] == 1
-    assert about["rate_hz"] == 50.0
-    assert about["delays_s"] == {"sensor -> agent": 0.012}
-    assert about["observation"][1] == {"name": "past_actions", "units": ["V"], "history": 2, "size": 1}
-    assert about["action"][1] == {"name": "brake", "unit": "1", "low": 0.0, "high": 0.1}
-    np.testing.assert_allclose(about["normaliser"]["std"], weights["std"])
-    assert set(about["hashes"]) == {"log", "parameters"}
-    assert about["files"]["policy.onnx"] == hashlib.sha256((bundle / "policy.onnx").read_bytes()).hexdigest()
-    assert about["versions"]["numpy"] == np.__version__
-
-
 def test_onnx_carries_the_contract(bundle, contract):
     onnx = pytest.importorskip("onnx")
     model = onnx.load(bundle / "policy.onnx")
@@ -133,14 +120,6 @@ def test_wrong_observations_are_refused(runner):
         runner.act(np.zeros(4))
     with pytest.raises(SafetyStop, match=r"observation pendulum\[0\]\[2\], past_actions\[1\]\[0\] is not finite"):
         runner.act(np.array([0.0, 0.0, np.nan, 0.0, np.inf]))
-
-
-def test_missing_files_are_named(bundle, tmp_path):
-    with pytest.raises(Sim2RealError, match=r"holds no policy\.json[\s\S]*hint: "):
-        load_bundle(tmp_path / "nowhere")
-    (bundle / "policy.safetensors").unlink()
-    with pytest.raises(Sim2RealError, match=r"lacks policy\.safetensors"):
-        load_bundle(bundle)
 
 
 @pytest.mark.parametrize(("name", "backend"), [("policy.safetensors", "numpy"), ("policy.onnx", "onnx")])
@@ -171,13 +150,6 @@ def test_a_contract_that_does_not_fit_is_refused(bundle, change, message):
     path = bundle / "policy.json"
     path.write_text(json.dumps(change(json.loads(path.read_text()))))
     with pytest.raises(Sim2RealError, match=message):
-        load_bundle(bundle)
-
-
-def test_a_truncated_json_is_refused(bundle):
-    path = bundle / "policy.json"
-    path.write_text(path.read_text()[:100])
-    with pytest.raises(Sim2RealError, match=r"policy\.json is no JSON"):
         load_bundle(bundle)
 
 

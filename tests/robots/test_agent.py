@@ -102,24 +102,6 @@ def test_history_is_what_was_seen_and_told_newest_first():
         rows = [np.concatenate([position, velocity, np.asarray(decision.goal)]), *rows[:2]]
 
 
-@pytest.mark.parametrize("history", [0, 1])
-def test_a_policy_may_see_little_or_nothing_of_the_past(history):
-    agent = make_agent(history)
-    step_state, _ = started(agent)
-    for _ in range(2):
-        step_state = seeing(step_state, np.ones(2), np.zeros(2))
-        assert agent.observe(step_state).shape == (5 + 6 * history,)
-        step_state, _ = agent.act(step_state, np.zeros(2))
-
-
-def test_its_message_says_what_it_is_about():
-    agent = make_agent()
-    step_state, first = started(agent)
-    np.testing.assert_allclose(first.aim, AIM)
-    _, decision = agent.step(seeing(step_state, np.zeros(2), np.zeros(2)))
-    np.testing.assert_allclose(decision.aim, AIM)
-
-
 def test_it_asks_the_policy_and_without_one_goals_stay():
     agent, policy = make_agent(), Push(np.array([1.0, -2.0]))
     step_state, _ = started(agent, policy=policy)

@@ -89,7 +89,3 @@ def test_a_part_of_another_kind_is_refused(pair):
     robot.task = pair.model
     with pytest.raises(UsageError, match=r"has task = .*, which does not inherit from .*RobotTask"):
         checked(robot, "here")
-
-
-def test_a_complete_robot_is_returned(pair):
-    assert checked(pair, "here") is pair

@@ -122,19 +122,6 @@ def test_terms_move_a_joint_as_a_simulation_by_hand(model_file, one):
     assert rms(found - expected) < 0.5 * rms(found - without)
 
 
-class StepByStep(DriveLaw):
-    """The law with a call before every step, also where no term is on."""
-
-    def steady(self, values, control):
-        return None
-
-
-def test_without_terms_all_steps_are_one_call(model_file):
-    goals, on = commands(300)
-    at_once, stepped = (in_c(model_file, OFF, goals, on, (0.4, -2.0), kind) for kind in (DriveLaw, StepByStep))
-    np.testing.assert_allclose(at_once, stepped, atol=1e-12)
-
-
 @pytest.mark.parametrize("one", [*MECHANICAL, "all", "none"])
 def test_a_law_without_absent_terms_returns_what_the_whole_law_does(one):
     law, rng = DriveLaw(np.array([1, 0]), np.array([1, 0]), np.array([2])), np.random.default_rng(0)
@@ -145,14 +132,6 @@ def test_a_law_without_absent_terms_returns_what_the_whole_law_does(one):
     whole, short = (kind(np, values, control, qpos, qvel) for kind in (law, law.among(values)))
     for some, other in zip((*whole[:2], *whole[2].values()), (*short[:2], *short[2].values()), strict=True):
         np.testing.assert_allclose(other, some, atol=1e-15)
-
-
-@pytest.mark.parametrize("one", sorted(set(MECHANICAL) - {"tilt", "gravcomp", "torque_limit"}))
-def test_a_term_that_follows_the_state_is_called_before_every_step(one):
-    law = DriveLaw(np.array([0]), np.array([0]), np.zeros(0, int))
-    own = OFF | {what: ON[what] for what in OPTIONAL[one]}
-    values = {n: np.array([[v]]) for n, v in {**OWN, **own}.items()}
-    assert law.steady(values, np.zeros((1, 3, 5))) is None
 
 
 @pytest.fixture(scope="module")
@@ -296,12 +275,6 @@ def test_an_encoder_off_its_axis_is_read_back():
     np.testing.assert_allclose(terms.angle(terms.read(angle)), angle, atol=2e-4)
     np.testing.assert_allclose(terms.rate(angle, 2.0), 2.0 * jax.vmap(jax.grad(lambda a: terms.read(a)[0]))(angle),
                                rtol=1e-5)  # fmt: skip
-
-
-def test_parameters_of_a_term_bring_it_back(model_file):
-    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_terms(("goal",))))
-    assert held_out_parts.having(robot, ["kp", "delay", "round_trip_delay"]) is robot
-    assert held_out_parts.having(robot, ["kp", "load"]).make_nodes()[2].law is not None
 
 
 def test_a_term_of_the_users_own_is_one_of_those_to_choose_from():

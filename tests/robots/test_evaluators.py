@@ -1,6 +1,5 @@
 """What evaluates residuals on C MuJoCo, and what does in a program: the same numbers."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -11,7 +10,6 @@ from small_robot import VALUES
 from test_engines import MAX_DELAY_S, SEGMENT_S, converged_robot, pair_log
 
 from sim2real.identify.config import FitConfig
-from sim2real.identify.fit import run_search
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 
@@ -89,17 +87,3 @@ def test_both_engines_take_given_values_alike(problems):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=0.05)
     np.testing.assert_allclose(one[0], c.at(z).residuals, atol=1e-3)
     assert np.abs(one[1:] - one[0]).max() > 1.0
-
-
-def test_a_search_on_c_is_of_the_segments_it_is_asked_for(problems):
-    """Other segments of the same recordings share programs, and nothing of the data."""
-    problem = problems.c
-    config = replace(problem.config, population=4, generations=10, strategy="SNES")
-    spans = [Span(0, b) for b in (0.2, 0.5)]
-    first = Problem(problem.model, problem._recordings, [Span(0, 0.3), Span(0, 0.55)], SEGMENT_S, config)
-    start = first.table.start()
-    run_search(first, start)
-    shared = run_search(first.recut(spans, SEGMENT_S), start)
-    fresh = run_search(Problem(problem.model, problem._recordings, spans, SEGMENT_S, config), start)
-    np.testing.assert_allclose(shared.record.history, fresh.record.history, rtol=1e-4)
-    np.testing.assert_allclose(shared.z, fresh.z, atol=1e-3)

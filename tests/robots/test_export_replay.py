@@ -22,8 +22,6 @@ from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.from_model.recorded import LoggedRobot
 from sim2real.worlds.mjx import MjxWorld
 from sim2real.worlds.recorded import RecordedActuator, command_delay
@@ -178,37 +176,3 @@ def test_the_exported_file_alone_does_in_c_what_the_graph_predicts(terms):
     off = lambda early_s: np.sqrt(np.mean((np.interp(ts - early_s, *rows) - ours) ** 2)) / np.std(ours)  # noqa: E731
     assert off(0.0) < 0.01
     assert off(0.002) > 0.01, f"2 ms of {FOUND['delay'] + FOUND['sensor_delay']} s would be seen"
-
-
-ANY = """<mujoco><option timestep="0.005"/><worldbody><body name="arm">
-  <joint name="servo" axis="0 1 0"/><geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.1" mass="0.3"/></body>
-  </worldbody><actuator>{drive}</actuator></mujoco>"""
-MOTOR = '<motor name="own" joint="servo" gear="2" ctrlrange="-0.5 0.5"/>'
-SHARED = {"damping": 0.02, "armature": 0.004, "frictionloss": 0.03, "payload": 0.1, "tilt_y": 0.1, "torque": 0.8}
-
-
-@pytest.mark.parametrize(
-    ("field", "own", "drive"),
-    [("goal", {"kp": 4.0, "kd": 0.08}, ""), ("goal", {"kp": 4.0, "kd": 0.08}, MOTOR), ("duty", {"gain": 0.6}, MOTOR),
-     ("goal_velocity", {"kd": 0.4}, "")],
-)  # fmt: skip
-def test_a_robot_that_only_its_file_describes_takes_its_drives_along(field, own, drive, tmp_path):
-    """Its own actuators, if any, are of other gains, limits and gears: one command, and the motion is the graph's."""
-    path, values = tmp_path / "any.xml", {**SHARED, **own}
-    path.write_text(ANY.format(drive=drive))
-    config = RobotConfig(path, ("servo",), (field,), step_s=STEP_S, rate_hz=100.0,
-                         terms=tuple(ParameterPattern(what) for what in values))  # fmt: skip
-    robot = MjcfRobot(config)
-    ts, ours = predicted(robot, {**values, "delay": 0.0131}, field, GOALS)
-    rows = [Estimate(n, "1", "dynamics", "", v, v, "accepted") for n, v in values.items()]
-    rows.append(Estimate("delay", "s", "delay", "", 0.0, 0.0131, "accepted"))
-    known = Identification("any", (), Judgement("accepted", ()), tuple(rows))
-    terms = find_terms(known, robot.identified_mjcf, {"delay": "command"})
-    assert terms.unexpressed == ()
-    assert terms.joints["servo"]["effort_limit"].estimate == pytest.approx(0.8)
-    assert mujoco.MjModel.from_xml_string(robot.identified_mjcf(values)).nu == 1
-    text = late_mjcf(robot.identified_mjcf(values), terms, Late(robot.export_lead_s, robot.profile_rad_s), [])
-    off = lambda early_s: np.interp(ts - early_s, *played(text, "servo", GOALS)) - ours  # noqa: E731
-    assert np.ptp(ours) > 0.2
-    assert np.sqrt(np.mean(off(0.0) ** 2)) < 0.01 * np.std(ours)
-    assert np.sqrt(np.mean(off(0.002) ** 2)) > 0.01 * np.std(ours), "2 ms would be seen"

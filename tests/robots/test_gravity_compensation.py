@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sim2real.graph.episode import Episode, Steps
-from sim2real.identify import fit as fitting
 from sim2real.identify.fit import fit
 from sim2real.identify.problem import thinned
 from sim2real.identify.problem.segments import Span
@@ -85,30 +84,6 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch
     assert float(values["kp"]) == pytest.approx(KP, rel=0.02)
     errors = {t.names(table): float(np.sqrt(t.ahead.mean())) for t in every}
     assert errors["gravcomp",] < 0.1 * errors[()]
-
-
-@pytest.mark.night
-def test_a_fit_that_would_take_long_takes_the_segments_with_most_motion(recorded, monkeypatch):
-    """As many of each recording; all are predicted, and the parts that are held out are as many as ever."""
-    robot, episode = recorded
-    model = held_out_parts.offering(robot, "gravcomp").identifiable(0.02)
-    table = model.parameters.with_terms(["gravcomp"])
-    spans = [Span(r, begin) for r in range(3) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
-    config = IdentifyConfig(generations=0, folds=3, max_delay_s=0.02)
-    whole = fit(model, [episode] * 3, spans, 0.6, config, table)
-    of_segment = 0.6 / STEP_S * (thinned.BESIDE + 1) * len(whole.problem.table)
-    monkeypatch.setattr(fitting, "MOST_OF_FIT", 6 * of_segment + 1)
-    few = fit(model, [episode] * 3, spans, 0.6, config, table)
-    assert (len(whole.problem.train), len(few.problem.train)) == (15, 6)
-    counts = np.asarray(whole.problem.data.ts)[:15, : whole.problem.ts.shape[1]] >= 0.0
-    reach = [np.ptp(x[there]) for x, there in zip(whole.problem.measured(0), counts, strict=True)]
-    chosen = np.isin(np.arange(15), [whole.problem.spans.index(span) for span in few.problem.spans])
-    assert [int(chosen[whole.problem.recording == r].sum()) for r in range(3)] == [2, 2, 2]
-    assert np.mean(np.array(reach)[chosen]) > 1.2 * np.mean(np.array(reach)[~chosen])
-    assert len(few.windows.train) == 15
-    assert len(folds_of(few.problem, 3)) == 3
-    for name, value in few.values.items():
-        assert value == pytest.approx(whole.values[name], rel=0.02, abs=5e-3)
 
 
 def test_the_share_is_the_models_own_unless_it_is_chosen_and_none_without_gravity(recorded, tmp_path):

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.robots.from_model.couplings import couplings_of, groups
 from sim2real.robots.from_model.holding import apply, plan
 from sim2real.robots.from_model.mjcf import driven, joints_of
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
@@ -154,21 +153,6 @@ def test_a_joint_that_cannot_be_held_is_refused(tmp_path, text, hold, cause):
         held(tmp_path / "arm.xml", text, hold)
 
 
-def test_the_inertia_of_the_hip_is_that_with_the_knee_bent(tmp_path):
-    _, straight = held(tmp_path / "a.xml", arm())
-    _, bent = held(tmp_path / "b.xml", arm(LIMITED, BENT))
-    whole = mujoco.MjModel.from_xml_path(str(tmp_path / "b.xml"))
-    found = []
-    for model, qpos in ((straight, [0.0]), (bent, [0.0]), (whole, [0.0, -1.5])):
-        data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-        data.qpos[:] = qpos
-        mujoco.mj_forward(model, data)
-        mujoco.mj_fullM(model, data, full)
-        found.append(full[0, 0])
-    assert found[1] == pytest.approx(found[2], rel=1e-9)
-    assert found[0] > 1.3 * found[1]
-
-
 FINGERS = """<mujoco><compiler angle="radian"/><default><geom size=".01" pos="0 0 .1"/><joint axis="1 0 0"/>
   <site pos="0 0 .1"/></default><worldbody><body name="palm"><joint name="wrist" axis="0 0 1"/><geom size=".05"/>
   <body name="a" pos="0 .1 0"><joint name="a"/><geom/><site name="a"/></body>
@@ -209,12 +193,6 @@ def test_what_a_coupling_moves_is_never_held(tmp_path, rest, joints, free, left)
     model = driven(path, joints, 0.002, False, False)
     assert {model.joint(i).name for i in range(model.njnt)} == {*joints} | free
     assert (model.neq, model.ntendon) == left
-
-
-def test_equalities_that_share_a_joint_are_one_group():
-    rest = '<equality><joint joint1="a" joint2="b"/><joint joint1="c" joint2="b"/></equality>'
-    model = mujoco.MjModel.from_xml_string(FINGERS.format(rest))
-    assert groups(couplings_of(model)) == [frozenset({1, 2, 3})]
 
 
 FOUR_BAR = """<mujoco><default><geom type="capsule" size=".01"/><joint axis="0 1 0"/></default><worldbody>

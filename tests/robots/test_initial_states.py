@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_robot import VALUES
@@ -35,59 +34,6 @@ def test_trees_share_rollouts_with_the_same_derivatives(problem):
     assert np.abs(alone).max() > 1.0
     np.testing.assert_allclose(together, alone, atol=1e-4 * np.abs(alone).max())
     np.testing.assert_array_equal(at, again)
-
-
-def test_a_point_is_evaluated_once(problem):
-    z, asked = problem.table.start(), []
-    states = problem.evaluator._initial
-    errors = states._errors
-    states._errors = lambda *given: (asked.append(1), errors(*given))[1]
-    first = states.fitted(z, problem.evaluator._decoded(z[None], problem.data), problem.data)
-    count = len(asked)
-    assert states.fitted(z.copy(), {}, problem.data) is first
-    assert len(asked) == count > 0
-
-
-def test_a_search_is_of_the_segments_that_move_most(problem):
-    evaluator, data = problem.evaluator, problem.data
-    moved = np.zeros((20, data.ts.shape[1], 2))
-    moved[7, 1:, 0], moved[3, 1:, 1], moved[11, 1:, 0] = 3.0, 2.0, 1.0
-    recording = np.zeros(20, np.int32)
-    recording[19] = 1
-    many = data._replace(
-        fitted=jnp.arange(20),
-        weight=jnp.array([1.0] * 20).at[5].set(0.0),
-        recording=jnp.asarray(recording),
-        ts=jnp.zeros((20, data.ts.shape[1])),
-        measured={**data.measured, "position": jnp.asarray(moved)},
-    )
-    picked = np.flatnonzero(evaluator.lively(many).weight).tolist()
-    assert len(picked) == 8
-    assert {19, 7, 3, 11} <= set(picked)  # the best of each recording, and those that move
-    assert 5 not in picked
-    few = data._replace(weight=jnp.ones(len(data.fitted)))
-    assert np.all(evaluator.lively(few).weight == 1.0)
-
-
-def test_a_descent_from_a_differentiated_point_needs_no_jacobian_of_its_own(problem, monkeypatch):
-    evaluator, z, size = problem.evaluator, problem.table.start(), len(problem.table)
-    known = evaluator.linearised(z, problem.data)
-    present = np.arange(size) < size - 1
-    rest = problem.part([0], present)
-    rolled_out, raw = [], evaluator._raw
-    monkeypatch.setattr(evaluator, "_raw", lambda y, *given: (rolled_out.append(len(y)), raw(y, *given))[1])
-    # Without a segment and a parameter: their rows and columns are 0, the others those of the point.
-    J = evaluator.around(z, rest)[1](z)
-    assert rolled_out == [1]
-    kept = (np.asarray(rest.weight) > 0.0)[:, None, None, None] & present
-    expected = np.where(kept, known.jacobian, 0.0).reshape(-1, size)
-    np.testing.assert_array_equal(J[: len(expected)], expected)
-    # A point that was differentiated without them is no base for a descent with them.
-    evaluator._last = [(z, rest, known)]
-    evaluator.around(z, problem.data)[1](z)
-    groups = evaluator._together.groups(np.asarray(problem.data.present))
-    assert rolled_out == [1, 1, 1 + len(groups)]  # the friction of both trees shares a rollout
-    assert len(groups) == size - 1
 
 
 @pytest.mark.parametrize(

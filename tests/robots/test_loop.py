@@ -88,12 +88,6 @@ def test_a_delay_comes_from_the_nodes_parameters_where_they_have_one():
     assert delay_of("sensor", "world", None) == {}
 
 
-def test_a_row_of_draws_is_drawn_together_and_the_rest_is_fixed(drawn):
-    np.testing.assert_array_equal(drawn["damping"], 10.0 * drawn["gain"])
-    assert set(drawn["gain"].tolist()) == set(range(10))
-    assert set(drawn["friction"].tolist()) == {np.float32(0.1)}
-
-
 def test_delays_are_drawn_with_the_dynamics_and_their_sum_is_kept():
     found = drawn_in_a_loop(VALUES, {"gain": np.arange(3.0), **LATE}, TICK_S, SPREAD_S)
     np.testing.assert_allclose(found["sensor_delay"] + found["actuator_delay"], [0.016, 0.023, 0.005])
@@ -108,13 +102,6 @@ def test_delays_are_drawn_with_the_dynamics_and_their_sum_is_kept():
     assert drawn_in_a_loop(VALUES, {"gain": np.arange(3.0)}, TICK_S, SPREAD_S).keys() == {"gain"}
 
 
-def test_one_delay_that_is_drawn_alone_moves_the_sum():
-    """A sensor's delay below a tick cannot be simulated: the sum is what counts, and the other delay is as it was."""
-    found = drawn_in_a_loop(VALUES, {"sensor_delay": np.array([0.002, 0.03])}, TICK_S, SPREAD_S)
-    np.testing.assert_allclose(found["sensor_delay"] + found["actuator_delay"], [0.003, 0.031])
-    np.testing.assert_allclose(found["sensor_delay"], [0.003, 0.013])
-
-
 @pytest.mark.parametrize("draws", [{}, LATE])
 def test_the_bounds_hold_whatever_is_drawn_and_interpolated(draws):
     bounds = delay_bounds(VALUES, TICK_S, SPREAD_S, LEAD_S, draws)
@@ -127,14 +114,6 @@ def test_the_bounds_hold_whatever_is_drawn_and_interpolated(draws):
         assert used.max() <= high
     assert bounds["sensor_delay"][1] == pytest.approx(0.0 if draws else 0.013 - TICK_S - SPREAD_S)
     assert bounds["actuator_delay"][1] == 0.0
-
-
-def test_the_same_key_draws_the_same_and_without_samples_nothing_is_drawn():
-    one, two = (draw_values(jax.random.key(3), VALUES, DRAWS) for _ in range(2))
-    assert {k: float(v) for k, v in one.items()} == {k: float(v) for k, v in two.items()}
-    fixed = draw_values(jax.random.key(3), VALUES, {})
-    assert {k: float(v) for k, v in fixed.items()} == pytest.approx(VALUES)
-    assert draw_values(jax.random.key(3), {}, {}) == {}
 
 
 def test_draws_of_unequal_length_use_rows_that_all_have():
@@ -159,11 +138,6 @@ def test_the_loop_in_simulation_has_trainable_delays_at_the_world_alone(nodes):
         assert float(dist.delay) == pytest.approx(bounds[name][0], rel=1e-5)
         assert connection.skip
         assert not connection.blocking
-
-
-def test_without_delays_the_loop_has_none(nodes):
-    found = simulated_loop(*nodes, None)
-    assert not any(c.trainable or c.delay for n in found.values() for c in n.inputs.values())
 
 
 def test_a_recorded_loop_bears_every_delay_that_may_be_identified(nodes):

@@ -10,7 +10,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.robots.from_model.mjcf import driven, force_of, gains_of, joints_of, limit_of, read_model
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern, expand, place
+from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.from_model.usual_parameters import usual_terms
 from sim2real.worlds.driven import DriveCommand
@@ -48,14 +48,6 @@ def model_file(tmp_path):
 
 def config(path, **options):
     return RobotConfig(**{"model": path, "joints": JOINTS, "commands": ("goal",), "step_s": 0.002, **options})
-
-
-def test_what_a_file_says_of_its_joints(model_file):
-    own = read_model(model_file)
-    assert joints_of(own) == ("left_hip", "left_knee", "right_hip")
-    assert (limit_of(own, "left_hip"), limit_of(own, "right_hip")) == (3.0, None)
-    assert gains_of(own, "left_hip") == (12.0, 0.7)
-    assert gains_of(own, "right_hip") is None
 
 
 def test_a_gear_counts_in_what_a_file_says(tmp_path):
@@ -194,17 +186,6 @@ def test_parameters_by_pattern_stand_where_they_belong(model_file):
     np.testing.assert_allclose(world.body_mass[body], robot.model.body_mass[body] + 0.7, rtol=1e-6)
 
 
-def test_nominal_values_are_the_models_own(model_file):
-    own, made = read_model(model_file), driven(model_file, JOINTS, 0.002, False, False)
-    placed = expand(
-        [ParameterPattern("kp", each=True), ParameterPattern("damping"), ParameterPattern("kd", "left_knee")],
-        JOINTS,
-        made,
-        own,
-    )
-    assert [p.parameter.nominal for p in placed] == pytest.approx([8.0, 12.0, 0.15, 0.5])
-
-
 def test_the_start_is_where_the_encoders_say(model_file):
     robot = MjcfRobot(config(model_file, terms=(ParameterPattern("zero", nominal=0.1, free=False),)))
     params = robot.identifiable(0.02).params({"zero": 0.1, "delay": 0.0}, jnp.array([0.5, -0.3, 1.0, 2.0]))
@@ -273,13 +254,6 @@ def test_terms_as_flags(text, term):
 def test_wrong_terms_are_refused(text):
     with pytest.raises(UsageError):
         ParameterPattern.parse(text)
-
-
-def test_placing_nothing_changes_nothing(model_file):
-    robot = MjcfRobot(config(model_file))
-    world = robot.make_nodes()[2]
-    base = robot.base(world.init_params())
-    assert place((), {}, base, world.joints, world.qvel_at).model.dof_damping is base.model.dof_damping
 
 
 def test_the_armature_is_the_rotors_whatever_the_time_step(tmp_path):

@@ -1,7 +1,6 @@
 """The folder of a model card: plain MuJoCo, without sim2real and JAX, computes each of its figures within 1 %."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -31,7 +30,6 @@ from sim2real.stages.excitation.simulated_log import simulate
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get("SIM2REAL_DATA", ROOT.parent / "shared" / "data"))
 ALONE = """
 import runpy, sys
 class Absent:
@@ -164,24 +162,6 @@ def test_a_robot_that_only_its_file_describes(own, commands, tmp_path):
     robot, episode = two_links(tmp_path, own, commands)
     found = known(robot, episode, {**own, "delay": 0.0131}, (2.0, 3.0, 4.0))
     check(card_of(robot, found, tmp_path / "card"), 20)
-
-
-@pytest.mark.night
-def test_the_go2_of_the_public_recording(tmp_path):
-    """The robot and its estimates: twelve joints that follow chirps in the air."""
-    if not (DATA / "go2" / "chirp_fit.npz").is_file():
-        pytest.skip(f"{DATA / 'go2'} is not there; SIM2REAL_DATA names the folder of the public recordings")
-    own = {"kp": 18.29, "damping": 1.411, "armature": 0.007738, "frictionloss": 0.4}
-    recorded = np.load(DATA / "go2" / "chirp_fit.npz")
-    joints = tuple(f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf"))
-    terms = tuple(ParameterPattern(what) for what in own)
-    robot = MjcfRobot(RobotConfig(DATA / "go2" / "go2.xml", joints, ("goal",), terms=terms))
-    at = np.round(1e6 * (recorded["t_s"] - recorded["t_s"][0])).astype(np.int64)
-    steps = Steps(at, at, at, np.full(len(at), -1), at, 0 * at)
-    outputs = {"sensor": {"position": recorded["q_rad"]}, "actuator": {"goal": recorded["q_told_rad"]}}
-    episode = Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
-    found = known(robot, episode, {**own, "delay": 0.0005}, (6.0, 8.0, 10.0))
-    check(card_of(robot, found, tmp_path / "card"), 80)
 
 
 @pytest.mark.night

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
-from sim2real.graph.base import InputState, StepState
 from sim2real.graph.episode import named_leaves
-from sim2real.robots.control_loop.messages import Decision, EpisodeStart, JointReading
+from sim2real.robots.control_loop.messages import Decision, EpisodeStart
 from sim2real.robots.servo import parameters
-from sim2real.robots.servo.agent import AgentParams
 from sim2real.robots.servo.datasheet import DataSheet
-from sim2real.robots.servo.task import NO_AIM
 
 
 def slouching():
@@ -25,29 +22,6 @@ def slouching():
         observe=lambda reading, goal, aim: goal - reading.position,
         history=0,
     )
-
-
-def aimless():
-    return PairRobot(aim=NO_AIM)
-
-
-def observation_of(robot):
-    """Return what the policy sees in the first step of the loop in simulation."""
-    nodes, task = robot.training(robot.nominal(), {}, {}, False)
-    agent, n, one = nodes["agent"], len(robot.drive.servos.joints), jnp.zeros(1)
-    reading = JointReading(jnp.zeros((1, n)), jnp.zeros((1, n)))
-    params = AgentParams(aim=jnp.zeros(robot.task.aim_size), start=jnp.zeros(n))
-    step_state = StepState(
-        state=agent.init_state(), params=params, inputs={"sensor": InputState(one.astype(int), one, one, reading)}
-    )
-    return task, task.observe(step_state)
-
-
-@pytest.mark.parametrize("kind", [PairRobot, slouching, aimless, "arm"])
-def test_an_observation_has_as_many_entries_as_the_robot_announces(kind, arm):
-    robot = arm.load() if kind == "arm" else kind()
-    task, seen = observation_of(robot)
-    assert seen.shape == (robot.agent.observation_size,) == (task.observation_size,)
 
 
 def test_it_names_its_units_joints_and_actions(pair):

@@ -96,15 +96,6 @@ def test_dynamics_and_delays_are_drawn_together_and_aims_vary(drawn):
     assert 0.7 < aims.max() <= 0.8
 
 
-def test_the_actions_are_speeds_of_the_goals(pair, trained):
-    np.testing.assert_array_equal(trained.task.action_low, [-2.0, -2.0])
-    np.testing.assert_array_equal(trained.task.action_high, [2.0, 2.0])
-    start, goals = np.asarray(trained.params["agent"].start), trained.rows["goal"]
-    count = np.arange(1, len(goals) + 1)[:, None]
-    expected = np.clip(start + count / 50.0 * np.asarray(SPEEDS), pair.drive.servos.low, pair.drive.servos.high)
-    np.testing.assert_allclose(goals, expected, atol=1e-5)
-
-
 def test_the_joints_follow_and_the_policy_sees_them_late(trained):
     joints, seen = trained.rows["joints"], trained.rows["seen"]
     goals = trained.rows["goal"]
@@ -119,13 +110,6 @@ def test_the_joints_follow_and_the_policy_sees_them_late(trained):
     np.testing.assert_allclose(seen[:, 6], float(trained.params["agent"].aim[0]), atol=1e-6)
 
 
-def test_the_first_observation_is_of_the_start(trained):
-    start = np.asarray(trained.params["agent"].start)
-    np.testing.assert_allclose(trained.first[:2], start, atol=1e-4)
-    np.testing.assert_allclose(trained.first[4:6], start, atol=1e-6)
-    assert not np.asarray(trained.first[7:]).any(), "no history yet"
-
-
 def test_a_value_function_may_see_where_the_joints_are_and_what_they_are_like(trained):
     true = np.asarray(trained.true)
     np.testing.assert_allclose(true[:2], trained.params["agent"].start, atol=1e-6)
@@ -136,15 +120,3 @@ def test_a_value_function_may_see_where_the_joints_are_and_what_they_are_like(tr
 def test_the_reward_is_the_tasks_less_a_little_for_speed(pair, trained):
     price = 0.01 * np.mean((np.asarray(SPEEDS) / pair.drive.servos.speed) ** 2)
     np.testing.assert_allclose(trained.rows["reward"], trained.rows["of_task"] - price, atol=1e-6)
-
-
-def test_what_is_seen_lies_within_its_bounds(pair, trained):
-    terms = pair.agent.observation
-    assert [t.name for t in terms] == ["position", "velocity", "goal", "aim", "past position, velocity, goal"]
-    unknown = (-np.inf,), (np.inf,)
-    low, high = (np.concatenate([np.tile(getattr(t, b) or unknown[i], t.history) for t in terms])
-                 for i, b in enumerate(("low", "high")))  # fmt: skip
-    seen = np.concatenate([trained.first[None], trained.rows["seen"]])
-    assert seen.shape[1] == len(low) == len(high)
-    assert ((seen >= low - 1e-6) & (seen <= high + 1e-6)).all()
-    assert np.isfinite(low).sum() == len(low) - 1, "nothing is known of the aim"

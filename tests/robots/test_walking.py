@@ -23,9 +23,7 @@ from sim2real.policy.bundle import load_bundle
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.messages import gravity_of
 from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
-from sim2real.stages.live.scene import drawn, scene_of
 from sim2real.stages.live.steering import gamepad, steer, terminal_keys
-from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ROOT = Path(__file__).parents[2]
 BUNDLE = ROOT / "pipelines/go2/walk"
@@ -84,12 +82,6 @@ def test_play_writes_a_picture(tmp_path, capsys):
     run(PlayConfig("go2", seconds=0.5, video=tmp_path / "a.gif", runs=tmp_path))
     assert (tmp_path / "a.gif").read_bytes()[:3] == b"GIF"
     assert "walked for 0.5 s" in capsys.readouterr().err
-
-
-@pytest.mark.night
-def test_play_writes_a_film(tmp_path):
-    run(PlayConfig("go2", seconds=0.5, video=tmp_path / "a.mp4", runs=tmp_path))
-    assert (tmp_path / "a.mp4").read_bytes()[4:8] == b"ftyp"
 
 
 def test_a_film_without_ffmpeg_and_another_format_are_refused_before_the_walk(tmp_path, monkeypatch):
@@ -182,22 +174,3 @@ def test_the_commands_of_the_guide_run(tmp_path, monkeypatch):
     for command in commands:
         assert not cli.main(shlex.split(command))
     assert (tmp_path / "walk.gif").is_file()
-
-
-@pytest.mark.night
-def test_the_training_of_the_guide_is_on_rough_ground(tmp_path, monkeypatch, capsys):
-    text = (ROOT / "docs/guides/walk.md").read_text()
-    command, *_ = re.findall(r"^    sim2real (train .*roughness.*)$", text, re.MULTILINE)
-    (tmp_path / "pipelines").symlink_to(ROOT / "pipelines")
-    monkeypatch.chdir(tmp_path)
-    assert not cli.main([*shlex.split(command), "--explain", "--timelines", "1", "--episode-s", "1"])
-    out = capsys.readouterr().out
-    assert re.search(r"^roughness +0 +\[0\.00\d+, 0\.03\d+\]", out, re.MULTILINE)
-    assert re.search(r"^push angular +.* rad/s", out, re.MULTILINE)
-    assert "0.3 of these differences at the first update, up to 1 while success is above 0.35" in out
-
-
-def test_the_viewer_draws_the_robot_from_its_file():
-    scene = scene_of(load_pipeline("go2"), ROBOT)
-    assert scene["mjcf"] == str(ROBOT.mjcf)
-    assert len(drawn(scene)._places) == 12

@@ -82,11 +82,6 @@ def test_a_dict_of_what_is_different_is_a_configuration(pendulum):
         python_arguments.config_of({"held_out": 2.0, "log": ()}, pendulum.identify)
 
 
-def test_one_recording_is_as_good_as_several(pendulum):
-    assert python_arguments.recordings_of(RECORDING, pendulum) == [RECORDING]
-    assert python_arguments.recordings_of((RECORDING, RECORDING), pendulum) == [RECORDING] * 2
-
-
 @pytest.mark.parametrize("kind", [str, Path])
 def test_artifacts_are_saved_and_loaded_by_any_path(kind, tmp_path):
     folder = kind(tmp_path / "new" / "folder")
@@ -101,27 +96,6 @@ def test_artifacts_are_saved_and_loaded_by_any_path(kind, tmp_path):
 
 
 DEPLOYED = Deployment((Scores({"success": 1.0}),), (Gap("success", 1.0, None, None),), advice=Advice("fine", ()))
-
-
-@pytest.mark.parametrize(
-    ("artifact", "short", "table"),
-    [
-        (FOUND, "Identification(pipeline: pendulum, verdict: accepted, why: off by <0.01 rad", "<td>21.05</td>"),
-        (RECORDING, "Recording(pipeline: -, log: ", "sensor 3"),
-        (DEPLOYED, "Deployment(episodes: 1, verdict: fine)", "<td>success</td><td>1</td><td>-</td>"),
-    ],
-)
-def test_a_notebook_shows_an_artifact_in_a_few_words(artifact, short, table):
-    assert repr(artifact).startswith(short)
-    assert len(repr(artifact)) < 300
-    shown = artifact._repr_html_()
-    assert table in shown
-    assert "<0.01" not in shown, "what comes from files is escaped"
-
-
-def test_long_things_have_short_names(pendulum):
-    assert repr(EPISODE) == "Episode(0.000 s, steps: sensor 3)"
-    assert repr(pendulum) == "Pipeline('pendulum')"
 
 
 def test_an_artifact_unpacks_into_itself_and_its_summary():

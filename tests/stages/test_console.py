@@ -1,35 +1,11 @@
 """What is printed, and where."""
 
-import io
 import threading
 import time
 
 import pytest
 
 from sim2real.stages.terminal import console
-
-
-def test_table_aligns_numbers_right_and_text_left():
-    text = console.table([["mass", 0.123456, True], ["inertia", 12, False]], ["name", "value", "ok"])
-    assert text.splitlines() == [
-        "name      value  ok",
-        "-------  ------  ---",
-        "mass     0.1235  yes",
-        "inertia      12  no",
-    ]
-
-
-def test_table_fills_gaps():
-    assert console.table([["a", None], ["long", 2.0], ["b"]]) == "a     -\nlong  2\nb"
-    assert console.table([], ["x", "y"]) == "x  y\n-  -"
-    assert console.table([]) == ""
-
-
-def test_pairs():
-    assert (
-        console.pairs({"rmse_rad": 0.5, "bounds": {}, "delays": [0.25, 1]})
-        == "rmse_rad  0.5\nbounds    -\ndelays    0.25, 1"
-    )
 
 
 def test_talk_goes_to_stderr_and_results_to_stdout(capsys, tmp_path, monkeypatch):
@@ -80,19 +56,6 @@ def test_the_time_goes_on_while_one_step_takes_long(capsys, monkeypatch):
     with pytest.raises(KeyError), console.progress(None, "record"):
         raise KeyError
     assert threading.active_count() == before
-
-
-def test_a_terminal_is_drawn_again_while_one_step_takes_long(monkeypatch):
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
-    screen = Terminal()
-    monkeypatch.setattr("sys.stderr", screen)
-    monkeypatch.setattr(console, "_TICK_S", 0.001)
-    with console.progress(None, "identify: errors"):
-        while screen.getvalue().count("identify: errors: 00:0") < 3:
-            time.sleep(0.001)
 
 
 def test_what_a_terminal_would_obey_is_shown_instead(capsys):

@@ -16,7 +16,6 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.robots.control_loop.loop import control_nodes
 from sim2real.robots.roles import ROLES
-from sim2real.robots.score_columns import as_columns, as_sent
 from sim2real.stages.deploy import simulation_gap, simulations
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -46,14 +45,6 @@ def states(tmp_path_factory):
     )
 
 
-def test_vectors_become_columns(states):
-    outputs, t_s, found = states
-    for field in ("position", "velocity"):
-        for i in range(3):
-            np.testing.assert_array_equal(found[f"{field}[{i}]"], outputs["sensor"][field][:, i])
-    np.testing.assert_allclose(t_s, 0.02 * np.arange(50) + 0.0005)
-
-
 def test_the_command_is_what_was_sent_and_the_rest_is_the_supervisors(states):
     outputs, _, found = states
     for i in range(3):
@@ -66,17 +57,6 @@ def test_the_command_is_what_was_sent_and_the_rest_is_the_supervisors(states):
 def test_the_arms_score_reads_them(states):
     _, t_s, found = states
     assert set(ARM.task.score(t_s, found)) == {"success", "reached", "distance_m", "first_reached_s"}
-
-
-def test_numbers_keep_their_names():
-    robot = SimpleNamespace(drive=SimpleNamespace(command="action"))
-    sent = as_sent(robot, {"action": np.zeros((4, 1))}, {"action": np.arange(4.0)[:, None]})
-    assert {n: v.tolist() for n, v in sent.items()} == {"command": [0.0, 1.0, 2.0, 3.0]}
-    columns = as_columns({"th": np.arange(3.0), "pose": np.arange(12.0).reshape(3, 2, 2)})
-    assert {n: v.tolist() for n, v in columns.items()} == {
-        "th": [0, 1, 2],
-        **{f"pose[{i}]": [i, 4 + i, 8 + i] for i in range(4)},
-    }
 
 
 def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():

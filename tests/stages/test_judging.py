@@ -11,12 +11,10 @@ from sim2real.artifacts.deployment import Advice, Changed, Course, Deployment, D
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
-from sim2real.stages.deploy import show, verdict
+from sim2real.stages.deploy import verdict
 from sim2real.stages.deploy.next_command import with_command
 from sim2real.stages.estimation import replay
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.view.page.deployment_tables import tables
-from sim2real.view.page.stage_verdicts import deploy_banner
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 STEADY = Drift((replace(FRICTION, now=6.1, explains=0.01, p=0.8),), 0.05, (), 20.0)
@@ -82,13 +80,6 @@ def test_an_episode_that_paused_is_no_evidence_against_the_model(folder):
     for paused_s in (0.0, 0.09):
         short = replace(found, courses=(replace(off, paused_s=paused_s), replace(off, episode=0)))
         assert verdict.verdict(short, BUNDLE).status == "re-identify"
-
-
-def test_what_has_most_likely_changed_is_said_where_the_model_is_off_and_no_test_is_sure():
-    told = verdict.verdict(deployed(identified=0.04, drift=LIKELY), BUNDLE)
-    assert told.status == "re-identify"
-    assert "most likely the robot has changed: friction is 12 rad/s^2" in told.reasons[1]
-    assert verdict.verdict(deployed(drift=LIKELY), BUNDLE).status == "fine", "by itself that is no proof"
 
 
 @pytest.mark.parametrize(
@@ -171,12 +162,6 @@ def replace_terms(terms):
     return SimpleNamespace(logs=IDENTIFIED.logs, terms=terms, world=None)
 
 
-def test_times_stand_beside_those_of_training():
-    rows = {g.quantity: g for g in verdict._times_of_training(deployed(took_s=0.004), BUNDLE)}
-    assert rows["step_of_agent_p99_s"].gap == pytest.approx(0.003)
-    assert rows["round_trip_delay_s"].simulation == pytest.approx(0.05)
-
-
 def test_a_deployment_without_an_identification_says_so(folder):
     told = verdict.judge(deployed(), load_pipeline("pendulum"), BUNDLE, None, folder).advice
     assert (told.status, told.next) == ("not judged", "sim2real identify pendulum --run runs/pendulum/T")
@@ -192,21 +177,6 @@ def test_a_policy_that_does_not_move_is_trained_again_though_its_model_cannot_be
     assert (told.status, told.next) == ("re-train", "sim2real train pendulum --run runs/pendulum/T")
     assert told.reasons == ("success is 0.00, in simulation 1.00", "0.0 s of them in motion")
     assert verdict.judge(deployed(), pipeline, BUNDLE, IDENTIFIED, folder).advice.status == "not judged"
-
-
-def test_console_and_page_end_in_the_verdict(capsys):
-    shown = deployed(drift=ALARM)
-    shown = replace(shown, advice=Advice("re-identify", ("friction is 12",), "sim2real identify pendulum"))
-    show.show_verdict(shown)
-    said = capsys.readouterr()
-    assert "friction" in said.out
-    assert said.err.splitlines() == ["verdict: re-identify", "  friction is 12", "next: sim2real identify pendulum"]
-    banner = deploy_banner(shown)
-    assert (banner.tone, banner.title) == ("doubt", "Re-identify")
-    assert banner.reasons == ["Friction is 12.", "next: sim2real identify pendulum"]
-    gap, drift, replay = tables(shown)
-    assert [t.rows[0][0] for t in (gap, drift, replay)] == ["success", "friction", "hinge"]
-    assert drift.rows[0][-1] == "yes"
 
 
 def test_the_verdict_is_in_the_artifact(tmp_path):

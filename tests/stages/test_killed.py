@@ -15,11 +15,9 @@ from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identificati
 from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, finished, newest, open_stage
 from sim2real.artifacts.run.stage_status import TAKES, stage_status
-from sim2real.commands import info
 from sim2real.commands.flags import RunFlags
 from sim2real.commands.loop import run_loop
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.view.page import page
 
 TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "accepted")
 NOT_DRIFTED = Drift((Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 0.8),), 0.05, (), 18.0)
@@ -131,15 +129,6 @@ def test_a_run_that_is_killed_at_any_stage_ends_as_if_it_had_not_been(tmp_path, 
             assert Iterations.load(run_dir).plan is None
 
 
-def test_a_run_that_is_killed_twice_in_one_iteration_goes_on(tmp_path):
-    run_dir = killed(Stages(tmp_path / "runs"), 4, "within")
-    killed(Stages(tmp_path / "runs"), 1, "within", resume=run_dir)
-    last = Stages(tmp_path / "runs")
-    last.run(resume=run_dir)
-    assert [stage for stage, _ in last.calls] == ["train", "deploy"]
-    assert [r.number for r in Iterations.load(run_dir).rows] == [1, 2]
-
-
 def test_a_killed_run_whose_own_logs_do_not_suffice_records_and_does_not_repeat_that(tmp_path):
     """Killed in the identification from the new recording: what was identified from the deployment's logs is stale."""
     run_dir = killed(Stages(tmp_path / "runs", lacking=(1, 2)), 6, "within")
@@ -198,20 +187,6 @@ def test_what_was_made_from_an_older_stage_is_made_again(tmp_path, by_hand, foll
     again.run(iterations, resume=run_dir)
     assert [stage for stage, _ in again.calls] == follows
     assert not any(s.stale for s in stage_status(run_dir).values())
-
-
-def test_info_and_the_report_say_what_is_out_of_date_and_why(tmp_path):
-    stages = Stages(tmp_path / "runs", ("fine",))
-    run_dir = stages.run(1)
-    stages("identify", load_pipeline("pendulum").identify, run_dir)
-    why = "train was not made from identify.2, the newest identify: the hashes of its parameters differ"
-    said = info.run(run_dir)
-    assert f"out of date: {why}" in said
-    assert [line.split()[1] for line in said.splitlines() if line.startswith(("identify", "train ")) and "-" in line][
-        :2
-    ] == ["finished", "finished"]
-    assert "out of date: deploy was made from train, which is out of date" in said
-    assert any(why in note.text for note in page._about_others(run_dir, {}))
 
 
 @pytest.mark.parametrize(

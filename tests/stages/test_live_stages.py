@@ -8,54 +8,10 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections import Counter
 
 import pytest
-from live_robots import TINY
-
-from sim2real import cli
 
 pytest.importorskip("rerun")
-from rerun.chunk import RrdReader
-
-
-def rows_of(path):
-    rows = Counter()
-    for chunk in RrdReader(path).stream().to_chunks():
-        if not chunk.is_static:
-            rows[chunk.entity_path] += chunk.num_rows
-    return rows
-
-
-def tiny(stage):
-    return [f"--{flag.removeprefix(f'--{stage}.')}" for flag in TINY if flag.startswith(f"--{stage}.")]
-
-
-@pytest.mark.night
-def test_a_search_streams_its_loss_and_its_best_fit(run_copy, tmp_path):
-    file = tmp_path / "identify.rrd"
-    home = ["--run", str(run_copy), "--runs", str(run_copy.parent.parent)]
-    assert cli.main(["identify", "pendulum", *home, *tiny("identify"), "--view", str(file)]) == 0
-    rows = rows_of(file)
-    (loss,) = [entity for entity in rows if "/loss/" in entity]
-    assert rows[loss] > 3
-    fits = {entity for entity in rows if "/fit_" in entity and entity.endswith("/th")}
-    measured = next(rows[entity] for entity in rows if entity.endswith("/measured/th"))
-    assert fits
-    assert all(rows[entity] >= 100 for entity in fits)
-    assert measured >= 100
-    assert (run_copy / "identify.2" / "best_fit.npz").is_file()
-
-
-@pytest.mark.night  # `make test` streams a search, above
-def test_a_training_streams_its_curves_and_a_viewer_joins_it(run_copy, tmp_path):
-    file = tmp_path / "train.rrd"
-    home = ["--run", str(run_copy), "--runs", str(run_copy.parent.parent)]
-    assert cli.main(["train", "pendulum", *home, *tiny("train"), "--view", str(file)]) == 0
-    rows = rows_of(file)
-    assert any(entity.endswith("/return/0") for entity in rows)
-    assert any(entity.endswith("/success/0") for entity in rows)
-    assert (run_copy / "train.2" / "progress.jsonl").is_file(), "a viewer joins a training that has none"
 
 
 @pytest.mark.process

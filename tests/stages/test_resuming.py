@@ -63,13 +63,6 @@ def test_the_policy_of_a_resumed_training_is_the_uninterrupted_ones(runs, tmp_pa
     np.testing.assert_allclose(sum(terms), found.history.returns, rtol=1e-4)
 
 
-@pytest.mark.night
-def test_a_stage_folder_and_a_run_name_it_too(runs):
-    own = folder(runs)
-    for target in (own, own.parent):
-        assert resume.find_interrupted("pendulum", settings(own, target), runs).folder == own
-
-
 def settings(own, target, **changes):
     from sim2real.commands import flags
     from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -111,24 +104,6 @@ def test_what_cannot_be_resumed_is_refused(runs, tmp_path):
     found = resume.find_interrupted("pendulum", settings(own, own), runs)
     with pytest.raises(UsageError, match="trains on other parameters than"):
         resume.check_same_parameters(found, other)
-
-
-@pytest.mark.night
-def test_a_sweep_names_what_it_tried_and_no_checkpoint_is_written_where_that_is_said(tmp_path, capsys, monkeypatch):
-    report, left = learn_policy.show_progress, []
-    monkeypatch.setattr(
-        learn_policy, "show_progress", lambda *given: (report(*given), left.extend(tmp_path.rglob(CHECKPOINT)))
-    )
-    options = ("--sweep", "gamma=0.9,0.99", "--ppo.num-seeds", "2", "--no-checkpoint")
-    assert cli.main([*TINY, "--runs", str(tmp_path), *options]) == 0
-    said = capsys.readouterr().out
-    assert not left
-    assert "gamma=0.9 " in said
-    assert "gamma=0.99 " in said
-    history = Bundle.load(folder(tmp_path)).history
-    assert history.settings == ("gamma=0.9",) * 2 + ("gamma=0.99",) * 2
-    assert history.returns.shape == (3, 4)
-    assert f"({history.settings[history.best_seed]}, seed {history.best_seed % 2})" in said
 
 
 def test_what_cannot_be_swept_is_refused_at_once(capsys):

@@ -136,29 +136,11 @@ def test_an_estimate_at_a_bound_is_identified_once_more_with_wider_ones(world, c
     assert WIDER in capsys.readouterr().err
 
 
-def test_with_a_wider_bound_another_estimate_may_come_to_its_own(world):
-    """Of an SO-101 with twice the friction: the elbow's was at its bound, then the shoulder's."""
-    world.judgements = ["hit a bound"] * 2
-    world.asks = [f"sim2real identify pendulum --bounds {bounds}" for bounds in ("friction 0.1 80", "damping 0.1 9")]
-    again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
-    assert again == ["identify"] * 3 + ["train", "deploy"]
-    own, _, last = (config for stage, config in world.calls[4:] if stage == "identify")
-    assert last == replace(own, bounds={**own.bounds, "friction": (0.1, 80.0), "damping": (0.1, 9.0)})
-
-
 def test_an_estimate_that_stays_at_a_bound_leads_to_a_recording_and_then_to_an_end(world):
     """The model may be wrong: bounds are not moved for ever."""
     world.judgements = ["hit a bound"] * 6
     again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
     assert again == ["identify"] * 2 + ["record"] + ["identify"] * 2 + ["train", "deploy"]
-
-
-def test_delays_that_a_deployment_does_not_tell_are_recorded(world, capsys):
-    """A policy that moves slowly: no delay, and inertia in its place, explains its log as well."""
-    world.trips = ["at a bound"]
-    again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
-    assert again == ["identify", "record", "identify", "train", "deploy"]
-    assert "do not suffice (the sum of the delays is at a bound)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -177,18 +159,6 @@ def test_a_policy_that_fails_in_simulation_is_trained_once_more_for_longer(world
     assert done == again
     steps = [config.ppo.total_steps for stage, config in world.calls if stage == "train"]
     assert steps == [ppo.total_steps * n for n in (1, 1, 2, 4)][: len(steps)]
-
-
-def test_a_first_identification_at_a_bound_is_done_once_more_too(world):
-    world.first, world.judgements = 0, ["hit a bound"]
-    world.go(verdict("fine", 1.0))
-    assert [stage for stage, _ in world.calls] == ["record", "identify", "identify", "train", "deploy"]
-
-
-def test_a_run_that_goes_around_once_leaves_that_to_who_attends_it(world):
-    world.first, world.judgements, world.successes = 0, ["hit a bound"], [0.2]
-    world.go(verdict("fine", 1.0), iterations=1)
-    assert tuple(stage for stage, _ in world.calls) == STAGES
 
 
 LATER = DelayChanged("the delay is 60 ms", hint="record, identify and train again")
@@ -239,12 +209,6 @@ def test_a_goal_goes_on_until_it_is_reached_or_the_iterations_end(world):
     assert [r.number for r in rows] == [1, 2, 3]
 
 
-def test_the_last_iteration_says_what_it_would_do(world):
-    again, rows = world.go(verdict("re-train"), verdict("re-train"), iterations=2)
-    assert again == ["train", "deploy"]
-    assert rows[-1].then == "the last iteration: it would train with another seed, deploy"
-
-
 @pytest.mark.parametrize(
     ("told", "said"),
     [
@@ -257,8 +221,3 @@ def test_the_last_iteration_says_what_it_would_do(world):
 def test_a_goal_that_is_none_is_refused_before_anything_moves(told, said):
     with pytest.raises(UsageError, match=said):
         RunFlags(**told)
-
-
-def test_a_goal_that_the_task_does_not_know_is_refused(world):
-    with pytest.raises(UsageError, match=r"no .speed. in the gap report"):
-        world.go(replace(verdict("fine"), episodes=(Scores({}),)), until="speed=1")

@@ -11,7 +11,6 @@ from flax import struct
 from sim2real import composer
 from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
-from sim2real.composer.task import split_reward
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.train.environment.composed import TaskEnvironment, TaskState
@@ -150,18 +149,6 @@ def test_the_truth_of_a_composed_task_has_what_its_hooks_drew(named):
     assert 0.5 <= one[-1] <= 2.0
 
 
-def test_named_terms_are_one_reward_in_the_c_engine(named):
-    environment = composer.Environment(named.environment.task)
-    environment.reset()
-    reward = environment.step(np.ones(1)).reward
-    assert reward == pytest.approx(0.25 - environment.physics.data.qpos[0] ** 2)
-
-
-def test_names_without_terms_are_refused():
-    with pytest.raises(UsageError, match=r"returned no terms[\s\S]*hint: return a number"):
-        split_reward({})
-
-
 @struct.dataclass
 class Earned:
     """The part of a composed world's state that a reward may read."""
@@ -187,9 +174,3 @@ def test_a_reward_that_ignores_the_composed_task_is_refused(reads):
         return
     with pytest.raises(UsageError, match="ignores `get_reward`"):
         _require_reward(task, graph_state, jnp.zeros(1), "world")
-
-
-def test_a_composed_world_knows_whether_its_task_has_a_reward():
-    bare = cart('ctrlrange="-2 1" ctrllimited="true"').task.root_entity
-    assert not composer.ComposedWorld("world", composer.NullTask(bare)).has_reward
-    assert composer.ComposedWorld("world", Named(bare)).has_reward

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from environments import Sign
@@ -14,7 +13,6 @@ from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bu
 from sim2real.policy.network import NetworkSpec
 from sim2real.train.config import PPOConfig
 from sim2real.train.networks.architectures import GRU, make_network
-from sim2real.train.networks.policy import Policy
 from sim2real.train.networks.sequences import unroll
 from sim2real.train.ppo.trainer import train
 
@@ -55,20 +53,6 @@ def test_the_bundle_remembers_until_it_is_reset(learnt, backend, tmp_path):
         np.testing.assert_allclose(found[1:], sign, atol=0.4)
     forgetful = [load_bundle(tmp_path, backend).act(row)[0] for row in rows]
     assert forgetful[1] != pytest.approx(found[1], abs=1e-3)
-
-
-@pytest.mark.night
-def test_weights_make_the_same_policy(learnt):
-    policy = learnt.best
-    again = Policy.from_weights(policy.to_weights(), policy.spec)
-    assert jax.tree.structure(again) == jax.tree.structure(policy)
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(policy), strict=True))
-
-
-@pytest.mark.night
-def test_an_observation_alone_tells_no_action(learnt):
-    with pytest.raises(UsageError, match=r"network 'gru' remembers[\s\S]*hint: call step"):
-        learnt.best.get_action(jnp.zeros(2))
 
 
 @pytest.mark.night  # `make test` resumes a training without memory: test_checkpoint.py

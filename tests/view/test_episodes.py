@@ -1,14 +1,11 @@
 """The picture of what episodes are drawn from."""
 
-import xml.etree.ElementTree as ET
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.identification import Noise
-from sim2real.view.page.episodes import episodes_svg, picture
+from sim2real.view.page.episodes import picture
 
 
 @pytest.fixture
@@ -23,23 +20,6 @@ def episodes():
         drawn_s={"agent": rng.uniform(0.001, 0.002, 50), "lost": np.array([np.nan])},
         off={"q[0]": rng.normal(0.0, 0.1, 50)},
     )
-
-
-def test_every_part_has_a_panel(episodes):
-    text = episodes_svg(episodes, "here")
-    ET.fromstring(text)
-    for title in (
-        "gain [1/s]",
-        "round_trip_delay [ms]",
-        "steps of agent [ms]",
-        "q[0]: difference from the model [rad]",
-    ):
-        assert title in text
-
-
-def test_a_curriculum_has_a_panel_too(episodes):
-    assert "share of all differences" not in episodes_svg(episodes, "here")
-    assert "share of all differences" in episodes_svg(replace(episodes, curriculum=(0.0, 1.0)), "here")
 
 
 def test_the_picture_is_a_png_also_of_nothing(episodes, tmp_path):

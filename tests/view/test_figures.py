@@ -17,7 +17,7 @@ from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Identification, Quantity
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.run_folder import Source, finished_stages
+from sim2real.artifacts.run.run_folder import finished_stages
 from sim2real.view import style, timing
 from sim2real.view.identification import figures as identify_figures
 from sim2real.view.identification import intervals, residuals
@@ -137,11 +137,6 @@ def test_every_reference_in_a_figure_leads_somewhere(picture):
     assert references <= ids
 
 
-def test_colours_follow_the_page_and_stand_alone(picture):
-    assert "var(--ink, #1b2430)" in picture
-    assert synthetic_run.COLOR in picture
-
-
 def test_measured_and_predicted_are_drawn_as_they_are(drawn, found):
     (axes, closer), rows = drawn["predictions"].axes[:2], found.disjoint()
     lines, whole = lines_of(axes), found.samples["recording"] == 0
@@ -174,43 +169,6 @@ def test_text_is_never_parsed_as_mathematics(drawn, picture):
     assert "late wake-up" in ["".join(t.itertext()) for t in ET.fromstring(picture).iter(f"{SVG}text")]
 
 
-def test_units_stand_at_the_axes(drawn):
-    assert {"th [rad]", "thdot [rad/s]", "actuator.action [V]"} <= set(texts(drawn["record"]))
-    assert {"th [rad]", "actuator.action [V]"} <= set(texts(drawn["deployment"]))
-
-
-def test_lines_differ_by_more_than_colour(drawn):
-    lines = [line for line in drawn["predictions"].axes[0].lines if len(line.get_xdata())]
-    assert [line.is_dashed() for line in lines] == [False, True, True]
-    legend = texts(drawn["predictions"])
-    assert {"measured", "identified model", "nominal model", "held out"} <= set(legend)
-
-
-def test_the_latest_awakening_is_named(drawn):
-    assert "Around the latest wake-up: agent, 4.0 ms" in texts(drawn["schedule"])
-
-
-def test_nodes_have_their_own_order_and_colour(drawn, log):
-    assert timing.in_order(log.episode) == ["actuator", "sensor", "agent"]
-    colors = [timing.color_of(log.episode, n, "mine") for n in ("actuator", "agent", "sensor")]
-    assert colors == [synthetic_run.COLOR, "mine", "mine"], "a name that nobody knows is no colour"
-    histogram = drawn["histograms"].axes[0]
-    assert histogram.get_ylabel() == "actuator\nsteps"
-    assert {to_hex(patch.get_edgecolor()) for patch in histogram.patches} >= {synthetic_run.COLOR}
-    assert "computing, or in the node's own colour" in texts(drawn["schedule"])
-
-
-def test_the_age_of_inputs_has_a_column(drawn):
-    shown = texts(drawn["histograms"])
-    assert "Age of inputs" in shown
-    assert shown.count("no inputs") == 1
-    assert shown.count("p50 0.01 · p99 0.01 · max 0.01") == 2
-
-
-def test_correlations_stand_in_the_cells(drawn):
-    assert texts(drawn["correlation"]).count("0.50") == 6
-
-
 def test_a_parameter_without_truth_nominal_or_bounds_can_be_drawn(found):
     bare = [
         replace(e, truth=None, nominal=None, lower=None, upper=None, low95=None, high95=None, standard_error=None)
@@ -219,35 +177,6 @@ def test_a_parameter_without_truth_nominal_or_bounds_can_be_drawn(found):
     labels = texts(figure_of(intervals.intervals, bare))
     assert "truth" not in labels
     assert labels.count("no standard error") == len(bare)
-
-
-def test_overlapping_segments_are_drawn_once(found):
-    t_s = found.samples["t"][found.disjoint()]
-    assert np.all(np.diff(t_s) > 0)
-    assert set(found.samples["segment"][found.disjoint()]) == {0, 1, 2, 3, 5}
-
-
-def test_recordings_do_not_hide_each_other(found):
-    several = replace(
-        found, samples=synthetic_run.three_recordings(), logs=tuple(Source(f"../{n}.mcap", "") for n in "abc")
-    )
-    assert several.disjoint().sum() == 3 * found.disjoint().sum()
-    labels = texts(figure_of(identify_figures.predictions, several))
-    assert [labels.count(f"{n}.mcap") for n in "abc"] == [2, 2, 2]
-    assert "time, log after log [s]" in texts(figure_of(residuals.figure, several))
-    assert np.all(np.diff(residuals.residuals(several, "th").t_s) > 0)
-
-
-def test_more_fields_than_panels_leave_the_last_ones_out(found):
-    many = dict(found.samples)
-    for i in range(8):
-        many |= {f"q[{i}]_measured": found.samples["t"], f"q[{i}]_identified": found.samples["t"]}
-    assert len(identify_figures.shown(replace(found, samples=many), [0])) == 6
-
-
-def test_a_free_run_says_its_errors_and_is_not_squeezed_by_one_that_runs_away(drawn):
-    assert any("identified RMSE 0.0123, MAE 0.00984 · no delay" in t for t in texts(drawn["free"]))
-    assert max(axes.get_ylim()[1] for axes in drawn["free"].axes) < 2.0, "one model's values reach 30"
 
 
 def test_residuals_are_white_or_not():
@@ -265,21 +194,6 @@ def test_only_what_lies_behind_the_fitted_start_counts_as_residual(found):
     rest = residuals.residuals(replace(found, settle_s=0.5), "th")
     assert len(rest.every) == 3 * 24
     np.testing.assert_allclose(rest.every, -0.01, atol=1e-9)
-
-
-def test_the_assumed_deviation_is_drawn_where_it_is_known(found):
-    told = texts(figure_of(residuals.figure, replace(found, sigma={"th": 0.002})))
-    assert "assumed noise of the measurement" in told
-    assert any("5 times the assumed" in t for t in told)
-
-
-def test_a_parameter_that_may_be_zero_is_drawn_between_its_bounds(found):
-    zero = replace(found.parameters[0], nominal=0.0, lower=-1.0, upper=1.0, estimate=0.25)
-    assert "position between the bounds [%]" in texts(figure_of(intervals.intervals, [zero, *found.parameters]))
-
-
-def test_recordings_that_disagree_are_named(drawn):
-    assert {"friction", "round_trip_delay: disagree", "ms"} <= set(texts(drawn["aggregate"]))
 
 
 def test_a_sample_is_shown_when_it_was_taken_and_a_command_when_it_was_sent(log):

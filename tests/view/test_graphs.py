@@ -34,12 +34,6 @@ def test_a_timeline_shows_each_step_and_each_message_that_is_used(tmp_path):
     assert "<svg" in picture._repr_svg_()
 
 
-def test_a_graph_shows_its_nodes_and_what_is_special_about_connections():
-    texts = [t.get_text() for t in sim2real.plot_graph(robot()).figure.axes[0].texts]
-    assert {"sensor\n50 Hz", "agent\n25 Hz", "w\n100 Hz"} <= set(texts)
-    assert {"4 ms, window 3, blocking", "1 ms", "0 ms, skip"} <= set(texts)
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [

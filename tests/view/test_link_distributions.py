@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Link, Ranged
-from sim2real.view.identification.links import draw_link, link_blocks
-from sim2real.view.style import new_figure, styled
+from sim2real.view.identification.links import link_blocks
 
 
 @pytest.fixture
@@ -36,16 +35,3 @@ def test_numbers_stand_with_their_intervals_and_what_is_not_known_is_left_out(li
     assert table.rows[0][1:] == ["6.700", "6.500 to 6.900", "ms"]
     assert table.rows[3][1:] == ["3.000", "2.000 to 4.000", "%"]
     assert link_blocks([]) == []
-
-
-def test_the_distribution_is_drawn_where_messages_are_with_mean_and_95_percent(link):
-    with styled():
-        ax = new_figure(2.0).subplots()
-        draw_link(ax, link)
-    assert sorted(float(line.get_xdata()[0]) for line in ax.lines) == pytest.approx([6.7, 12.6])
-    (filled,) = ax.collections
-    x, y = filled.get_paths()[0].vertices.T
-    assert 1.0 < x.min() < 3.0
-    assert 13.0 < x.max() < 15.0
-    assert y.max() == pytest.approx(100.0 * link.share.max())
-    assert "3 % lost, 2.1 in a row" in ax.get_title("left")

@@ -12,7 +12,6 @@ from sim2real.view.live.follower import Follower
 from sim2real.view.live.log_source import LogSource, _thinned
 from sim2real.view.live.stage_sources import FitSource, ProgressSource
 from sim2real.view.model_scene import ModelScene
-from sim2real.view.rerun_content import Curve, readable
 
 rr = pytest.importorskip("rerun")
 from rerun.chunk import RrdReader  # noqa: E402
@@ -158,18 +157,6 @@ def test_a_floating_base_turns_as_measured_and_its_foot_is_on_the_floor(tmp_path
     moving, static = rows_of(tmp_path / "floating.rrd")
     assert moving == {"/robot/body_1": 2, "/robot/body_2": 2}
     assert {e for e in static if "geom" in e} == {"/robot/body_1/geom_1", "/robot/body_2/geom_2"}
-
-
-def test_of_very_many_plots_the_constant_ones_are_left_out_and_goals_stand_beside_positions():
-    def plots(count):
-        names = [f"{name}[{i}] [rad]" for name in ("position", "q", "kp") for i in range(count)]
-        curve = lambda name: Curve(name, name, "", np.arange(3.0), np.arange(3.0) * (name[0] != "k"))  # noqa: E731
-        return {name: [curve(name)] for name in names}
-
-    assert list(readable(plots(9))) == list(plots(9))
-    merged = readable(plots(12))
-    assert list(merged) == [f"position[{i}] [rad]" for i in range(12)]
-    assert [c.label for c in merged["position[3] [rad]"]] == ["position[3] [rad]", "q[3] [rad]"]
 
 
 def test_a_model_moves_as_its_joints_do(tmp_path):

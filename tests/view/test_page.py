@@ -14,13 +14,10 @@ import pytest
 import synthetic_run
 from sketches import sketched
 
-from sim2real.artifacts.deployment import Changed, Drift
-from sim2real.artifacts.identification import HeldOutPart, Identification, Judgement, WorstSecond
-from sim2real.artifacts.posterior import Alternative, Posterior
-from sim2real.artifacts.summary import ArtifactTable, words_and_unit
+from sim2real.artifacts.identification import Identification, Judgement, WorstSecond
 from sim2real.errors import Sim2RealError
-from sim2real.view.blocks import MISSING, FigureBlock, TableBlock, decimals_for, fixed, number
-from sim2real.view.identification.section import _alternatives, _banner, _parts
+from sim2real.view.blocks import MISSING, decimals_for, fixed, number
+from sim2real.view.identification.section import _banner
 from sim2real.view.page.page import deploy_page, identify_page, report
 
 CHROMIUM = next((path for n in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(n))), None)
@@ -93,79 +90,12 @@ def test_the_numbers_are_there(page):
     assert {"bus p50", "bus max", "1.23"} <= words, "the time on the bus"
 
 
-def test_the_head_names_the_worst_position_and_a_table_has_them_all(page):
-    words = page.words
-    assert {"held-out RMSE of th, the worst of 2, after 1 s", "0.0234 rad"} <= set(words)
-    rows = words.index("Held-out RMSE of every position after 1 s, the largest first")
-    assert {"no better than", "no delay", "none", "0.01170"} <= set(words[rows : rows + 60])
-
-
-def test_the_verdict_stands_above_everything_in_words_and_colour(page):
-    banners = [attrs["class"] for _, attrs in page.elements if "banner" in (attrs.get("class") or "")]
-    boxes = ["banner good", "banner doubt", "banner good", "banner doubt"]
-    assert banners[:4] == boxes, "record, identify, train; the deployment has no verdict"
-    assert banners[4:] == boxes[:3], "the verdict of each section"
-    words = page.words
-    title = next(w for w in words if w.startswith("Hit a bound"))
-    assert words.index(title) < words.index("Parameters")
-    assert {"At a bound: friction.", "sensor_delay is <b>loose</b>."} <= set(words)
-
-
-@pytest.mark.parametrize(
-    ("status", "tone"),
-    [("accepted", "good"), ("not identifiable", "doubt"), ("no improvement on held-out data", "bad")],
-)
-def test_each_verdict_has_a_tone(status, tone):
-    found = _banner(Identification("robot", (), Judgement(status, ()), ()))
-    assert found is not None
-    assert found.tone == tone
-    assert found.title.lower().startswith(status)
-
-
-def test_the_next_command_stands_in_the_first_box_after_the_first_reason():
-    verdict = Judgement(
-        "hit a bound", ("gain is at its bound", "friction is not determined"), next="sim2real identify x"
-    )
-    found = _banner(Identification("robot", (), verdict, ()))
-    assert found is not None
-    assert found.reasons == ["Gain is at its bound.", "next: sim2real identify x", "Friction is not determined."]
-
-
 def test_an_unexplained_second_makes_an_accepted_identification_doubtful():
     worst = WorstSecond("elbow", "q", "rad", 0, 3, 5.1, 6.1, 0.8, 400.0, 0.49)
     found = Identification("robot", (), Judgement("accepted", ()), (), worst=worst)
     banners = [_banner(replace(found, worst=replace(worst, of_motion=share))) for share in (0.49, 0.5, None)]
     assert [banner.tone for banner in banners] == ["good", "doubt", "doubt"]
     assert banners[1].title == "Accepted, but the model does not explain one second"
-
-
-def test_what_the_data_determines_is_told(page):
-    assert f"Only sensor_delay + {synthetic_run.EVIL} is determined: fix one." in page.words
-    assert "Standard error from one minute of such data" in page.words
-    assert {"1.2 times", "0.20"} <= set(page.words)
-
-
-def test_what_lies_at_a_bound_is_named(only):
-    run = only("identify")
-    data = synthetic_run.parameters()
-    data["parameters"][2] |= {"verdict": "at a bound", "estimate": 0.0599}
-    (run / "identify" / "parameters.json").write_text(json.dumps(data))
-    text = identify_page(run / "identify").read_text(encoding="utf-8")
-    assert "At a bound: sensor_delay (the upper, 60.00 ms)." in text
-
-
-def test_free_runs_and_recordings_have_blocks_only_where_there_are_any(run):
-    names = ("identify-free", "identify-aggregate")
-    text = identify_page(run / "identify").read_text(encoding="utf-8")
-    assert [f'id="{n}-' in text for n in names] == [True, False]
-    (run / "identify" / "free_runs.npz").unlink()
-    data = {**synthetic_run.parameters(), "aggregate": synthetic_run.aggregate()}
-    (run / "identify" / "parameters.json").write_text(json.dumps(data))
-    np.savez(run / "identify" / "predictions.npz", **synthetic_run.three_recordings())
-    page = identify_page(run / "identify").read_text(encoding="utf-8")
-    assert [f'id="{n}-' in page for n in names] == [False, True]
-    assert "Over 3 recordings" in page
-    assert "Their differences in round_trip_delay exceed the standard errors." in page
 
 
 def test_every_stage_has_a_section_and_an_entry_in_the_contents(page):
@@ -276,18 +206,6 @@ def test_one_seed_and_missing_numbers_are_shown(only):
     assert "truth" not in words
 
 
-def test_what_was_swept_and_what_each_term_of_the_reward_added_are_shown(only):
-    run = only("identify", "train")
-    document = synthetic_run.history(2)
-    terms = {f"reward/{n}": [[share * v for v in row] for row in document["returns"]] for n, share in TERMS.items()}
-    document |= {"settings": ["gamma=0.9", "gamma=0.99"], "best_seed": 1, "others": terms}
-    (run / "train" / "history.json").write_text(json.dumps(document))
-    text = Page(report(run).read_text(encoding="utf-8")).words
-    assert {"settings", "gamma=0.9", "gamma=0.99", "of it angle", "of it voltage"} <= set(text)
-    assert not [word for word in text if "reward/" in word]
-
-
-TERMS = {"angle": 0.75, "voltage": 0.25}
 MALFORMED = {
     "no JSON": ("identify", "parameters.json", b"{", "parameters.json is malformed"),
     "no parameters": ("identify", "parameters.json", b"{}", "missing required field"),
@@ -343,21 +261,6 @@ def test_a_value_has_as_many_decimals_as_its_standard_error_is_worth():
     assert fixed(8.507, decimals_for(None, 8.507)) == "8.507"
 
 
-def test_a_quantity_says_its_unit():
-    assert words_and_unit("angle_rms_rad") == ("angle rms", "rad")
-    assert words_and_unit("speed_rms_rad_s") == ("speed rms", "rad/s")
-    assert words_and_unit("success") == ("success", "1")
-
-
-@pytest.mark.parametrize(
-    ("width_pt", "narrow", "layout"), [(360, False, ""), (756, False, "wide"), (756, True, "narrow")]
-)
-def test_only_a_wide_figure_scrolls_on_a_telephone(width_pt, narrow, layout):
-    svg = f'<svg role="img" aria-label="gain" width="{width_pt}pt" height="90pt"></svg>'
-    assert FigureBlock(svg, "caption", narrow).layout == layout
-    assert FigureBlock(svg, "caption", phone=svg).layout == "twice"
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_a_browser_shows_it_without_an_error(path, tmp_path):
     assert CHROMIUM is not None
@@ -369,75 +272,3 @@ def test_a_browser_shows_it_without_an_error(path, tmp_path):
     assert [attrs["id"] for tag, attrs in dom.elements if tag == "section"] == ["record", "identify", "train", "deploy"]
     assert sum(tag == "svg" for tag, _ in dom.elements) == done.stdout.count("<figure")
     assert synthetic_run.EVIL in dom.words
-
-
-FRAME = """<iframe src="{url}" style="border:0;width:{width}px;height:800px"></iframe><pre id="wide"></pre><script>
-document.querySelector("iframe").onload = event => {{
-  const page = event.target.contentDocument
-  const wide = [...page.querySelectorAll("body *:not(.skip)")].filter(
-    e => !e.closest(".scroll, svg, .hidden") && e.getBoundingClientRect().right > {width} + 1)
-  document.getElementById("wide").textContent = JSON.stringify(
-    {{width: page.documentElement.scrollWidth, wide: wide.map(e => e.outerHTML.slice(0, 80))}})
-}}
-</script>"""
-"""Measures a page in a frame, as a window of Chromium is at least 500 pixels wide; figures and tables scroll inside."""
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-@pytest.mark.parametrize("width", [1280, 390])
-def test_nothing_is_wider_than_the_screen(path, tmp_path, width):
-    assert CHROMIUM is not None
-    frame = tmp_path / "frame.html"
-    frame.write_text(FRAME.format(url=path.resolve().as_uri(), width=width))
-    flags = [
-        *FLAGS,
-        "--hide-scrollbars",
-        "--allow-file-access-from-files",
-        "--virtual-time-budget=3000",
-        f"--user-data-dir={tmp_path}/own",
-    ]
-    command = [CHROMIUM, *flags, f"--window-size={width + 20},900", "--dump-dom", frame.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    (measured,) = re.findall(r'<pre id="wide">(.*?)</pre>', done.stdout, re.DOTALL)
-    assert json.loads(measured.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&")) == {
-        "width": width, "wide": []
-    }  # fmt: skip
-
-
-def test_parts_that_were_left_out_have_a_table_with_mean_and_worst():
-    rows = tuple(
-        HeldOutPart(name, terms, {}, {}, {"th": error}, {})
-        for name, terms, error in (("0 to 9 s", ("drag",), 0.1), ("9 to 18 s", (), 0.3))
-    )
-    found = Identification("robot", (), Judgement("", ()), (), left_out=rows, terms=("drag",), units={"th": "rad"})
-    (table,) = _parts(found)
-    assert table.columns == ["held-out part", "terms", "th ahead [rad]"]
-    assert table.rows == [
-        ["0 to 9 s", "drag", "0.100"], ["9 to 18 s", "none", "0.300"], ["mean", "", "0.200"], ["worst", "", "0.300"],
-    ]  # fmt: skip
-    assert _parts(replace(found, left_out=())) == []
-
-
-def test_models_that_explain_the_recordings_as_well_stand_beside_the_estimate():
-    def normal(names, mean, **more):
-        size = len(names)
-        ends = np.full(size, -9.0), np.full(size, 9.0)
-        return Posterior(names, ("linear",) * size, np.array(mean), np.eye(size), *ends, **more)
-
-    other = Alternative("with drag", 0.3, normal(("gain", "drag"), [2.5, 0.1]))
-    own = normal(("gain",), [2.0], without={"drag": 0.0}, others=(other,))
-    found = Identification("robot", (), Judgement("", ()), (), posterior=own)
-    (table,) = _alternatives(found)
-    assert table.columns == ("parameter", "estimate", "with drag")
-    assert table.rows == [["share of the draws", "70 %", "30 %"], ["gain", "2.00", "2.50"], ["drag", MISSING, "0.100"]]
-    assert _alternatives(replace(found, posterior=replace(own, others=()))) == []
-
-
-def test_short_times_are_in_ms_and_numbers_without_their_unit_stay():
-    """A share is no time, and texts that hold seconds keep their unit."""
-    drift = Drift((Changed("delay", "s", 0.044, 0.041, 0.039, 0.043, 0.0286, 0.5),), 0.05, (), 10.0)
-    (row,) = TableBlock.of("drift", drift.rows()).rows
-    assert list(row) == ["delay", "44.00", "41.00", "39.00 to 43.00", "ms", "2.9 %", "no"]
-    table = ArtifactTable(("parameter", "unit", "run"), [["delay", "s", "0.044 ± 0.001"]])
-    (text,) = TableBlock.of("comparison", table).rows
-    assert list(text)[1:] == ["s", "0.044 ± 0.001"]

@@ -57,15 +57,6 @@ def test_the_recording_is_whole_by_the_viewers_own_check(saved):
     assert "1 file verified without error" in rerun("rrd", "verify", saved)
 
 
-@needs_rerun
-def test_it_was_sent_by_columns(saved):
-    stats = rerun("rrd", "stats", saved)
-    numbers = dict(line.split(" = ", 1) for line in stats.splitlines() if " = " in line)
-    rows, chunks = (int(numbers[n].split()[0].replace(" ", "")) for n in ("num_rows_max", "num_chunks"))
-    assert rows >= synthetic_run.STEPS, "a column of a whole episode in one chunk"
-    assert chunks < 250
-
-
 def test_every_curve_stands_on_the_one_timeline(saved, finished_run):
     rows = rows_by_entity(saved)
     for tab in tabs_of(finished_stages(finished_run)):
@@ -205,20 +196,6 @@ def software_vulkan(monkeypatch):
 @pytest.mark.usefixtures("software_vulkan")
 def test_the_viewer_draws_the_curves(saved, tmp_path):
     assert drawn_roles(saved, tmp_path / "run.png") == FIRST_TAB
-
-
-@needs_rerun
-@needs_vulkan
-@pytest.mark.usefixtures("software_vulkan")
-@pytest.mark.night  # `make test` finds drawings in the test above
-def test_an_error_screen_is_no_drawing(tmp_path):
-    (tmp_path / "damaged.rrd").write_bytes(b"nothing")
-    assert drawn_roles(tmp_path / "damaged.rrd", tmp_path / "error.png", 2.0) == set()
-    from matplotlib.image import imread
-
-    pixels = imread(tmp_path / "error.png")[..., :3]
-    colours = len(np.unique((pixels * 16).astype(int).reshape(-1, 3), axis=0))
-    assert colours > 20, "the error screen has many colours, so their number proves nothing"
 
 
 def test_each_recording_of_an_identification_has_a_tab_of_its_own(only):

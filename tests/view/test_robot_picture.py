@@ -74,21 +74,3 @@ def test_a_picture_is_drawn_or_its_driver_is_named(joint, tmp_path, monkeypatch)
     assert pixels.shape[:2] == (360, 480)
     assert pixels[..., :3].std() > 0.05
     assert drawing.placed == ("th",)
-
-
-@pytest.mark.night
-def test_a_model_without_shapes_gets_balls_and_its_one_joint_the_measured_angle(tmp_path, monkeypatch):
-    """The export of the pendulum has masses only: without balls the picture is an empty sky."""
-    (tmp_path / "robot.xml").write_text(
-        '<mujoco><worldbody><body><joint name="hinge" axis="0 1 0"/>'
-        '<inertial pos="0 0 0.01" mass="0.2" diaginertia="1e-4 1e-4 1e-4"/></body></worldbody></mujoco>'
-    )
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    drawings = [robot_picture.drawn(tmp_path / "robot.xml", {"th": angle}) for angle in (0.0, 2.0)]
-    if drawings[0].png is None:
-        assert drawings[0].reason.startswith("MuJoCo did not draw it (")
-        return
-    assert [(d.placed, d.balls) for d in drawings] == [(("th",), True)] * 2
-    upright, down = (imread(BytesIO(d.png))[..., :3].astype(float) for d in drawings)
-    assert upright.std() > 0.05
-    assert abs(upright - down).max() > 0.3

@@ -7,10 +7,7 @@ import pytest
 from oracles.conformance import NodeConformance
 from oracles.hash_nodes import Value
 
-from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, StepState
-from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.worlds.ode import OdeWorld
 
 
@@ -68,28 +65,9 @@ def test_it_converges_as_a_method_of_order_four():
     assert 14 < coarse / fine < 18
 
 
-def test_a_tick_is_split_into_equal_parts():
-    assert Oscillator("w", 100, substep_s=0.002).substeps == 5  # exactly, though 0.01 / 0.002 is a little more
-    assert Oscillator("w", 100, substep_s=0.003).substeps == 4
-    assert Oscillator("w", 100, substep_s=1.0).substeps == 1
-    with pytest.raises(UsageError, match="substep_s must be positive"):
-        Oscillator("w", 100, substep_s=0.0)
-
-
 def test_limits_hold_after_every_substep():
     world = Oscillator("w", 10)
     world.top = 0.05
     ss, _ = world.step(StepState(state=world.init_state()))
     assert float(ss.state["v"]) == pytest.approx(-0.05)
     assert float(ss.state["x"]) > 0.994
-
-
-def test_commands_come_in_through_the_graph():
-    world, force = Oscillator("world", 100), Force("force", 100)
-    world.connect(force, skip=True)
-    nodes = {"world": world, "force": force}
-    graph = CompiledGraph(nodes, force, draw(nodes, 1.0))
-    _, records = graph.rollout(graph.init(jax.random.key(0)), ("world",))
-    t = 0.01 * np.arange(1, 100)  # the first command is read by the second tick
-    expected = 1.0 - (1.0 - np.cos(0.01)) * np.cos(t) - np.sin(0.01) * np.sin(t)
-    np.testing.assert_allclose(records["world"].output["x"][1:100], expected, atol=1e-5)
