@@ -38,8 +38,8 @@ def test_in_the_middle_of_a_recording_references_begin_at_the_goals(pair):
         np.testing.assert_array_equal(after.variables["other"], before)
 
 
-def test_the_world_is_half_a_step_behind_its_commands(played):
-    world = played.world
+def test_the_world_is_half_a_step_behind_its_commands(pair):
+    world = pair.model.make_world()
     assert world.lead_s == 0.0025
     gs = GraphState(params={"actuator": DelayParams(delay=0.02), "sensor": DelayParams(delay=0.005)})
     assert world.init_delays(None, gs) == {"actuator": pytest.approx(0.0225)}
@@ -47,8 +47,8 @@ def test_the_world_is_half_a_step_behind_its_commands(played):
         assert world.init_delays(None, GraphState(params=params)) == {}
 
 
-def test_the_sensor_passes_on_what_the_world_shows_with_its_own_delay(played):
-    sensor = SimSensor("sensor", 50.0, played.world)
+def test_the_sensor_passes_on_what_the_world_shows_with_its_own_delay(pair):
+    sensor = SimSensor("sensor", 50.0, pair.model.make_world())
     message = JointReading(jnp.array([0.1, 0.2]), jnp.array([1.0, 2.0]))
     _, passed = sensor.step(StepState(inputs=heard("world", message)))
     np.testing.assert_array_equal(passed.position, message.position)

@@ -24,9 +24,15 @@ SPEEDS = jnp.array([1.5, -1.0])
 
 
 @pytest.fixture(scope="module")
-def trained(pair):
-    """The loop with delays, and half a second in which the goals move at one speed."""
-    nodes, task = pair.training(DELAYED, DRAWS, {}, True)
+def loop(pair):
+    """The nodes of the loop with delays, and its task."""
+    return pair.training(DELAYED, DRAWS, {}, True)
+
+
+@pytest.fixture(scope="module")
+def trained(pair, loop):
+    """Half a second in which the goals move at one speed; MJX compiles for 20 s, so its tests run at night."""
+    nodes, task = loop
     graph = CompiledGraph(nodes, pair.roles.supervisor, draw(nodes, 0.5))
     env = GraphEnvironment(graph, task)
 
@@ -45,15 +51,15 @@ def trained(pair):
 
     params, (first, true), rows, blow = jax.jit(run)(jax.random.key(5))
     return SimpleNamespace(
-        nodes=nodes, task=task, params=params, first=first, true=true, rows=jax.tree.map(np.asarray, rows), blow=blow
+        params=params, first=first, true=true, rows=jax.tree.map(np.asarray, rows), blow=blow
     )
 
 
 @pytest.fixture(scope="module")
-def drawn(trained):
+def drawn(loop):
     """The parameters of many episodes."""
     keys = jax.random.split(jax.random.key(0), 400)
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(trained.task.params))(keys))
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(loop[1].params))(keys))
 
 
 @pytest.mark.night
@@ -96,6 +102,7 @@ def test_dynamics_and_delays_are_drawn_together_and_aims_vary(drawn):
     assert 0.7 < aims.max() <= 0.8
 
 
+@pytest.mark.night
 def test_the_joints_follow_and_the_policy_sees_them_late(trained):
     joints, seen = trained.rows["joints"], trained.rows["seen"]
     goals = trained.rows["goal"]
@@ -110,6 +117,7 @@ def test_the_joints_follow_and_the_policy_sees_them_late(trained):
     np.testing.assert_allclose(seen[:, 6], float(trained.params["agent"].aim[0]), atol=1e-6)
 
 
+@pytest.mark.night
 def test_a_value_function_may_see_where_the_joints_are_and_what_they_are_like(trained):
     true = np.asarray(trained.true)
     np.testing.assert_allclose(true[:2], trained.params["agent"].start, atol=1e-6)
@@ -117,6 +125,7 @@ def test_a_value_function_may_see_where_the_joints_are_and_what_they_are_like(tr
         assert np.isin(np.asarray(trained.params["world"].values[name]).ravel(), true).all()
 
 
+@pytest.mark.night
 def test_the_reward_is_the_tasks_less_a_little_for_speed(pair, trained):
     price = 0.01 * np.mean((np.asarray(SPEEDS) / pair.drive.servos.speed) ** 2)
     np.testing.assert_allclose(trained.rows["reward"], trained.rows["of_task"] - price, atol=1e-6)
