@@ -50,9 +50,7 @@ def trained(pair, loop):
         return first.graph.params, (seen, env.privileged(first)), rows, blow
 
     params, (first, true), rows, blow = jax.jit(run)(jax.random.key(5))
-    return SimpleNamespace(
-        params=params, first=first, true=true, rows=jax.tree.map(np.asarray, rows), blow=blow
-    )
+    return SimpleNamespace(params=params, first=first, true=true, rows=jax.tree.map(np.asarray, rows), blow=blow)
 
 
 @pytest.fixture(scope="module")

@@ -4,82 +4,14 @@ import os
 import signal
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
-import numpy as np
 import pytest
+from loop_stages import Stages
 
-from sim2real.artifacts.bundle import History
-from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Scores
-from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run.iterations import Iterations
-from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, finished, newest, open_stage
-from sim2real.artifacts.run.stage_status import TAKES, stage_status
-from sim2real.commands.flags import RunFlags
-from sim2real.commands.loop import run_loop
+from sim2real.artifacts.run.run_folder import STAGES, attempts, finished, open_stage
+from sim2real.artifacts.run.stage_status import stage_status
 from sim2real.stages.pipeline.pipeline import load_pipeline
-
-TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "accepted")
-NOT_DRIFTED = Drift((Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 0.8),), 0.05, (), 18.0)
-
-
-class Stages:
-    """Stages that take up what the real ones do, and leave small files; the process may die in one.
-
-    Args:
-        root: Folder of all runs.
-        verdicts: Of each deployment that finishes.
-        lacking: Identifications, by their number from 0, that show too little.
-    """
-
-    def __init__(self, root, verdicts=("re-identify", "fine"), lacking=()):
-        self.root, self.verdicts, self.lacking = root, verdicts, lacking
-        self.calls, self.die = [], None
-
-    def __call__(self, stage, config, run_dir):
-        here = len(self.calls)
-        self.calls.append((stage, config))
-        inputs = {}
-        if stage == "identify" and config.log:
-            inputs = {f"log_{i}": Path(log) for i, log in enumerate(config.log)}
-        elif stage in TAKES:
-            before, output = TAKES[stage]
-            inputs = {output: newest(self.root, "pendulum", before, run_dir).output(output)}
-        number = 0 if run_dir is None else sum(a.finished for a in attempts(run_dir, stage))
-        with open_stage(self.root, "pendulum", stage, config, inputs, run_dir) as opened:
-            self._die(here, "within")
-            content = f"{opened.folder} {number}"  # no two outputs are the same
-            if stage == "record":
-                opened.output("log", "session.mcap").write_text(content)
-            if stage == "identify":
-                logs = tuple(Source.of(path, opened.run_dir) for path in inputs.values())
-                status = "not identifiable" if number in self.lacking else "accepted"
-                found = Identification("pendulum", logs, Judgement(status, (content,)), (TRIP,))
-                found.write(opened.output("parameters", "parameters.json"))
-            if stage == "train":
-                opened.output("bundle", "bundle").mkdir()
-                (opened.folder / "bundle" / "policy.json").write_text(content)
-                good = np.ones((1, 1))
-                History(np.ones(1), np.ones(1), good, good).save(opened.output("history", "history.json"))
-            if stage == "deploy":
-                opened.output("log_0", "episode_0.mcap").write_text(content)
-                advice, gap = Advice(self.verdicts[number], ("why",)), (Gap("success", 0.5, 1.0, -0.5),)
-                Deployment((Scores({}),), gap, drift=NOT_DRIFTED, advice=advice).save(opened.folder)
-                opened.output("result", "result.json")
-        self._die(here, "after")
-        return opened.result
-
-    def _die(self, call, when):
-        if self.die == (call, when):
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    def run(self, iterations=5, resume=None):
-        pipeline = load_pipeline("pendulum")
-        stages = {stage: getattr(pipeline, stage) for stage in STAGES}
-        flags = RunFlags(iterations=iterations, runs=self.root, resume=resume, **stages)
-        run_loop.run_all(pipeline, flags, self)
-        (run_dir,) = (self.root / "pendulum").iterdir()
-        return run_dir
 
 
 def killed(stages, call, when, **options):

@@ -1,94 +1,38 @@
 """Around the loop: what each verdict makes a run do again, and when it stops."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
+from loop_stages import WIDER, Stages, verdict
 
-from sim2real.artifacts.bundle import History
-from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Scores
-from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run.iterations import Iterations
-from sim2real.artifacts.run.run_folder import STAGES, Source, open_stage
+from sim2real.artifacts.run.run_folder import STAGES
 from sim2real.commands.flags import RunFlags
-from sim2real.commands.loop import run_loop
-from sim2real.errors import DelayChanged, Sim2RealError, UsageError
+from sim2real.errors import DelayChanged, UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.view.page.iterations import iterations_sections
-
-WIDER = "sim2real identify pendulum --bounds friction 0.1 80 --max-delay-s 0.1"
-FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
-
-
-def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False):
-    alarms = Drift((FRICTION if drift else replace(FRICTION, p=0.8),), 0.05, ("friction",) if drift else (), seconds)
-    gap = (Gap("success", success, 1.0, success - 1.0),)
-    return Deployment((Scores({}),), gap, drift=alarms, advice=Advice(status, (reason,)))
 
 
 @pytest.fixture
 def world(tmp_path, monkeypatch):
-    """Stages that leave what the loop reads; each deployment takes the next verdict."""
+    """Stages; ``go`` plays a run with these verdicts, and returns the stages after the first four and its rows."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sim2real.view.page.page.report", lambda run_dir: run_dir / "report.html")
-    seen = SimpleNamespace(
-        calls=[],
-        verdicts=[],
-        judgements=[],
-        asks=[],
-        trips=[],
-        successes=[],
-        first=4,
-        root=tmp_path / "runs" / "pendulum",
-    )
+    stages = Stages(tmp_path / "runs")
 
-    def call(stage, config, run_dir):
-        seen.calls.append((stage, config))
-        with open_stage(tmp_path / "runs", "pendulum", stage, config, run_dir=run_dir) as opened:
-            if stage == "record":
-                opened.output("log", "session.mcap").touch()
-            if stage == "identify":
-                logs = (Source("record/session.mcap", ""),)
-                status = seen.judgements.pop(0) if len(seen.calls) > seen.first and seen.judgements else "accepted"
-                if status == "fails":
-                    raise Sim2RealError("nothing could be simulated")
-                asked = "" if status != "hit a bound" else seen.asks.pop(0) if seen.asks else WIDER
-                told = Judgement(status, (), asked)
-                trip = seen.trips.pop(0) if len(seen.calls) > 4 and seen.trips else "accepted"
-                delays = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, trip)
-                found = Identification("pendulum", logs, told, (delays,))
-                found.write(opened.output("parameters", "parameters.json"))
-            if stage == "train":
-                curve = np.array([[seen.successes.pop(0) if seen.successes else 1.0]])
-                History(np.ones(1), np.ones(1), curve, curve).save(opened.output("history", "history.json"))
-            if stage == "deploy":
-                opened.output("log_0", "episode_0.mcap").touch()
-                found = seen.verdicts.pop(0)
-                if isinstance(found, DelayChanged):
-                    raise found
-                found.save(opened.folder)
-                opened.output("result", "result.json")
-        return opened.result
+    def go(*verdicts, **options):
+        stages.verdicts, stages.refused = list(verdicts), 0
+        run_dir = stages.run(**options)
+        return [s for s, _ in stages.calls[4:]], Iterations.load(run_dir).rows
 
-    def go(*verdicts, iterations=5, train=None, **told):
-        pipeline = load_pipeline("pendulum")
-        seen.verdicts = list(verdicts)
-        stages = {stage: getattr(pipeline, stage) for stage in STAGES}
-        stages["train"] = replace(pipeline.train, **(train or {}))
-        flags = RunFlags(iterations=iterations, runs=tmp_path / "runs", **stages, **told)
-        run_loop.run_all(pipeline, flags, call)
-        (run_dir,) = (tmp_path / "runs" / "pendulum").iterdir()
-        return [s for s, _ in seen.calls[4:]], Iterations.load(run_dir).rows
-
-    seen.go = go
-    return seen
+    stages.go = go
+    return stages
 
 
 def test_without_the_flag_a_run_goes_around_once(world):
     again, rows = world.go(verdict("re-identify"), iterations=1)
     assert (again, rows) == ([], ())
-    (folder,) = world.root.iterdir()
+    (folder,) = (world.root / "pendulum").iterdir()
     assert iterations_sections(folder) == []
 
 
@@ -99,7 +43,7 @@ def test_a_fine_robot_ends_the_loop(world, capsys):
     assert rows[0].stages == STAGES
     assert rows[1].stages == ("train.2", "deploy.2")
     assert [c.seed for s, c in world.calls if s == "train"] == [0, 1], "the same seed would train the same policy"
-    (folder,) = world.root.iterdir()
+    (folder,) = (world.root / "pendulum").iterdir()
     (section,) = iterations_sections(folder)
     assert [row[:3] for row in section.blocks[0].rows] == [
         ["1", "record, identify, train, deploy", "0.6000"],

@@ -1,0 +1,99 @@
+"""Stages that take up what the real ones do and leave small files, and a run with them."""
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.artifacts.bundle import History
+from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Gap, Scores
+from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
+from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, newest, open_stage
+from sim2real.artifacts.run.stage_status import TAKES
+from sim2real.commands.flags import RunFlags
+from sim2real.commands.loop import run_loop
+from sim2real.errors import Sim2RealError
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "accepted")
+FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
+WIDER = "sim2real identify pendulum --bounds friction 0.1 80 --max-delay-s 0.1"
+
+
+def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False):
+    """Return a deployment that was judged so."""
+    alarms = Drift((FRICTION if drift else replace(FRICTION, p=0.8),), 0.05, ("friction",) if drift else (), seconds)
+    gap = (Gap("success", success, 1.0, success - 1.0),)
+    return Deployment((Scores({}),), gap, drift=alarms, advice=Advice(status, (reason,)))
+
+
+class Stages:
+    """Stages that only write small files; the process may die in one.
+
+    Args:
+        root: Folder of all runs.
+        verdicts: Of each deployment that finishes: a status, a deployment, or an error that is raised.
+        lacking: Identifications, by their number from 0, that show too little.
+        judgements: Statuses of the identifications after the first one, in their order; "fails" is an error.
+        successes: Of the trainings, in simulation.
+    """
+
+    def __init__(self, root, verdicts=("re-identify", "fine"), lacking=(), judgements=(), successes=()):
+        self.root, self.verdicts, self.lacking = root, [*verdicts], lacking
+        self.judgements, self.successes = [*judgements], [*successes]
+        self.calls, self.die, self.refused = [], None, 0
+
+    def __call__(self, stage, config, run_dir):
+        here = len(self.calls)
+        self.calls.append((stage, config))
+        inputs = {}
+        if stage == "identify" and config.log:
+            inputs = {f"log_{i}": Path(log) for i, log in enumerate(config.log)}
+        elif stage in TAKES:
+            before, output = TAKES[stage]
+            inputs = {output: newest(self.root, "pendulum", before, run_dir).output(output)}
+        number = 0 if run_dir is None else sum(a.finished for a in attempts(run_dir, stage))
+        with open_stage(self.root, "pendulum", stage, config, inputs, run_dir) as opened:
+            self._die(here, "within")
+            content = f"{opened.folder} {number}"  # no two outputs are the same
+            if stage == "record":
+                opened.output("log", "session.mcap").write_text(content)
+            if stage == "identify":
+                status = self.judgements.pop(0) if number and self.judgements else "accepted"
+                status = "not identifiable" if number in self.lacking else status
+                if status == "fails":
+                    raise Sim2RealError("nothing could be simulated")
+                logs = tuple(Source.of(path, opened.run_dir) for path in inputs.values())
+                told = Judgement(status, (content,), WIDER if status == "hit a bound" else "")
+                Identification("pendulum", logs, told, (TRIP,)).write(opened.output("parameters", "parameters.json"))
+            if stage == "train":
+                opened.output("bundle", "bundle").mkdir()
+                (opened.folder / "bundle" / "policy.json").write_text(content)
+                curve = np.array([[self.successes.pop(0) if self.successes else 1.0]])
+                History(np.ones(1), np.ones(1), curve, curve).save(opened.output("history", "history.json"))
+            if stage == "deploy":
+                opened.output("log_0", "episode_0.mcap").write_text(content)
+                found = self.verdicts[number + self.refused]
+                if isinstance(found, Exception):
+                    self.refused += 1
+                    raise found
+                (verdict(found) if isinstance(found, str) else found).save(opened.folder)
+                opened.output("result", "result.json")
+        self._die(here, "after")
+        return opened.result
+
+    def _die(self, call, when):
+        if self.die == (call, when):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def run(self, iterations=5, resume=None, train=None, **told):
+        """Run; return the run folder."""
+        pipeline = load_pipeline("pendulum")
+        stages = {stage: getattr(pipeline, stage) for stage in STAGES}
+        stages["train"] = replace(pipeline.train, **(train or {}))
+        flags = RunFlags(iterations=iterations, runs=self.root, resume=resume, **stages, **told)
+        run_loop.run_all(pipeline, flags, self)
+        (run_dir,) = (self.root / "pendulum").iterdir()
+        return run_dir
