@@ -6,11 +6,14 @@ import threading
 import numpy as np
 import pytest
 from families import FAMILIES, IDS, STS
+from virtual_bus import IdleDevice
 
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError
+from sim2real.hardware.device import VOLTAGE, Counters, Transaction
 from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.plausibility import Plausibility
+from sim2real.hardware.safety.rig import Rig
 
 WAYS = ("stop", "stop_quietly", "close", "disable", "make_safe")
 NAMES = [family.name for family in FAMILIES]
@@ -232,3 +235,74 @@ def test_made_safe_while_the_torque_goes_on(family, writes, monkeypatch):
         robot.sleep(0.01)
         assert family.on(robot) == []
         assert not device.armed
+
+
+class Plain(IdleDevice):
+    """A device that sends whatever it is told, as a driver of a plug-in may."""
+
+    motors, commanded, silence_s, torque_withheld, counters = ("wheel",), VOLTAGE, 0.0, False, Counters()
+
+    def __init__(self):
+        self.log, self.hold = [], None
+
+    def disable(self):
+        self.log.append("off")
+
+    def command(self, values):
+        if self.hold is not None:
+            self.hold[0].set()
+            assert self.hold[1].wait(10.0)
+        self.log.append(values.tolist())
+        return Transaction(self.clock.now_ns(), 0, 0, 0)
+
+    def reach(self):
+        return np.full(1, -10.0), np.full(1, 10.0)
+
+    def rest(self):
+        return np.zeros(1)
+
+    def without_host(self): ...
+
+    def measure(self): ...
+
+    def effort(self, command, position_rad): ...
+
+
+def test_the_rig_sends_nothing_after_off_to_a_device_that_would_obey():
+    device = Plain()
+    rig = Rig(device, GateConfig(5.0))
+    rig.start()
+    watchdog = rig._done
+    rig.stop()
+    sent = list(device.log)
+    assert sent[-1] == "off"
+    rig._watch(watchdog)
+    rig._watch(threading.Event())
+    with pytest.raises(SafetyStop):
+        rig.command(np.ones(1), 0.0, 0.0)
+    assert device.log == sent
+    # The watchdog of the last episode does not speak in the next one.
+    rig.start()
+    begun = list(device.log)
+    rig._watch(watchdog)
+    assert device.log == begun
+    rig.close()
+
+
+def test_off_waits_for_a_command_that_is_on_its_way():
+    device = Plain()
+    rig = Rig(device, GateConfig(5.0))
+    rig.start()
+    rig._lock, device.hold = NotingLock(), (threading.Event(), threading.Event())
+    watchdog = threading.Thread(target=lambda: rig._watch(rig._done))
+    watchdog.start()
+    assert device.hold[0].wait(10.0)
+    leaving = threading.Thread(target=rig.stop)
+    leaving.start()
+    assert rig._lock.waited_for.wait(10.0)
+    assert "off" not in device.log
+    device.hold[1].set()
+    watchdog.join(10.0)
+    leaving.join(10.0)
+    assert device.log[-1] == "off"
+    rig.close()

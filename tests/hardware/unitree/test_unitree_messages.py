@@ -95,6 +95,7 @@ def test_bytes_of_another_message_are_refused(wire):
         LowCmd.from_wire(wire)
 
 
+@pytest.mark.process
 def test_a_reader_of_generated_types_gets_the_message():
     fields = {"__annotations__": LowCmd.__annotations__, "__module__": __name__}
     generated = dataclass(type(idl.IdlStruct)("LowCmd", (idl.IdlStruct,), fields, typename=LowCmd.__idl_typename__))
