@@ -14,6 +14,7 @@ import numpy as np
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.summary import ArtifactTable, Summed
 from sim2real.artifacts.timing import Timing
+from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.types import Json
@@ -51,6 +52,10 @@ class Recording(Summed):
         """
         path = Path(path)
         log = path / LOG if path.is_dir() else path
+        if path.is_dir() and not log.is_file():
+            inside = path / "record"
+            hint = f"name its record stage, {inside}" if inside.is_dir() else "name a log, or a record stage's folder"
+            raise Sim2RealError(f"{path} is a folder without {LOG}", hint=hint)
         truth = truth or log.with_name(TRUTH)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", TruncatedLogWarning)

@@ -40,6 +40,7 @@ def pendulum():
         (lambda p: sim2real.record(p, None), "folder must be the path of a folder; got NoneType"),
         (lambda p: sim2real.record(p, "folder", DeployConfig()), "of type RecordConfig; got DeployConfig"),
         (lambda p: sim2real.record(p, "folder", {"seconds": 3}), "config has no seconds. Available: "),
+        (lambda p: sim2real.identify(p, RECORDING, {"generations": "many"}), "generations must be a number"),
         (lambda p: sim2real.identify(p, "nope.mcap"), "there is no log nope.mcap"),
         (lambda p: sim2real.identify("nope.mcap", p), "there is no log nope.mcap"),
         (lambda p: sim2real.identify(p, [Path("nope.mcap")]), "there is no log nope.mcap"),
@@ -90,6 +91,10 @@ def test_artifacts_are_saved_and_loaded_by_any_path(kind, tmp_path):
     assert python_arguments.identification_of(folder).values == {"gain": 21.0494}
     with pytest.raises(Sim2RealError, match="there is no log"):
         Recording.load(kind(tmp_path / "none.mcap"))
+    (tmp_path / "run" / "record").mkdir(parents=True)
+    with pytest.raises(Sim2RealError) as caught:
+        Recording.load(kind(tmp_path / "run"))
+    assert "run/record" in caught.value.hint
     for load in (Bundle.load, Deployment.load, Timing.load):
         with pytest.raises(Sim2RealError):
             load(kind(tmp_path / "none"))

@@ -45,7 +45,7 @@ def require_new(
             messages.append(f"{log.path} is {path}, which these parameters were identified from")
         elif any(_contains(positions, piece) for piece in pieces):
             messages.append(f"{log.path} holds measurements that these parameters were identified from")
-    return _refuse(messages, "take a log of later motion, or --force: errors there are no test of a fit", force)
+    return _refuse(messages, "take a log of later motion: errors there are no test of a fit", force)
 
 
 def require_standing(robot: RecordedRobot, log: Recording, model: IdentifiableModel) -> None:
@@ -94,12 +94,12 @@ def require_apart(
         for other, other_digest, whole in zip(fitted, hashes, positions, strict=True):
             if (digest and digest == other_digest) or any(_contains(whole, p) for p in pieces):
                 messages.append(f"{log.path} is to be held out, and {other.path}, with the same measurements, fitted")
-    _refuse(messages, "name each log once, or --force: held-out errors of a fitted log are no test of the fit", force)
+    _refuse(messages, "name each log once: held-out errors of a fitted log are no test of the fit", force)
 
 
 def _refuse(messages: list[str], hint: str, force: bool) -> list[str]:
     if messages and not force:
-        raise UsageError("; ".join(messages), hint=hint)
+        raise UsageError("; ".join(messages), hint=f"{hint}; --force (in Python {{'force': True}}) uses it anyway")
     for sentence in messages:
         note(f"warning: {sentence}")
     return messages

@@ -122,6 +122,9 @@ def config_of(value: Any, default: T, name: str = "config") -> T:
     if unknown := [f"{n}" for n in value if n not in {f.name for f in fields(base)}]:
         names = ", ".join(f.name for f in fields(base))
         raise UsageError(f"{name} has no {', '.join(unknown)}. Available: {names}")
+    for n, v in value.items():
+        if isinstance(getattr(base, n), int | float) and isinstance(v, str):
+            raise wrong(v, f"{name}.{n}", "a number", f"the default is {getattr(base, n)!r}")
     # Replace the fields; nested dicts replace fields of nested configurations.
     new = {n: _inner(getattr(base, n), v, f"{name}.{n}") for n, v in value.items()}
     try:
