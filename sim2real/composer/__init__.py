@@ -1,7 +1,7 @@
 """Worlds from parts: entities, arenas, tasks, observables and the environment that runs them.
 
 Names and semantics are those of ``dm_control.composer``; models are MuJoCo's ``MjSpec``. A task uses the names here and
-in ``mjcf``, ``observation``, ``variation`` and ``initializers``. ``models`` edits and composes models, ``physics`` has
+in ``mjcf``, ``observation`` and ``variation``. ``models`` edits and composes models, ``physics`` has
 the two engines. ``BraxEnv`` and ``MjxVectorEnv`` live in ``sim2real.interop``.
 """
 
@@ -23,10 +23,10 @@ from sim2real.composer.errors import EpisodeInitializationError as EpisodeInitia
 from sim2real.composer.errors import PhysicsError as PhysicsError
 from sim2real.composer.hooks import HOOK_NAMES as HOOK_NAMES
 from sim2real.composer.initializer import Initializer as Initializer
-from sim2real.composer.initializers.prop_initializer import PropPlacer as PropPlacer
 from sim2real.composer.models.model import Model as Model
 from sim2real.composer.observables import Observables as Observables
 from sim2real.composer.physics.c.physics import Physics as Physics
+from sim2real.composer.prop_placer import PropPlacer as PropPlacer
 from sim2real.composer.robot import SENSOR_SITES_GROUP as SENSOR_SITES_GROUP
 from sim2real.composer.robot import Robot as Robot
 from sim2real.composer.task import NullTask as NullTask

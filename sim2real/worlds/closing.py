@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.composer.models.mjcf.translate import mj
-from sim2real.composer.physics.mjx.import_mjx import mjx
+from sim2real.composer.physics.mjx.import_mjx import held_links, mjx
 from sim2real.types import MjModel, PyTree
 
 _PATH, _CORRECTIONS = 32, 8
@@ -87,7 +87,8 @@ class Closing:
 
     def _rows(self, qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Return errors ``(rows,)`` and Jacobian ``(rows, nv)`` of the equalities."""
-        data: PyTree = mjx.com_pos(self._model, mjx.kinematics(self._model, self._data.replace(qpos=qpos)))
+        with held_links():
+            data: PyTree = mjx.com_pos(self._model, mjx.kinematics(self._model, self._data.replace(qpos=qpos)))
         if self._model.ntendon:
             data = mjx.tendon(self._model, data)
         data = mjx.make_constraint(self._model, data)

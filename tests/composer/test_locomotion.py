@@ -182,25 +182,6 @@ def test_tasks_give_the_same_rewards_and_observations(oracle, ours, name, monkey
                 np.testing.assert_array_equal(b[key], value, err_msg=key)
 
 
-@pytest.mark.parametrize("own", [pytest.param(False, marks=pytest.mark.night), True], ids=["the arm's", "ours"])
-def test_an_arm_reaches_for_a_pose_as_dm_controls_does(oracle, ours, own, monkeypatch):
-    found = []
-    for package, kit in zip(PACKAGES, (oracle, ours), strict=True):
-        kinova = module(package, "entities.manipulators.kinova")
-        arena, arm, hand = kit.composer.Arena(), kinova.JacoArm(), kinova.JacoHand()
-        arena.attach(arm)
-        arm.attach(hand)
-        if own and package == "ported":
-            monkeypatch.setattr(arm, "set_site_to_xpos", None, raising=False)
-        place = importlib.import_module(f"{kit.composer.__name__}.initializers.tcp_initializer")
-        physics = kit.mjcf.Physics.from_mjcf_model(arena.mjcf_model)
-        pose = np.array([0.1, 0.2, 0.3]), np.array([0.0, 1.0, 1.0, 0.0])
-        place.ToolCenterPointInitializer(hand, arm, *pose)(physics, np.random.RandomState(0))
-        np.testing.assert_allclose(physics.bind(hand.tool_center_point).xpos, pose[0], atol=1e-8)
-        found.append(np.array(physics.bind(arm.joints).qpos))
-    np.testing.assert_allclose(found[1], found[0], atol=1e-6)
-
-
 def test_a_camera_follows_players(ours, monkeypatch):
     monkeypatch.setattr("dm_control.mujoco.engine.Physics.contexts", SimpleNamespace(mujoco=None))
     poses = []

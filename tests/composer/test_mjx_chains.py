@@ -5,7 +5,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim2real.composer.physics.mjx import mjx
+from sim2real.composer.physics.mjx.import_mjx import held_links, mjx
 
 
 def _chain(links: int) -> mujoco.MjModel:
@@ -22,7 +22,8 @@ def programs():
         device, data = mjx.put_model(model), mjx.make_data(model)
         angles = np.linspace(-1.0, 1.0, 8 * links, dtype=np.float32).reshape(8, links)
         run = jax.jit(jax.vmap(lambda q: mjx.kinematics(device, data.replace(qpos=q)).xpos))
-        return model, angles, run.lower(angles).compile()
+        with held_links():
+            return model, angles, run.lower(angles).compile()
 
     return make
 

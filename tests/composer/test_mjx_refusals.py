@@ -10,7 +10,6 @@ from dm_env import specs
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.variation.colors import HsvVariation
 from sim2real.errors import UsageError
 
 ROD = """
@@ -251,7 +250,7 @@ def test_states_keyframes_colours_and_choices():
         physics.reset(0)
         physics.set_state(0.5 * physics.get_state())
         hue = 0.6 + 0.0 * physics.bind(self.hinge).qpos[0]
-        physics.bind(self.geom).rgba = HsvVariation(hue, 0.5, 0.8)(random_state=random_state)
+        physics.bind(self.geom).rgba = physics.np.stack([hue, 0.5 + 0 * hue, 0.8 + 0 * hue, 1.0 + 0 * hue])
         drawn = physics.np.asarray(random_state.choice(3, size=4, p=[0, 0, 1]))
         physics.variables["drawn"] = drawn + 0.0 * random_state.standard_normal(4)
 

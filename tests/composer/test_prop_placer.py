@@ -80,3 +80,12 @@ def test_settling_is_tried_again_then_fails(world):
         placer(physics, np.random.RandomState(0))
     with pytest.raises(ValueError, match="greater than zero"):
         composer.PropPlacer(spheres, [0, 0, 0], max_settle_physics_attempts=0)
+
+
+def test_a_failed_placement_leaves_contacts_on(world):
+    physics, spheres = world
+    placer = composer.PropPlacer(spheres, deterministic.Constant((0, 0, 0.3)), max_attempts_per_prop=2)
+    for _ in range(2):
+        with pytest.raises(composer.EpisodeInitializationError):
+            placer(physics, np.random.RandomState(0))
+        assert physics.model.geom_contype.tolist() == [1, 1, 1, 1]

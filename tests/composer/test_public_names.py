@@ -18,7 +18,6 @@ NAMES = {
         "get_attachment_frame", "get_frame_freejoint", "get_frame_joints", "get_freejoint",
     ],
     "composer.physics.mjx": ["JaxRandomState", "MjxEnvironment", "MjxPhysics", "State"],
-    "composer.initializers": ["JointStaticIsolator", "PropPlacer", "ToolCenterPointInitializer"],
     "composer.observation": [
         "DEFAULT_BUFFER_SIZE", "DEFAULT_DELAY", "DEFAULT_UPDATE_INTERVAL", "Updater", "observable",
     ],
@@ -29,11 +28,9 @@ NAMES = {
 }  # fmt: skip
 MODULES = [
     "arena", "define", "entity", "environment", "initializer", "robot", "task", "mjcf.element",
-    "initializers.prop_initializer", "initializers.tcp_initializer", "initializers.utils",
     "observation.observable.base", "observation.observable.mjcf", "observation.updater",
     *(f"variation.{name}" for name in (
-        "base", "colors", "deterministic", "distributions", "math", "noises", "rotations", "variation_broadcaster",
-        "variators",
+        "base", "deterministic", "distributions", "noises", "variators",
     )),
 ]  # fmt: skip
 """Modules that dm_control has under these names too: what is written for it imports from them."""

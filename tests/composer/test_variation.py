@@ -3,15 +3,7 @@ import pytest
 
 from sim2real import composer
 from sim2real.composer import mjcf, variation
-from sim2real.composer.variation import (
-    colors,
-    deterministic,
-    distributions,
-    math,
-    noises,
-    rotations,
-    variation_broadcaster,
-)
+from sim2real.composer.variation import deterministic, distributions, noises
 
 RNG = np.random.RandomState
 
@@ -76,35 +68,6 @@ def test_noise_builds_on_the_initial_or_the_current_value():
     for kind, expected in ((noises.Additive, (12, 102)), (noises.Multiplicative, (20, 200))):
         fixed, cumulative = kind(deterministic.Constant(2)), kind(deterministic.Constant(2), cumulative=True)
         assert (fixed(10, 100, None), cumulative(10, 100, None)) == expected
-
-
-def test_rotations_are_unit_quaternions():
-    quaternion = rotations.UniformQuaternion()(random_state=RNG(0))
-    assert np.linalg.norm(quaternion) == pytest.approx(1)
-    turn = rotations.QuaternionFromAxisAngle([0, 0, 1], distributions.Uniform(np.pi / 2, np.pi / 2, single_sample=True))
-    np.testing.assert_allclose(turn(random_state=RNG(0)), [2**-0.5, 0, 0, 2**-0.5])
-    np.testing.assert_array_equal(rotations.QuaternionFromAxisAngle([0, 0, 1], 0.0)(), [1, 0, 0, 0])
-    np.testing.assert_allclose(rotations.QuaternionPreMultiply(turn)(np.array([0.0, 1, 0, 0]), None, None)[2], 2**-0.5)
-    np.testing.assert_allclose(rotations.QuaternionRotate(turn, [1.0, 0, 0])(), [0, 1, 0], atol=1e-12)
-    point = distributions.UniformPointOnSphere()(random_state=RNG(0))
-    assert np.linalg.norm(point) == pytest.approx(1)
-
-
-def test_colours_and_functions():
-    np.testing.assert_allclose(colors.HsvVariation(0.5, 1, 1)(), [0, 1, 1, 1])
-    np.testing.assert_allclose(colors.GrayVariation(0.3, alpha=0.5)(), [0.3, 0.3, 0.3, 0.5])
-    np.testing.assert_allclose(colors.RgbVariation(0.1, deterministic.Constant(0.2), 0.3)(), [0.1, 0.2, 0.3, 1])
-    assert math.Norm([deterministic.Constant(3), 4])() == 5
-    assert (math.Max([1, 2])(), math.Min([1, 2])(), math.Log(1.0)()) == (2, 1, 0)
-
-
-def test_broadcast_draws_are_the_same_for_all():
-    broadcaster = variation_broadcaster.VariationBroadcaster(distributions.Uniform())
-    first, second = broadcaster.get_proxy(), broadcaster.get_proxy()
-    rng = RNG(0)
-    ahead = [first(random_state=rng) for _ in range(3)]
-    assert [second(random_state=rng) for _ in range(3)] == ahead
-    assert len(set(ahead)) == 3
 
 
 @pytest.fixture

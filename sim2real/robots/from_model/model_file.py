@@ -1,12 +1,12 @@
-"""A model file as MuJoCo reads it, within a budget: what would take MuJoCo minutes or gigabytes is refused first."""
+"""A model file as MuJoCo reads it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any, Final
 
-from sim2real.composer.models.mjcf.budget import Budget
-from sim2real.composer.models.mjcf.translate import mj
+import mujoco as mj
+
 from sim2real.errors import UsageError
 from sim2real.robots.from_model import meshes
 
@@ -25,12 +25,10 @@ def read(path: Path, contacts: bool) -> tuple[Any, list[str]]:
         contacts: Whether bodies touch, so that all meshes are needed.
 
     Raises:
-        UsageError: When the file is missing, beyond the budget, or MuJoCo cannot read or compile it.
+        UsageError: When the file is missing, or MuJoCo cannot read or compile it.
     """
-    # Count the file's memory before MuJoCo reads it.
     if not path.is_file():
         raise UsageError(f"there is no model {path}", hint="name an MJCF or URDF file with --mjcf")
-    Budget(path).check(path)
     omitted: list[str] = []
     notes: list[str] = []
     packaged = False

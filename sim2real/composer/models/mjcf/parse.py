@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sim2real.composer.models.mjcf.budget import Budget
 from sim2real.composer.models.mjcf.explicit_values import Document
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
@@ -39,10 +38,8 @@ def from_string(
         ValueError: MuJoCo's own message, when the document cannot be parsed.
         UsageError: When a document that it includes is not there.
     """
-    budget = Budget(Path(folder) / "the document", finite=False)
     text = _decoded(text, "the document") if isinstance(text, bytes) else text
-    whole = _with_included(text, Path(folder), Path(folder), assets or {}, budget)
-    budget.count(whole)
+    whole = _with_included(text, Path(folder), Path(folder), assets or {})
     spec, document = _parse(whole, assets)
     if os.fspath(folder):
         spec.modelfiledir = str(Path(folder).resolve())
@@ -63,9 +60,7 @@ def from_path(path: str | os.PathLike[str], assets: dict[str, bytes] | None = No
     path = Path(path)
     if not path.is_file():
         raise UsageError(f"there is no MJCF file {str(path)!r}", hint="give the path of a file that exists")
-    budget = Budget(path, finite=False)
-    whole = _read(path, path.parent, assets or {}, budget)
-    budget.count(whole)
+    whole = _read(path, path.parent, assets or {})
     spec, document = _parse(whole, assets)
     spec.modelfiledir = str(path.parent.resolve())
     return spec, document
@@ -78,24 +73,19 @@ def _decoded(text: bytes, what: str) -> str:
         raise UsageError(f"{what} is not UTF-8: byte 0x{text[error.start]:02x}", hint="save it as UTF-8") from None
 
 
-def _read(path: Path, folder: Path, assets: dict[str, bytes], budget: Budget, level: int = 0) -> str:
+def _read(path: Path, folder: Path, assets: dict[str, bytes], level: int = 0) -> str:
     """Return the text of a document with its included documents in place."""
     name = str(path.relative_to(folder)) if path.is_relative_to(folder) else str(path)
-    if name not in assets:
-        budget.add(path.stat().st_size)
     text = _decoded(assets[name] if name in assets else path.read_bytes(), str(path))
-    return _with_included(text, path.parent, folder, assets, budget, level)
+    return _with_included(text, path.parent, folder, assets, level)
 
 
-def _with_included(
-    text: str, beside: Path, folder: Path, assets: dict[str, bytes], budget: Budget, level: int = 0
-) -> str:
+def _with_included(text: str, beside: Path, folder: Path, assets: dict[str, bytes], level: int = 0) -> str:
     """Return a document with its included documents in place; two folders are searched for them.
 
     Args:
         level: Number of documents that include this one.
     """
-    budget.add(len(text))
     if level > _MOST_INCLUDES:
         raise UsageError(f"{beside} has documents that include each other", hint="remove the circle")
 
@@ -107,7 +97,7 @@ def _with_included(
                 f"the document includes {match[1]!r}, which is not there",
                 hint=f"looked for {candidates[0]}; from_xml_string takes model_dir and assets",
             )
-        body = _ROOT.search(_read(path, folder, assets, budget, level + 1))
+        body = _ROOT.search(_read(path, folder, assets, level + 1))
         return body[2] if body else ""
 
     return _INCLUDE.sub(included, _COMMENT.sub("", text)) if "<include" in text else text

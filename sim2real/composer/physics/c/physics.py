@@ -36,19 +36,18 @@ class Physics(BoundPhysics):
 
     Args:
         legacy_step: After a step, also compute positions and velocities of the new state, as dm_control does.
-        data: A ``mujoco.MjData`` after ``mj_resetData``; default: a new one.
     """
 
     np = np
 
-    def __init__(self, model: MjModel, legacy_step: bool = True, data: MjData | None = None) -> None:
+    def __init__(self, model: MjModel, legacy_step: bool = True) -> None:
         self.legacy_step = legacy_step
         self.variables: dict[str, PyTree] = {}
         self._suppress = False
-        self._start(model, data)
+        self._start(model)
 
-    def _start(self, model: MjModel, data: MjData | None = None) -> None:
-        self._load(model, mj.MjData(model) if data is None else data)
+    def _start(self, model: MjModel) -> None:
+        self._load(model, mj.MjData(model))
         with self.suppress_physics_errors():
             self.after_reset()
 

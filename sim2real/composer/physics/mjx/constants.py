@@ -11,6 +11,7 @@ from mujoco import mjx
 
 from sim2real.composer.models.mjcf.translate import mj
 from sim2real.composer.physics.arrays import multiply_quaternions, rotate
+from sim2real.composer.physics.mjx.import_mjx import held_links
 from sim2real.composer.physics.mjx.warp.warp_fields import is_warp, varies
 from sim2real.errors import UsageError
 
@@ -75,7 +76,8 @@ def derive(host: MjModel, model: mjx.Model) -> dict[str, jax.Array]:
 @jax.jit
 def _at_reference(model: mjx.Model, data: PyTree) -> mjx.Data:
     """Return what follows from the reference position; traced once for all programs with a model of this form."""
-    data = mjx.com_pos(model, mjx.kinematics(model, data.replace(qpos=model.qpos0)))
+    with held_links():
+        data = mjx.com_pos(model, mjx.kinematics(model, data.replace(qpos=model.qpos0)))
     return mjx.transmission(model, mjx.crb(model, mjx.tendon(model, mjx.camlight(model, data))))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import weakref
 from collections.abc import Iterable
@@ -149,7 +150,7 @@ class MjxEnvironment:
         views.freeze(self.model)
         # Trace once without physics to learn what a copy must carry.
         self._changed: tuple[str, ...] = ()
-        self._dry = self._stays_dirty = False
+        self.has_reward = self._stays_dirty = False
         self._steady = True
         self._earned: PyTree = (np.zeros(()), np.zeros(()), {})  # like a reward, a discount and a reward's terms
         self._discover()
@@ -162,17 +163,28 @@ class MjxEnvironment:
         self._action_spec = self.task.action_spec(view)
 
     def _physics(
-        self, state: State | None = None, model: mjx.Model | None = None, law: stepping.Law | None = None
+        self,
+        state: State | None = None,
+        model: mjx.Model | None = None,
+        law: stepping.Law | None = None,
+        initial: mjx.Data | None = None,
+        dry: bool = False,
     ) -> tuple[MjxPhysics, JaxRandomState]:
-        """Return the view of a state, or of the model's initial state, for hooks."""
+        """Return the view of a state, or of an initial state, for hooks.
+
+        Args:
+            initial: Start of the episodes; default: the model's.
+            dry: Whether no physics is computed.
+        """
+        initial = self.initial if initial is None else initial
         compiled = self.mjx_model if model is None else model
-        data = self.initial if state is None else state.data
+        data = initial if state is None else state.data
         engine = stepping.Lawful(law) if law else self._warp or stepping
         physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, engine)
         physics.changed.update(self._changed)  # every copy carries every field that any hook sets
         physics.switch_on()
-        physics.start = self.initial
-        physics.dry = self._dry
+        physics.start = initial
+        physics.dry = dry
         if state is None:
             # On Warp no quantity has been computed yet; a copy's own model is not the one of the initial data.
             physics.is_dirty = self._warp is not None or model is not None
@@ -187,13 +199,11 @@ class MjxEnvironment:
         """Trace resets and steps, without physics, to find out what hooks set and keep; programs must carry it."""
         key = jax.random.key(0)
         action = jax.tree.map(lambda s: jnp.zeros(s.shape, jax.dtypes.canonicalize_dtype(s.dtype)), self._action_spec)
-        self._dry = True
         with self._hooks.watching((self.task, *self.task.iter_entities())):
             state, after = self._trace(key, action)
             self._earned = after.reward, after.discount, after.terms
             if self._stays_dirty:
                 state, after = self._trace(key, action)
-        self._dry = False
         self._changed = tuple(sorted({*state.leaves, *after.leaves}))
         missing = sorted(set(after.variables) - set(state.variables))
         if missing:
@@ -204,8 +214,8 @@ class MjxEnvironment:
         check_variables(state.variables, after.variables)
 
     def _trace(self, key: jax.Array, action: jax.Array) -> tuple[State, State]:
-        state = jax.eval_shape(self.reset, key)
-        return state, jax.eval_shape(self.step, state, action)
+        state = jax.eval_shape(functools.partial(self._reset, dry=True), key)
+        return state, jax.eval_shape(functools.partial(self._step, dry=True), state, action)
 
     def reset(
         self,
@@ -221,7 +231,18 @@ class MjxEnvironment:
             start: Positions ``(nq,)`` and velocities ``(nv,)`` that the hooks find; default: the model's, at rest.
             law: Sets fields of the model from the state, not on Warp; ``step`` takes the same.
         """
-        physics, random_state = self._physics(None, model, law)
+        return self._reset(key, model, start, law)
+
+    def _reset(
+        self,
+        key: jax.Array,
+        model: mjx.Model | None = None,
+        start: tuple[ArrayLike, ArrayLike] | None = None,
+        law: stepping.Law | None = None,
+        initial: mjx.Data | None = None,
+        dry: bool = False,
+    ) -> State:
+        physics, random_state = self._physics(None, model, law, initial, dry)
         random_state.key = key
         if start is not None:
             physics.replace("data", "qpos", start[0])
@@ -257,12 +278,7 @@ class MjxEnvironment:
         Args:
             data: Start of the episodes; default: ``initial``.
         """
-        before = self._dry, self.initial
-        self._dry, self.initial = True, self.initial if data is None else data
-        try:
-            return self.reset(key, model, start)
-        finally:
-            self._dry, self.initial = before
+        return self._reset(key, model, start, initial=data, dry=True)
 
     def step_apart(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> tuple[State, jax.Array]:
         """Run the hooks of a control step without its physics.
@@ -273,8 +289,8 @@ class MjxEnvironment:
         Returns:
             The copy, and the controls of each physics step ``(substeps, nu)``.
         """
-        physics, random_state = self._physics(state, model)
-        physics.dry, controls = True, []
+        physics, random_state = self._physics(state, model, dry=True)
+        controls = []
         self._hooks.run("before_step", physics, action, random_state)
         for _ in range(self.substeps):
             self._hooks.run("before_substep", physics, action, random_state)
@@ -294,8 +310,18 @@ class MjxEnvironment:
             action: Shape ``(nu,)``, unless the task has an ``action_spec`` of its own.
             model: The ``mjx.Model`` of this copy; default: the compiled one.
         """
+        return self._step(state, action, model, law)
+
+    def _step(
+        self,
+        state: State,
+        action: jax.Array,
+        model: mjx.Model | None = None,
+        law: stepping.Law | None = None,
+        dry: bool = False,
+    ) -> State:
         # Run the hooks and the physics steps.
-        physics, random_state = self._physics(state, model, law)
+        physics, random_state = self._physics(state, model, law, dry=dry)
         self._hooks.run("before_step", physics, action, random_state)
         rings, diverged = self._substeps(physics, random_state, state, action)
         self._hooks.run("after_step", physics, random_state)
@@ -306,12 +332,12 @@ class MjxEnvironment:
         dtype, task = state.reward.dtype, type(self.task).__name__
         # Compute the reward, the discount and the end of the episode.
         earned = self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics)
-        self.has_reward = not (isinstance(earned, int | float) and earned == 0)
         reward, terms = split_reward(earned)
         discount = jnp.asarray(self._hooks.call(f"{task}.get_discount", self.task.get_discount, physics), dtype)
         ends = self._hooks.call(f"{task}.should_terminate_episode", self.task.should_terminate_episode, physics)
         observation = {r.name: r.read(rings[r.name], now) for r in self._rings}
-        if self._dry:
+        if dry:  # while the environment is made
+            self.has_reward = not (isinstance(earned, int | float) and earned == 0)
             self._stays_dirty = self._stays_dirty or physics.is_dirty is not False
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
@@ -343,14 +369,14 @@ class MjxEnvironment:
             self._hooks.run("after_substep", physics, random_state)
             now, counts = state.steps * self.substeps + i + 1, i < self.substeps - 1
             new = {r.name: r.update(rings[r.name], now, physics, random_state, counts) for r in buffered}
-            if self._dry:  # is dirtiness the same before every physics step?
+            if physics.dry:  # is dirtiness the same before every physics step?
                 self._steady = physics.is_dirty is entry
             dirty = jnp.asarray(physics.is_dirty, bool)
             return (physics.tree(random_state), {**rings, **new}, dirty, diverged), None
 
         # One physics step needs no loop; several become a scan, so that programs stay small.
         carry = (physics.tree(random_state), state.rings, jnp.asarray(entry, bool), jnp.zeros((), bool))
-        if self.substeps == 1 or self._dry:
+        if self.substeps == 1 or physics.dry:
             carry, _ = substep(carry, jnp.zeros((), jnp.int32))
             tree, rings, _, diverged = carry
         else:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
 import jax
@@ -19,14 +20,23 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 _vmap = scan._nvmap
+_tracing = threading.RLock()
 
 
-def hold_links() -> None:
-    """Have MJX's walks along the tree of bodies end a fusion of XLA's at each link.
+@contextlib.contextmanager
+def held_links() -> Iterator[None]:
+    """Have MJX's walks along the tree of bodies end a fusion of XLA's at each link, for what is traced in the block.
 
-    On a CPU XLA fuses the whole chain, and computes each link's pose at each use: twice as often with every link.
+    On a CPU XLA fuses the whole chain, and computes each link's pose at each use: twice as often with every link. Code
+    that calls MJX elsewhere is not affected; one thread at a time traces such a block.
     """
-    scan._nvmap = _held
+    with _tracing:
+        before = scan._nvmap
+        scan._nvmap = _held
+        try:
+            yield
+        finally:
+            scan._nvmap = before
 
 
 def _held(f: Callable[..., T], carry: T | None, *args: jax.Array) -> T:
@@ -39,6 +49,3 @@ def _barrier(leaf: PyTree) -> PyTree:
     """Return a leaf behind a barrier, unless it is a type of joint: the trace depends on those."""
     is_static = not isinstance(leaf, jax.Array) or not jnp.issubdtype(leaf.dtype, jnp.inexact)
     return leaf if is_static else jax.lax.optimization_barrier(leaf)
-
-
-hold_links()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 from mujoco import mjx
 
+from sim2real.composer.physics.mjx.import_mjx import held_links
 from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.physics.mjx.random import JaxRandomState
 from sim2real.composer.physics.mjx.warp.warp_fields import is_warp
@@ -74,7 +75,8 @@ def _touches(physics: MjxPhysics, geoms: jax.Array, later: jax.Array) -> jax.Arr
     if physics.dry:
         return jnp.zeros((), bool)
     model = physics.mjx_model
-    data = mjx.collision(model, mjx.com_pos(model, mjx.kinematics(model, physics.mjx_data)))
+    with held_links():
+        data = mjx.collision(model, mjx.com_pos(model, mjx.kinematics(model, physics.mjx_data)))
     impl: Any = data._impl
     contact = impl.contact
     pair = jnp.stack([contact.geom1, contact.geom2])

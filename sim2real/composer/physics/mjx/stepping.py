@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
+from sim2real.composer.physics.mjx.import_mjx import held_links
+
 if TYPE_CHECKING:
     from sim2real.types import PyTree
 
@@ -66,6 +68,7 @@ class Lawful:
 
 
 @jax.jit
+@held_links()
 def _integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if model.opt.integrator == mjx.IntegratorType.RK4:
         # MuJoCo leaves sensors as they were before the step, mjx.rungekutta4 as in its last stage
@@ -85,6 +88,7 @@ def forward(model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Dat
 
 
 @jax.jit
+@held_links()
 def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute the quantities of positions and velocities, and set the state as MuJoCo does.
 
@@ -100,6 +104,7 @@ def _positions(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 @jax.jit
+@held_links()
 def _react(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Compute forces and accelerations from what follows from positions and velocities."""
     data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))

@@ -11,9 +11,7 @@ import numpy as np
 from sim2real.composer import variation
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.initializer import Initializer
-from sim2real.composer.initializers.utils import JointStaticIsolator
 from sim2real.composer.models.traversal import get_frame_freejoint
-from sim2real.composer.variation.rotations import IDENTITY_QUATERNION
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -53,7 +51,7 @@ class PropPlacer(Initializer):
         self,
         props: Iterable[Entity],
         position: Varying,
-        quaternion: Varying = IDENTITY_QUATERNION,
+        quaternion: Varying = (1.0, 0.0, 0.0, 0.0),
         ignore_collisions: bool = False,
         max_qvel_tol: float = 1e-3,
         max_qacc_tol: float = 1e-2,
@@ -99,16 +97,20 @@ class PropPlacer(Initializer):
             return
         cached = [self._disable_contacts(physics, prop) for prop in (*self._props, *ignored)]
         try:
-            physics.forward()
-        except PhysicsError as error:
-            raise PhysicsError(
-                "Despite disabling contact for all props in this initializer, `physics.forward()` resulted in a "
-                f"`PhysicsError`: {error}"
-            ) from error
-        if self._settles:
-            self._place_and_settle(physics, random_state, cached)
-        else:
-            self._place(physics, random_state, cached)
+            try:
+                physics.forward()
+            except PhysicsError as error:
+                raise PhysicsError(
+                    "Despite disabling contact for all props in this initializer, `physics.forward()` resulted in a "
+                    f"`PhysicsError`: {error}"
+                ) from error
+            if self._settles:
+                self._place_and_settle(physics, random_state, cached)
+            else:
+                self._place(physics, random_state, cached)
+        finally:  # also after a failure: the next attempt may run on the same model
+            for contacts in cached:
+                _restore(contacts)
 
     def _place_on_mjx(self, physics: MjxPhysics, random_state: JaxRandomState, ignored: list[Entity]) -> None:
         """Place the props inside a compiled program; ``physics.fail`` marks the copies without a place."""
@@ -168,11 +170,12 @@ class PropPlacer(Initializer):
             self._place(physics, random_state, cached)
             start = physics.data.time
             # Run the physics until the props rest; the time of the physics does not count.
-            isolator = JointStaticIsolator(physics, self._joints)
+            held, positions, velocities = self._held_joints(physics)
             try:
                 while physics.data.time - start < self._max_time:
-                    with isolator:
-                        physics.step()
+                    physics.step()
+                    if positions.size:
+                        held.qpos, held.qvel = positions, velocities
                     speed, acceleration = np.abs(moving.qvel).max(), np.abs(moving.qacc).max()
                     rests = speed < self._qvel_tol and acceleration < self._qacc_tol
                     if rests and physics.data.time - start > self._min_time:
@@ -189,6 +192,12 @@ class PropPlacer(Initializer):
                 message, hint="raise max_settle_physics_time or max_settle_physics_attempts"
             )
         _log.warning(message)
+
+    def _held_joints(self, physics: Physics) -> tuple[Any, np.ndarray, np.ndarray]:
+        """Return all joints but those of the props, bound, and their present positions and velocities."""
+        root = self._joints[0].root.root_model
+        bound = physics.bind([j for j in root.find_all("joint") if j not in self._joints])
+        return bound, bound.qpos.copy(), bound.qvel.copy()
 
 
 def _restore(contacts: _Contacts) -> None:
