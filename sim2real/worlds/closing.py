@@ -8,11 +8,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.composer.physics.mjx.import_mjx import held_links, mjx
 from sim2real.types import MjModel, PyTree
+
+mj: Any = mujoco
 
 _PATH, _CORRECTIONS = 32, 8
 """Steps from the model's start to the recorded angles, and Newton steps there. A loop has several solutions: a path of

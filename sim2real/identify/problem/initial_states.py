@@ -6,13 +6,16 @@ each tree. The states at the last points are cached, as a descent uses them agai
 
 from collections.abc import Callable, Mapping
 from itertools import zip_longest
+from typing import Any
 
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.problem.residuals import STATE_DIFFERENCE, InitialState, SegmentResiduals
 from sim2real.identify.problem.segments import Data
 from sim2real.types import MjModel
+
+mj: Any = mujoco
 
 _STEPS = 2
 """Gauss-Newton steps of an initial state; they share the derivatives at the first point."""

@@ -6,10 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.types import MjModel
+
+mj: Any = mujoco
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.robots.from_model.couplings import Coupling, below, couplings_of, groups, upwards
 from sim2real.types import MjModel, MjSpec
+
+mj: Any = mujoco
 
 _HOME = "home"
 """The keyframe that is used if a model has several."""

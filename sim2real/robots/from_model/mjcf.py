@@ -7,14 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.robots.from_model import model_file, payload
 from sim2real.robots.from_model.holding import Holding, apply, plan
 from sim2real.types import MjModel, MjSpec, PyTree
 from sim2real.worlds.drive_terms import NO_LIMIT
+
+mj: Any = mujoco
 
 _LEAST_FRICTION, _LEAST_GRAVCOMP = 1e-9, 1e-9
 _SOFT, _HOLDS = (0.02, 1.0, 0.9, 0.95, 0.001, 0.5, 2.0), 0.9999

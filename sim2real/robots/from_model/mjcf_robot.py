@@ -6,13 +6,14 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import msgspec
+import mujoco
 import numpy as np
 
 from sim2real.artifacts.files import check
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
@@ -56,6 +57,8 @@ from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRob
 from sim2real.types import PyTree, Scalar
 from sim2real.worlds.driven import OF_PAYLOAD, DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
+
+mj: Any = mujoco
 
 ROBOT_FILE = "robot.toml"
 COMMANDS = tuple(f.name for f in fields(DriveCommand))

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-import mujoco as mj
+import mujoco
 
 from sim2real.errors import UsageError
 from sim2real.robots.from_model import meshes
+
+mj: Any = mujoco
 
 _PACKAGES: Final = (
     "put the folder of the package above the model, or name the folder that it is in with ROS_PACKAGE_PATH; without "

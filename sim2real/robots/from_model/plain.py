@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
+from typing import Any
 
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.identify.export.plain import PlainSimulation, converged
 from sim2real.robots.from_model.mjcf import copy_back, driven_spec
 from sim2real.types import Json
 from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DrivenWorld, DriveParams
+
+mj: Any = mujoco
 
 
 def driven_simulation(

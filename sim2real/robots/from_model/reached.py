@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.graph.episode import Episode
 from sim2real.robots.from_model.payload import holding
 from sim2real.types import MjModel
+
+mj: Any = mujoco
 
 Recordings = Iterable[Episode]
 _WINDOW_S = 0.06

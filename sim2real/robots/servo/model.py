@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.errors import UsageError
 from sim2real.identify.export.plain import PlainSimulation, converged
 from sim2real.identify.parameters import Parameter
@@ -29,6 +29,8 @@ from sim2real.types import Array, PyTree, Scalar
 if TYPE_CHECKING:
     from sim2real.composer.physics.c.rollouts import WorldParams
     from sim2real.hardware.emulation.emulated_bus import BusEmulation
+
+mj: Any = mujoco
 
 _AT_ONCE = 1e9
 """Speed that stands for an infinite one in a document [rad/s]."""

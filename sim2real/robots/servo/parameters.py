@@ -7,12 +7,12 @@ gear, and gain, damping and inertia by its square.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
 
 from sim2real.arrays import beside_damping
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.export.plain import converged
 from sim2real.identify.parameters import Parameter
 from sim2real.later import jax, jnp
@@ -24,6 +24,7 @@ from sim2real.types import MjSpec, PyTree, Scalar
 if TYPE_CHECKING:
     from sim2real.hardware.joint import Joint
 
+mj: Any = mujoco
 _NAMES = ("gain", "damping", "armature", "friction")
 MISSES = "goal_offset"
 """Constant difference between a servo's position and its goal [rad]: of the zeros, or of worn gears."""

@@ -4,13 +4,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from sim2real.arrays import namespace
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.servo.parts import GoalTask
 from sim2real.types import MjSpec, PyTree, Scalar
+
+mj: Any = mujoco
 
 PAYLOAD = "payload"
 """Name of the parameter, and of its term."""

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
 from sim2real.composer.physics.mjx.warp import warp_fields
 from sim2real.composer.world import ComposedWorld, WorldParams
 from sim2real.graph.base import GraphState
@@ -20,6 +20,8 @@ from sim2real.robots.walking.scene import Ground
 if TYPE_CHECKING:
     from sim2real.composer.physics.mjx.environment import State
     from sim2real.composer.physics.mjx.physics import MjxPhysics
+
+mj: Any = mujoco
 
 PAYLOAD, ARMATURE = "payload", "armature"
 _ROWS = 9
