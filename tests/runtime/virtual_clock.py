@@ -51,8 +51,12 @@ class VirtualClock(MonotonicClock):
     def lock(self):
         return _Lock(self)
 
+    def taking_part(self):
+        """Return the threads for which time waits."""
+        return set(threading.enumerate()) - self._others
+
     def _jump(self):
-        taking_part = set(threading.enumerate()) - self._others
+        taking_part = self.taking_part()
         if not taking_part <= self._waiting.keys():
             return
         deadline = min(deadline for _, deadline in self._waiting.values())

@@ -54,6 +54,7 @@ def test_a_resumed_run_is_complete(finished_run_dir):
     assert log == {"path": "record/session.mcap", "sha256": recorded["sha256"]}
 
 
+@pytest.mark.night
 def test_resuming_a_finished_run_does_nothing(run_copy, capsys):
     before = {stage: manifest_of(run_copy / stage)["started"] for stage in STAGES}
     root = run_copy.parent.parent
