@@ -1,7 +1,6 @@
 """The posterior: what is drawn from it, and what its file takes."""
 
-import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,44 +55,6 @@ def test_a_direction_without_spread_is_no_problem(posterior):
     drawn = flat.sample(np.random.default_rng(0), 100)
     np.testing.assert_allclose(drawn["gain"], 3.0, rtol=1e-6)
     assert drawn["offset"].std() == pytest.approx(0.2, rel=0.3)
-
-
-@dataclass(frozen=True)
-class Document:
-    posterior: Posterior
-
-
-def test_there_and_back_through_json(posterior, tmp_path):
-    write_json(tmp_path / "a.json", Document(posterior))
-    back = read_json(tmp_path / "a.json", Document).posterior
-    assert (back.names, back.transform) == (posterior.names, posterior.transform)
-    for name in ("mean", "covariance", "low", "high"):
-        np.testing.assert_array_equal(getattr(back, name), getattr(posterior, name))
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda d: d.pop("mean"), "missing required field `mean`"),
-        (lambda d: d.update(mean="much"), "could not convert"),
-        (lambda d: d.update(covariance=[[1.0, 0.0], [0.0]]), "inhomogeneous"),
-        (lambda d: d.update(names=None), "Expected `array`, got `null`"),
-        (lambda d: d.update(low=[0.0]), "mixed sizes"),
-        (lambda d: d.update(covariance=[[1.0]]), "mixed sizes"),
-        (lambda d: d.update(names=["gain"]), "mixed sizes"),
-        (lambda d: d.update(transform=["log"]), "mixed sizes"),
-        (lambda d: d.update(transform=["log", "linear", "cubic"]), "Invalid enum value 'cubic'"),
-        (lambda d: d["mean"].__setitem__(0, None), "no number"),
-        (lambda d: d["covariance"][1].__setitem__(1, None), "no number"),
-    ],
-)
-def test_damaged_files(posterior, tmp_path, damage, message):
-    write_json(tmp_path / "a.json", Document(posterior))
-    document = json.loads((tmp_path / "a.json").read_text())
-    damage(document["posterior"])
-    (tmp_path / "a.json").write_text(json.dumps(document))
-    with pytest.raises(ValueError, match=message):
-        read_json(tmp_path / "a.json", Document)
 
 
 def test_draws_are_of_all_alternatives_and_survive_a_file(posterior, tmp_path):

@@ -1,31 +1,14 @@
-"""What is written can be read: any text, NaN and infinite numbers in every kind of text file that stages write."""
+"""What is written can be read: any text, NaN and infinite numbers in the TOML files that stages write."""
 
-import dataclasses
-import math
-import random
 import re
-import typing
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim2real.artifacts import files
-from sim2real.artifacts.bundle import History
-from sim2real.artifacts.deployment import Deployment
-from sim2real.artifacts.episodes import Episodes
-from sim2real.artifacts.files import plain, read_arrays, read_json, write_arrays, write_json
-from sim2real.artifacts.identification import Identification, Matrix
-from sim2real.artifacts.posterior import Posterior
-from sim2real.artifacts.run.iterations import Iterations
-from sim2real.artifacts.run.manifest import read_manifest, write_manifest
-from sim2real.artifacts.sensitivity import Sensitivity
-from sim2real.artifacts.timing import Timing
+from sim2real.artifacts.files import write_json
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.log.importing.mapping import (
     FieldMapping,
@@ -37,9 +20,7 @@ from sim2real.log.importing.mapping import (
 )
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import RobotConfig
-from sim2real.stages.latency.result import Latency
 
-FILES = (Deployment, Episodes, History, Identification, Iterations, Latency, Sensitivity, Timing)
 ODD = [
     "\U0001f600",
     "\x7f",
@@ -57,122 +38,7 @@ ODD = [
     "\ufffe",
     "a.b",
 ]
-BESIDE = ("recordings", "simulated", "probe", "samples", "free", "timing")
-"""Fields that lie in files of their own."""
-SQUARE = {History: ("returns", "success"), Matrix: ("matrix",)}
 TEXT = st.one_of(st.text(max_size=8), st.sampled_from(ODD))
-NUMBERS = (math.inf, -math.inf, math.nan, 1e308, -0.0, 5e-324, 0.1)
-
-
-def drawn(kind: typing.Any, rng: random.Random, tame: bool = False) -> typing.Any:
-    """Return any value of a field's type; two of each, so that sizes fit, and a tame one where a class refuses it."""
-    inner, origin = typing.get_args(kind), typing.get_origin(kind)
-    numbers = (0.5,) if tame else NUMBERS
-    if kind is float:
-        return rng.choice(numbers)
-    if kind is str:
-        return rng.choice(ODD) + chr(rng.choice([rng.randrange(0xD800), rng.randrange(0xE000, 0x110000)]))
-    if kind in (Posterior, typing.Any, object, type(None)):
-        return None
-    if kind is np.ndarray:
-        return np.array(rng.choices(numbers, k=2))
-    if kind in (bool, int):
-        return kind(rng.randrange(2))
-    if dataclasses.is_dataclass(kind):
-        return built(kind, rng, tame)
-    if origin is typing.Literal:
-        return rng.choice(inner)
-    if origin is tuple:
-        return tuple(drawn(k, rng, tame) for k in (inner if inner[-1] is not Ellipsis else inner[:1] * 2))
-    if origin in (dict, Mapping):
-        keys = ["identified" if tame and inner[0] is str else drawn(inner[0], rng, tame), drawn(inner[0], rng, tame)]
-        return {key: drawn(inner[1], rng, tame) for key in keys}
-    if origin in (list, Sequence):
-        return [drawn(inner[0], rng, tame), drawn(inner[0], rng, tame)]
-    return drawn(rng.choice(inner), rng, tame)  # a union
-
-
-def built(kind: typing.Any, rng: random.Random, tame: bool) -> typing.Any:
-    """Return an object of a class that may check its fields."""
-    hints = typing.get_type_hints(kind)
-    for strict in (tame, tame, True):
-        names = [f.name for f in dataclasses.fields(kind) if f.name not in BESIDE]
-        values = {name: drawn(hints[name], rng, strict) for name in names}
-        values |= {n: np.tile(values[n], (2, 1)) for n in SQUARE.get(kind, ())}
-        try:
-            return kind(**values)
-        except ValueError:
-            continue
-    return kind(**values)
-
-
-def plainly(value: typing.Any) -> typing.Any:
-    """Return a document as dicts and lists, with None for what JSON lacks."""
-    value = msgspec.to_builtins(value, enc_hook=lambda array: array.tolist())
-
-    def without_nan(v: typing.Any) -> typing.Any:
-        if isinstance(v, dict):
-            return {k: without_nan(x) for k, x in v.items()}
-        return (
-            [without_nan(x) for x in v]
-            if isinstance(v, list | tuple)
-            else None
-            if v in (math.inf, -math.inf) or v != v
-            else v
-        )
-
-    return without_nan(value)
-
-
-@pytest.mark.parametrize("kind", FILES)
-def test_documents_of_stages(tmp_path, kind):
-    rng = random.Random(1)
-    for _ in range(20):
-        document = drawn(kind, rng)
-        write_json(tmp_path / "x.json", document)
-        assert plainly(read_json(tmp_path / "x.json", kind)) == plainly(document)
-
-
-@pytest.mark.parametrize("name", ["file", "a/b", "a.npy", "..", "/abs", "\u2028", *(o for o in ODD if "\0" not in o)])
-def test_arrays_of_any_name(tmp_path, name):
-    write_arrays(tmp_path / "x.npz", {name: np.array(NUMBERS), "other": np.zeros((0, 2))})
-    found = read_arrays(tmp_path / "x.npz")
-    np.testing.assert_array_equal(found[name], NUMBERS)
-    assert found["other"].shape == (0, 2)
-
-
-@pytest.mark.parametrize("write", [write_json, write_arrays])
-def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, write):
-    write(tmp_path / "x", {"a": np.zeros(1)})
-    before = (tmp_path / "x").read_bytes()
-    with pytest.raises((TypeError, ValueError)):
-        write(tmp_path / "x", {"a": np.ones(1), "b": np.array([object()])})
-    assert (tmp_path / "x").read_bytes() == before
-    assert [f.name for f in tmp_path.iterdir()] == ["x"]
-
-
-def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
-    done = []
-    monkeypatch.setattr(files.os, "fsync", lambda fd: done.append("synced"))
-    monkeypatch.setattr(files.os, "replace", lambda draft, path: done.append("named"))
-    write_json(tmp_path / "x.json", {})
-    write_arrays(tmp_path / "x.npz", {})
-    assert done == ["synced", "named"] * 2
-
-
-def test_an_array_whose_name_a_zip_file_cuts_off_is_refused(tmp_path):
-    with pytest.raises(Sim2RealError, match="null character"):
-        write_arrays(tmp_path / "x.npz", {"a\0b": np.zeros(1)})
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_manifests(tmp_path, seed):
-    rng = random.Random(seed)
-    entries = {drawn(str, rng): {"path": drawn(str, rng), "sha256": drawn(str, rng)}}
-    texts = {key: drawn(str, rng) for key in ("pipeline", "stage", "status", "started")}
-    written = {**texts, "inputs": entries, "outputs": {}, "summary": {drawn(str, rng): drawn(float, rng)}}
-    write_manifest(tmp_path, written)
-    assert read_manifest(tmp_path) == plain(written)
 
 
 @settings(max_examples=60, deadline=None)
@@ -204,19 +70,6 @@ def test_mappings_of_recorders(tmp_path_factory, texts, number):
 def test_bytes_that_are_no_text_are_refused_in_words(write):
     with pytest.raises(Sim2RealError, match="bytes that are no text"):
         write(b"robot\xff.xml".decode(errors="surrogateescape"))
-
-
-def test_a_document_without_infinity_reads_as_before(tmp_path):
-    (tmp_path / "x.json").write_text('{"parameter": null, "of": [1.0, null]}')
-    assert read_json(tmp_path / "x.json", Old) == Old(None, (1.0, None))
-
-
-@dataclasses.dataclass
-class Old:
-    """A file that was written before."""
-
-    parameter: float | None
-    of: tuple[float | None, ...]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """The timing of a session: what it says, and what training draws from it."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,17 +57,6 @@ def test_it_says_what_happened(episode):
     assert list(timing.bus_s) == ["sensor"]
 
 
-def test_it_comes_back_to_the_last_bit(episode, tmp_path):
-    timing = Timing.of(episode)
-    assert timing.save(tmp_path) == {"timing": "timing.json", "timing_samples": "timing.npz"}
-    back = Timing.load(tmp_path)
-    assert (back.nodes, back.connections, back.bus) == (timing.nodes, timing.connections, timing.bus)
-    for name in ("steps_s", "bus_s", "transport_s"):
-        ours, theirs = getattr(timing, name), getattr(back, name)
-        assert set(ours) == set(theirs)
-        assert all(np.array_equal(ours[n], theirs[n]) for n in ours)
-
-
 def test_hiccups_are_left_out_and_counted(episode):
     delays, dropped = Timing.of(episode).computation(0.005)
     assert dropped == {"agent": 2}
@@ -77,17 +65,6 @@ def test_hiccups_are_left_out_and_counted(episode):
     assert np.unique(delays["agent"].sample(rng, (1000,))).tolist() == [0.001]
     with pytest.raises(Sim2RealError, match="only 0 of 100 steps of node 'sensor' took less"):
         Timing.of(episode).computation(0.0001)
-
-
-def test_samples_of_other_nodes_are_refused(episode, tmp_path):
-    Timing.of(episode).save(tmp_path)
-    document = json.loads((tmp_path / "timing.json").read_text())
-    del document["nodes"]["agent"]
-    (tmp_path / "timing.json").write_text(json.dumps(document))
-    with pytest.raises(Sim2RealError, match="its nodes differ from"):
-        Timing.load(tmp_path)
-    with pytest.raises(Sim2RealError, match="cannot read"):
-        Timing.load(tmp_path / "nowhere.json")
 
 
 def test_what_was_written_before_the_bus_was_timed_is_read(episode, tmp_path):
@@ -102,11 +79,4 @@ def test_what_was_written_before_the_bus_was_timed_is_read(episode, tmp_path):
     assert Timing.load(tmp_path).nodes == timing.nodes
     (tmp_path / "timing.json").write_text(json.dumps(document | {"format": 3}))
     with pytest.raises(Sim2RealError, match="has format 3, this version reads 2"):
-        Timing.load(tmp_path)
-
-
-def test_a_node_on_the_bus_that_is_none_of_the_sessions_is_refused(episode, tmp_path):
-    timing = Timing.of(episode)
-    replace(timing, bus_s={"other": np.ones(3)}).save(tmp_path)
-    with pytest.raises(Sim2RealError, match="lacks a node that is on the bus"):
         Timing.load(tmp_path)

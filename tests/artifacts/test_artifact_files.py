@@ -1,0 +1,285 @@
+"""Files of artifacts: what is written is read back, to the last bit; what is damaged is refused in words."""
+
+import dataclasses
+import json
+import math
+import random
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from sim2real.artifacts import files
+from sim2real.artifacts.bundle import History
+from sim2real.artifacts.deployment import Deployment
+from sim2real.artifacts.episodes import Episodes, Varied
+from sim2real.artifacts.files import plain, read_arrays, read_json, write_arrays, write_json
+from sim2real.artifacts.identification import Estimate, Identification, Judgement, Matrix, Noise
+from sim2real.artifacts.posterior import Posterior
+from sim2real.artifacts.run.iterations import Iterations
+from sim2real.artifacts.run.manifest import read_manifest, write_manifest
+from sim2real.artifacts.run.run_folder import Source
+from sim2real.artifacts.sensitivity import Sensitivity
+from sim2real.artifacts.timing import NONE, ConnectionTiming, NodeTiming, Spread, Timing
+from sim2real.errors import Sim2RealError
+from sim2real.stages.latency.result import Latency
+
+FILES = (Deployment, Episodes, History, Identification, Iterations, Latency, Sensitivity, Timing)
+ODD = [
+    "\U0001f600",
+    "\x7f",
+    "\x00",
+    '"""',
+    "a\n[[terms]]",
+    "\u2028",
+    "",
+    "\\",
+    "'",
+    "#",
+    "nan",
+    "inf",
+    "null",
+    "\ufffe",
+    "a.b",
+]
+BESIDE = ("recordings", "simulated", "probe", "samples", "free", "timing")
+"""Fields that lie in files of their own."""
+SQUARE = {History: ("returns", "success"), Matrix: ("matrix",)}
+NUMBERS = (math.inf, -math.inf, math.nan, 1e308, -0.0, 5e-324, 0.1)
+
+
+def drawn(kind: typing.Any, rng: random.Random, tame: bool = False) -> typing.Any:
+    """Return any value of a field's type; two of each, so that sizes fit, and a tame one where a class refuses it."""
+    inner, origin = typing.get_args(kind), typing.get_origin(kind)
+    numbers = (0.5,) if tame else NUMBERS
+    if kind is float:
+        return rng.choice(numbers)
+    if kind is str:
+        return rng.choice(ODD) + chr(rng.choice([rng.randrange(0xD800), rng.randrange(0xE000, 0x110000)]))
+    if kind in (Posterior, typing.Any, object, type(None)):
+        return None
+    if kind is np.ndarray:
+        return np.array(rng.choices(numbers, k=2))
+    if kind in (bool, int):
+        return kind(rng.randrange(2))
+    if dataclasses.is_dataclass(kind):
+        return built(kind, rng, tame)
+    if origin is typing.Literal:
+        return rng.choice(inner)
+    if origin is tuple:
+        return tuple(drawn(k, rng, tame) for k in (inner if inner[-1] is not Ellipsis else inner[:1] * 2))
+    if origin in (dict, Mapping):
+        keys = ["identified" if tame and inner[0] is str else drawn(inner[0], rng, tame), drawn(inner[0], rng, tame)]
+        return {key: drawn(inner[1], rng, tame) for key in keys}
+    if origin in (list, Sequence):
+        return [drawn(inner[0], rng, tame), drawn(inner[0], rng, tame)]
+    return drawn(rng.choice(inner), rng, tame)  # a union
+
+
+def built(kind: typing.Any, rng: random.Random, tame: bool) -> typing.Any:
+    """Return an object of a class that may check its fields."""
+    hints = typing.get_type_hints(kind)
+    for strict in (tame, tame, True):
+        names = [f.name for f in dataclasses.fields(kind) if f.name not in BESIDE]
+        values = {name: drawn(hints[name], rng, strict) for name in names}
+        values |= {n: np.tile(values[n], (2, 1)) for n in SQUARE.get(kind, ())}
+        try:
+            return kind(**values)
+        except ValueError:
+            continue
+    return kind(**values)
+
+
+def plainly(value: typing.Any) -> typing.Any:
+    """Return a document as dicts and lists, with None for what JSON lacks."""
+    value = msgspec.to_builtins(value, enc_hook=lambda array: array.tolist())
+
+    def without_nan(v: typing.Any) -> typing.Any:
+        if isinstance(v, dict):
+            return {k: without_nan(x) for k, x in v.items()}
+        return (
+            [without_nan(x) for x in v]
+            if isinstance(v, list | tuple)
+            else None
+            if v in (math.inf, -math.inf) or v != v
+            else v
+        )
+
+    return without_nan(value)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_documents_of_stages(tmp_path, kind):
+    rng = random.Random(1)
+    for _ in range(20):
+        document = drawn(kind, rng)
+        write_json(tmp_path / "x.json", document)
+        assert plainly(read_json(tmp_path / "x.json", kind)) == plainly(document)
+
+
+@pytest.mark.parametrize("name", ["file", "a/b", "a.npy", "..", "/abs", "\u2028", *(o for o in ODD if "\0" not in o)])
+def test_arrays_of_any_name(tmp_path, name):
+    write_arrays(tmp_path / "x.npz", {name: np.array(NUMBERS), "other": np.zeros((0, 2))})
+    found = read_arrays(tmp_path / "x.npz")
+    np.testing.assert_array_equal(found[name], NUMBERS)
+    assert found["other"].shape == (0, 2)
+
+
+@pytest.mark.parametrize("write", [write_json, write_arrays])
+def test_a_file_that_cannot_be_written_leaves_the_old_one(tmp_path, write):
+    write(tmp_path / "x", {"a": np.zeros(1)})
+    before = (tmp_path / "x").read_bytes()
+    with pytest.raises((TypeError, ValueError)):
+        write(tmp_path / "x", {"a": np.ones(1), "b": np.array([object()])})
+    assert (tmp_path / "x").read_bytes() == before
+    assert [f.name for f in tmp_path.iterdir()] == ["x"]
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(files.os, "fsync", lambda fd: done.append("synced"))
+    monkeypatch.setattr(files.os, "replace", lambda draft, path: done.append("named"))
+    write_json(tmp_path / "x.json", {})
+    write_arrays(tmp_path / "x.npz", {})
+    assert done == ["synced", "named"] * 2
+
+
+def test_an_array_whose_name_a_zip_file_cuts_off_is_refused(tmp_path):
+    with pytest.raises(Sim2RealError, match="null character"):
+        write_arrays(tmp_path / "x.npz", {"a\0b": np.zeros(1)})
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_manifests(tmp_path, seed):
+    rng = random.Random(seed)
+    entries = {drawn(str, rng): {"path": drawn(str, rng), "sha256": drawn(str, rng)}}
+    texts = {key: drawn(str, rng) for key in ("pipeline", "stage", "status", "started")}
+    written = {**texts, "inputs": entries, "outputs": {}, "summary": {drawn(str, rng): drawn(float, rng)}}
+    write_manifest(tmp_path, written)
+    assert read_manifest(tmp_path) == plain(written)
+
+
+def test_a_document_without_infinity_reads_as_before(tmp_path):
+    (tmp_path / "x.json").write_text('{"parameter": null, "of": [1.0, null]}')
+    assert read_json(tmp_path / "x.json", Old) == Old(None, (1.0, None))
+
+
+@dataclasses.dataclass
+class Old:
+    """A file that was written before."""
+
+    parameter: float | None
+    of: tuple[float | None, ...]
+
+
+POSTERIOR = Posterior(("gain",), ("log",), np.zeros(1), np.eye(1), -np.ones(1), np.ones(1))
+COLUMNS = {n: np.ones(4) * i for i, n in enumerate(("t", "into", "segment", "recording", "held_out", "th_measured"))}
+NODE = NodeTiming(2, Spread(0.02, 0.02, 0.021), NONE, Spread(0.001, 0.002, 0.003), {"sensor": NONE}, 1)
+IDENTIFIED = Identification(
+    "pendulum",
+    (Source("record/session.mcap", "ab" * 32),),
+    Judgement("accepted", ("because",), "sim2real train pendulum"),
+    (Estimate("gain", "1", "dynamics", "about", 2.0, 0.1 + 0.2, "accepted", np.inf, None, 1e-300),),
+    correlation=Matrix(("gain",), np.ones((1, 1))),
+    posterior=POSTERIOR,
+    samples=COLUMNS,
+    free={n: v[:2] for n, v in COLUMNS.items()},
+)
+TIMED = Timing(
+    {"agent": NODE, "sensor": NODE},
+    (ConnectionTiming("agent", "sensor", 2, 0, NONE),),
+    steps_s={"agent": np.array([0.001, 0.003]), "sensor": np.array([0.002])},
+    bus_s={"sensor": np.array([4e-4])},
+    transport_s={"agent/sensor": np.array([1e-5])},
+)
+DRAWN = Episodes(
+    (Varied("gain", "1", 2.0, 1.9, 2.1, open=True),),
+    noise=(Noise("q[0]", "rad", 0.1, 0.0, 0.2),),
+    draws={"gain": np.array([1.9, 2.0, 2.2])},
+    recorded_s={"agent": np.array([0.001, 0.002])},
+    off={"q[0]": np.array([0.1, -0.1])},
+)
+
+
+def same(a, b):
+    """Return whether two values are the same, where a file has null for what is infinite or no number."""
+    if is_dataclass(a):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    if isinstance(a, dict | tuple):
+        pairs = zip(a.values(), b.values(), strict=True) if isinstance(a, dict) else zip(a, b, strict=True)
+        return len(a) == len(b) and all(same(x, y) for x, y in pairs)
+    if isinstance(a, np.ndarray):
+        return np.array_equal(np.where(np.isfinite(a), a, np.nan), b, equal_nan=True)
+    return b is None if isinstance(a, float) and not np.isfinite(a) else a == b
+
+
+@pytest.mark.parametrize("artifact", [IDENTIFIED, TIMED, DRAWN, replace(IDENTIFIED, samples={}, free={})])
+def test_a_folder_gives_back_what_was_saved(artifact, tmp_path):
+    written = artifact.save(tmp_path)
+    assert {f.name for f in tmp_path.iterdir()} == set(written.values())
+    assert same(artifact, type(artifact).load(tmp_path))
+
+
+DAMAGE = [
+    (IDENTIFIED, "parameters.json", {"format": 2}, "format 2"),
+    (IDENTIFIED, "parameters.json", {"parameters": [{"name": "gain"}]}, "parameters"),
+    (IDENTIFIED, "parameters.json", {"correlation": {"names": ["a", "b"], "matrix": [[1.0]]}}, "matrix"),
+    (IDENTIFIED, "parameters.json", {"verdict": None}, "null"),
+    (IDENTIFIED, "parameters.json", {"posterior": {"mean": [0.0]}}, "names"),
+    (TIMED, "timing.json", {"format": 3}, "format 3"),
+    (TIMED, "timing.json", {"nodes": {}}, "nodes"),
+    (DRAWN, "episodes.json", {"format": 99}, "format 99"),
+    (DRAWN, "episodes.json", {"parameters": []}, "other parameters"),
+    (DRAWN, "episodes.json", {"noise": [{"column": "q", "unit": "", "deviation": -1, "quantum": 0, "bias": 0}]}, "q"),
+]
+DAMAGE_OF_POSTERIORS = [
+    ({"mean": "much"}, "convert"),
+    ({"covariance": [[1.0, 0.0], [0.0]]}, "inhomogeneous"),
+    ({"names": None}, "array"),
+    ({"low": [0.0, 1.0]}, "sizes"),
+    ({"transform": ["cubic"]}, "cubic"),
+    ({"mean": [None]}, "number"),
+]
+DAMAGE += [
+    (IDENTIFIED, "parameters.json", {"posterior": {**plain(POSTERIOR), **change}}, word)
+    for change, word in DAMAGE_OF_POSTERIORS
+]
+
+
+@pytest.mark.parametrize(("artifact", "file", "change", "word"), DAMAGE)
+def test_a_damaged_file_is_refused_and_named(artifact, file, change, word, tmp_path):
+    artifact.save(tmp_path)
+    document = json.loads((tmp_path / file).read_text())
+    (tmp_path / file).write_text(json.dumps({**document, **change}))
+    with pytest.raises(Sim2RealError, match=word) as refused:
+        type(artifact).load(tmp_path)
+    assert file.partition(".")[0] in str(refused.value)
+    assert "sim2real" in refused.value.hint
+
+
+@pytest.mark.parametrize(
+    "artifact",
+    [
+        replace(IDENTIFIED, samples={**COLUMNS, "th_nominal": np.ones(3)}),
+        replace(TIMED, bus_s={"other": np.ones(3)}),
+        replace(DRAWN, draws={"gain": np.zeros((2, 2))}),
+        replace(DRAWN, draws={"drag": np.zeros(2)}),
+    ],
+)
+def test_arrays_that_do_not_belong_to_the_document_are_refused(artifact, tmp_path):
+    artifact.save(tmp_path)
+    with pytest.raises(Sim2RealError):
+        type(artifact).load(tmp_path)
+
+
+@pytest.mark.parametrize("kind", [Identification, Timing, Episodes])
+@pytest.mark.parametrize("content", [None, "", "{", "[]"])
+def test_a_missing_or_cut_file_is_refused(kind, content, tmp_path):
+    name = {Identification: "parameters.json", Timing: "timing.json", Episodes: "episodes.json"}[kind]
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(Sim2RealError, match=name):
+        kind.load(tmp_path)
