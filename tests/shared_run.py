@@ -39,7 +39,7 @@ ROBOT = replace(hidden.Hidden.draw(1), jitter=0.0, lost=0.0, play=0.0)
 NODES = {"sensor": None, "agent": "sensor", "actuator": "agent"}
 EPOCH_NS = 1_790_000_000_000_000_000
 SUMMARY = {
-    "transactions": 1200, "lost_replies": 0, "late_replies": 0, "late_s": [0.0] * 3, "suspects": [],
+    "transactions": 1200, "lost_replies": 0, "late_replies": 0, "late_s": [0.0] * 3,
     "command_timeouts": 0, "monotonic_ns": 0,
 }  # fmt: skip
 

@@ -110,7 +110,7 @@ def servos() -> Iterator[Rig]:
     ):
         bus = BusConfig(robot.port, baud_rate=BAUD, silence_s=1.0, max_silence_s=1.0)
         device = DynamixelServos(bus, list(range(1, JOINTS + 1)), VoltageDrive(SUPPLY_V))
-        with Rig(device, GateConfig(LIMIT_V, stuck_effort=2.0)) as rig:
+        with Rig(device, GateConfig(LIMIT_V)) as rig:
             yield rig
 
 
@@ -123,7 +123,7 @@ def legs() -> Iterator[Rig]:
     with EmbeddedRobot("pipelines.go2.plant:Go2Body", UnitreeEmulation()) as robot:
         device = UnitreeLegs(robot.port, silence_s=1.0, max_silence_s=1.0)
         low, high = device.reach()
-        gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale, stuck_effort=2.0)
+        gate = GateConfig((low.tolist(), high.tolist()), stale=device.commanded.stale)
         with Rig(device, gate) as rig:
             yield rig
 

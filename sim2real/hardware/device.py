@@ -325,13 +325,6 @@ class Device(ABC):
             HardwareLost: The device is silent.
         """
 
-    @abstractmethod
-    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the share of full torque that motors apply, ``(n,)`` in [-1, 1], from command and positions ``(n,)``.
-
-        A device with columns gets commands ``(n, k)``.
-        """
-
     def soften(self, command: np.ndarray, left: float) -> np.ndarray:
         """Return a command of a soft stop, in place of the last one.
 

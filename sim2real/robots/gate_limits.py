@@ -26,8 +26,6 @@ class GateLimits:
     """Age from which a command is replaced, by zero volts or, in position mode, by the last one (servos hold) [s]."""
     max_speed_rad_s: float = 60.0
     """Joint speed above which the robot is stopped, whether measured or computed from successive positions [rad/s]."""
-    stuck_effort: float = 0.2
-    """A joint driven both ways with more than this fraction of its torque must move, or the robot is stopped [1]."""
     freeze_rad_s: float = 2.0
     """A joint that moved this fast and then reads the same for 0.05 s stops the robot: its encoder froze [rad/s]."""
     envelope_rad: tuple[float, float] | None = None
@@ -43,7 +41,6 @@ class GateLimits:
         positive = (
             "command_timeout_s",
             "max_speed_rad_s",
-            "stuck_effort",
             "max_sample_age_s",
             "stop_s",
             "freeze_rad_s",

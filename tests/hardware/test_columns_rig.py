@@ -81,10 +81,6 @@ class Legs(IdleDevice):
         self.heard.append(np.array(values))
         return Transaction(self.clock.now_ns(), 0, 0, 0)
 
-    def effort(self, command, position_rad):
-        q, _, kp, _, tau = command.T
-        return np.clip((kp * (q - position_rad) + tau) / 20.0, -1.0, 1.0)
-
     def soften(self, command, left):
         q, _, kp, _, _ = command.T
         return np.stack([q, 0.0 * q, kp * left, np.full(N, DAMPING), 0.0 * q], axis=-1)

@@ -177,7 +177,7 @@ def test_a_gates_new_limits_are_checked():
         GateConfig(max_sample_age_s=0.0)
     with pytest.raises(UsageError, match="stop_s"):
         GateLimits(stop_s=0.0)
-    limits = GateLimits(envelope_rad=(-1.0, 2.0), stop_s=0.3, max_sample_age_s=0.4, stuck_effort=0.5)
+    limits = GateLimits(envelope_rad=(-1.0, 2.0), stop_s=0.3, max_sample_age_s=0.4)
     gate = limits.gate(1.0, joints=("a",))
     assert (gate.envelope_rad, gate.stop_s, gate.max_sample_age_s) == ((-1.0, 2.0), 0.3, 0.4)
-    assert (gate.slew_per_s, gate.stuck_effort, gate.joints) == (400.0, 0.5, ("a",))
+    assert (gate.slew_per_s, gate.joints) == (400.0, ("a",))

@@ -33,7 +33,7 @@ def play(seed):
     family, faults, rng = draw(seed)
     robot = family.robot("Ramp", speed_rad_s=SPEED_RAD_S[family])
     readings, wrong, ending = 0, [], rng.choice(("stop", "stop_quietly", "close", "kill", "stall", "hang"))
-    gate = {"max_speed_rad_s": None, "stuck_effort": 2.0, "freeze_rad_s": 1e6}
+    gate = {"max_speed_rad_s": None, "freeze_rad_s": 1e6}
     rig = family.rig(robot, gate, max_silence_s=rng.choice([0.1, 0.5]))
     end = "fine"
     try:

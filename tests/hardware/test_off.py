@@ -201,11 +201,11 @@ def test_a_command_that_hangs_does_not_keep_the_torque_on(monkeypatch):
 def test_a_reading_that_is_no_number_hides_no_other_joint(bad):
     check = Plausibility(GateConfig(envelope_rad=(-1.0, 1.0)))
     with pytest.raises(SafetyStop):
-        check.check(np.array([bad, 5.0]), 0.0, 0.0, np.zeros(2))
+        check.check(np.array([bad, 5.0]), 0.0, 0.0, np.zeros(2, bool))
     check = Plausibility(GateConfig(max_speed_rad_s=1.0))
-    check.check(np.zeros(2), 0.0, 0.0, np.zeros(2))
+    check.check(np.zeros(2), 0.0, 0.0, np.zeros(2, bool))
     with pytest.raises(SafetyStop):
-        check.check(np.array([0.0, bad]), 0.01, 0.0, np.zeros(2))
+        check.check(np.array([0.0, bad]), 0.01, 0.0, np.zeros(2, bool))
 
 
 def switch_on_twice(device):
@@ -264,8 +264,6 @@ class Plain(IdleDevice):
     def without_host(self): ...
 
     def measure(self): ...
-
-    def effort(self, command, position_rad): ...
 
 
 def test_the_rig_sends_nothing_after_off_to_a_device_that_would_obey():

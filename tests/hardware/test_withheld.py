@@ -64,20 +64,6 @@ def test_positions_start_where_the_joints_are_and_pass_the_gate(open_rig):
     assert_untouched(robot, reg.GOAL_POSITION, rig.device, (1, 2, 3))
 
 
-def test_a_motor_that_is_not_pushed_may_stand_still(open_rig):
-    """With torque, volts both ways and not one count of motion would be a stuck encoder."""
-    rig, robot = open_rig(VoltageDrive(5.0), "FirstOrder", (1,), limit=4.0, stuck_s=0.05)
-    rig.start()
-    for k in range(40):
-        assert rig.command(np.array([4.0 if k % 20 < 10 else -4.0]), 0.0, 1e-9 * rig.clock.now_ns()).tolist()[0] != 0.0
-        rig.measure()
-        rig.clock.sleep(0.01)
-    assert rig.suspects == []
-    assert rig.measure().velocity_rad_s[0] == 0.0
-    rig.stop()
-    assert_untouched(robot, reg.GOAL_PWM, rig.device, (1,))
-
-
 def test_a_policy_that_hangs_gets_the_same_answer(open_rig):
     rig, robot = open_rig(VoltageDrive(5.0), "FirstOrder", (1,), limit=4.0)
     rig.start()

@@ -9,11 +9,6 @@ def episode(end, dry=False):
     return SimpleNamespace(metadata={"dry_run": dry, "log": {"session_end": end}})
 
 
-def end(late=0, suspects=(), **other):
-    answers = {"transactions": 400, "lost_replies": 3, "late_replies": late, "late_s": [0.0001, 0.0035, 0.02]}
-    return {**answers, "suspects": list(suspects), **other}
-
-
 def test_a_log_that_tells_nothing_of_servos_has_no_block():
     assert servo_blocks([episode(None), episode({"timing": {}})]) == []
     assert servo_blocks([episode({"transactions": 0, "late_replies": 0, "late_s": [None] * 3})]) == []

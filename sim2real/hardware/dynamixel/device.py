@@ -54,10 +54,6 @@ class DynamixelServos(ServoBus, Device):
         """Write the goals of all servos in one transaction, ``(n,)`` [V or rad]."""
         return self.drive.send(self, values)
 
-    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the share of full torque that the servos apply, from command and angles, all ``(n,)``."""
-        return self.drive.effort(command, position_rad)
-
 
 def servos(port: str, ids: Sequence[int], drive: Drive, *, baud_rate: int, silence_s: float) -> DynamixelServos:
     """Return servos on a port, not opened yet: the device of the name ``dynamixel``; see ``DeviceFactory``."""

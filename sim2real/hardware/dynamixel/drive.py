@@ -41,10 +41,6 @@ class Drive(ABC):
     def send(self, bus: ServoBus, command: np.ndarray) -> Transaction:
         """Write a command to the servos."""
 
-    @abstractmethod
-    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the fraction of full torque that the servos apply, shape (n,) in [-1, 1], from command and angles."""
-
     def reading(self, reading: Reading) -> Reading:
         """Return a measurement with positions in this drive's angles; here unchanged."""
         return reading
@@ -73,11 +69,6 @@ class VoltageDrive(Drive):
     def send(self, bus: ServoBus, command: np.ndarray) -> Transaction:
         """Write voltages [V]."""
         return bus.write_goal_pwm({i: float(v) / self.supply_v for i, v in zip(bus.ids, command, strict=True)})
-
-    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the command as a fraction of the supply voltage."""
-        del position_rad
-        return np.clip(command / self.supply_v, -1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -143,11 +134,6 @@ class PositionDrive(Drive):
         """Write joint angles [rad]."""
         angles = command + self._zero_rad
         return bus.write_goal_position({i: float(a) for i, a in zip(bus.ids, angles, strict=True)})
-
-    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the duty that the P gain computes from the position error, ignoring the profile."""
-        error_count = (command - position_rad) / reg.RAD_PER_COUNT
-        return np.clip(error_count * self.p_gain / reg.P_GAIN_UNIT / reg.PWM_FULL_SCALE, -1.0, 1.0)
 
     def reading(self, reading: Reading) -> Reading:
         """Return the measurement with joint angles [rad]."""

@@ -150,12 +150,6 @@ class StsServos(GuardedServos[StsLink], Device):
             return link.write(self.ids[0], reg.GOAL_POSITION, goals[self.ids[0]])
         return link.write_each(reg.GOAL_POSITION, goals)
 
-    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the duty that the P gain computes from the position error, ignoring the profile."""
-        gear = np.abs(self._scale) / reg.RAD_PER_COUNT
-        limit = self._drive.torque
-        return np.clip((command - position_rad) / gear * self._drive.p_gain * reg.P_GAIN_UNIT_PER_RAD, -limit, limit)
-
     def check(self) -> None:
         """Raise SafetyStop if a servo has lost its settings, or its torque is off."""
         if not self.armed or self.torque_withheld:

@@ -16,8 +16,6 @@ RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
 ACCELERATION_UNIT: Final = 100  # counts/s^2; 8.7 deg/s^2 in the table
 LOAD_FULL_SCALE: Final = 1000  # load and torque registers count in units of 0.1 %
 CURRENT_UNIT_A: Final = 0.0065
-P_GAIN_UNIT_PER_RAD: Final = 0.166
-"""Duty per radian of position error and count of P gain: measured by Rhoban with an oscilloscope (BAM, STS3215)."""
 FASTEST_COUNTS_PER_S: Final = 3400
 """Speed of the setpoint at power-up, measured by Rhoban (BAM): about the motor's speed without load."""
 BAUD_RATES: Final = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)

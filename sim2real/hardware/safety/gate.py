@@ -27,10 +27,6 @@ class GateConfig:
             one value or one per joint [rad/s]; None: not checked.
         stale: Replacement of a stale command: ``zero``, or ``hold``, the last command that was sent (for positions), or
             a number. A tuple with one for each column is for commands of the shape (n, k).
-        stuck_effort: Fraction of a joint's torque: a joint that is driven with more than this in both directions must
-            move, or the robot is stopped; one value or one per joint; above 1: not checked. See
-            `sim2real.hardware.safety.plausibility`.
-        stuck_s: Duration of that drive in each direction without a break [s].
         freeze_rad_s: A joint that is pushed, moved this fast between two readings, and then reads the same to the count
             for ``freeze_s``, stops the robot: its encoder has frozen, or it hit an obstacle [rad/s].
         envelope_rad: Measured positions beyond which the robot is stopped, (low, high), each one value or one per joint
@@ -46,8 +42,6 @@ class GateConfig:
     node: str = "actuator"
     stale: Stale | tuple[Stale, ...] = "zero"
     joints: tuple[str, ...] = ()
-    stuck_effort: float | Sequence[float] = 0.2
-    stuck_s: float = 0.2
     freeze_rad_s: float = 2.0
     freeze_s: float = 0.05
     envelope_rad: tuple[float | Sequence[float], float | Sequence[float]] | None = None
@@ -73,7 +67,7 @@ class GateConfig:
         if self.envelope_rad is not None and not np.all(np.less(*map(np.asarray, self.envelope_rad))):
             raise UsageError(f"gate of {self.node!r}: envelope_rad = {self.envelope_rad} holds no position")
         # All other limits are positive, each one value or one per joint.
-        positive = ("command_timeout_s", "max_speed_rad_s", "stuck_effort", "stuck_s", "max_sample_age_s", "stop_s")
+        positive = ("command_timeout_s", "max_speed_rad_s", "max_sample_age_s", "stop_s")
         for name in ("slew_per_s", "freeze_rad_s", "freeze_s", *positive):
             value = getattr(self, name)
             if value is not None and not np.all(np.asarray(value) > 0.0):

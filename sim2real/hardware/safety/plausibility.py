@@ -1,4 +1,4 @@
-"""Checks whether measured positions are physically possible: no jumps, and no standstill under changing torque."""
+"""Checks whether measured positions are physically possible: no jump, no frozen encoder, within the envelope."""
 
 from collections.abc import Mapping
 
@@ -11,8 +11,6 @@ from sim2real.leaps import STAMP_S, reach_rad
 
 _MIN_SPEED_RATIO = 0.5
 """The smallest share of its speed that a joint keeps from one reading to the next."""
-_HARD = 10.0
-"""A push in one direction, which a weight would explain, is suspicious after this many times ``stuck_s``."""
 
 
 def require_parts(parts: Mapping[str, np.ndarray], declared: Mapping[str, ReadingPart]) -> None:
@@ -48,53 +46,34 @@ class Plausibility:
     speed from the reading before counts there, too.
 
     **Envelope.** A position outside of ``envelope_rad`` stops the robot.
-
-    **Standstill.** A joint stands still if its reading does not change by a single count. That is normal at rest, while
-    holding, with friction, and at a stop. "Push" is the torque of the command:
-
-    - A joint that stands still although it was pushed in both directions, each with more than ``stuck_effort`` of its
-      torque for ``stuck_s`` without a break, is not plausible: the robot is stopped.
-    - If the push has changed by twice that for ``stuck_s``, the joint may lie against something: it is suspicious.
-    - If it was pushed in one direction with twice that for ten times ``stuck_s``, it may hold a weight: it is
-      suspicious.
-
-    Suspicious joints do not stop the robot; they are listed in ``suspects``.
-
-    Attributes:
-        suspects: Descriptions of the suspicious joints since ``reset``.
     """
 
     def __init__(self, config: GateConfig) -> None:
         self._config = config
-        self._enough_s = config.stuck_s * np.array([[1.0], [1.0], [1.0], [_HARD], [_HARD]])
         self.reset()
 
     def reset(self) -> None:
         """Forget all measurements; called when torque goes on or off."""
-        self.suspects: list[str] = []
         self._t_s: float | None = None
         self._unsure_s = 0.0
-        self._position = self._since_s = self._start = self._speed = self._before = self._held_s = self._longest_s = (
-            np.zeros(0)
-        )
+        self._position = self._since_s = self._speed = self._before = np.zeros(0)
 
-    def check(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
+    def check(self, position_rad: np.ndarray, t_s: float, unsure_s: float, pushed: np.ndarray) -> None:
         """Check a measurement.
 
         Args:
             position_rad: Shape (n,): the joints' positions [rad].
             t_s: Time of the measurement [s].
             unsure_s: Uncertainty of that time [s].
-            effort: Shape (n,): fraction of its torque that each joint is pushed with, in [-1, 1].
+            pushed: Shape (n,), bool: whether the last command pushes each joint.
 
         Raises:
-            SafetyStop: A position jumped or lies outside of the envelope, or a joint stands still although it was
-                pushed in both directions.
+            SafetyStop: A position is not a number, jumped, lies outside of the envelope, or has frozen.
         """
         self._require_finite(position_rad)
         self._require_inside(position_rad)
         if self._t_s is None or len(position_rad) != len(self._position):
-            self._begin(position_rad, t_s, unsure_s, effort)
+            self._begin(position_rad, t_s, unsure_s)
             return
         # Jumps: no joint is faster than its limit.
         elapsed_s = max(0.0, t_s - self._t_s)
@@ -106,25 +85,19 @@ class Plausibility:
             speed = np.abs(position_rad - self._position) / (elapsed_s + STAMP_S + unsure_s)
             self._speed[moved] = np.maximum(speed, _MIN_SPEED_RATIO * self._before)[moved]
             self._before = speed
-        # Freeze and standstill: both count from the last motion.
+        # Freeze: it counts from the last motion.
         self._position = position_rad.copy()
-        self._since_s[moved], self._start[moved] = t_s + unsure_s, effort[moved]
-        self._require_no_freeze(t_s, effort)
-        self._held_s[:, moved] = self._longest_s[:, moved] = 0.0
-        self._require_motion(effort, elapsed_s)
+        self._since_s[moved] = t_s + unsure_s
+        self._require_no_freeze(t_s, pushed)
 
-    def _begin(self, position_rad: np.ndarray, t_s: float, unsure_s: float, effort: np.ndarray) -> None:
+    def _begin(self, position_rad: np.ndarray, t_s: float, unsure_s: float) -> None:
         n = len(position_rad)
         self._t_s, self._unsure_s, self._position = t_s, unsure_s, position_rad.copy()
         # Of each joint [rad/s]: before it stood still, and between the last two samples.
         self._speed, self._before = np.zeros(n), np.zeros(n)
-        self._since_s, self._start = np.full(n, t_s), effort.copy()
-        # Duration of the push of each joint, now and at most since it moved. Rows: up, down, different from that at the
-        # start of the standstill, hard up, hard down.
-        self._held_s, self._longest_s = np.zeros((5, n)), np.zeros((5, n))
+        self._since_s = np.full(n, t_s)
         fastest = np.inf if self._config.max_speed_rad_s is None else self._config.max_speed_rad_s
         self._fastest = np.broadcast_to(np.asarray(fastest, np.float64), n)
-        self._stuck = np.broadcast_to(np.asarray(self._config.stuck_effort, np.float64), n)
 
     def _require_finite(self, position_rad: np.ndarray) -> None:
         """Refuse values that are no numbers, which pass every comparison."""
@@ -159,39 +132,14 @@ class Plausibility:
                 hint="look at the encoder and the cable; max_speed_rad_s sets the limit",
             )
 
-    def _require_no_freeze(self, t_s: float, effort: np.ndarray) -> None:
+    def _require_no_freeze(self, t_s: float, pushed: np.ndarray) -> None:
         fast = self._speed > self._config.freeze_rad_s
         if not fast.any():
             return
-        still = t_s - self._since_s >= self._config.freeze_s
-        for i in np.flatnonzero(fast & still & (effort != 0.0)):
+        still_s = t_s - self._since_s
+        for i in np.flatnonzero(fast & (still_s >= self._config.freeze_s) & pushed):
             raise SafetyStop(
-                f"{self._standing(int(i))}, but moved at {self._speed[i]:.2g} rad/s or more just before",
+                f"{self._config.joint(int(i))} has read {self._position[i]:.6g} rad for {still_s[i]:.2f} s, "
+                f"but moved at {self._speed[i]:.2g} rad/s or more just before",
                 hint="is its encoder stuck, or did it hit something? freeze_rad_s sets the limit",
             )
-
-    def _require_motion(self, effort: np.ndarray, elapsed_s: float) -> None:
-        limit, more = self._stuck, 2.0 * self._stuck
-        # Add the elapsed time to the rows whose push continues, and clear the others.
-        other = np.abs(effort - self._start) >= more
-        pushed = [effort >= limit, effort <= -limit, other, effort >= more, effort <= -more]
-        self._held_s = (self._held_s + elapsed_s) * pushed
-        before = self._longest_s
-        self._longest_s = np.maximum(before, self._held_s)
-        long = self._longest_s >= self._enough_s
-        if not long.any():
-            return
-        # A push in both directions stops the robot; the others are listed once.
-        was_long = before >= self._enough_s
-        for i in np.flatnonzero(long[0] & long[1]):
-            raise SafetyStop(
-                f"{self._standing(int(i))}, though it was pushed both ways with more than {limit[i]:.0%} of its torque",
-                hint="is it blocked, its encoder stuck, its supply off? stuck_effort sets the limit",
-            )
-        for i in np.flatnonzero(long[2:].any(axis=0) & ~was_long[2:].any(axis=0)):
-            how = "its push changed by" if long[2, i] else "it is pushed with"
-            self.suspects.append(f"{self._standing(int(i))}, though {how} {more[i]:.0%} of its torque")
-
-    def _standing(self, index: int) -> str:
-        lasted_s = (self._t_s or 0.0) - self._since_s[index]
-        return f"{self._config.joint(index)} has read {self._position[index]:.6g} rad for {lasted_s:.2f} s"

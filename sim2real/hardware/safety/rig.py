@@ -126,11 +126,6 @@ class Rig:
         if not self.device.torque_withheld:
             raise UsageError(f"{type(self.device).__name__} cannot do a dry run: it does not withhold its torque")
 
-    @property
-    def suspects(self) -> list[str]:
-        """Suspicious joints since `start`, which did not stop the robot; see `Plausibility`."""
-        return self._plausibility.suspects
-
     def start(self) -> None:
         """Switch the torque on, at rest, and start the watchdog of stale commands; torque is off if this raises."""
         with self._lock:
@@ -200,7 +195,7 @@ class Rig:
         """
         self._check()
         self._supervise()
-        # Take the last command before the reading, as its effort acted while the sample was taken.
+        # Take the last command before the reading, as it acted while the sample was taken.
         sent = self._sent
         measured = self.device.measure()
         reading, transaction = self._mounting.reading(measured), measured.transaction
@@ -212,12 +207,11 @@ class Rig:
             self.repeats += 1
             return reading
         require_parts(measured.parts, self.device.parts)
-        effort = np.zeros(len(measured.position_rad))
+        pushed = np.zeros(len(measured.position_rad), bool)
         if sent is not None and not self.torque_withheld:
-            # On the motors' side: the checks do not depend on the direction.
-            effort = self.device.effort(self._mounting.to_motors(sent), measured.position_rad)
+            pushed = _pushed(sent, self.gate.config)
         sampled_s = 1e-9 * transaction.t_sent_ns
-        self._plausibility.check(reading.position_rad, sampled_s, 1e-9 * transaction.late_ns, effort)
+        self._plausibility.check(reading.position_rad, sampled_s, 1e-9 * transaction.late_ns, pushed)
         self._speed_rad_s, self._sampled_s = reading.velocity_rad_s, sampled_s
         return reading
 
@@ -382,6 +376,15 @@ class Rig:
 
     def _now_s(self) -> float:
         return 1e-9 * self.clock.now_ns()
+
+
+def _pushed(sent: np.ndarray, gate: GateConfig) -> np.ndarray:
+    """Return which joints a command pushes, (n,): it holds a position, or differs from its replacement when stale."""
+    pushed = np.full(len(sent), gate.stale == "hold")
+    for column, stale in zip(sent.reshape(len(sent), -1).T, gate.replacements, strict=True):
+        if stale != "hold":
+            pushed |= column != (0.0 if stale == "zero" else stale)
+    return pushed
 
 
 def _require_stale(gate: GateConfig, device: Device) -> None:

@@ -20,7 +20,7 @@ from sim2real.hardware.device import (
 )
 from sim2real.hardware.unitree.dds import Address
 from sim2real.hardware.unitree.guarded import GuardedLegs
-from sim2real.hardware.unitree.legs import NAMES, TORQUE_NM, LegDrive, command
+from sim2real.hardware.unitree.legs import NAMES, LegDrive, command
 from sim2real.hardware.unitree.messages import MOTORS, LowCmd, LowState
 from sim2real.hardware.unitree.sit_down import motors_on
 
@@ -178,11 +178,6 @@ class UnitreeLegs(GuardedLegs, Device):
         self._require_possible(values)
         begin_ns, transfer_ns = self.publish(self._message(values))
         return Transaction(begin_ns, begin_ns - called_ns, transfer_ns, 0)
-
-    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the share of full torque that the controllers compute at a speed of 0, ``(12,)``."""
-        q, dq, kp, kd, tau = command.T
-        return np.clip((kp * (q - position_rad) + kd * dq + tau) / TORQUE_NM[self._places], -1.0, 1.0)
 
     def soften(self, command: np.ndarray, left: float) -> np.ndarray:
         """Return the command with a smaller position gain and torque, and more damping: the robot sinks."""

@@ -63,6 +63,5 @@ def summary_lines(deployment: Deployment, summaries: Sequence[Mapping[str, Json]
         **{name: value for name, value in last.items() if name == "measured delay"},
         "lost replies": last["lost_replies"],
         "late replies": last["late_replies"],
-        "odd measurements": sum(len(summary["suspects"]) for summary in summaries),
         "command timeouts": last["command_timeouts"],
     }

@@ -63,12 +63,11 @@ def rig_summary(rig: Rig) -> dict[str, Any]:
 
     Returns:
         ``late_replies``: answers whose sample's time is not sure, or that came after they had been asked for again;
-        ``late_s``: by how much answers took longer than their bytes, median, 99 % and largest [s];
-        ``suspects``: warnings about the measurements.
+        ``late_s``: by how much answers took longer than their bytes, median, 99 % and largest [s].
     """
     counters = rig.device.counters
     quantiles = np.quantile(counters.late_s, [0.5, 0.99, 1.0]).tolist() if counters.late_s.size else [None] * 3
-    return {"late_replies": counters.late_replies, "late_s": quantiles, "suspects": list(rig.suspects)}
+    return {"late_replies": counters.late_replies, "late_s": quantiles}
 
 
 def bus_use(robot: Robot, rig: Rig) -> dict[str, dict[str, list[int]]]:
@@ -94,8 +93,6 @@ def warn(summary: Mapping[str, Any]) -> None:
             f"warning: {share:.1%} of the answers came late: when those samples were taken is not sure\n"
             "hint: set the adapter's latency timer to 1 ms, and close what else runs on this machine"
         )
-    for suspect in summary["suspects"]:
-        note(f"warning: {suspect}\nhint: does it lie on something, or does its encoder stand still?")
 
 
 def sent_rows(gate: SafetyGate, field: str, unit: str) -> list[dict[str, Any]]:

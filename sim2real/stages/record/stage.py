@@ -105,7 +105,6 @@ def run(pipeline: Pipeline, config: RecordConfig, root: Path, run_dir: Path | No
                 "seconds": config.duration_s,
                 "lost replies": summary["lost_replies"],
                 "late replies": summary["late_replies"],
-                "odd measurements": len(summary["suspects"]),
                 "transactions": summary["transactions"],
                 "commands clamped": summary["gate"]["clamped"],
             }

@@ -1,4 +1,4 @@
-"""The servos on a page: late and lost answers, suspicious measurements, and commands."""
+"""The servos on a page: late and lost answers, and commands."""
 
 from collections.abc import Mapping, Sequence
 
@@ -23,7 +23,7 @@ DRY = Banner(
 def servo_blocks(episodes: Sequence[Episode]) -> list[Block]:
     """Return sentences and table on the servos of one session; empty for a log without servos."""
     ends: list[Mapping[str, Json]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
-    items = [*_answers(ends[-1]), *_suspicious(ends)]  # the count of answers covers all episodes of a session
+    items = _answers(ends[-1])  # the count of answers covers all episodes of a session
     blocks: list[Block] = [ListBlock("Servos and their measurements", items)] if items else []
     rows = [_row(s, f"episode {i}: " if len(ends) > 1 else "") for i, e in enumerate(ends) for s in e.get("sent", [])]
     if rows:
@@ -51,19 +51,6 @@ def _answers(end: Mapping[str, Json]) -> list[str]:
             f"the slowest {last} ms."
         )
     return items
-
-
-def _suspicious(ends: Sequence[Mapping[str, Json]]) -> list[str]:
-    """Return sentences on suspicious measurements."""
-    if not any("suspects" in end for end in ends):
-        return []
-    several = len(ends) > 1
-    sentences = [
-        f"Suspicious, but no reason to stop{f', in episode {i}' if several else ''}: {suspect}."
-        for i, end in enumerate(ends)
-        for suspect in end.get("suspects", [])
-    ]
-    return sentences or ["No measurement was suspicious: no joint stood still under load."]
 
 
 def _row(sent: Mapping[str, Json], which: str) -> list[str]:

@@ -10,19 +10,18 @@ _DEPLOYED: dict[str, Tone] = {"fine": "good", "look at this joint": "bad"}
 
 
 def record_banner(log: Signals) -> Banner:
-    """Return the verdict on a recording: whether it is complete, and what its session judged of the measurements."""
+    """Return the verdict on a recording: whether it is complete, and its answers came in time."""
     if log.dry:
         return DRY
     end = log.episode.metadata.get("log", {}).get("session_end") or {}
-    faults = [*log.warnings, *(f"Suspicious: {suspect}." for suspect in end.get("suspects", []))]
+    faults = list(log.warnings)
     late = int(end.get("late_replies") or 0) / max(1, int(end.get("transactions") or 0))
     if late > MAX_LATE:
         faults.append(f"{late:.1%} of the answers came so late that the time of the sample is uncertain.")
     if faults:
-        return Banner("doubt", "Incomplete" if log.warnings else "Suspicious measurements", faults)
+        return Banner("doubt", "Incomplete" if log.warnings else "Late answers", faults)
     lost = f"; {number(end['lost_replies'])} lost answers were requested again" if "lost_replies" in end else ""
-    judged = ", no suspicious measurement" if "suspects" in end else ""
-    return Banner("good", "Complete", [f"{log.episode.duration_s:.1f} s{judged}{lost}."])
+    return Banner("good", "Complete", [f"{log.episode.duration_s:.1f} s{lost}."])
 
 
 def train_banner(success: float) -> Banner:

@@ -33,7 +33,6 @@ def test_it_moves_and_measures(serve, connect):
     asked = reading.transaction
     assert before_ns <= asked.t_sent_ns <= before_ns + 10**9
     assert asked.transfer_ns > 10_000 * (11 + 3 * 12)  # what the bytes need on the wire
-    assert device.effort(goal, goal - 0.01)[0] == pytest.approx(0.166 * 254 * 0.01)
     device.check()
     device.disable()
     assert device.counters.transactions > 120

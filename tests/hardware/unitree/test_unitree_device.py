@@ -195,10 +195,3 @@ def test_the_guide_makes_the_device_and_has_its_limits():
         assert words in page
     assert f"`LegDrive.lie_s`, {drive.lie_s:g} s" in page
     assert all(f"`{name}`" in page for name in found["legs"].parts)
-
-
-def test_the_effort_is_a_share_of_the_largest_torque():
-    device = UnitreeLegs("lo:0", MIXED)
-    command = np.tile([0.1, 0.0, 50.0, 1.0, 0.0], (12, 1))
-    effort = device.effort(command, np.zeros(12))
-    np.testing.assert_allclose(effort[:3], [5.0 / 23.7, 5.0 / 23.7, 5.0 / 45.4])

@@ -204,11 +204,6 @@ class ODrive(Device):
             return self._ask("r axis0.controller.input_vel", 1)[1]  # takes as long, and moves nothing
         return self._tell(f"v 0 {values[0] / TURN:.6f} 0")
 
-    def effort(self, command: np.ndarray, position_rad: np.ndarray) -> np.ndarray:
-        """Return the share of the largest torque: what the loop makes of the last error of speed."""
-        del position_rad
-        return np.clip(self._loop.gain * (command - self._speed) / self._loop.torque, -1.0, 1.0)
-
     def check(self) -> None:
         """Ask whether the axis has stopped itself, which an answer to `f` does not contain."""
         self._require_no_error()
