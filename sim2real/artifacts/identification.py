@@ -574,7 +574,6 @@ class Link:
         drift: Rate of the stamps' clock relative to the commands' clock, minus 1 [s/s].
         delays: Shape ``(K,)``: values of the sum [s].
         share: Shape ``(K,)``: share of the messages with each of these values.
-        jitter: Standard deviation of the commands' delay, over all links between command and motion together [s].
     """
 
     name: str
@@ -587,7 +586,6 @@ class Link:
     drift: Ranged
     delays: np.ndarray
     share: np.ndarray
-    jitter: Ranged = Ranged(None, None, None)
 
     def rows(self) -> ArtifactTable:
         """Return a row for each number that the log determines."""
@@ -596,7 +594,6 @@ class Link:
             (f"{total}, mean", self.mean, 1e3, "ms"),
             (f"{total}, 95 % of the messages", self.p95, 1e3, "ms"),
             (f"{name}, deviation", self.deviation, 1e3, "ms"),
-            (f"{' + '.join(self.parts[1:]) or 'commands'}, deviation", self.jitter, 1e3, "ms"),
             (f"{name}, lost", self.lost, 100.0, "%"),
             (f"{name}, lost in a row", self.burst, 1.0, ""),
             (f"{name}, drift of the clock", self.drift, 1e6, "us/s"),
@@ -693,11 +690,12 @@ class Identification(Shown):
         return {name: value for name, value in facts.items() if value}
 
     def rows(self) -> ArtifactTable:
-        """Return a row for each parameter."""
+        """Return a row for each parameter; of the delays their sum alone, which is what a log determines."""
+        summed = any(p.name == ROUND_TRIP for p in self.parameters)
         rows = [
             [p.name, p.estimate, Interval(p.low95, p.high95), p.unit, p.nominal, p.truth, _off(p), p.verdict]
             for p in self.parameters
-            if not p.absent
+            if not p.absent and not (summed and p.kind == "delay")
         ]
         headers = ("parameter", "estimate", "95 % interval", "unit", "nominal", "truth", "off by", "verdict")
         return ArtifactTable(headers, rows)

@@ -18,7 +18,7 @@ from sim2real.identify.problem.segments import Data, Span
 from sim2real.identify.problem.thinned import MOST_OF_FIT, few_of, of_recordings, thinned
 from sim2real.identify.search.refine import Refined, refine, remaining
 from sim2real.identify.search.search import SearchResult, search
-from sim2real.identify.uncertainty.uncertainty import Uncertainty, centred, uncertainty
+from sim2real.identify.uncertainty.uncertainty import Uncertainty, uncertainty
 
 INSIDE = 0.01
 """Distance from a bound at which the fit of a parameter begins [widths of the bounds]."""
@@ -140,7 +140,6 @@ def fit(
         z, loss, left, converged = refined[-1].z, refined[-1].loss, refined[-1].left, refined[-1].converged
         loss = problem.loss(z) if as_start else loss  # a start is found on some of the segments
     else:
-        z = centred(problem.table, z)
         left = remaining(problem, z)
         converged = left < _CONVERGED
     return Fit(problem, z, loss, result, tuple(refined), windows, left, converged)
@@ -174,13 +173,9 @@ def run_search(problem: Problem, start: np.ndarray, report: OnProgress | None = 
         if report:
             report("search", 1.0 / config.generations, best, z)
 
-    free = config.initial_state == "free"
-    # Centre the delays: a log does not determine how their sum is shared between both sides of the world.
-    middle = lambda z: centred(problem.table, z) if free else z  # noqa: E731
     _compiling(report, "search", start)(True)
     result = search(problem.evaluator.searched(problem.data), start, config, advance)
-    z = middle(result.z)
-    result = replace(result, z=z, loss=problem.loss(z))
+    result = replace(result, loss=problem.loss(result.z))
     if report:  # this loss is exact; a generation's losses linearise initial states at its middle
         report("search", 0.0, result.loss, result.z)
     return result

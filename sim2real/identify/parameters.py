@@ -174,6 +174,10 @@ class ParameterTable:
             changed[name] = replace(self[name], nominal=float(value), free=False)
         return ParameterTable(changed.values(), self.recordings)
 
+    def with_free(self, name: str) -> ParameterTable:
+        """Return the table with one more parameter to identify."""
+        return ParameterTable((replace(p, free=p.free or p.name == name) for p in self.parameters), self.recordings)
+
     def with_nominal(self, values: Mapping[str, float]) -> ParameterTable:
         """Return the table with other nominal values, which are starts of a search; unknown names are ignored."""
         return ParameterTable(

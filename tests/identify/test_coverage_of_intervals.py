@@ -12,7 +12,7 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span, cut
 from sim2real.identify.problem.sizes import padded
-from sim2real.identify.uncertainty import identifiability, uncertainty
+from sim2real.identify.uncertainty import uncertainty
 from sim2real.identify.uncertainty.uncertainty import Linearised
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
@@ -21,9 +21,8 @@ from sim2real.stages.pipeline.pipeline import load_pipeline
 SEGMENTS, SEGMENT_S, RATE_HZ, MAX_DELAY_S = 10, 1.5, 50.0, 0.06
 TRUTH = {
     "gain": 21.1, "gravity": 112.0, "damping": 0.9, "friction": 6.0,
-    "sensor_delay": 0.0213, "actuator_delay": 0.0258,
+    "sensor_delay": 0.0, "actuator_delay": 0.0471,
 }  # fmt: skip
-GROUPS = ("gain", "gravity", "damping", "friction")
 
 
 def asynchronous_log(rng):
@@ -69,7 +68,6 @@ def fitted(request):
         def step(z, _):
             r, J = problem.residuals.linearised(z, data)[:2]
             r, J = r.reshape(-1), J.reshape(-1, z.size)
-            # A little damping: where initial states are free, nothing fixes the shift between the delays.
             return z - jnp.linalg.solve(J.T @ J + 10.0 * jnp.eye(z.size), J.T @ r), None
 
         # From the truth, two steps are enough.
@@ -151,31 +149,15 @@ def test_intervals_hold_the_truth_as_often_as_they_say(fitted):
     problem = fitted[0]
     names = list(problem.table.names)
     truth = np.array([TRUTH[n] for n in names])
-    delays = [names.index("sensor_delay"), names.index("actuator_delay")]
-    covered, total, off = np.zeros(len(names)), 0, []
+    covered, off = np.zeros(len(names)), []
     for values, spread, _ in spreads(fitted):
         covered += (spread.low <= truth) & (truth <= spread.high)
-        error = values[delays].sum() - truth[delays].sum()
-        total += abs(error) <= 1.96 * uncertainty.sum_of(spread, delays)
-        off.append(error)
-    shares = {n: covered[names.index(n)] for n in GROUPS} | {"round trip": total}
+        off.append((values - truth)[names.index("actuator_delay")])
+    shares = dict(zip(names, covered, strict=True))
     # As often as 95 % of so many draws do, within 2.76 standard deviations: of 400, 368 to 392.
     usual, spread = 0.95 * len(off), 2.76 * np.sqrt(0.0475 * len(off))
     # With unknown initial states the gain varies 1.16 times as much as its standard errors say, and its interval holds
     # the truth in 90 % of cases in place of 95 %, since the pendulum sticks at standstill. The cause is not proven.
     least = usual - spread - (0.04 * len(off) if problem.config.initial_state == "free" else 0.0)
     assert all(least <= n <= usual + spread for n in shares.values()), {n: int(v) for n, v in shares.items()}
-    # Each delay by itself may be anywhere that a shift of time can reach: its interval holds the truth more often.
-    assert np.all(covered[delays] >= usual - spread), covered[delays]
     assert np.max(np.abs(off)) < 1e-3
-
-
-@pytest.mark.night
-def test_what_cannot_be_told_is_named_in_all(fitted):
-    problem = fitted[0]
-    for _, spread, at in spreads(fitted):
-        verdict = dict(zip(problem.table.names, spread.verdict, strict=True))
-        messages = identifiability.from_linearised(problem, at).messages
-        assert {n for n, v in verdict.items() if v == "not identifiable"} == {"sensor_delay", "actuator_delay"}
-        assert set(verdict.values()) == {"accepted", "not identifiable"}
-        assert any("sensor_delay + actuator_delay" in m for m in messages)

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,7 +9,6 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Steps
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
-from sim2real.identify.uncertainty.uncertainty import centred, sum_of
 from sim2real.identify.validation.prediction import errors, samples
 
 SETTLE_S = 0.3
@@ -27,6 +25,15 @@ def test_groups_are_recovered(fitted, group):
 
 def test_round_trip_is_recovered(fitted):
     assert round_trip(fitted.values) == pytest.approx(round_trip(fitted.truth), abs=0.001)
+
+
+def test_how_the_delay_is_shared_between_both_sides_of_the_world_changes_little(fitted):
+    table = fitted.problem.table.with_fixed({"sensor_delay": 0.012})
+    values = {**fitted.values, "sensor_delay": 0.012, "actuator_delay": fitted.values["actuator_delay"] - 0.012}
+    problem = Problem(fitted.problem.model, [fitted.episode], fitted.problem.spans, 1.3, fitted.problem.config, table)
+    best, worse = (fitted.loss(fitted.problem.table.encode(v)) for v in (
+        fitted.values, {**fitted.values, "actuator_delay": fitted.values["actuator_delay"] + 0.004}))  # fmt: skip
+    assert abs(problem.loss(table.encode(values)) - best) < 0.2 * (worse - best)
 
 
 def test_the_nominal_model_without_delays_is_much_worse(fitted):
@@ -61,46 +68,10 @@ def check_measurements(fitted, columns):
 
 def test_the_interval_of_the_round_trip_covers_the_truth(fitted):
     spread, names = fitted.spread, list(fitted.problem.table.names)
-    delays = [names.index("sensor_delay"), names.index("actuator_delay")]
-    error = sum_of(spread, delays)
+    assert spread.verdict == ("accepted",) * 5
+    error = spread.standard_error[names.index("actuator_delay")]
     assert abs(round_trip(fitted.values) - round_trip(fitted.truth)) < 1.96 * error
     assert error < 0.002
-
-
-def test_the_delays_alone_are_not_identifiable_and_the_groups_are(fitted):
-    verdicts = dict(zip(fitted.problem.table.names, fitted.spread.verdict, strict=True))
-    assert {n for n, v in verdicts.items() if v == "not identifiable"} == {"sensor_delay", "actuator_delay"}
-    spread, names = fitted.spread, list(fitted.problem.table.names)
-    sensor, actuator = names.index("sensor_delay"), names.index("actuator_delay")
-    assert spread.correlation[sensor, actuator] < -0.9
-    assert spread.low[sensor] < fitted.truth["sensor_delay"] < spread.high[sensor]
-    assert spread.low[actuator] < fitted.truth["actuator_delay"] < spread.high[actuator]
-    np.testing.assert_allclose(spread.covariance, spread.covariance.T, rtol=1e-6, atol=1e-18)
-    assert np.all(np.linalg.eigvalsh(spread.covariance) > 0)
-    assert np.all(spread.low < spread.high)
-
-
-def test_time_is_shifted_to_the_middle_of_what_the_bounds_admit(fitted):
-    table = fitted.problem.table
-    middle = {n: float(v) for n, v in table.decode(jnp.asarray(centred(table, fitted.found.z))).items()}
-    total = round_trip(fitted.values)
-    assert middle["sensor_delay"] + middle["actuator_delay"] == pytest.approx(total, abs=1e-4)
-    least = max(table["sensor_delay"].low, total - table["actuator_delay"].high)
-    most = min(table["sensor_delay"].high, total - table["actuator_delay"].low)
-    assert middle["sensor_delay"] == pytest.approx((least + most) / 2, abs=1e-4)
-    for group in ("gain", "gravity", "damping", "friction"):
-        assert middle[group] == pytest.approx(fitted.values[group], rel=1e-4)
-
-
-def test_shifting_time_between_the_delays_changes_little(fitted):
-    shifted = {**fitted.values}
-    move = 0.004 if shifted["actuator_delay"] > 0.03 else -0.004
-    shifted["sensor_delay"] += move
-    shifted["actuator_delay"] -= move
-    longer = {**fitted.values, "actuator_delay": fitted.values["actuator_delay"] + 0.004}
-    encode = fitted.problem.table.encode
-    best, same, worse = (fitted.loss(encode(v)) for v in (fitted.values, shifted, longer))
-    assert abs(same - best) < 0.2 * (worse - best)
 
 
 @pytest.mark.parametrize(("node", "field"), [("sensor", "th"), ("sensor", "thdot"), ("actuator", "action")])

@@ -10,7 +10,7 @@ from scipy import stats
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty import uncertainty
-from sim2real.identify.uncertainty.uncertainty import Linearised, centred, from_linearised, sum_of, time_shift
+from sim2real.identify.uncertainty.uncertainty import Linearised, from_linearised
 
 WIDE = 1e4
 
@@ -212,52 +212,11 @@ def test_the_misfit_counts_every_deviation(delayed):
     assert from_linearised(stub(delayed.table), at).misfit == pytest.approx(10.0)
 
 
-def test_time_is_shifted_from_commands_to_measurements(delayed):
-    np.testing.assert_array_equal(time_shift(delayed.table), [0.0, 1.0, -1.0])
-
-
-@pytest.mark.parametrize("initial_state", ["free", "measured", "rest"])
-def test_a_delay_is_never_accepted_by_itself(delayed, initial_state):
-    """Not even where the bounds leave a shift so little room that each seems known."""
-    x = np.array([1.0, 0.002, 0.0005])
-    found = from_linearised(stub(delayed.table, initial_state), replace(delayed.at, x=x))
-    assert found.verdict == ("accepted", "not identifiable", "not identifiable")
-
-
 def test_with_one_delay_fixed_the_other_is_known(delayed):
     one = delayed.table.with_fixed({"early": 0.0})
-    np.testing.assert_array_equal(time_shift(one), np.zeros(2))
     r = delayed.at.residuals
     at = Linearised(r, delayed.X[..., :2], np.diag(12.0 / one.span**2), delayed.at.x[:2], r)
     assert from_linearised(stub(one, "free"), at).verdict == ("accepted", "accepted")
-
-
-def test_the_sum_of_delays_is_known_and_each_is_not(delayed):
-    found = from_linearised(stub(delayed.table, "free"), delayed.at)
-    assert found.verdict == ("accepted", "not identifiable", "not identifiable")
-    assert found.correlation[1, 2] < -0.9
-    # 0.02 s of time can go to commands, 0.025 s to measurements: uniform over those 0.045 s.
-    assert np.sqrt(found.covariance[1, 1]) == pytest.approx(0.045 / np.sqrt(12.0), rel=0.01)
-    flat = delayed.X[..., [0, 1]].reshape(-1, 2)
-    r = delayed.at.residuals
-    free = 3 + 2 * 20  # and the initial states
-    information = flat.T @ flat * (r.size - free) / np.sum(r**2) / found.inflation + np.diag([0.0, 12.0 / 0.05**2])
-    alone = np.sqrt(np.linalg.inv(information)[1, 1]) * found.widening[2]
-    assert sum_of(found, [1, 2]) == pytest.approx(alone, rel=0.01)
-    assert found.low[1] == pytest.approx(0.0, abs=2e-3)
-    assert found.high[1] == pytest.approx(0.045, abs=5e-3)
-    assert found.low[2] == pytest.approx(0.0, abs=5e-3)
-    assert found.high[2] == pytest.approx(0.045, abs=5e-3)
-
-
-def test_time_is_centred_within_the_bounds(delayed):
-    z = delayed.table.encode({"gain": 1.0, "late": 0.01, "early": 0.045})
-    x = delayed.table.scale(centred(delayed.table, z))[0]
-    # The measurement's delay can be 0.005 to 0.055 s: the other is 0.05 s at most, and 0 at least.
-    np.testing.assert_allclose(x[1:], [0.03, 0.025], atol=1e-6)
-    assert x[0] == pytest.approx(delayed.table.scale(z)[0][0])
-    one = delayed.table.with_fixed({"early": 0.0})
-    np.testing.assert_array_equal(centred(one, z[:2]), z[:2])
 
 
 def test_an_inverse_of_what_doubles_do_not_resolve_has_no_negative_variances():

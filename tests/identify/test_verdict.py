@@ -8,7 +8,6 @@ import pytest
 from sim2real.artifacts.identification import Determined, Prediction
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty.identifiability import messages_of
-from sim2real.identify.uncertainty.round_trip import RoundTrip
 from sim2real.identify.validation import verdict
 from sim2real.identify.validation.verdict import Position, scores
 
@@ -45,10 +44,6 @@ def spread(misfit=1.0, **verdicts):
 def check(*groups):
     combinations = tuple("" if len(g) == 1 else " + ".join(g) for g in groups)
     return Determined(1.0, groups, messages_of(combinations, groups), {})
-
-
-def trip(estimate=0.0166, error=0.0003, apart=False):
-    return RoundTrip(DELAYS, (), apart, estimate, error, estimate - 2 * error, estimate + 2 * error, 0.0, 0.12)
 
 
 def judge(prediction, spread=spread(), check=check(), positions=ONE, x=None, **more):  # noqa: B008 - neither changes
@@ -168,16 +163,6 @@ def test_a_bound_of_0_that_a_user_set_above_the_models_is_a_bound():
     assert (found.status, found.next) == ("hit a bound", "--bounds offset -1 1")
 
 
-def test_a_round_trip_at_a_bound_is_told_and_the_shares_of_it_are_not():
-    loose = dict.fromkeys(DELAYS, "not identifiable")
-    found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(0.12))
-    assert (found.status, found.next) == ("hit a bound", "--max-delay-s 0.12")
-    assert any("the sum of the delays is at its upper one" in r for r in found.reasons)
-    found = judge(rows(0.1, 1.0), spread(**loose), check(DELAYS), trip=trip(0.0))
-    assert found.status == "accepted"
-    assert any("the sum of the delays is estimated at its lowest possible value, 0" in r for r in found.reasons)
-
-
 def test_a_delay_whose_bounds_were_narrowed_gets_wider_ones():
     narrow = TABLE.with_bounds({"sensor_delay": (0.0, 0.01)}).with_fixed({"actuator_delay": 0.0})
     x, own = (narrow.low + narrow.high) / 2, narrow.names.index("sensor_delay")
@@ -197,20 +182,6 @@ def test_not_identifiable():
     found = judge(rows(0.1, 1.0), check=check(("gain",)))
     assert found.status == "not identifiable"
     assert "nothing in this data determines gain: excite it, fix it or give it a prior" in found.reasons
-
-
-def test_delays_are_judged_by_their_sum_which_is_named():
-    group, loose = check(DELAYS), spread(**dict.fromkeys(DELAYS, "not identifiable"))
-    found = judge(rows(0.1, 1.0), loose, group, trip=trip())
-    assert found.status == "accepted"
-    said = "sensor_delay and actuator_delay cannot be separated by a log, which determines their sum, 16.6 ms [16.0,"
-    assert any(r.startswith(said) for r in found.reasons)
-    found = judge(rows(0.1, 1.0), loose, group, trip=trip(error=0.02))
-    assert found.status == "not identifiable"
-    assert any(r.startswith("not even their sum is known: 16.6 ms") for r in found.reasons)
-    mixed = check(("gain", "actuator_delay"))
-    assert judge(rows(0.1, 1.0), loose, mixed, trip=trip()).status == "not identifiable"
-    assert judge(rows(0.1, 1.0), spread(), group, trip=trip(apart=True)).status == "not identifiable"
 
 
 def test_the_first_that_applies_is_the_status_and_all_are_reasons():

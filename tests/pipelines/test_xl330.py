@@ -108,7 +108,7 @@ def test_every_parameter_acts(synthetic):
 
 def test_no_seed_decides():
     """Ten seeds of a search ended between 15 and 28 mrad at a gain that was held out: refinement draws nothing."""
-    assert (PIPELINE.identify.generations, PIPELINE.identify.refine) == (0, 1)
+    assert PIPELINE.identify.generations == 0
 
 
 @pytest.fixture(scope="module")

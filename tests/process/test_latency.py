@@ -27,7 +27,7 @@ def tested(tmp_path):
 
 @pytest.mark.night
 def test_steps_tell_what_the_device_takes(tested, capsys):
-    folder = tested("--duration-s", "10", "--identify.generations", "0", "--identify.refine", "1")
+    folder = tested("--duration-s", "10", "--identify.generations", "0")
     found = Latency.load(folder)
     truth = true_values(Recording.load(folder / "session.mcap"), load_pipeline("pendulum").load().roles)
     assert found.hidden.estimate == pytest.approx(truth["round_trip_delay"], abs=0.005)

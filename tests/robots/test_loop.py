@@ -52,15 +52,16 @@ def drawn():
 def test_delays_to_identify_may_be_as_short_as_any_robots():
     sensor, actuator = delay_parameters(0.06)
     assert (sensor.name, actuator.name) == DELAYS
-    assert (sensor.low, sensor.high, actuator.low, actuator.high) == (0.0, 0.06, 0.0, 0.06)
+    assert (sensor.low, sensor.high, actuator.low, actuator.high) == (0.0, 0.06, 0.0, 0.12)
+    assert (sensor.free, actuator.free) == (False, True)
     assert (sensor.side, actuator.side) == ("measurement", "command")
     assert (sensor.leaf, actuator.leaf) == ("sensor.delay", "actuator.delay")
     assert {sensor.kind, actuator.kind} == {"delay"}
     assert {sensor.nominal, actuator.nominal} == {0.0}
     table = ParameterTable([sensor, actuator])
     for z in (-30.0, 0.0, 30.0):
-        found = table.decode(jnp.full(2, z))
-        assert 0.0 <= float(found["sensor_delay"]) <= 0.06 * (1 + 1e-6)
+        found = table.decode(jnp.full(1, z))
+        assert 0.0 <= float(found["actuator_delay"]) <= 0.12 * (1 + 1e-6)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +145,7 @@ def test_a_recorded_loop_bears_every_delay_that_may_be_identified(nodes):
     sensor, _, actuator, world = nodes
     found = recorded_loop(sensor, actuator, world, 0.06, TICK_S, LEAD_S)
     assert list(found) == ["sensor", "actuator", "world"]
-    assert (world.inputs["actuator"].delay_dist.min, world.inputs["actuator"].delay_dist.max) == (0.0, 0.06 + LEAD_S)
+    assert (world.inputs["actuator"].delay_dist.min, world.inputs["actuator"].delay_dist.max) == (0.0, 0.12 + LEAD_S)
     # A tick more than the largest delay: the sensor's steps are simulated that much later.
     from_world = sensor.inputs["world"].delay_dist
     assert (from_world.min, from_world.max) == (0.0, pytest.approx(0.07))

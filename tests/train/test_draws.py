@@ -5,29 +5,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement, Quantity
+from sim2real.artifacts.identification import Estimate, Identification, Judgement, Quantity
 from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import UsageError
 from sim2real.train.environment.draws import COUNT, draw_robots, widen_posterior, without_default_ranges
 from sim2real.train.environment.variation import VariationConfig
 
-NAMES = ("gain", "gravity", "sensor_delay", "actuator_delay", "zero")
-KINDS = ("dynamics", "dynamics", "delay", "delay", "measurement")
+NAMES = ("gain", "gravity", "actuator_delay", "zero")
+KINDS = ("dynamics", "dynamics", "delay", "measurement")
 SUM_S = 0.0005
-"""Deviation of the sum of both delays [s]; that of each is 10 ms."""
+"""Deviation of the delay [s]."""
 
 
 @pytest.fixture
 def found():
-    """Gain and gravity are correlated, a log knows only the sum of the delays."""
-    covariance = np.zeros((5, 5))
+    """Gain and gravity are correlated, and there is one delay."""
+    covariance = np.zeros((4, 4))
     covariance[:2, :2] = np.array([[1.0, 0.65], [0.65, 1.0]]) * 0.005**2
-    covariance[2:4, 2:4] = 0.01**2 * np.array([[1.0, -1.0], [-1.0, 1.0]]) + SUM_S**2 / 4
-    covariance[4, 4] = 1.0
-    mean = np.array([np.log(20.0), np.log(100.0), 0.02, 0.025, 0.0])
-    low, high = mean - np.array([1.0, 1.0, 0.02, 0.025, 9.0]), mean + np.array([1.0, 1.0, 0.04, 0.035, 9.0])
-    transform = ("log", "log", "linear", "linear", "linear")
-    values = dict(zip(NAMES, (20.0, 100.0, 0.02, 0.025, 0.0), strict=True))
+    covariance[2, 2], covariance[3, 3] = SUM_S**2, 1.0
+    mean = np.array([np.log(20.0), np.log(100.0), 0.045, 0.0])
+    low, high = mean - np.array([1.0, 1.0, 0.045, 9.0]), mean + np.array([1.0, 1.0, 0.075, 9.0])
+    transform = ("log", "log", "linear", "linear")
+    values = dict(zip(NAMES, (20.0, 100.0, 0.045, 0.0), strict=True))
     return Identification(
         pipeline="pendulum",
         logs=(),
@@ -55,37 +54,34 @@ def test_a_pipelines_own_range_ends_where_the_parameter_was_identified():
 
 def test_draws_are_as_correlated_and_as_narrow_as_the_posterior(found):
     draws = drawn(found, misfit=False)
-    assert set(draws) == set(NAMES[:4]), "what belongs to the measurement is no robot's"
+    assert set(draws) == set(NAMES[:3]), "what belongs to the measurement is no robot's"
     gain, gravity = np.log(draws["gain"]), np.log(draws["gravity"])
     assert gain.std() == pytest.approx(0.005, rel=0.1)
     assert np.corrcoef(gain, gravity)[0, 1] == pytest.approx(0.65, abs=0.06)
 
 
-def test_the_sum_of_the_delays_is_drawn_as_it_is_known(found):
+def test_the_delay_is_drawn_as_it_is_known(found):
     draws = drawn(found, misfit=False)
-    total = draws["sensor_delay"] + draws["actuator_delay"]
-    assert total.mean() == pytest.approx(0.045, abs=1e-4)
-    assert total.std() == pytest.approx(SUM_S, rel=0.1)
-    assert draws["sensor_delay"].std() < SUM_S, "how they share it is left alone"
+    assert draws["actuator_delay"].mean() == pytest.approx(0.045, abs=1e-4)
+    assert draws["actuator_delay"].std() == pytest.approx(SUM_S, rel=0.1)
 
 
 @pytest.mark.parametrize(("options", "randomise", "factor"), [({}, 1.0, 3.0), ({"misfit": False}, 2.0, 2.0)])
 def test_what_the_model_leaves_unexplained_widens_the_draws(found, options, randomise, factor):
     draws = drawn(found, randomise, **options)
     assert np.log(draws["gain"]).std() == pytest.approx(factor * 0.005, rel=0.1)
-    assert (draws["sensor_delay"] + draws["actuator_delay"]).std() == pytest.approx(factor * SUM_S, rel=0.1)
+    assert draws["actuator_delay"].std() == pytest.approx(factor * SUM_S, rel=0.1)
 
 
 def test_what_differs_between_recordings_widens_them_too(found):
     two = np.ones(2)
     both = tuple(
         Quantity(n, "1", two, two, mean, 0.0, between, 0.0, 1.0, False)
-        for n, mean, between in (("gain", 20.0, 0.4), (ROUND_TRIP, 0.045, 0.002))
+        for n, mean, between in (("gain", 20.0, 0.4), ("actuator_delay", 0.045, 0.002))
     )
     draws = drawn(replace(found, aggregate=both), misfit=False)
     assert np.log(draws["gain"]).std() == pytest.approx(np.hypot(0.005, 0.4 / 20.0), rel=0.1)
-    total = draws["sensor_delay"] + draws["actuator_delay"]
-    assert total.std() == pytest.approx(np.hypot(SUM_S, 0.002), rel=0.1)
+    assert draws["actuator_delay"].std() == pytest.approx(np.hypot(SUM_S, 0.002), rel=0.1)
 
 
 def test_a_parameter_that_is_open_is_drawn_from_all_of_its_bounds(found):
@@ -104,7 +100,7 @@ def test_a_point_estimate_a_uniform_range_and_a_data_sheet(found):
     assert drawn(found, 0.0) == {}
     assert drawn(None) == {}
     uniform = drawn(found, uniform=0.3)
-    for name in NAMES[:4]:
+    for name in NAMES[:3]:
         value = found.values[name]
         assert 0.7 * value <= uniform[name].min() < 0.75 * value
         assert 1.25 * value < uniform[name].max() <= 1.3 * value

@@ -1,1 +1,1 @@
-"""Distributions of delays that no time stamp shows: jitter, losses and clock drift of links."""
+"""Distributions of delays that no time stamp shows: deviations, losses and clock drift of links."""

@@ -29,23 +29,20 @@ class Watched:
         x: Shape ``(P,)``: the unknowns at the estimate.
         delay_s: The measurements' delay at the estimate [s].
         again: Shape ``(N,)``, bool: whether a measurement repeats the previous values.
-        pick: Shape ``(E,)``: the segments that are used.
-        counts: Shape ``(E, C)``, bool: which of their measurements are the ``N`` that count.
     """
 
     linearise: Linearise
     x: np.ndarray
     delay_s: float
     again: np.ndarray
-    pick: np.ndarray
-    counts: np.ndarray
 
 
-def motion(problem: Problem, z: np.ndarray, late: str) -> Watched:
+def motion(problem: Problem, z: np.ndarray, late: str, delay_s: float) -> Watched:
     """Return the motion of a problem.
 
     Args:
         z: Shape ``(P,)``: the estimate.
+        delay_s: The measurements' delay there [s].
     """
     data, table = problem.data, problem.table
     pick = _apart(problem)
@@ -53,7 +50,6 @@ def motion(problem: Problem, z: np.ndarray, late: str) -> Watched:
     delays = np.linspace(0.0, table[late].high, max(2, round(table[late].high / _STEP_S) + 1))
     states = 2 * len(problem.channels) if problem.config.initial_state == "free" else 0
     x = np.concatenate([np.asarray(z, np.float64)[moved], np.zeros(states * len(pick))])
-    delay_s = float(table.decode(jnp.asarray(z, jnp.float32))[late])
     curves, slopes = _programs(problem, jnp.asarray(z, jnp.float32), late, pick, data, delay_s, moved)
     ts = np.asarray(slopes(jnp.asarray(x[: len(moved)], jnp.float32), _shifts(x, moved, states, pick), delay_s)[2])
     counts = ts >= 0.0
@@ -73,7 +69,7 @@ def motion(problem: Problem, z: np.ndarray, late: str) -> Watched:
             jacobian[e, :, :, len(moved) + states * e : len(moved) + states * (e + 1)] = np.moveaxis(by_state[e], 0, -1)
         return DelayEvidence(stamps[counts], delays, np.moveaxis(errors, 0, -1)[counts], jacobian[counts], prior)
 
-    return Watched(linearise, x, delay_s, _again(problem, data, pick)[counts], pick, counts)
+    return Watched(linearise, x, delay_s, _again(problem, data, pick)[counts])
 
 
 def _programs(

@@ -1,19 +1,18 @@
-"""Links from one log: mean, jitter and losses of the measurements' link and its clock's drift, with the dynamics.
+"""Links from one log: mean, deviation and losses of the measurements' link and its clock's drift, with the dynamics.
 
 The delay of each measurement is hidden, and with it the time of the measured motion. ``hidden`` sums over it: the
 shares of all delays are unknowns beside the dynamics, the initial states and the noise. The commands' delay moves the
-motion as a whole. Its mean adds to that of the measurements, and a log determines only the sum; its deviation is
-estimated afterwards, from the effect of late commands on the motion (``jitter``).
+motion as a whole. Its mean adds to that of the measurements, and a log determines only the sum.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 
 from sim2real.artifacts.identification import Link, Ranged
 from sim2real.errors import UsageError
-from sim2real.identify.delays import jitter
-from sim2real.identify.delays.delay_residuals import Watched, motion
+from sim2real.identify.delays.delay_residuals import motion
 from sim2real.identify.delays.hidden_delays import Hidden, Linearise, hidden
 from sim2real.identify.delays.likelihood import Likelihood
 from sim2real.identify.delays.lost_messages import Losses, losses
@@ -81,31 +80,27 @@ def links(problem: Problem, z: np.ndarray) -> tuple[Link, ...]:
     Raises:
         UsageError: When no delay of the measurements is identified.
     """
-    late = measured(problem.table)
-    evidence = motion(problem, z, late)
+    late, table = measured(problem.table), problem.table
+    # Give both sides of the world half of the delay, so that those of single measurements can be shorter or longer.
+    values = {n: np.asarray(v, np.float64) for n, v in table.decode(jnp.asarray(z, jnp.float32)).items()}
+    commands = [c.parameter.name for c in table.columns if c.parameter.side == "command"]
+    half_s = (float(values[late]) + sum(float(values[n]) for n in commands)) / 2.0
+    if commands and not table[late].free:
+        values = values | {late: np.float64(half_s), commands[0]: np.float64(half_s)}
+    z = table.encode(values)
+    evidence = motion(problem, z, late, float(values[late]))
     estimate = find(evidence.linearise, evidence.x, evidence.delay_s, evidence.again)
-    held, parts = _commands(problem.table, z)
-    return (replace(describe(late, (late, *parts), estimate, held), jitter=_jitter(problem, z, evidence, estimate)),)
-
-
-def _jitter(problem: Problem, z: np.ndarray, watched: Watched, estimate: StreamEstimate) -> Ranged:
-    """Return the deviation of the commands' delays."""
-    counts = watched.counts.copy()
-    counts[watched.counts] = ~watched.again
-    hidden_delays, delay_s = estimate.hidden, estimate.hidden.mean[0]
-    late = jitter.late_commands(problem, z, watched.pick, counts)
-    evidence = watched.linearise(hidden_delays.x, delay_s).rows(~watched.again)
-    delays = delay_s + hidden_delays.drift * evidence.stamps
-    return jitter.deviation(evidence, delays, hidden_delays.deviation[0], hidden_delays.noise, late)
+    held, parts = _commands(table, z)
+    return (describe(late, (late, *parts), estimate, held),)
 
 
 def measured(table: ParameterTable) -> str:
     """Return the name of the measurements' delay."""
-    names = sorted({c.parameter.name for c in table.columns if c.parameter.side == "measurement"})
-    if len(names) != 1:
+    names = sorted({p.name for p in table if p.side == "measurement"})
+    if len(names) != 1 or not any(c.parameter.kind == "delay" for c in table.columns):
         raise UsageError(
-            f"links need one identified delay of the measurements, and there is {', '.join(names) or 'none'}",
-            hint="do not hold the measurements' delay with --fix, or remove --links",
+            f"links need an identified delay and one of the measurements, and there is {', '.join(names) or 'none'}",
+            hint="do not hold the delay with --fix, or remove --links",
         )
     return names[0]
 

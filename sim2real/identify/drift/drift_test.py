@@ -71,13 +71,11 @@ class Fitted:
 def ways(table: ParameterTable, causes: Causes) -> list[Way]:
     """Return the changes to test: of each parameter, and of causes.
 
-    A log determines only the sum of the delays on either side of the world: both move by half. A cause that moves
-    unidentified parameters is not tested.
+    A cause that moves unidentified parameters is not tested.
     """
-    delays = [i for i, c in enumerate(table.columns) if c.parameter.kind == "delay"]
-    changes = [Way(n, np.eye(len(table))[i]) for i, n in enumerate(table.names) if len(delays) < 2 or i not in delays]
-    if len(delays) > 1:
-        changes.append(Way(ROUND_TRIP, np.isin(np.arange(len(table)), delays) / len(delays)))
+    kinds = [c.parameter.kind for c in table.columns]
+    names = [ROUND_TRIP if k == "delay" and kinds.count(k) == 1 else n for k, n in zip(kinds, table.names, strict=True)]
+    changes = [Way(n, np.eye(len(table))[i]) for i, n in enumerate(names)]
     for cause, shares in causes.items():
         if set(shares) <= set(table.names):
             changes.append(Way(cause, np.array([shares.get(n, 0.0) for n in table.names])))
@@ -290,6 +288,7 @@ def _values(
     """Return the unit, the value before, and those after moving by ``ends`` on the scale; of a cause factors."""
     if name == ROUND_TRIP and name not in posterior.names:
         total = sum(x for x, c in zip(posterior.mean, table.columns, strict=True) if c.parameter.kind == "delay")
+        total += sum(p.nominal for p in table if p.kind == "delay" and not p.free)
         now, low, high = (float(max(total + e, 0.0)) for e in ends)
         return "s", float(total), now, low, high
     if name not in posterior.names:

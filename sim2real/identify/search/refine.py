@@ -16,13 +16,10 @@ from sim2real.identify.problem.programs import OnCompile
 from sim2real.identify.problem.segments import Data
 from sim2real.identify.search.tether import Tether
 from sim2real.identify.uncertainty.uncertainty import (
-    centred,
-    determined,
     deviation,
     linearise,
     loss_variance,
     root_of_inverse,
-    time_shift,
 )
 
 _COARSE = 1e-3
@@ -93,16 +90,14 @@ def refine(
             "no start of the refinement can be simulated: every loss is infinite or no number",
             hint="search first, with generations above 0, or check the nominal values",
         )
-    # Descend roughly from each start, with the shift of the delays held.
+    # Descend roughly from each start.
     fine = problem.evaluator.precision
     first_gain = gain or (_ROUGH if coarse else _COARSE if settle else fine)
-    ends = [descent.down(z, first_gain, pinned=True) for z in np.asarray(starts)[np.isfinite(first)]]
+    ends = [descent.down(z, first_gain) for z in np.asarray(starts)[np.isfinite(first)]]
     z, loss = min(ends, key=lambda end: end[1])
     if coarse or not settle:
         return Refined(z, loss, float(np.nanmin(first)), descent.steps, np.nan, False, tuple(ends))
     # Descend from the best end to the minimum.
-    if descent.tether.shift.any():
-        z, loss = descent.down(z, fine, pinned=True)
     z, loss = descent.down(z, fine)
     # Test the end; if it is no minimum, continue from a better point nearby.
     left, converged = remaining(problem, z, data), False
@@ -121,13 +116,14 @@ def remaining(problem: Problem, z: np.ndarray, data: Data | None = None) -> floa
     """Return how much is left of a descent: the largest move of the next Gauss-Newton step [standard errors].
 
     A scale-free test of convergence (Bates and Watts, Technometrics 23, 1981). Where the step leaves the bounds it ends
-    there. The delays' common shift, which a log does not determine, does not count.
+    there.
 
     Args:
         z: Shape ``(P,)``: the point.
         data: Segments to fit; default: all fitted ones.
     """
-    at, rest = linearise(problem, z, data), determined(problem)
+    at = linearise(problem, z, data)
+    rest = np.arange(len(at.x))
     if data is not None:
         rest = rest[np.asarray(data.present)[rest]]
     J, variance = at.jacobian.reshape(-1, len(at.x))[:, rest], loss_variance(problem, at)
@@ -143,16 +139,14 @@ class _Descent:
     """Descends on one problem and data.
 
     Attributes:
-        tether: Holds what the log does not determine. Where initial states are not fitted, it does determine the
-            delays' common shift.
+        tether: Holds what the log does not determine.
         steps: Evaluations so far.
     """
 
     def __init__(self, problem: Problem, data: Data, on_step: OnStep | None, on_compile: OnCompile | None) -> None:
         self._problem, self._data, self._on_step, self._on_compile = problem, data, on_step, on_compile
         self._best: tuple[float, np.ndarray] = (np.inf, np.zeros(0))
-        free = problem.config.initial_state == "free"
-        self.tether = Tether(problem.table, data, time_shift(problem.table) if free else None)
+        self.tether = Tether(problem.table, data)
         self.steps = 0
 
     def at(self, z: np.ndarray) -> float:
@@ -161,7 +155,7 @@ class _Descent:
         self._report(loss, z)
         return loss
 
-    def down(self, z: np.ndarray, gain: float, pinned: bool = False) -> tuple[np.ndarray, float]:
+    def down(self, z: np.ndarray, gain: float) -> tuple[np.ndarray, float]:
         """Descend from a point until a round gains a smaller share of the loss; return where that ends, and its loss.
 
         In a round initial states may keep the derivatives that they have at its start. Where the loss is larger at its
@@ -169,15 +163,13 @@ class _Descent:
 
         Args:
             z: Shape ``(P,)``: the point.
-            pinned: Whether the delays' common shift is held in its middle.
         """
         z = np.asarray(z, np.float64)
-        z = centred(self._problem.table, z) if pinned and self.tether.shift.any() else z
         loss = self.at(z)
         # Rounds of Levenberg-Marquardt; a round that ends worse goes half way back.
         for _ in range(_ROUNDS):
             z, loss = self._off_bounds(z, loss)
-            end = self._round(z, gain, pinned)
+            end = self._round(z, gain)
             held, after = loss + self._held(z), self.at(end)
             for _ in range(_BACK):
                 if after + self._held(end) <= held:
@@ -194,7 +186,6 @@ class _Descent:
 
     def around(self, z: np.ndarray, loss: float) -> np.ndarray | None:
         """Return a point that is better, seen before or within about a standard error; None if none of those is."""
-        # The middle of the delays' common shift can be worse than where it was held before.
         if self._best[0] < (1.0 - _BETTER) * loss:
             return self._best[1]
         table = self._problem.table
@@ -238,7 +229,7 @@ class _Descent:
         """Return what the tether adds to the loss."""
         return 0.5 * float(np.sum(self.tether.rows(self._problem.table.scale(z)[0])[0] ** 2) / self._data.count)
 
-    def _round(self, z: np.ndarray, gain: float, pinned: bool) -> np.ndarray:
+    def _round(self, z: np.ndarray, gain: float) -> np.ndarray:
         """Return where least squares ends from a point."""
         from scipy.optimize import least_squares  # 0.2 s
 
@@ -254,15 +245,15 @@ class _Descent:
             return z
         # Hold what the data does not determine by the residuals that the next step leaves, if the slope is right.
         self.tether.deviation = self._deviation(left)
-        table, norm = self._problem.table, float(np.linalg.norm(first)) if pinned else 0.0
+        table = self._problem.table
 
         def tethered(y: np.ndarray) -> np.ndarray:
             self._report(np.inf, y)
-            return np.nan_to_num(np.append(value(y), self.tether.rows(table.scale(y)[0], norm)[0]), nan=np.inf)
+            return np.nan_to_num(np.append(value(y), self.tether.rows(table.scale(y)[0])[0]), nan=np.inf)
 
         def tethered_slope(y: np.ndarray) -> np.ndarray:
             x, stretch = table.scale(y)
-            return np.vstack([slope(y), self.tether.rows(x, norm)[1] * stretch])
+            return np.vstack([slope(y), self.tether.rows(x)[1] * stretch])
 
         # Descend with scipy.
         most, near = max(1, self._problem.config.refine_steps), max(_NEAR, self._problem.evaluator.precision)

@@ -1,7 +1,6 @@
 """Flags with which to identify again after an estimate at a bound."""
 
 from sim2real.identify.parameters import Parameter
-from sim2real.identify.uncertainty.round_trip import RoundTrip
 
 _WIDER = 4.0
 """Factor between the old and the new bound on a logarithmic scale."""
@@ -30,17 +29,6 @@ def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
     else:
         low, high = (low, high + (high - low)) if upper else (low - (high - low), high)
     return f"--bounds {p.name} {low:.6g} {high:.6g}"
-
-
-def way_out_of(trip: RoundTrip, parameters: dict[str, Parameter], max_delay_s: float) -> str:
-    """Return flags for a round-trip delay that lies at a bound.
-
-    Args:
-        parameters: Name -> parameter, with its bounds.
-        max_delay_s: Longest delay of the model [s].
-    """
-    flags = [way_out(parameters[n], trip.at_bound == "upper", max_delay_s) for n in trip.parts]
-    return " ".join(dict.fromkeys(flag for flag in flags if flag))
 
 
 def _longer(p: Parameter, max_delay_s: float) -> str:

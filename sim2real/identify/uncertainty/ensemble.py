@@ -12,7 +12,6 @@ from sim2real.identify.uncertainty.negligible import ABSENT, NOT_REACHED
 from sim2real.identify.uncertainty.uncertainty import (
     Linearised,
     Uncertainty,
-    centred,
     from_linearised,
     linearise,
     loss_variance,
@@ -74,9 +73,9 @@ def _optima(estimate: Fit, at: Linearised, spread: Uncertainty) -> list[Alternat
 
     # Test each end by a linear step first, as a refinement takes longer.
     for z, loss in estimate.refined[-1].ends if estimate.refined else ():
-        if not loss <= (1.0 + _WORSE) * estimate.loss or not apart(table.scale(centred(table, z))[0]):
+        if not loss <= (1.0 + _WORSE) * estimate.loss or not apart(table.scale(z)[0]):
             continue
-        x, residuals = _descended(linearise(problem, centred(table, z)))
+        x, residuals = _descended(linearise(problem, z))
         if not (apart(x) and as_good(residuals)):
             continue
         # Refine the end further, as the estimate was refined after the first round.

@@ -8,7 +8,7 @@ import numpy as np
 from sim2real.artifacts.identification import Determined
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
-from sim2real.identify.uncertainty.uncertainty import VAGUE, Linearised, linearise, time_shift
+from sim2real.identify.uncertainty.uncertainty import VAGUE, Linearised, linearise
 
 _PART = 0.1
 """Smallest entry with which a parameter takes part in a direction, as a share of the largest entry."""
@@ -29,15 +29,11 @@ def from_linearised(problem: Problem, at: Linearised, without: Collection[str] =
     J = at.jacobian.reshape(-1, len(at.x)) * table.span  # per width of the bounds
     held = np.isin(table.names, list(without))
     J[:, held] = 0.0
-    shift = time_shift(table) / table.span
-    if shift.any():  # the residuals' change along the shift is no information: see ``uncertainty``
-        unit = shift / np.linalg.norm(shift)
-        J = J - np.outer(J @ unit, unit)
     # Compute the condition number from the eigenvalues, and the directions that the data leaves open.
     information = J.T @ J
     weights, axes = np.linalg.eigh(information)
     largest = float(weights[-1])
-    gone = int(shift.any()) + int(held.sum())  # the shift and absent parameters are 0 by construction
+    gone = int(held.sum())  # absent parameters are 0 by construction
     least = float(weights[gone]) if gone < len(weights) else largest
     condition = float(np.sqrt(largest / max(least, largest * 1e-14, 1e-300)))
     loose = weights < 1.0 / VAGUE**2

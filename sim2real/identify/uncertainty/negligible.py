@@ -16,7 +16,7 @@ from sim2real.identify.parameters import Parameter
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty.identifiability import from_linearised
 from sim2real.identify.uncertainty.profile import ONE_SIDED, profile, worse_with
-from sim2real.identify.uncertainty.uncertainty import VAGUE, Linearised, Uncertainty, scaled, time_shift
+from sim2real.identify.uncertainty.uncertainty import VAGUE, Linearised, Uncertainty, scaled
 
 NEGLIGIBLE, NOT_REACHED = "negligible", "not reached"
 ABSENT = (NEGLIGIBLE, NOT_REACHED)
@@ -145,8 +145,7 @@ def _apart(bounds: Bounds, problem: Problem, at: Linearised, check: Determined) 
     """Return those whose effect differs from that of every undetermined parameter, which could hide them."""
     table = problem.table
     open_names = {n for group in check.undetermined for n in group} - {table.names[i] for i in bounds}
-    delays = {c.label for c in table.columns if c.parameter.kind == "delay"} if time_shift(table).any() else set[str]()
-    J = at.jacobian.reshape(-1, len(at.x))[:, np.isin(table.names, list(open_names - delays))]
+    J = at.jacobian.reshape(-1, len(at.x))[:, np.isin(table.names, list(open_names))]
     size = np.linalg.norm(J, axis=0)
     alike = lambda effect: np.abs(effect @ J) / np.maximum(size * np.linalg.norm(effect), 1e-300)  # noqa: E731
     return {i: one for i, one in bounds.items() if alike(one[2]).max(initial=0.0) < _ALIKE}

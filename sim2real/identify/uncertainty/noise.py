@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sim2real.artifacts.identification import Noise
-from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.uncertainty.uncertainty import Linearised, Uncertainty, time_shift
+from sim2real.identify.uncertainty.uncertainty import Linearised, Uncertainty
 
 _ORDER = 3
 """Differences of this order remove slow changes, such as the errors of a model."""
@@ -50,23 +49,20 @@ def noises(samples: Mapping[str, np.ndarray], units: Mapping[str, str]) -> tuple
     return tuple(rows)
 
 
-def widening(table: ParameterTable, at: Linearised, spread: Uncertainty) -> float:
+def widening(at: Linearised, spread: Uncertainty) -> float:
     """Return the factor on the deviations of the posterior with which its predictions cover the model's errors.
 
     The posterior is the uncertainty of the best parameters. It becomes narrow with long recordings, even if no
     parameters explain them: a robot that the model does not describe acts, from moment to moment, like one with other
     parameters. With this factor, the predictions of draws spread on average as widely as slow residuals. White noise of
-    the measurement does not count, nor the shares of the delays in their sum, which no log determines. Without slow
-    residuals the factor is 1.
+    the measurement does not count. Without slow residuals the factor is 1.
     """
     raw = at.raw.transpose(0, 2, 1)  # (S, F, C): one row a field of a segment
     inside = np.broadcast_to(at.compared[:, None], raw.shape)
     total, white, count = _squares(raw, at.compared)
     slow = max(0.0, total - white) / count if count else 0.0
-    # Compare it with the spread of the predictions, without the shift of time.
+    # Compare it with the spread of the predictions.
     J = at.jacobian.transpose(0, 2, 1, 3)[inside]
-    shift = time_shift(table)
-    J = J - np.outer(J @ shift, shift) / max(float(shift @ shift), 1.0)
     predicted = float(np.einsum("np,pq,nq->n", J, spread.scale_covariance, J).mean()) if J.size else 0.0
     return float(np.sqrt(1.0 + slow / predicted)) if predicted > 0.0 else 1.0
 

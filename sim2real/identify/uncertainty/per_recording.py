@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.identification import ROUND_TRIP, Quantity
+from sim2real.artifacts.identification import Quantity
 from sim2real.identify.fit import Fit, Value, as_numbers
-from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty.aggregate import aggregate
-from sim2real.identify.uncertainty.uncertainty import Uncertainty, from_linearised, linearise, sum_of
+from sim2real.identify.uncertainty.uncertainty import Uncertainty, from_linearised, linearise
 from sim2real.identify.validation.folds import MOST
 from sim2real.identify.validation.optional_terms import statistics
 
@@ -19,10 +18,10 @@ def compare_recordings(estimate: Fit) -> tuple[Quantity, ...]:
     """Identify each recording alone, and combine the estimates of each quantity."""
     alone, table = identify_each(estimate), estimate.problem.table
     rows = []
-    for name, unit, parts in _quantities(table):
-        values = np.array([sum(np.ravel(estimates[n])[0] for n in parts) for estimates, _ in alone])
-        errors = np.array([sum_of(spread, [table.names.index(n) for n in parts]) for _, spread in alone])
-        rows.append(aggregate(values, errors, name, unit))
+    for p in (p for p in table if p.free and not p.per_recording):
+        values = np.array([np.ravel(estimates[p.name])[0] for estimates, _ in alone])
+        errors = np.array([spread.standard_error[table.names.index(p.name)] for _, spread in alone])
+        rows.append(aggregate(values, errors, p.name, p.unit))
     return tuple(rows)
 
 
@@ -56,11 +55,3 @@ def identify_each(estimate: Fit) -> list[tuple[Mapping[str, Value], Uncertainty]
             compared=end.compared[mask])  # fmt: skip
         alone.append((as_numbers(table, z), from_linearised(problem, part)))
     return alone
-
-
-def _quantities(parameters: ParameterTable) -> list[tuple[str, str, list[str]]]:
-    """Return the quantities to compare: name, unit, and the parameters whose sum each is."""
-    free = [p for p in parameters if p.free and not p.per_recording]
-    delays = [p.name for p in free if p.kind == "delay"]
-    rows = [(p.name, p.unit, [p.name]) for p in free if p.kind != "delay" or len(delays) == 1]
-    return rows + ([(ROUND_TRIP, "s", delays)] if len(delays) > 1 else [])

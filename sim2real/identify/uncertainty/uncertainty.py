@@ -96,20 +96,6 @@ class Uncertainty:
     widening: np.ndarray
 
 
-def centred(table: ParameterTable, z: np.ndarray) -> np.ndarray:
-    """Return ``z (P,)`` with the delays on either side of the world shifted to the middle of what their bounds admit.
-
-    The log determines only their sum, so a search shares it between them by chance.
-    """
-    x, _ = table.scale(z)
-    shift = time_shift(table)
-    down, up = shift_range(table, x, shift)
-    moved = table.unscale(x + shift * (down + up) / 2)
-    scaled = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, moved, strict=True)])
-    share = np.clip((scaled - table.low) / table.span, 1e-6, 1 - 1e-6)
-    return np.where(shift != 0.0, np.log(share / (1 - share)), z)
-
-
 def linearise(problem: Problem, z: np.ndarray, data: Data | None = None) -> Linearised:
     """Compute residuals and Jacobian at a point.
 
@@ -146,37 +132,23 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
     scaled by (1 + rho) / (1 - rho), rho their correlation from one sample to the next. Where the model is wrong, that
     is still too small: standard errors then grow to what the estimate varies by between blocks of the recordings, but
     only where blocks differ more than by chance, as a standard error from a few blocks is itself off by a fifth.
-
-    A log does not separate the delays on either side of the world: with one longer and the other shorter by as much,
-    and a world that starts that much earlier or later, every message stays the same. Residuals do change a little along
-    this shift, but only by rounding to the world's ticks and by noise in the initial states. So the shift counts as
-    unknown within the bounds, and neither delay is ever accepted alone. Where initial states are free no other
-    estimate depends on it, and it is held while the others are judged; if they are given, the others move with it.
     """
     # Covariance of a linear model with white noise.
     table, size = problem.table, len(at.x)
     J, (count, free, inflation) = at.jacobian.reshape(-1, size), _freedom(problem, at)
     variance = loss_variance(problem, at)
-    shift, rest = time_shift(table), determined(problem)
-    precision = J[:, rest].T @ J[:, rest] / variance + at.prior[np.ix_(rest, rest)]
-    cov = np.zeros((size, size))
-    root = root_of_inverse(precision)
-    cov[np.ix_(rest, rest)] = root @ root.T
+    root = root_of_inverse(J.T @ J / variance + at.prior)
+    cov = root @ root.T
     # Widen the errors to those between blocks of the log.
     quantile = float(special.stdtrit(max(count / inflation - free, 1.0), 0.975))
-    linear, wider = np.sqrt(np.diag(cov)), np.ones(size)
-    error, freedom = _by_blocks(*_blocks(problem, at, rest), (at.prior * variance)[np.ix_(rest, rest)])
-    wider[rest] = _widening(error / linear[rest], freedom, quantile, freedom >= _LEAST_FREEDOM)
+    linear = np.sqrt(np.diag(cov))
+    error, freedom = _by_blocks(*_blocks(problem, at), at.prior * variance)
+    wider = _widening(error / linear, freedom, quantile, freedom >= _LEAST_FREEDOM)
     # No standard error grows beyond that of a uniform distribution within the bounds.
     wider = np.minimum(wider, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(linear, 1e-30)))
     cov *= np.outer(wider, wider)
-    # Directions that shift all delays are limited by the bounds alone.
-    down, up = shift_range(table, at.x, shift)
-    reach = quantile * np.sqrt(np.diag(cov))
-    low = table.unscale(at.x - reach + np.minimum(down * shift, up * shift))
-    high = table.unscale(at.x + reach + np.maximum(down * shift, up * shift))
-    cov += np.outer(shift, shift) * (up - down) ** 2 / 12.0
     error = np.sqrt(np.diag(cov))
+    low, high = (table.unscale(at.x + sign * quantile * error) for sign in (-1.0, 1.0))
     # Return to the parameters' own scales.
     slope = table.slope(at.x)
     margin = np.minimum(at.x - table.low, table.high - at.x) / table.span
@@ -186,19 +158,12 @@ def from_linearised(problem: Problem, at: Linearised) -> Uncertainty:
         standard_error=error * np.abs(slope),
         low=low,
         high=high,
-        verdict=tuple(_verdict(e, m, bool(s)) for e, m, s in zip(error / table.span, margin, shift, strict=True)),
+        verdict=tuple(_verdict(e, m) for e, m in zip(error / table.span, margin, strict=True)),
         correlation=cov / np.outer(error, error),
         inflation=inflation,
         misfit=float(np.sqrt(np.sum(at.raw**2) / max(count, 1))),
         widening=wider,
     )
-
-
-def determined(problem: Problem) -> np.ndarray:
-    """Return the numbers of the parameters that are judged one by one: without the delay that carries the shift."""
-    shift = time_shift(problem.table)
-    fixed = np.flatnonzero(shift > 0)[:1] if problem.config.initial_state == "free" else np.array([], int)
-    return np.setdiff1d(np.arange(len(shift)), fixed)
 
 
 def loss_variance(problem: Problem, at: Linearised) -> float:
@@ -240,11 +205,10 @@ def between_parts(
     parts = len(moved)
     error = np.sqrt((parts - 1) / parts * np.sum((moved - moved.mean(axis=0)) ** 2, axis=0))
     errors = np.sqrt(np.diag(spread.scale_covariance))
-    shifts = time_shift(table) != 0.0
-    ratio, repeated = error / np.maximum(errors, 1e-30), (share.max(axis=0) <= _ALONE) & ~shifts
+    ratio, repeated = error / np.maximum(errors, 1e-30), share.max(axis=0) <= _ALONE
     factor = _widening(ratio, np.full(len(x), parts - 1.0), float(special.stdtrit(1e3, 0.975)), repeated)
     factor = np.minimum(factor, np.maximum(1.0, table.span / np.sqrt(12.0) / np.maximum(errors, 1e-30)))
-    return scaled(spread, table, x, np.where(shifts, 1.0, factor))
+    return scaled(spread, table, x, factor)
 
 
 def scaled(spread: Uncertainty, table: ParameterTable, x: np.ndarray, factor: np.ndarray) -> Uncertainty:
@@ -255,7 +219,6 @@ def scaled(spread: Uncertainty, table: ParameterTable, x: np.ndarray, factor: np
         factor: Shape ``(P,)``: on standard errors and on the reach of intervals.
     """
     # Widen on the parameters' scales, then return to their units.
-    shifts = time_shift(table) != 0.0
     cov = spread.scale_covariance * np.outer(factor, factor)
     middle = np.array([c.parameter.to_scale(v) for c, v in zip(table.columns, table.unscale(x), strict=True)])
     low, high = (
@@ -271,7 +234,7 @@ def scaled(spread: Uncertainty, table: ParameterTable, x: np.ndarray, factor: np
         standard_error=spread.standard_error * factor,
         low=table.unscale(middle - factor * (middle - low)),
         high=table.unscale(middle + factor * (high - middle)),
-        verdict=tuple(_verdict(e, m, bool(s)) for e, m, s in zip(error / table.span, margin, shifts, strict=True)),
+        verdict=tuple(_verdict(e, m) for e, m in zip(error / table.span, margin, strict=True)),
         widening=spread.widening * factor,
     )
 
@@ -281,45 +244,18 @@ def sum_of(spread: Uncertainty, columns: list[int]) -> float:
     return float(np.sqrt(max(spread.covariance[np.ix_(columns, columns)].sum(), 0.0)))
 
 
-def time_shift(table: ParameterTable) -> np.ndarray:
-    """Return the shift of time between delays as a direction ``(P,)``: +1 for measurements, -1 for commands.
-
-    Zeros where delays are identified on one side only. How initial states are found does not matter.
-    """
-    side = [c.parameter.side if c.parameter.kind == "delay" else "" for c in table.columns]
-    direction = np.array([{"measurement": 1.0, "command": -1.0}.get(s, 0.0) for s in side])
-    return direction if {-1.0, 1.0} <= set(direction) else np.zeros_like(direction)
-
-
-def _verdict(error: float, margin: float, shifts: bool) -> str:
+def _verdict(error: float, margin: float) -> str:
     """Judge by standard error and distance from the nearer bound, both as shares of the bounds' width.
 
-    A delay that trades with another (``shifts``) is never identifiable, however narrow its bounds. An estimate at a
-    bound is reported as that, even if it is vague as well.
+    An estimate at a bound is reported as that, even if it is vague as well.
     """
-    if shifts:
-        return "not identifiable"
     if margin < AT_BOUND:
         return "at a bound"
     return "not identifiable" if error > VAGUE else "accepted"
 
 
-def shift_range(table: ParameterTable, x: np.ndarray, shift: np.ndarray) -> tuple[float, float]:
-    """Return how far time may shift, down and up, before a delay meets its bound; (0, 0) where it cannot shift.
-
-    Args:
-        x: Shape ``(P,)``: the point, on their scales.
-        shift: Shape ``(P,)``: what ``time_shift`` returns.
-    """
-    moved = shift != 0.0
-    if not moved.any():
-        return 0.0, 0.0
-    room = np.stack([(table.low - x)[moved] / shift[moved], (table.high - x)[moved] / shift[moved]])
-    return float(room.min(axis=0).max()), float(room.max(axis=0).min())
-
-
-def _blocks(problem: Problem, at: Linearised, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradient ``(B, Q)`` and information ``(B, Q, Q)`` of blocks of the recordings, for some parameters.
+def _blocks(problem: Problem, at: Linearised) -> tuple[np.ndarray, np.ndarray]:
+    """Return gradient ``(B, P)`` and information ``(B, P, P)`` of blocks of the recordings.
 
     A block is a segment, or several in a row where there are many, to include slower changes. Segments are split only
     where they are few: parts that share an initial state are not independent.
@@ -330,7 +266,7 @@ def _blocks(problem: Problem, at: Linearised, columns: np.ndarray) -> tuple[np.n
     gradients, informations = [], []
     for s in range(segments):
         for a, b in pairwise(edges):
-            J = at.jacobian[s, a:b].reshape(-1, len(at.x))[:, columns]
+            J = at.jacobian[s, a:b].reshape(-1, len(at.x))
             gradients.append(J.T @ at.residuals[s, a:b].reshape(-1))
             informations.append(J.T @ J)
     firsts = np.arange(0, len(gradients), max(1, segments // _BLOCKS))

@@ -10,8 +10,7 @@ import numpy as np
 from sim2real.artifacts.identification import Determined, HeldOut, Judgement, Prediction
 from sim2real.identify.model import IdentifiableModel, position_of
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.uncertainty.bounds import is_physical, way_out, way_out_of
-from sim2real.identify.uncertainty.round_trip import RoundTrip
+from sim2real.identify.uncertainty.bounds import is_physical, way_out
 from sim2real.identify.uncertainty.uncertainty import Uncertainty
 from sim2real.log.schema import unit_of
 
@@ -101,7 +100,6 @@ def judge(
     spread: Uncertainty,
     check: Determined,
     *,
-    trip: RoundTrip | None = None,
     max_delay_s: float = 1.0,
     beyond: Sequence[str] = (),
     left: float | None = None,
@@ -121,16 +119,11 @@ def judge(
         return Judgement("not converged", (_not_converged(left), *reasons))
     # Collect the reasons: estimates at bounds, absent parameters, undetermined groups.
     determined = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
-    bounded, at_zero, flags = _at_bounds(table, x, spread, determined, trip, max_delay_s)
+    bounded, at_zero, flags = _at_bounds(table, x, spread, determined, max_delay_s)
     reasons += bounded
     reasons += _absent(table, spread)
     reasons += [f"{name} is estimated at its lowest possible value, 0; the fit is the same with 0" for name in at_zero]
-    together = trip.parts if trip and not trip.apart else ()
-    groups = zip(check.undetermined, check.messages, strict=True)
-    undetermined = [message for group, message in groups if not set(group) <= set(together)]
-    if trip and together:
-        undetermined += [f"not even their sum is known: {trip}"] * (trip.verdict == "not identifiable")
-        reasons.append(f"{' and '.join(together)} cannot be separated by a log, which determines their sum, {trip}")
+    undetermined = list(check.messages)
     reasons += undetermined
     if spread.misfit > 3.0:
         reasons.append(
@@ -219,7 +212,6 @@ def _at_bounds(
     x: np.ndarray,
     spread: Uncertainty,
     determined: Sequence[int],
-    trip: RoundTrip | None,
     max_delay_s: float,
 ) -> tuple[list[str], list[str], str]:
     """Return sentences about estimates at a bound, names of those at their lowest possible value, and flags to widen.
@@ -237,15 +229,6 @@ def _at_bounds(
         else:
             flags.append(way_out(p, upper, max_delay_s))
             messages.append(_bound(label, upper, f"{p.high if upper else p.low:.4g} {p.unit}", flags[-1]))
-    if trip and not trip.apart and trip.verdict == "at a bound":
-        parts = {c.label: c.parameter for c in table.columns if c.label in trip.parts}
-        upper = trip.at_bound == "upper"
-        if all(is_physical(p, upper) for p in parts.values()):
-            at_zero.append("the sum of the delays")
-        else:
-            flags.append(way_out_of(trip, parts, max_delay_s))
-            bound = trip.upper if upper else trip.lower
-            messages.append(_bound("the sum of the delays", upper, f"{1e3 * bound:.4g} ms", flags[-1]))
     return messages, at_zero, " ".join(dict.fromkeys(f for f in flags if f))
 
 

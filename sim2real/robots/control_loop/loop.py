@@ -56,16 +56,22 @@ def delay_of(node: str, input_name: str, graph_state: GraphState | None) -> dict
 
 
 def delay_parameters(max_delay_s: float, roles: Roles = ROLES) -> list[Parameter]:
-    """Return the delays as parameters to identify: from the world to the sensor, and from the actuator to the world.
+    """Return the delays as parameters: from the world to the sensor, and from the actuator to the world.
+
+    A log determines their sum alone: with one longer and the other shorter by as much, and a world that is as much
+    earlier, every message stays the same. So the first is a constant, and the second, up to twice ``max_delay_s``, is
+    identified: it is the sum.
 
     Args:
-        max_delay_s: Upper bound of each delay [s].
+        max_delay_s: Upper bound of the sensor's delay [s].
     """
     delay = Parameter("", "s", 0.0, 0.0, max_delay_s, "linear", "delay")
     about = "from motion to measurement's time stamp", "from command's departure to the motor"
     return [
-        replace(delay, name=DELAYS[0], about=about[0], leaf=f"{roles.sensor}.delay", side="measurement"),
-        replace(delay, name=DELAYS[1], about=about[1], leaf=f"{roles.actuator}.delay", side="command"),
+        replace(delay, name=DELAYS[0], about=about[0], leaf=f"{roles.sensor}.delay", side="measurement", free=False),
+        replace(
+            delay, name=DELAYS[1], about=about[1], leaf=f"{roles.actuator}.delay", side="command", high=2 * max_delay_s
+        ),
     ]
 
 
@@ -182,7 +188,7 @@ def recorded_loop(
     """Connect the nodes that identification simulates: recorded commands drive the world, the sensor measures it.
 
     Args:
-        max_delay_s: Upper bound of the delays [s].
+        max_delay_s: Upper bound of the sensor's delay, and half of that of the actuator's [s].
         ahead_s: How much later than recorded the sensor's steps are simulated [s].
         lead_s: Time that the world adds to the actuator's delay [s].
 
@@ -190,7 +196,7 @@ def recorded_loop(
         The three nodes by name.
     """
     start = max_delay_s / 4
-    to_world = TrainableDist.create(start, 0.0, max_delay_s + lead_s, "zoh_mean", burst=BURST)
+    to_world = TrainableDist.create(start, 0.0, 2 * max_delay_s + lead_s, "zoh_mean", burst=BURST)
     world.connect(actuator, skip=True, delay_dist=to_world)
     sensor.connect(world, delay_dist=TrainableDist.create(start, 0.0, max_delay_s + ahead_s, "linear"))
     return {n.name: n for n in (sensor, actuator, world)}

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim2real.artifacts.files import number
-from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.model import IdentifiableModel
@@ -16,7 +15,6 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.uncertainty import identifiability, uncertainty
-from sim2real.identify.uncertainty.round_trip import SURE_S
 from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
 
@@ -31,7 +29,7 @@ class ParameterCheck:
 
     Attributes:
         standard_error_per_minute: Standard error to expect from one minute of such data.
-        determined: ``alone``, ``in a group`` of which only combinations are determined, or ``no``.
+        determined: ``alone``, or ``in a group`` of which only combinations are determined.
         excite: The motion that determines it, as text.
     """
 
@@ -83,16 +81,7 @@ def determine(
         )
         for c, error in zip(problem.table.columns, errors, strict=True)
     ]
-    groups, messages = list(found.undetermined), list(found.messages)
-    # With free initial states only the sum of the delays is determined. That suffices, so it is no open group.
-    if (total := _round_trip(problem, linearised)) is not None:
-        delays = tuple(c.label for c in problem.table.columns if c.parameter.kind == "delay")
-        groups = [g for g in groups if not set(g) <= set(delays)]
-        if total.determined == "no":
-            groups.append(delays)
-            messages.append(f"not even the sum of {' and '.join(delays)} is determined: let the commands change more")
-        rows.append(total)
-    return Determination(problem.segments, length_s, found.condition, tuple(groups), tuple(messages), tuple(rows))
+    return Determination(problem.segments, length_s, found.condition, found.undetermined, found.messages, tuple(rows))
 
 
 def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:
@@ -113,23 +102,3 @@ def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[l
     if len(spans) > _MAX_SEGMENTS:
         spans = [spans[i] for i in np.linspace(0, len(spans) - 1, _MAX_SEGMENTS).round().astype(int)]
     return spans, length_s
-
-
-def _round_trip(problem: Problem, linearised: uncertainty.Linearised) -> ParameterCheck | None:
-    """Return the sum of the delays; None if the model has no direction that shifts the delays in time."""
-    shift = uncertainty.time_shift(problem.table)
-    if not shift.any():
-        return None
-    # Hold the sensor's delay: the other delays then have the variance of the sum.
-    free = np.flatnonzero(~(shift > 0))
-    jacobian = linearised.jacobian.reshape(-1, len(linearised.x))[:, free]
-    delays = [int(np.flatnonzero(free == i)[0]) for i in np.flatnonzero(shift < 0)]
-    # A longer recording has information in proportion to its duration.
-    duration_s = problem.segment_s * len(problem.train)
-
-    def standard_error(seconds: float) -> float:
-        information = jacobian.T @ jacobian * seconds / duration_s + linearised.prior[np.ix_(free, free)]
-        return float(np.sqrt(np.linalg.inv(information)[np.ix_(delays, delays)].sum()))
-
-    determined = "alone" if standard_error(duration_s) < SURE_S else "no"
-    return ParameterCheck(ROUND_TRIP, "s", None, standard_error(60.0), determined)

@@ -22,7 +22,6 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.identify.fit import Fit
 from sim2real.identify.uncertainty import identifiability, noise, uncertainty
 from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
-from sim2real.identify.uncertainty.round_trip import RoundTrip, round_trip
 from sim2real.identify.validation.verdict import judge, positions, scores
 from sim2real.identify.validation.worst_second import worst_second
 from sim2real.stages.estimation import held_out_parts, promises
@@ -36,7 +35,6 @@ class Findings:
     Attributes:
         at: The residuals at the estimate.
         check: The combinations of parameters that the data determines.
-        trip: The sum of the delays; None without delays.
         widening: Factor on deviations with which draws cover the errors of the model.
     """
 
@@ -44,7 +42,6 @@ class Findings:
     at: uncertainty.Linearised
     spread: uncertainty.Uncertainty
     check: Determined
-    trip: RoundTrip | None
     widening: float
 
     @property
@@ -65,8 +62,7 @@ class Findings:
         # Give parameters that the model does not need a single bound.
         spread, check = negligible(fit.problem, fit.z, at, spread, check)
         fit, at = _with_nominal_limits(fit, at, spread)
-        trip = round_trip(fit.problem.table, at.x, spread)
-        return Findings(fit, at, spread, check, trip, noise.widening(fit.problem.table, at, spread))
+        return Findings(fit, at, spread, check, noise.widening(at, spread))
 
 
 def _with_nominal_limits(
@@ -140,7 +136,6 @@ def judged(
         findings.x,
         findings.spread,
         findings.check,
-        trip=findings.trip,
         max_delay_s=max_delay_s,
         beyond=outside,
         left=None if fit.converged else fit.left,
@@ -167,6 +162,8 @@ def judged(
 
 def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
     parameters, spread = findings.fit.problem.table, findings.spread
+    # How the delay is shared between both sides of the world is a convention: only the sum has a true value.
+    own_truth = lambda p: None if p.kind == "delay" and ROUND_TRIP in truth else truth.get(p.name)  # noqa: E731
     rows = []
     for i, column in enumerate(parameters.columns):
         p = column.parameter
@@ -185,14 +182,14 @@ def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
                 lower=p.low,
                 upper=p.high,
                 verdict=spread.verdict[i],
-                truth=truth.get(p.name),
+                truth=own_truth(p),
             )
         )
     for p in (p for p in parameters if not p.free):
         numbers = {"standard_error": 0.0, "low95": p.nominal, "high95": p.nominal, "lower": p.low, "upper": p.high}
         columns_ = (p.name, p.unit, p.kind, p.about, p.nominal, p.nominal)
-        rows.append(Estimate(*columns_, verdict="fixed", truth=truth.get(p.name), **numbers))
-    return rows + ([_round_trip(findings.trip, truth)] if findings.trip else [])
+        rows.append(Estimate(*columns_, verdict="fixed", truth=own_truth(p), **numbers))
+    return rows + round_trip(rows, truth)
 
 
 def _without_interval(row: Estimate) -> Estimate:
@@ -202,20 +199,15 @@ def _without_interval(row: Estimate) -> Estimate:
     return replace(row, standard_error=None, low95=None, high95=None, verdict="not converged")
 
 
-def _round_trip(trip: RoundTrip, truth: Mapping[str, float]) -> Estimate:
-    """Return the row of the sum of all delays, which a log determines even if it does not separate the delays."""
-    return Estimate(
-        name=ROUND_TRIP,
-        unit="s",
-        kind="derived",
-        about=" + ".join([*trip.parts, *trip.held]),
-        nominal=0.0,
-        estimate=trip.estimate,
-        standard_error=trip.standard_error,
-        low95=trip.low,
-        high95=trip.high,
-        lower=trip.lower,
-        upper=trip.upper,
-        verdict=trip.verdict,
-        truth=truth.get(ROUND_TRIP),
-    )
+def round_trip(rows: Sequence[Estimate], truth: Mapping[str, float]) -> list[Estimate]:
+    """Return the row of the sum of all delays, of which one is identified: at most one row."""
+    delays = [row for row in rows if row.kind == "delay"]
+    free = [row for row in delays if row.verdict != "fixed"]
+    if len(free) != 1 or "@" in free[0].name:
+        return []
+    held = sum(row.estimate for row in delays if row.verdict == "fixed")
+    moved = {n: getattr(free[0], n) for n in ("estimate", "low95", "high95", "lower", "upper")}
+    moved = {n: None if value is None else value + held for n, value in moved.items()}
+    about = " + ".join(row.name for row in delays)
+    own = truth.get(ROUND_TRIP)
+    return [replace(free[0], name=ROUND_TRIP, kind="derived", about=about, nominal=0.0, truth=own, **moved)]

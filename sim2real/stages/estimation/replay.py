@@ -17,7 +17,7 @@ from sim2real.identify.validation import prediction
 from sim2real.identify.validation.verdict import positions
 from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts, promises
-from sim2real.stages.estimation.replay_problem import problem_of_logs
+from sim2real.stages.estimation.replay_problem import longest_delay_s, problem_of_logs
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 _REPETITIONS = 16
@@ -39,8 +39,7 @@ def tested(
     robot = held_out_parts.having(
         in_world(pipeline.load(), identification.world), [p.name for p in identification.parameters]
     )
-    delays_s = [p.upper for p in identification.parameters if p.kind == "delay" and p.upper is not None]
-    longest_s = max([pipeline.identify.max_delay_s, *delays_s])
+    longest_s = longest_delay_s(robot, identification, pipeline.identify.max_delay_s)
     config = replace(pipeline.identify, settle_s=identification.settle_s, max_delay_s=longest_s)
     # Cut the logs into segments.
     problem, ahead_s = problem_of_logs(robot, identification, episodes, config)

@@ -23,6 +23,17 @@ _LEAST, _LEAST_S = 4, 5.0
 """Fewest segments with motion for a test, and the shortest length of all logs [s]."""
 
 
+def longest_delay_s(robot: RecordedRobot, identification: Identification, least_s: float) -> float:
+    """Return the ``max_delay_s`` whose model has room for the delays of an identification [s].
+
+    Args:
+        least_s: Its smallest value [s].
+    """
+    highs = {p.name: p.high for p in robot.identifiable(1.0).parameters if p.kind == "delay"}
+    uppers = {p.name: p.upper for p in identification.parameters if p.kind == "delay" and p.verdict != "fixed"}
+    return max([least_s, *(u / highs[n] for n, u in uppers.items() if u is not None and n in highs)])
+
+
 def problem_of_logs(
     robot: RecordedRobot, identification: Identification, episodes: Sequence[Episode], config: IdentifyConfig
 ) -> tuple[Problem, float]:

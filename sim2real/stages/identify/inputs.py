@@ -169,6 +169,11 @@ def table_of(model: IdentifiableModel, config: IdentifyConfig, episodes: Sequenc
     if config.terms not in ("own", "none"):
         bounded = bounded.with_reached(model.reached(episodes))
     table = held_out_parts.widest(bounded, config.terms).with_fixed(config.fix)
+    # A data sheet's delay of one side fixes how the delay is shared: then the other side's is identified.
+    for p in table:
+        held = p.kind == "delay" and p.side == "measurement" and not p.free and p.name not in config.fix
+        if held and any(q.name in config.fix for q in table if q.kind == "delay" and q.side == "command"):
+            table = table.with_free(p.name)
     if config.links:
         measured(table)  # raises an error before the search if the model has no such delay
     return table

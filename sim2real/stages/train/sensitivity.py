@@ -83,14 +83,15 @@ def moves_of(identification: Identification) -> list[Move]:
         return []
     moves = []
     for p in identification.parameters:
-        along = np.isin(posterior.names, DELAYS if p.name == ROUND_TRIP else [p.name]).astype(float)
+        along = np.isin(posterior.names, [p.name]).astype(float)
         if p.low95 is None or p.high95 is None or p.kind == "measurement" or not along.any():
             continue
         if (half := (p.high95 - p.low95) / 2) <= 0.0:
             continue
         models = tuple(_most_likely(posterior, along, p.estimate, float(multiple * half)) for multiple in MULTIPLES)
         values = np.array([sum(v for v, one in zip(m.values(), along, strict=True) if one) for m in models])
-        moves.append(Move(p.name, p.unit, p.estimate, half, values, models))
+        name = ROUND_TRIP if p.name in DELAYS else p.name  # the other side's delay is held
+        moves.append(Move(name, p.unit, p.estimate, half, values, models))
     return moves
 
 

@@ -26,6 +26,7 @@ from sim2real.robots.worlds import in_world
 from sim2real.stages.estimation import held_out_parts, promises
 from sim2real.stages.estimation.fitted_logs import require_new
 from sim2real.stages.estimation.predicted_logs import stretches
+from sim2real.stages.estimation.replay_problem import longest_delay_s
 from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline import from_model, python_arguments
@@ -313,8 +314,7 @@ def identified_robot(identification: Identification, pipeline: Pipeline) -> tupl
     """
     names = [p.name for p in identification.parameters]
     robot = held_out_parts.having(in_world(pipeline.load(), identification.world), names)
-    delays_s = [p.upper for p in identification.parameters if p.kind == "delay" and p.upper is not None]
-    longest_s = max([pipeline.identify.max_delay_s, *delays_s])
+    longest_s = longest_delay_s(robot, identification, pipeline.identify.max_delay_s)
     return robot, replace(pipeline.identify, settle_s=identification.settle_s, max_delay_s=longest_s)
 
 

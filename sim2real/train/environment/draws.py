@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.identification import ROUND_TRIP, Identification
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.posterior import TRANSFORMS, Posterior
 from sim2real.errors import UsageError
 from sim2real.train.environment.variation import VariationConfig
@@ -63,8 +63,7 @@ def without_default_ranges(
 def widen_posterior(identification: Identification, posterior: Posterior, factor: float) -> Posterior:
     """Return the identification's posterior, and its alternatives, with deviations times a factor.
 
-    The variance between recordings is added after that. All delays move together, as a log determines only their sum:
-    how they share it does not affect a policy, and bounds on each delay would distort the sum.
+    The variance between recordings is added after that.
     """
     others = tuple(replace(o, posterior=_widen(o.posterior, identification, factor)) for o in posterior.others)
     return replace(_widen(posterior, identification, factor), others=others)
@@ -72,14 +71,7 @@ def widen_posterior(identification: Identification, posterior: Posterior, factor
 
 def _widen(posterior: Posterior, identification: Identification, factor: float) -> Posterior:
     covariance = posterior.covariance * factor**2
-    names, parameters = list(posterior.names), identification.parameters
-
-    # Give each delay the same share of the sum of all delays.
-    delays = [i for i, n in enumerate(names) if any(p.name == n and p.kind == "delay" for p in parameters)]
-    share = np.eye(len(names))
-    if delays:
-        share[np.ix_(delays, delays)] = 1.0 / len(delays)
-    covariance = share @ covariance @ share.T
+    names = list(posterior.names)
 
     # Add the variance between recordings, on the scale of the posterior.
     for quantity in identification.aggregate:
@@ -87,6 +79,4 @@ def _widen(posterior: Posterior, identification: Identification, factor: float) 
             i = names.index(quantity.name)
             slope = float(TRANSFORMS[posterior.transform[i]][2](np.float64(quantity.mean)))
             covariance[i, i] += (quantity.between / slope) ** 2
-        elif quantity.name == ROUND_TRIP and delays:
-            covariance[np.ix_(delays, delays)] += (quantity.between / len(delays)) ** 2
     return replace(posterior, covariance=covariance)
