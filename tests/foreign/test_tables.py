@@ -105,7 +105,7 @@ def test_the_content_decides_not_the_suffix(tmp_path, suffix):
         (b"SQLite format 3\0" + bytes(99), "ros2 bag convert"),
         (b"#ROSBAG V2.0\n" + bytes(99), "rosbags-convert"),
         (b"\x28\xb5\x2f\xfd" + bytes(99), "zstd -d"),
-        (gzip.compress(b"t,q\n0,1\n"), "gunzip"),
+        (gzip.compress(b"t,q\n0,1\n", mtime=0), "gunzip"),
         (b"\x89HDF\r\n\x1a\n" + bytes(99), "h5py"),
         (b"MATLAB 5.0 MAT-file" + bytes(99), "loadmat"),
         (b"ULog\x01\x12\x35" + bytes(99), "ulog2csv"),
