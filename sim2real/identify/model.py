@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -60,6 +60,15 @@ class Channel:
 def position_of(channel: Channel) -> str:
     """Return the name of a channel's position among the columns."""
     return channel.position if channel.index is None else f"{channel.position}[{channel.index}]"
+
+
+def measured_channels(model: IdentifiableModel, episodes: Sequence[Episode]) -> IdentifiableModel:
+    """Return the model without the velocities that a log lacks, as files of other recorders do."""
+    for episode in episodes:
+        fields = episode.outputs.get(model.sensor, {})
+        if any(c.velocity is not None and c.velocity not in fields for c in model.channels):
+            model.channels = tuple(replace(c, velocity=None) for c in model.channels)
+    return model
 
 
 class IdentifiableModel(Protocol):

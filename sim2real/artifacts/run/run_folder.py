@@ -83,6 +83,11 @@ class StageFolder:
         """Name -> path of each output."""
         return {name: self.folder / entry["path"] for name, entry in self.manifest.get("outputs", {}).items()}
 
+    def logs(self) -> list[Path]:
+        """Return the logs of a recording; an imported data set has one for each episode."""
+        names = [name for name in self.outputs if name == "log" or name.startswith("log_")]
+        return [self.output(name) for name in sorted(names, key=lambda name: (len(name), name)) or ["log"]]
+
     def output(self, name: str) -> Path:
         """Return the path of one output.
 

@@ -155,9 +155,10 @@ def is_unit(text: str) -> bool:
     return bool(words) and all(w in _UNIT or w in ("n", "m", "nm", "a", "v", "%", "kg", "per", "mm") for w in words)
 
 
-def is_number(label: str) -> bool:
-    """Return whether a label is the number of a joint, not its name: ``3``, or ``m_3``."""
-    return bool(re.fullmatch(r"([a-z]{1,2}_?)?\d+", label))
+def are_numbers(labels: Sequence[str]) -> bool:
+    """Return whether labels are the numbers of joints, not their names: ``3``, or ``m_3``, with one letter for all."""
+    found = [re.fullmatch(r"([a-z]?)_?\d+", label) for label in labels]
+    return None not in found and len({match[1] for match in found if match}) == 1
 
 
 def same_joint(label: str, joint: str) -> bool:

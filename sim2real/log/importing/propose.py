@@ -18,7 +18,7 @@ from sim2real.log.importing import checks, lerobot
 from sim2real.log.importing.checks import Finding
 from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, in_si, to_toml
-from sim2real.log.importing.names import Meaning, about_torque, columns_of, is_number, meaning
+from sim2real.log.importing.names import Meaning, about_torque, are_numbers, columns_of, meaning
 from sim2real.log.importing.readers import Table
 
 _FIELDS = {"position": "goal", "velocity": "goal_velocity", "torque": "torque", "duty": "duty", "voltage": "duty"}
@@ -251,7 +251,7 @@ def collect(table: Table) -> tuple[list[Signal], list[str]]:
             values = np.concatenate([row.values for row in rows], axis=-1)
             whole = Signal(tuple(row.sources[0] for row in rows), tuple(labels), named, values)
             # Numbers count the joints.
-            if all(map(is_number, labels)):
+            if are_numbers(labels):
                 whole = whole.taken(sorted(range(len(labels)), key=lambda i: int(re.findall(r"\d+", labels[i])[0])))
             signals.append(whole)
         else:
@@ -377,7 +377,7 @@ def _joint_order(
         if how != "by name":
             draft.evidence.append(f"joints {how}: {pairs}")
         return places, hints.joints
-    named = [label for label in labels if label and not is_number(label)]
+    named = any(labels) and not are_numbers(labels)
     if (named and not hints.as_told) or len(hints.joints) != measured.width:
         raise UsageError(
             f"the {measured.width} columns of {measured.name!r} in {table.path} "
@@ -408,7 +408,7 @@ def _matched(
     found = columns_of(joints, command.labels) if any(command.labels) else None
     if found is not None:
         return command.taken(found[0]), kind, True
-    numbers = all(map(is_number, filter(None, (*measured.labels, *command.labels))))
+    numbers = are_numbers(measured.labels) and are_numbers(command.labels)
     if has_names and not numbers:
         raise UsageError(
             f"the commands {command.name!r} in {table.path} are of {', '.join(command.labels)}, the positions "

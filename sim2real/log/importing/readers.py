@@ -348,8 +348,8 @@ def _header(
     for i, line in reversed(above):
         text = re.sub(r"^\s*(#|%|//)+\s*", "", line)
         cells = [c.strip() for c in _cells(text, separator)]
-        if separator not in (None, ",") and len(cells) != width:
-            cells = [c.strip() for c in _cells(text, ",")]
+        for other in (",", None):  # the line of names may be separated in another way
+            cells = cells if len(cells) == width else [c.strip() for c in _cells(text, other)]
         if len(cells) != width or not any(cells):
             # A line of another width is text, and above it there are no names.
             if not _is_comment(line):

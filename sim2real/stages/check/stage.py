@@ -12,7 +12,7 @@ from sim2real.artifacts.run.run_folder import newest
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import NotInstalled, Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.model import IdentifiableModel, measured_channels
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import check_log
 from sim2real.installation import has_jax
@@ -142,6 +142,7 @@ def check(
         recordings = recordings_of(recording, pipeline)
         config, planned = replace(config, log=tuple(str(log.path) for log in recordings), plan=False), False
         logs = {shown(log.path): log.episode for log in recordings}
+    model = measured_channels(model, list(logs.values()))
     # Refuse logs that no parameter can be determined from, also without JAX.
     for episode in logs.values():
         check_log(episode, model)
@@ -196,7 +197,7 @@ def find_logs(pipeline: Pipeline, config: CheckConfig) -> dict[str, Episode]:
     paths, robot = [Path(p) for p in config.log], pipeline.load()
     if not paths and not config.plan:
         try:
-            paths = [newest(config.runs, pipeline.name, "record").output("log")]
+            paths = newest(config.runs, pipeline.name, "record").logs()
         except Sim2RealError as error:
             if not isinstance(robot, Robot):
                 raise UsageError(

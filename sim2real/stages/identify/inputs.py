@@ -14,7 +14,7 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.run_folder import Source, portable
 from sim2real.graph.episode import Episode
 from sim2real.identify.delays.links import measured
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.model import IdentifiableModel, measured_channels
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.refits import REFITS, Refits
@@ -127,7 +127,7 @@ def prepare(
     logs = (*fitted, *held_out)
     for log in (*logs, *([standing] if standing else [])):
         require_units(log, robot)
-    model = robot.identifiable(config.max_delay_s)
+    model = measured_channels(robot.identifiable(config.max_delay_s), [log.episode for log in logs])
     require_apart(fitted, held_out, model, config.force)
     episodes = [log.episode for log in fitted]
     table = table_of(model, config, episodes).with_begin(begin or {})

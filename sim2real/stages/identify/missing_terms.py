@@ -8,6 +8,7 @@ import numpy as np
 
 from sim2real.artifacts.identification import FreeRun, Identification, Noise, TriedTerm
 from sim2real.identify.fit import Fit
+from sim2real.identify.model import measured_channels
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.uncertainty.noise import noises
@@ -117,7 +118,7 @@ def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
     """
     config, chosen = inputs.config, fit.problem.table.terms
     robot = held_out_parts.offering(in_world(inputs.pipeline.load(), config.world), ",".join(["auto", *chosen]))
-    model, episodes = robot.identifiable(config.max_delay_s), inputs.episodes
+    model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
     bounded = model.parameters.with_bounds(config.bounds).with_reached(model.reached(episodes[: inputs.fitted]))
     table = held_out_parts.widest(bounded, "all").with_fixed(config.fix)
     further = set(table.terms) - set(chosen)
@@ -160,7 +161,7 @@ def lack(document: Identification, inputs: Inputs, fit: Fit) -> tuple[Identifica
     robot, more_terms = wider
 
     def attempt() -> list[FreeRun]:
-        model, episodes = robot.identifiable(config.max_delay_s), inputs.episodes
+        model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
         # Search from the start, as the printed command does: a fit without the term has distorted other parameters.
         table = table_of(model, more_terms, episodes[: inputs.fitted])
         refitted = fitted_to(model, episodes, inputs.fitted, inputs.windows, more_terms, table)

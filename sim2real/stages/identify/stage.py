@@ -152,4 +152,4 @@ def find_logs(
     if config.log:
         return [Path(p) for p in config.log] + held_out, run_dir
     recorded = newest(root, pipeline.name, "record", run_dir)
-    return [recorded.output("log"), *held_out], run_dir or recorded.run_dir
+    return [*recorded.logs(), *held_out], run_dir or recorded.run_dir

@@ -182,7 +182,7 @@ def open_questions(proposal: Proposal, path: Path, text: str, out: Path | None) 
         words = [w for w in sys.argv[1:] if w != "--"]
         command = shlex.join(["sim2real", *words]) if words[:1] == ["import"] else f"sim2real import {path}"
         hint = f"answer in {file}, then {command} --mapping {file}"
-    return UsageError(f"the names in {path} leave {len(proposal.questions)} questions open: {lines}", hint=hint)
+    return UsageError(f"the names in {path} leave open: {lines}", hint=hint)
 
 
 def refuse_contradictions(path: Path, episode: Episode, as_told: bool, joints: Sequence[str] = ()) -> None:

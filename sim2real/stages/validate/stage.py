@@ -14,7 +14,7 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.model import IdentifiableModel, measured_channels
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span, check_log, ranges
 from sim2real.identify.validation import prediction
@@ -255,7 +255,7 @@ def score(
         UsageError: A log was fitted, no log can be scored, or each recording has its own parameters.
     """
     robot, fitting = identified_robot(identification, pipeline)
-    model = robot.identifiable(fitting.max_delay_s)
+    model = measured_channels(robot.identifiable(fitting.max_delay_s), [log.episode for log in logs])
     models = models_of(identification, model)
     refused = dict(refused or {})
     fitted = require_new(identification, logs, model, config.force)
