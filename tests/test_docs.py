@@ -39,6 +39,7 @@ def python_of(page: str) -> list[str]:
 
 
 MARKS = {
+    "README.md": [NIGHT],
     "docs/graph.md": [PROCESS],
     "docs/guides/compose.md": [NIGHT],
     "docs/guides/interop.md": [NIGHT],
@@ -51,6 +52,7 @@ MARKS = {
 TINY_FIT = '{"generations": 2, "population": 8, "refine": 1, "refine_steps": 3, "folds": 0, "free_run_s": 0.0}'
 TINY_PPO = '{"episode_s": 2.0, "timelines": 4, "ppo": {"total_steps": 512, "num_envs": 16, "minibatches": 2}}'
 SMALLER = {
+    "README.md": {"(pendulum, model)": f"(pendulum, model, {TINY_PPO})"},
     "docs/guides/interop.md": {"1_000_000": "64", "num_envs=64": "num_envs=2", "num_envs=128": "num_envs=2"},
     "docs/guides/notebook.md": {'"generations": 10': '"generations": 2'},
     "docs/reference/runs.md": {
@@ -63,6 +65,12 @@ SMALLER = {
 FILES = {"docs/tutorial.md": ("pipelines/head/__init__.py", "pipelines/head/robot.py")}
 """Pages whose first blocks are files."""
 TRUE = {
+    "README.md": [
+        "model.verdict.status == 'accepted'",
+        "20.96 < model.intervals['gain'][0] < 21.10 < model.intervals['gain'][1] < 21.19",
+        "0.0442 < model.intervals['round_trip_delay'][0] < 0.0445 < model.intervals['round_trip_delay'][1] < 0.0449",
+        "(folder / 'trained' / 'bundle' / 'policy.onnx').is_file()",
+    ],
     "docs/graph.md": [
         "abs(nodes['agent'].phase - 0.003) < 1e-9 and abs(nodes['actuator'].phase - 0.007) < 1e-9",
         "abs(statistics.age_s['sensor'].p99 - 0.001) < 1e-9",

@@ -256,11 +256,11 @@ def deploy_on_the_bus(
 
 
 TRAINED_ON = {
-    "data_sheet": "the data sheet, without delays",
-    "uniform": "the data sheet, parameters 30 % up and down",
-    "point": "the identified parameters and delays",
-    "posterior": "the posterior of the identification",
-    "all": "posterior, misfit, recorded timing and noise",
+    "data_sheet": "data-sheet values, no delays",
+    "uniform": "data-sheet values, varied by 30 %",
+    "point": "identified values and delays",
+    "posterior": "the same, varied by their uncertainty",
+    "all": "the same, with model error, timing, noise",
 }
 
 
