@@ -85,7 +85,8 @@ def keep_time() -> None:
     """Give the calling thread a real-time priority, if the operating system allows it.
 
     Processes and threads that are started from this one do not inherit it. On Linux it needs root, or a limit for
-    real-time priorities (``ulimit -r``) of at least 3. The effect is in docs/reference/choices.md.
+    real-time priorities (``ulimit -r``) of at least 3. Three nodes at 500 Hz beside an emulated bus on two
+    processors: the latest wake-up in a hundred is 0.2 to 0.4 ms late with it, 0.9 to 1.9 ms without.
     """
     with suppress(AttributeError, OSError):
         # If the guardian's higher priority is not allowed, this thread takes none either.

@@ -118,7 +118,7 @@ class Likelihood:
 def maximise(likelihood: Likelihood, p: np.ndarray, steps: int = 40) -> np.ndarray:
     """Maximise the likelihood by damped steps with the information matrix of the rows' gradients.
 
-    docs/reference/choices.md compares it with solvers of scipy, which do not use these gradients.
+    Solvers of scipy do not use these gradients.
 
     Args:
         p: Shape ``(size,)``: the start.

@@ -83,8 +83,8 @@ class CompiledGraph:
         self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.replayed), reusable)
         self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes, reusable=reusable)
         self.walk = Walk(self.program, self.supervisor)
-        # Unrolling halves a GPU's copies of the carried state (docs/reference/choices.md); on a CPU it costs time to
-        # compile.
+        # Unrolling halves a GPU's copies of the carried state: 100,000 pendulums on an H200 take 0.63 of the time. On a
+        # CPU it costs time to compile.
         self.rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
 
     @cached_property

