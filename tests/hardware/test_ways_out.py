@@ -32,8 +32,8 @@ def reboot(robot, rig):
     rig.device.link.port.write(rig.device.link.form.build(2, Instruction.REBOOT))
 
 
-def stop_guardian(robot, rig):
-    robot.guardian_works = False
+def kill_guardian(robot, rig):
+    robot.guardian_lives = False
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ FAULTS = {
     "wild readings": Fault(strike(wild=1.0), SafetyStop, "reads", PERIOD_S + 0.01),
     "a frozen encoder": Fault(strike(frozen_after_s=0.0), SafetyStop, "has read", 0.15, families=(VOLTS,)),
     "a servo that restarts": Fault(reboot, SafetyStop, "servo 2", 0.6),
-    "a guardian that was stopped": Fault(stop_guardian, SafetyStop, "guardian", PERIOD_S + 0.02),
+    "a guardian that has died": Fault(kill_guardian, SafetyStop, "guardian", PERIOD_S + 0.02),
     "a command that is no number": Fault(None, SafetyStop, "not finite", PERIOD_S),
     "a joint that is too fast": Fault(None, SafetyStop, "limit of 0.01 rad/s", PERIOD_S, families=(VOLTS,)),
     "a process that was stopped": Fault(None, SafetyStop, "guardian", SILENCE_S + 0.02),

@@ -16,7 +16,7 @@ from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.emulation import emulator
 from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.plant import OperatingMode
-from sim2real.hardware.safety import guardian, guardian_process
+from sim2real.hardware.safety import guardian_process
 from sim2real.runtime import clock
 
 pytestmark = pytest.mark.process
@@ -152,23 +152,7 @@ def test_torque_is_off_though_the_guardian_was_stopped_before_the_host_died(star
     host.kill()
     time.sleep(0.4)
     assert_off_soon(robot, since_ns)
-    stopped, gone = host.communicate()
-    # On a busy machine the host comes first: it notices that its guardian was stopped before it is killed.
-    assert "sim2real guardian: the control process is gone: torque is off" in gone or guardian._DEAD in stopped
-
-
-def test_a_guardian_that_does_not_answer_is_not_trusted(start_robot, open_bus, monkeypatch):
-    """As under a debugger, which the kernel does not report."""
-    robot = start_robot()
-    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.4)
-    monkeypatch.setattr(guardian.os, "waitid", lambda *_: None)
-    os.kill(bus.guardian_pid, signal.SIGSTOP)
-    begin = time.monotonic()
-    with pytest.raises(SafetyStop, match="has died or was stopped"):  # noqa: PT012 - it takes its time
-        while time.monotonic() < begin + 10.0:
-            bus.write_goal_pwm({1: 0.5})
-            time.sleep(0.002)
-    assert 0.4 < time.monotonic() - begin < 1.0
+    assert "sim2real guardian: the control process is gone: torque is off" in host.communicate()[1]
 
 
 def test_it_outlives_what_a_terminal_and_a_service_manager_send(start_host):
@@ -183,13 +167,13 @@ def test_it_outlives_what_a_terminal_and_a_service_manager_send(start_host):
     assert_off_soon(robot, since_ns)
 
 
-@pytest.mark.parametrize("way", ["it acted", "it died", "it was stopped"])
+@pytest.mark.parametrize("way", ["it acted", "it died"])
 def test_torque_is_taken_off_in_order_whatever_became_of_it(start_robot, open_bus, way):
     robot = start_robot()
     bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.1)
     bus.write_goal_pwm({1: 0.5})
-    if way != "it acted":
-        os.kill(bus.guardian_pid, signal.SIGKILL if way == "it died" else signal.SIGSTOP)
+    if way == "it died":
+        os.kill(bus.guardian_pid, signal.SIGKILL)
     time.sleep(0.3)
     bus.torque(False)
     assert bus.read(1, reg.TORQUE_ENABLE) == 0
@@ -198,12 +182,11 @@ def test_torque_is_taken_off_in_order_whatever_became_of_it(start_robot, open_bu
     assert bus.read(1, reg.TORQUE_ENABLE) == 0
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_without_it_the_control_process_stops(start_robot, open_bus, number):
+def test_without_it_the_control_process_stops(start_robot, open_bus):
     robot = start_robot()
     bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.4)
     bus.write_goal_pwm({1: 0.5})
-    os.kill(bus.guardian_pid, number)
+    os.kill(bus.guardian_pid, signal.SIGKILL)
     begin = time.monotonic()
     with pytest.raises(SafetyStop, match="the guardian has died"):  # noqa: PT012 - it takes its time
         while time.monotonic() < begin + 10.0:

@@ -35,7 +35,7 @@ class VirtualTime(ABC):
     Attributes:
         clock: The robot itself.
         reports: What the guardian told a person.
-        guardian_works: False: the guardian was stopped, and hears nothing.
+        guardian_lives: False: the guardian's process has died.
         host_lives: False: the host's process has died.
     """
 
@@ -44,7 +44,7 @@ class VirtualTime(ABC):
         self.truth_path = Path(self._folder.name) / "truth.bin" if truth_path is None else truth_path
         self.clock: Clock = self
         self.reports: list[str] = []
-        self.guardian_works = self.host_lives = True
+        self.guardian_lives = self.host_lives = True
         self._log: TruthLog
         self._now_ns = 0
         self._watchers: dict[threading.Event, list[Any]] = {}  # what is called, its period [ns], when it is due [ns]
@@ -71,7 +71,7 @@ class VirtualTime(ABC):
 
     def guardian_hears(self, messages: bytes) -> None:
         """Pass messages of the host to the guardian, which acts on them at once; none: the host has died."""
-        if self._guard is not None and self.guardian_works:
+        if self._guard is not None and self.guardian_lives:
             self._guard_acts(lambda guard: guard.hear(messages))
 
     def stop(self) -> None:
@@ -138,7 +138,7 @@ class VirtualTime(ABC):
             self._guard = guard
 
     def _guard_due_ns(self) -> int | None:
-        due_s = None if self._guard is None or not self.guardian_works else self._guard.due_s()
+        due_s = None if self._guard is None or not self.guardian_lives else self._guard.due_s()
         return None if due_s is None else math.ceil(1e9 * due_s) + 1
 
 
@@ -157,18 +157,18 @@ class VirtualChannel:
         self._messages += message
 
     def send(self, message: bytes) -> None:
-        """Send a message, at which the guardian acts at once."""
+        """Send a message, at which the guardian acts at once; OSError if it has died."""
+        if not self._robot.guardian_lives:
+            raise BrokenPipeError("the guardian has died")
         self._robot.guardian_hears(message)
 
     def receive(self, until_ns: int) -> bytes | None:
-        """Return messages; None if there are none: the guardian answers at once, or never."""
+        """Return messages; None if there are none: the guardian answers at once, or never; b"" if it has died."""
         del until_ns
+        if not self._robot.guardian_lives:
+            return b""
         messages, self._messages = self._messages, b""
         return messages or None
-
-    def is_stopped(self) -> bool:
-        """Return whether the guardian was stopped."""
-        return not self._robot.guardian_works
 
     def close(self, wait_s: float) -> None:
         """Close the connection."""

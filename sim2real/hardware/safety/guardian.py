@@ -1,7 +1,6 @@
 """The control process's side of the guardian: starts it, sends it signs of life, and reads its messages."""
 
 import math
-import os
 import select
 import socket
 import subprocess
@@ -21,13 +20,7 @@ _SETTLE_TIMEOUT_S: Final = 1.0
 _KILL_S: Final = 0.01
 _BEATS: Final = 10  # number of signs of life in the longest silence
 _INTERVAL_S: Final = 0.01  # between signs of life if silence is not limited
-# Send buffer for about 50 unread signs of life (on Linux 770 bytes each, of twice this size); when it is full, the
-# guardian hangs.
-_UNHEARD_BYTES: Final = 20_000
-# Longest time without an answer to a sign of life, for a guardian that a debugger stops: the kernel does not report it.
-# Even on a busy machine, no process of this priority waits longer.
-_HEARD_S: Final = 0.5
-_DEAD: Final = "the guardian has died or was stopped: the torque would stay on if this process died too"
+_DEAD: Final = "the guardian has died: the torque would stay on if this process died too"
 
 
 class Channel(Protocol):
@@ -47,10 +40,6 @@ class Channel(Protocol):
 
     def receive(self, until_ns: int) -> bytes | None:
         """Return messages; None if there are none until a time [ns]; b"" if the guardian has died."""
-        ...
-
-    def is_stopped(self) -> bool:
-        """Return whether the guardian was stopped, as by a debugger."""
         ...
 
     def close(self, wait_s: float) -> None:
@@ -75,9 +64,7 @@ class Process:
         self, program: Sequence[str], longest_s: float, arguments: Sequence[str] = (), pass_fds: Sequence[int] = ()
     ) -> None:
         self.clock: Clock = SYSTEM_CLOCK
-        # The signs of life go over a socket with a small buffer, which is full when the guardian hangs.
         self._link, other = socket.socketpair()
-        self._link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _UNHEARD_BYTES)
         command = [sys.executable, *program, str(other.fileno()), repr(longest_s), *arguments]
         try:
             # In a new session, so that Ctrl-C in a terminal reaches only the control process.
@@ -114,12 +101,6 @@ class Process:
         except (OSError, ValueError):
             return b""
 
-    def is_stopped(self) -> bool:
-        """Return whether the guardian was stopped, as by a debugger."""
-        with suppress(ChildProcessError, AttributeError):  # it has ended; or this system cannot tell
-            return os.waitid(os.P_PID, self.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
-        return False
-
     def close(self, wait_s: float) -> None:
         """Close the connection; then wait for the guardian's end, and kill it after a time [s]; 0: do not wait."""
         self._link.close()
@@ -135,9 +116,9 @@ class Process:
 class Guardian:
     """A separate process that makes the motors safe when this one dies, or gives no sign of life while torque is on.
 
-    In normal operation it only receives signs of life from `beat`, which cost 10 us each, and answers them: a guardian
-    that died or was stopped is noticed at the next one. If this process dies while the guardian is stopped, the kernel
-    lets it continue (Linux), and it makes the motors safe. It reports its actions on stderr.
+    In normal operation it only receives signs of life from `beat`, which cost 10 us each: a guardian that died is
+    noticed at the next one. If this process dies while the guardian is stopped, as by a debugger, the kernel lets it
+    continue (Linux), and it makes the motors safe. It reports its actions on stderr.
 
     Args:
         start: Starts the guardian, given the longest silence [s].
@@ -156,7 +137,6 @@ class Guardian:
         self._silence_s = silence_s
         self._interval_s = silence_s / _BEATS or _INTERVAL_S
         self._beat_s = -math.inf
-        self._unheard_s: float | None = None  # when the first sign of life was sent that was not answered yet
         self._armed = self._tripped = False
         self._lock = threading.RLock()  # reentrant, as a signal handler may close the bus in the middle of `beat`
         self._messages = b""
@@ -185,7 +165,7 @@ class Guardian:
             SafetyStop: As in `beat`.
         """
         with self._lock:
-            self._armed, self._beat_s, self._unheard_s = True, -math.inf, None
+            self._armed, self._beat_s = True, -math.inf
         try:
             self.beat()
         except SafetyStop:
@@ -212,9 +192,7 @@ class Guardian:
             # Any message means that it has taken over; without one, show it that this process lives.
             self._listen()
             if not self._messages:
-                self._require_running(now_s)
                 self._send(process.BEAT)
-                self._unheard_s = now_s if self._unheard_s is None else self._unheard_s
                 return
         raise SafetyStop(
             f"the guardian has taken the torque off: this process was silent for {self._silence_s:g} s",
@@ -239,13 +217,11 @@ class Guardian:
         """Wait until the motors are in the safe state, if it is making them safe. Never raises.
 
         Returns:
-            Whether it still watches: it has neither taken over nor died, and was not stopped.
+            Whether it still watches: it has neither taken over nor died.
         """
         try:
             with self._lock:
                 self._listen()
-                if not self._messages:
-                    self._require_running(self._now_s())
         except SafetyStop:
             return False
         if self.took_over and process.SAFE not in self._messages:
@@ -272,12 +248,6 @@ class Guardian:
         except OSError as error:  # it has died, or does not read
             raise SafetyStop(_DEAD, hint="start again") from error
 
-    def _require_running(self, now_s: float) -> None:
-        """Raise SafetyStop if the guardian was stopped, or has not answered for long."""
-        unheard = self._unheard_s is not None and now_s - self._unheard_s > _HEARD_S
-        if unheard or self._channel.is_stopped():
-            raise SafetyStop(_DEAD, hint="start again")
-
     def _listen(self, until_ns: int = 0) -> bool:
         """Read the guardian's messages, waiting until a time [ns]; return whether there were any.
 
@@ -289,9 +259,7 @@ class Guardian:
             if not received:
                 raise SafetyStop(_DEAD, hint="start again")
             heard = True
-            if process.HEARD in received:
-                self._unheard_s = None
-            self._messages += received.replace(process.HEARD, b"")
+            self._messages += received
         return heard
 
     def _hears(self, message: bytes, timeout_s: float) -> bool:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 READY, BEAT, REST, LEAVE, TRIP = b"r", b"+", b"-", b"q", b"!"
-HEARD, TRIPPED, SAFE, FAILED = b".", b"t", b"s", b"f"
+TRIPPED, SAFE, FAILED = b"t", b"s", b"f"
 GIVE_UP_S = 10.0
 _QUIET_S, _LONGEST_ANSWER_S = 0.002, 0.02
 _PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
@@ -99,8 +99,6 @@ class Guard:
                 self.make_safe("the control process is gone")
             return False
         self._armed, self._heard_s = messages.endswith(BEAT), self.now_s()
-        if self._armed:
-            self._say(HEARD)
         return True
 
     def _trip(self, reason: str) -> None:
