@@ -33,8 +33,7 @@ def test_each_column_has_its_limits_and_its_slew():
     limited.apply(np.array(SENT), 0.0, 0.0)
     out = limited.apply(np.array([[2.0, 90.0, -1.0], [-0.5, 10.0, 2.0]]), 0.0, 0.05)
     np.testing.assert_allclose(out, [[0.55, 50.0, 0.0], [-0.5, 10.0, 2.0]])
-    assert limited.counts.cut == [1, 0]
-    assert limited.counts.high == [0.55, -0.5]
+    assert (limited.counts.clamped, limited.counts.slewed) == (1, 1)
 
 
 def test_a_stale_command_holds_its_position_and_damps():

@@ -55,10 +55,6 @@ def test_positions_start_where_the_joints_are_and_pass_the_gate(open_rig):
     np.testing.assert_allclose(sent[-1], [0.5, -1.0, 0.3], atol=1e-2)
     counts = rig.gate.counts
     assert (counts.passed, counts.clamped) == (20, 20)
-    assert counts.cut[1] == 20
-    np.testing.assert_allclose(counts.low, np.min(sent, axis=0))
-    np.testing.assert_allclose(counts.high, np.max(sent, axis=0))
-    np.testing.assert_allclose(counts.total, np.sum(sent, axis=0))
     assert rig.device.counters.withheld >= 20 + 2 * 3
     rig.stop()
     assert_untouched(robot, reg.GOAL_POSITION, rig.device, (1, 2, 3))

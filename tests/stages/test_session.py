@@ -17,7 +17,7 @@ def step(seq, node="sensor"):
 @pytest.mark.parametrize("bad", [np.float64("nan"), np.array([0.0, np.nan]), float("nan"), np.float32("nan")])
 def test_a_nan_stops_the_graph_and_stands_in_the_log(bad):
     recorder = MemoryRecorder()
-    watch = session.Watch(recorder)
+    watch = session.Watch(recorder, "actuator", "action")
     watch.start(5, 7)
     watch.step(step(0), {"th": np.zeros(np.shape(bad)), "count": 3})
     watch.message(MessageRecord("agent", "sensor", 0, 0, 1, 2))
@@ -30,8 +30,17 @@ def test_a_nan_stops_the_graph_and_stands_in_the_log(bad):
 
 
 def test_infinity_and_other_types_are_none_of_its_business():
-    watch = session.Watch(MemoryRecorder())
+    watch = session.Watch(MemoryRecorder(), "actuator", "action")
     watch.step(step(0), {"range_m": np.inf, "flag": True, "n": np.int64(3), "image": np.zeros((2, 2), np.uint8)})
+
+
+def test_commands_are_summarised_for_each_motor():
+    watch = session.Watch(MemoryRecorder(), "actuator", "action")
+    for seq, action in enumerate(([1.0, -2.0], [3.0, 0.5])):
+        watch.step(step(seq, "actuator"), {"action": np.array(action, np.float32)})
+        watch.step(step(seq), {"action": np.array([9.0, 9.0])})
+    assert watch.commands == 2
+    assert [x.tolist() for x in (watch.low, watch.total, watch.high)] == [[1.0, -2.0], [4.0, -1.5], [3.0, 0.5]]
 
 
 def node(overruns, steps=200, **ages):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -103,30 +103,14 @@ class GateConfig:
 class GateCounts:
     """Counts of the calls of the gate, and of those in which each limit changed a command.
 
-    Args:
+    Attributes:
         passed: Calls that returned a command.
-        cut: For each actuator, calls in which a limit changed its command.
-        low: For each actuator, the lowest command that was returned; with columns, of the first one.
-        total: For each actuator, the sum of the commands that were returned; with columns, of the first one.
     """
 
     passed: int = 0
     clamped: int = 0
     slewed: int = 0
     stale: int = 0
-    cut: list[int] = field(default_factory=list)
-    low: list[float] = field(default_factory=list)
-    high: list[float] = field(default_factory=list)
-    total: list[float] = field(default_factory=list)
-
-    def add(self, allowed: np.ndarray, cut: np.ndarray) -> None:
-        """Count a returned command ``(n,)`` or ``(n, k)``, and the entries of it that a limit changed."""
-        if allowed.ndim > 1:
-            allowed, cut = allowed[:, 0], np.any(cut, axis=1, keepdims=True)[:, 0]
-        before = (self.low, self.high, self.total, self.cut) if self.passed else (allowed, allowed, 0.0, 0)
-        self.low, self.high = np.minimum(before[0], allowed).tolist(), np.maximum(before[1], allowed).tolist()
-        self.total, self.cut = np.add(before[2], allowed).tolist(), np.add(before[3], cut).tolist()
-        self.passed += 1
 
 
 class SafetyGate:
@@ -199,12 +183,11 @@ class SafetyGate:
         # Replace a stale command, or limit a fresh one; the comparison also catches an age of NaN.
         if not age_s <= self.config.command_timeout_s:
             self.counts.stale += 1
-            allowed, cut = fallback, np.zeros(wanted.shape, bool)
+            allowed = fallback
         else:
             allowed = self._slew(self._clamp(wanted), now_s)
-            cut = allowed != wanted
         self._last, self._last_s = allowed, now_s
-        self.counts.add(allowed, cut)
+        self.counts.passed += 1
         return allowed.copy()
 
     def _clamp(self, wanted: np.ndarray) -> np.ndarray:

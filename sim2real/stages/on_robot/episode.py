@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from sim2real.robots.contract import Robot, Session
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.failure import noted
 from sim2real.stages.on_robot.come_to_rest import come_to_rest
-from sim2real.stages.on_robot.open_robot import answer_rows, bus_use, rig_summary, sent_rows
+from sim2real.stages.on_robot.open_robot import answer_rows, bus_use, rig_summary
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note, progress
 from sim2real.stages.terminal.interruption import interruptible
@@ -37,11 +37,22 @@ _INTERRUPTED = 130
 
 
 class Watch:
-    """A recorder that passes everything on, keeps when the episode started, and stops the graph on a NaN."""
+    """A recorder that passes everything on, and stops the graph on a NaN.
 
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-        self.monotonic_ns = 0
+    Args:
+        actuator: The node whose commands are summarised.
+        field: Field of its output with a number for each motor.
+
+    Attributes:
+        monotonic_ns: When the episode started.
+        commands: Number of the actuator's commands.
+        low, total, high: Of each motor, over these commands.
+    """
+
+    def __init__(self, recorder: Recorder, actuator: str, field: str) -> None:
+        self._recorder, self._actuator, self._field = recorder, actuator, field
+        self.monotonic_ns = self.commands = 0
+        self.low, self.total, self.high = np.array([np.inf]), np.zeros(1), np.array([-np.inf])
 
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
         """Keep when the episode starts."""
@@ -51,10 +62,15 @@ class Watch:
     def step(self, record: StepRecord, output: Any) -> None:
         """Pass a step on."""
         self._recorder.step(record, output)
-        for name, leaf in named_leaves(output).items():
+        leaves = named_leaves(output)
+        for name, leaf in leaves.items():
             values = np.asarray(leaf)
             if values.dtype.kind == "f" and np.isnan(values).any():
                 raise SafetyStop(f"node {record.node!r} stopped: its output {name!r} is NaN in step {record.seq}")
+        if record.node == self._actuator:
+            sent = np.atleast_1d(np.asarray(leaves[self._field], np.float64))
+            self.commands, self.total = self.commands + 1, self.total + sent
+            self.low, self.high = np.minimum(self.low, sent), np.maximum(self.high, sent)
 
     def message(self, record: MessageRecord) -> None:
         """Pass the fate of a message on."""
@@ -91,7 +107,7 @@ def run_episode(
     graph.warmup(state)  # every program is compiled before torque goes on
     # Start the log, and run; an interrupted episode comes to rest before torque goes off.
     recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig)
-    watch = Watch(recorder)
+    watch = Watch(recorder, robot.roles.actuator, robot.drive.command)
     graph.recorder = watch
     try:
         try:
@@ -208,7 +224,7 @@ def _recorder(
 
 def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) -> dict[str, Any]:
     # Times of the nodes, in the order of the loop.
-    rig, command, counters = session.rig, robot.drive.command, session.rig.device.counters
+    rig, counters = session.rig, session.rig.device.counters
     timing = {
         n: {
             "steps": s.steps,
@@ -230,8 +246,25 @@ def _summary(robot: Robot, graph: AsyncGraph, session: Session, watch: Watch) ->
         "command_timeouts": rig.timeouts,
         **rig_summary(rig),
         "gate": asdict(rig.gate.counts),
-        "sent": sent_rows(rig.gate, command, robot.units.get(command, "")),
+        "sent": _sent_rows(watch, rig.gate.config.joints, robot),
     }
+
+
+def _sent_rows(watch: Watch, joints: Sequence[str], robot: Robot) -> list[dict[str, Any]]:
+    """Return for each motor which commands were sent, or withheld in a dry run: lowest, mean and highest."""
+    field = robot.drive.command
+    several = len(watch.total) > 1
+    return [
+        {
+            "name": joints[i] if i < len(joints) else f"{field}[{i}]" if several else field,
+            "unit": robot.units.get(field, ""),
+            "commands": watch.commands,
+            "low": float(watch.low[i]),
+            "mean": float(total) / watch.commands,
+            "high": float(watch.high[i]),
+        }
+        for i, total in enumerate(watch.total if watch.commands else ())
+    ]
 
 
 def _place(node: BaseNode) -> float:

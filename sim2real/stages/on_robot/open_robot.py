@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.hardware.safety.gate import SafetyGate
 from sim2real.hardware.safety.rig import Rig
 from sim2real.robots.contract import Robot, Session
 from sim2real.runtime.clock import realtime
@@ -95,44 +94,14 @@ def warn(summary: Mapping[str, Any]) -> None:
         )
 
 
-def sent_rows(gate: SafetyGate, field: str, unit: str) -> list[dict[str, Any]]:
-    """Return for each actuator what the gate let through since the robot started, as JSON takes it.
-
-    Args:
-        field: Field of the command, the name of what has none.
-
-    Returns:
-        ``name``, ``unit``, ``commands``, ``low``, ``mean`` and ``high`` of the sent
-        commands, or of those that a dry run withheld; and
-        ``cut``: commands that a limit of the gate had changed.
-    """
-    counts, names = gate.counts, gate.config.joints
-    if not counts.passed:
-        return []
-    several = len(counts.total) > 1
-    return [
-        {
-            "name": names[i] if i < len(names) else f"{field}[{i}]" if several else field,
-            "unit": unit,
-            "commands": counts.passed,
-            "low": counts.low[i],
-            "mean": total / counts.passed,
-            "high": counts.high[i],
-            "cut": counts.cut[i],
-        }
-        for i, total in enumerate(counts.total)
-    ]
-
-
 def show_withheld(summaries: Sequence[Mapping[str, Any]]) -> None:
     """Print what the episodes of a dry run would have sent."""
     several = len(summaries) > 1
     rows = []
     for number, summary in enumerate(summaries):
         for s in summary["sent"]:
-            share = f"{s['cut'] / max(1, s['commands']):.1%}"
-            figures = [s["unit"], s["commands"], s["low"], s["mean"], s["high"], s["cut"], share]
+            figures = [s["unit"], s["commands"], s["low"], s["mean"], s["high"]]
             rows.append([*([number] if several else []), s["name"], *figures])
-    heads = ["would have been sent to", "unit", "commands", "min", "mean", "max", "cut by the gate", "share"]
+    heads = ["would have been sent to", "unit", "commands", "min", "mean", "max"]
     print(table(rows, [*(["episode"] if several else []), *heads]))
     note("dry run: no joint was moved; no later stage uses this as a recording")

@@ -29,7 +29,7 @@ def servo_blocks(episodes: Sequence[Episode]) -> list[Block]:
     if rows:
         dry = any(is_dry(e) for e in episodes)
         caption = "Commands to the motors, which were not sent" if dry else "Commands to the motors"
-        heads = ("actuator", "unit", "commands", "min", "mean", "max", "cut by the gate", "share")
+        heads = ("actuator", "unit", "commands", "min", "mean", "max")
         blocks.append(TableBlock(caption, heads, rows, text_columns=(1,)))
     return blocks
 
@@ -54,7 +54,5 @@ def _answers(end: Mapping[str, Json]) -> list[str]:
 
 
 def _row(sent: Mapping[str, Json], which: str) -> list[str]:
-    commands, cut = int(sent["commands"]), int(sent["cut"])
     values = [number(float(sent[k])) for k in ("low", "mean", "high")]
-    share = f"{cut / max(1, commands):.1%}"
-    return [f"{which}{sent['name']}", str(sent["unit"]), number(commands), *values, number(cut), share]
+    return [f"{which}{sent['name']}", str(sent["unit"]), number(int(sent["commands"])), *values]
