@@ -12,7 +12,7 @@ from sim2real.artifacts.episodes import EPISODES, Episodes
 from sim2real.artifacts.files import check, make_folder, malformed, read_json, write_json
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
-from sim2real.artifacts.summary import ArtifactTable, Summed
+from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.policy.bundle import PolicyReference, load_bundle, make_runner, read_contract, read_weights, save_bundle
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.network import NetworkSpec
@@ -98,7 +98,7 @@ class History:
 
 
 @dataclass(frozen=True, repr=False)
-class Bundle(Summed):
+class Bundle(Shown):
     """A policy and its contract.
 
     Attributes:
@@ -122,7 +122,7 @@ class Bundle(Summed):
     spec: NetworkSpec = field(default_factory=NetworkSpec)
     graph: bytes | None = None
     references: Mapping[str, PolicyReference] = field(default_factory=dict)
-    summary: Mapping[str, Json] = field(default_factory=dict)  # pyright: ignore[reportIncompatibleMethodOverride]
+    summary: Mapping[str, Json] = field(default_factory=dict)
 
     def about(self) -> Mapping[str, Json]:
         """Return rate, success in simulation and folder, by name."""

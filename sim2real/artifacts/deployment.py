@@ -20,7 +20,7 @@ from sim2real.artifacts.files import (
 )
 from sim2real.artifacts.paths import shown
 from sim2real.artifacts.recording import TRUTH, Recording
-from sim2real.artifacts.summary import ArtifactTable, Interval, Summed, words_and_unit
+from sim2real.artifacts.summary import ArtifactTable, Interval, Shown, words_and_unit
 from sim2real.log.schema import unit_of
 from sim2real.types import Json
 
@@ -201,7 +201,7 @@ class Advice:
 
 
 @dataclass(frozen=True, repr=False)
-class Deployment(Summed):
+class Deployment(Shown):
     """Episodes on the robot, and the same policy in simulation.
 
     Attributes:
@@ -230,7 +230,7 @@ class Deployment(Summed):
     advice: Advice | None = None
     dry_run: bool = False
     format: int = FORMAT
-    summary: tuple[Mapping[str, Json], ...] = ()  # pyright: ignore[reportIncompatibleMethodOverride]
+    summary: tuple[Mapping[str, Json], ...] = ()
 
     def __post_init__(self) -> None:
         check(bool(self.episodes), "no episode")

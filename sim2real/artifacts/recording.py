@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim2real.artifacts.paths import shown
-from sim2real.artifacts.summary import ArtifactTable, Summed
+from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
@@ -26,7 +26,7 @@ LOG, TRUTH = "session.mcap", "truth.bin"
 
 
 @dataclass(frozen=True, repr=False)
-class Recording(Summed):
+class Recording(Shown):
     """A recorded session.
 
     Attributes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import textwrap
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -83,21 +83,6 @@ class Shown(ABC):
         if (table := self.rows()) is None:
             return shown
         return f"{shown}<table>{_row('th', table.headers)}{''.join(_row('td', row) for row in table.rows)}</table>"
-
-
-class Summed(Shown):
-    """An artifact of a stage with a ``summary``: text and numbers about the stage's run."""
-
-    if TYPE_CHECKING:
-
-        @property
-        def summary(self) -> Json:
-            """Text and numbers about the stage's run."""
-
-    def __iter__(self) -> Iterator[Json]:
-        """Yield the artifact and its summary: earlier versions returned a pair of them."""
-        yield self
-        yield self.summary
 
 
 def _row(tag: str, cells: Sequence[Json]) -> str:

@@ -8,7 +8,7 @@ import pytest
 
 import sim2real
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.deployment import Advice, Deployment, Gap, Scores
+from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
@@ -42,7 +42,6 @@ def pendulum():
         (lambda p: sim2real.record(p, "folder", {"seconds": 3}), "config has no seconds. Available: "),
         (lambda p: sim2real.identify(p, RECORDING, {"generations": "many"}), "generations must be a number"),
         (lambda p: sim2real.identify(p, "nope.mcap"), "there is no log nope.mcap"),
-        (lambda p: sim2real.identify("nope.mcap", p), "there is no log nope.mcap"),
         (lambda p: sim2real.identify(p, [Path("nope.mcap")]), "there is no log nope.mcap"),
         (lambda p: sim2real.identify(p, []), "recording is empty"),
         (lambda p: sim2real.identify(p, {"th": [0.0]}), "must be a Recording, or the path of its log; got dict"),
@@ -56,7 +55,6 @@ def pendulum():
         (lambda p: sim2real.train(p, FOUND, {"ppo": {"steps": 1}}), "config.ppo has no steps"),
         (lambda p: sim2real.train(p, FOUND, timing=3), "timing must be a Timing"),
         (lambda p: sim2real.deploy(p, "nope", "folder"), "nope"),
-        (lambda p: sim2real.deploy("nope", p, "folder"), "nope"),
         (lambda p: sim2real.deploy(p, FOUND, "folder"), "bundle must be a Bundle, or its folder; got Identification"),
         (lambda p: sim2real.check(p, 7), "recording must be a Recording"),
         (lambda p: sim2real.validate(p, {"gain": 1.0}, RECORDING), "identification must be an Identification"),
@@ -98,16 +96,3 @@ def test_artifacts_are_saved_and_loaded_by_any_path(kind, tmp_path):
     for load in (Bundle.load, Deployment.load, Timing.load):
         with pytest.raises(Sim2RealError):
             load(kind(tmp_path / "none"))
-
-
-DEPLOYED = Deployment((Scores({"success": 1.0}),), (Gap("success", 1.0, None, None),), advice=Advice("fine", ()))
-
-
-def test_an_artifact_unpacks_into_itself_and_its_summary():
-    """As earlier versions returned them."""
-    deployment, sessions = replace(DEPLOYED, summary=({"lost_replies": 0},))
-    assert deployment.episodes
-    assert sessions == ({"lost_replies": 0},)
-    recording, summary = RECORDING
-    assert recording is RECORDING
-    assert summary == {}

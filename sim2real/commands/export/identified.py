@@ -25,10 +25,10 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.installation import version
 from sim2real.log.reader import read_log
 from sim2real.robots.contract import RecordedRobot
-from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
 from sim2real.stages.pipeline.from_model import pipeline_beside
 from sim2real.stages.pipeline.pipeline import Pipeline, available
+from sim2real.stages.pipeline.pipeline import pipeline_of as pipeline_of_robot
 from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyPath, identification_of
 from sim2real.stages.terminal.console import note, wrote
 from sim2real.stages.validate.stage import identified_robot
@@ -73,7 +73,7 @@ def export(
     Raises:
         UsageError: The identification was interrupted or is of another robot, or the target cannot hold the model.
     """
-    pipeline, document, out = python_arguments.pipeline_of(robot), identification_of(identification), Path(out)
+    pipeline, document, out = pipeline_of_robot(robot), identification_of(identification), Path(out)
     if to not in FILES:
         raise UsageError(f"cannot export to {to!r}. Available: {', '.join(FILES)}")
     if document.pipeline != pipeline.name:

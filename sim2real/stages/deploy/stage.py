@@ -20,7 +20,7 @@ from sim2real.stages.deploy.show import show, show_sessions, summary_lines, writ
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_parameters import check_parameters, open_identification
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 
 
 def deploy(
@@ -47,7 +47,7 @@ def deploy(
         Sim2RealError: The policy does not fit the robot, or the cause that stopped the robot.
     """
     # Check all arguments before the robot moves.
-    pipeline, bundle = python_arguments.robot_first(robot, bundle)
+    pipeline = pipeline_of(robot)
     bundle, folder = python_arguments.bundle_of(bundle), python_arguments.folder_of(folder)
     config = python_arguments.config_of(config, pipeline.deploy)
     if identification is not None:

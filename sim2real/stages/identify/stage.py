@@ -22,8 +22,8 @@ from sim2real.stages.identify.judgement import judge
 from sim2real.stages.identify.live_fit import Best, searching
 from sim2real.stages.identify.show import show, summary
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import Pipeline
-from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of, robot_first
+from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
+from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
 
 
 def identify(
@@ -54,7 +54,7 @@ def identify(
         UsageError: When the recordings are too short, or the model does not fit them.
         Sim2RealError: When a recording holds no numbers where the model reads some, or other units.
     """
-    pipeline, recording = robot_first(robot, recording)
+    pipeline = pipeline_of(robot)
     config = config_of(config, pipeline.identify)
     fitted = recordings_of(recording, pipeline)
     held_out = recordings_of(hold_out, pipeline, "hold_out") if hold_out else ()

@@ -14,7 +14,7 @@ from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.robots.contract import RecordedRobot
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
+from sim2real.stages.pipeline.pipeline import Pipeline
 
 T = TypeVar("T")
 AnyRobot: TypeAlias = RecordedRobot | Pipeline | str
@@ -28,18 +28,6 @@ AnyBundle: TypeAlias = Bundle | AnyPath
 """A bundle, its folder, or that of a train stage."""
 AnyTiming: TypeAlias = Timing | AnyPath
 """A timing, or its file."""
-
-
-def is_robot(value: object) -> bool:
-    """Return whether a value is a robot or a pipeline; a name may also be a path."""
-    return isinstance(value, RecordedRobot | Pipeline)
-
-
-def robot_first(robot: Any, other: Any) -> tuple[Pipeline, Any]:
-    """Return the robot's pipeline and the other argument; earlier versions took them the other way round."""
-    if is_robot(other) and not is_robot(robot):
-        robot, other = other, robot
-    return pipeline_of(robot), other
 
 
 def recording_of(value: Any, pipeline: Pipeline, name: str = "recording") -> Recording:

@@ -31,7 +31,7 @@ from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline import from_model, python_arguments
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyRecording
 from sim2real.stages.terminal.console import artifact_table, note, progress
 from sim2real.stages.validate.config import ValidateConfig
@@ -231,7 +231,7 @@ def validate(
         recording: One recording that was not fitted, or several; or the paths of their logs.
         config: A dict holds the fields that differ from the default.
     """
-    pipeline = python_arguments.pipeline_of(robot)
+    pipeline = pipeline_of(robot)
     document = python_arguments.identification_of(identification)
     if document.pipeline != pipeline.name:
         raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {pipeline.name!r}")
