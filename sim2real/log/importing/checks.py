@@ -207,7 +207,7 @@ def _own(found: Response, i: int, names: Sequence[str], by_name: bool) -> tuple[
     if better[0] > 0.9 and own < 0.6:
         text = f"{name} follows the goal of {names[better[2]]} (r {better[0]:.2f}), not its own (r {own:.2f})"
         return [Finding("order", i, text, "refuse")], None
-    if not by_name:
+    if not by_name and max(own, better[0]) >= _FOLLOWS_R:
         for other, other_misfit, j in others:
             shape = 1 - other > 3 * (1 - own) + 0.02
             level = min(misfit, mirror) < 0.5 * other_misfit and other_misfit > 0.1

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -17,9 +14,19 @@ from sim2real.graph.episode import Episode
 from sim2real.log.importing import checks, lerobot
 from sim2real.log.importing.checks import Finding
 from sim2real.log.importing.importer import import_table
-from sim2real.log.importing.mapping import STAMP_UNITS, FieldMapping, ImportMapping, NodeMapping, in_si, to_toml
+from sim2real.log.importing.mapping import FieldMapping, ImportMapping, NodeMapping, in_si
 from sim2real.log.importing.names import Meaning, about_torque, are_numbers, columns_of, meaning
 from sim2real.log.importing.readers import Table
+from sim2real.log.importing.signals import ImportHints, Proposal, Signal, collect, require_one_clock, stamped
+from sim2real.log.importing.units import (
+    goal_unit,
+    position_unit,
+    rate_slope,
+    scales_of,
+    stated_unit,
+    turn_of,
+    turns_counted,
+)
 
 _FIELDS = {"position": "goal", "velocity": "goal_velocity", "torque": "torque", "duty": "duty", "voltage": "duty"}
 _EXTRA = {
@@ -32,115 +39,6 @@ _EXTRA = {
 }
 """Commands beside a goal: field -> quantity, side or None for any, and unit."""
 _GAINS = ("kp", "kd", "enabled")
-_RATES_HZ = (5.0, 12_000.0)
-"""Usual sampling rates of recorders."""
-_WALL_S = (1e9, 4e9)
-"""Wall clocks read this many seconds since 1970 (2001 to 2096)."""
-_DEG = 180 / np.pi
-_NAMED = ("rad", "deg", "rev", "mrad", "m", "mm")
-"""Units that a name can have, of positions."""
-
-Key = tuple[str, str, str]
-"""Node, field or empty, and key of a line of a mapping file."""
-
-
-@dataclass(frozen=True)
-class ImportHints:
-    """The user's information on a file.
-
-    Attributes:
-        pipeline: Name of the log's pipeline.
-        rate_hz: Rate of the samples if the file has no stamps [Hz].
-        joints: Names of the robot's joints, in its order; empty if unknown.
-        ranges: Shape ``(joints, 2)``: limits of the joints [rad]; None if unknown.
-        as_told: Keep names, order, signs and units, even if they are ambiguous or contradict the data.
-        slides: Names of the sliding joints, whose positions are lengths.
-        unit: Unit of positions and goals in the file; empty: by their names.
-        calibration: LeRobot's calibration of the arm.
-    """
-
-    pipeline: str
-    rate_hz: float | None = None
-    joints: tuple[str, ...] = ()
-    ranges: np.ndarray | None = None
-    as_told: bool = False
-    slides: tuple[str, ...] = ()
-    unit: str = ""
-    calibration: Path | None = None
-
-
-@dataclass(frozen=True)
-class Signal:
-    """Columns that belong together.
-
-    Attributes:
-        sources: Source of each column, as in a mapping.
-        labels: Joint of each column; empty if its name has none.
-        meaning: Meaning of the name.
-        values: Shape ``(N, columns)``; ``(columns,)`` for constants.
-        whole: Source of all columns together; None if they are separate signals of the file.
-    """
-
-    sources: tuple[str, ...]
-    labels: tuple[str, ...]
-    meaning: Meaning
-    values: np.ndarray
-    whole: str | None = None
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        return self.whole or ", ".join(self.sources[:3]) + (" ..." if len(self.sources) > 3 else "")
-
-    @property
-    def width(self) -> int:
-        """Number of columns."""
-        return len(self.sources)
-
-    def taken(self, places: Sequence[int]) -> Signal:
-        """Return some of the columns, in this order."""
-        whole = self.whole if list(places) == list(range(self.width)) else None
-        sources, labels = (tuple(part[i] for i in places) for part in (self.sources, self.labels))
-        return Signal(sources, labels, self.meaning, self.values[..., list(places)], whole)
-
-    def mapped(self, unit: str, **more: Any) -> FieldMapping:
-        """Return the field that has these columns."""
-        return FieldMapping(self.whole or self.sources, unit, shape=(-1,), **more)
-
-
-@dataclass
-class Proposal:
-    """A mapping, with the evidence for each line, and what is open.
-
-    Attributes:
-        joints: Names of the columns of measured positions, in the order of the log; numbers without names.
-        reasons: Evidence for a line of the mapping.
-        questions: What names and data do not decide: the line with its candidates.
-        evidence: Further sentences.
-    """
-
-    mapping: ImportMapping
-    joints: tuple[str, ...] = ()
-    reasons: dict[Key, str] = field(default_factory=dict)
-    questions: dict[Key, str] = field(default_factory=dict)
-    evidence: list[str] = field(default_factory=list)
-
-    def toml(self, name: str) -> str:
-        """Return the text of the mapping file of a file of this name."""
-        head = [f"Proposed by `sim2real import {name}`.", *self.evidence, f"Joints: {', '.join(self.joints)}"]
-        if self.questions:
-            head.insert(
-                1,
-                "Put an answer in place of each line with a question mark, then give this file to --mapping.",
-            )
-        return to_toml(self.mapping, head, self.reasons, self.questions)
-
-    def open_questions(self) -> list[str]:
-        """Return the open questions, one sentence each."""
-        return [
-            f"nodes.{node}.{f'fields.{name}.' * bool(name)}{key} = {text}"
-            for (node, name, key), text in self.questions.items()
-        ]
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # damaged files can hold numbers of any size
@@ -163,16 +61,18 @@ def propose(table: Table, hints: ImportHints) -> Proposal:
     nodes: dict[str, dict[str, Any]] = {}
     clocks = {}
     for node, signal, side in (("actuator", command, "command"), ("sensor", measured, "measured")):
-        nodes[node], clocks[node] = _stamped(signals, signal, side, node, table, hints, draft)
-    _agreeing_clocks(table, nodes, clocks, draft)
+        nodes[node], clocks[node] = stamped(signals, signal, side, node, table, hints, draft)
+    require_one_clock(table, nodes, clocks, draft)
     fields: dict[str, dict[str, FieldMapping]] = {"actuator": {}, "sensor": {}}
-    unit, turn = _position_unit(measured, command, kind, clocks, signals, table, hints, draft)
-    scale = _scales(measured, unit, hints)
+    unit, turn = position_unit(measured, command, kind, clocks, signals, table, hints, draft)
+    scale = scales_of(measured, unit, hints)
     fields["sensor"]["position"] = measured.mapped(unit, turn=turn, **scale)
     if kind == "position":
-        goal_unit = _goal_unit(command, measured, unit, clocks, hints, draft)
-        goal_turn = _turn(command, goal_unit, ("actuator", "goal"), draft)
-        fields["actuator"]["goal"] = command.mapped(goal_unit, turn=goal_turn, **_scales(command, goal_unit, hints))
+        unit_of_goals = goal_unit(command, measured, unit, clocks, hints, draft)
+        goal_turn = turn_of(command, unit_of_goals, ("actuator", "goal"), draft)
+        fields["actuator"]["goal"] = command.mapped(
+            unit_of_goals, turn=goal_turn, **scales_of(command, unit_of_goals, hints)
+        )
     else:
         si = {"velocity": "rad/s", "torque": "N m", "voltage": "V"}.get(kind, "")
         fields["actuator"][_FIELDS[kind]] = command.mapped(si)
@@ -208,86 +108,6 @@ def check_mapping(episode: Episode, joints: Sequence[str] = (), by_name: bool = 
                 t_s = episode.steps["actuator"].begun_s, episode.steps["sensor"].begun_s
                 findings += checks.check(t_s, *flat, names, by_name, acting)
     return findings
-
-
-def collect(table: Table) -> tuple[list[Signal], list[str]]:
-    """Return all signals of numbers with at most two dimensions, and notes on skipped ones.
-
-    Columns whose names differ only by the joint are one signal.
-
-    Raises:
-        UsageError: When a signal with the name of a position or a command cannot be read.
-    """
-    single: dict[tuple[Meaning, int, str], list[Signal]] = {}
-    signals: list[Signal] = []
-    notes: list[str] = []
-    lists = {key: words for key, words in table.words.items() if _names_joints(key, words)}
-    for key, why in table.broken.items():
-        named = meaning(key)
-        # Without such a column, another one could be taken for the positions.
-        if named.quantity == "position" or (named.side and not named.quantity):
-            raise UsageError(f"{key!r} in {table.path} cannot be read: {why}", hint="correct it, or remove the column")
-        notes.append(f"skipped: {key!r}: {why}")
-    for key, raw in table.columns.items():
-        named, values = meaning(key), raw.astype(np.float64)
-        if values.size and values.ndim <= 2 and not np.isfinite(values).any():
-            notes.append(f"skipped: {key!r} has no number in any sample")
-        elif values.ndim <= 1:
-            label = _label_of(key, named, table)
-            row = Signal((key,), (label,), named, values[..., None])
-            group = replace(named, label=""), values.size if values.ndim else 0, _group(key)
-            single.setdefault(group, []).append(row)
-        elif values.ndim == 2 and values.shape[1] <= 1000:
-            n = values.shape[1]
-            names = table.names.get(key) or next(iter(_lists_for(key, n, lists, table)), [""] * n)
-            labels = tuple(meaning(x).label or x.lower() for x in names) if len(names) == n else ("",) * n
-            signals.append(Signal(tuple(f"{key}[:,{i}]" for i in range(n)), labels, named, values, key))
-        else:
-            notes.append(f"skipped: {key!r} has samples of shape {values.shape[1:]}, as images have")
-    for (named, _, _), rows in single.items():
-        labels = [row.labels[0] for row in rows]
-        together = len(rows) > 1 and len(set(labels)) == len(labels) and "" not in labels and named.quantity != "stamp"
-        if together and (named.side or named.quantity):
-            values = np.concatenate([row.values for row in rows], axis=-1)
-            whole = Signal(tuple(row.sources[0] for row in rows), tuple(labels), named, values)
-            # Numbers count the joints.
-            if are_numbers(labels):
-                whole = whole.taken(sorted(range(len(labels)), key=lambda i: int(re.findall(r"\d+", labels[i])[0])))
-            signals.append(whole)
-        else:
-            signals += rows
-    if words := [key for key in table.words if key not in lists and len(set(table.words[key])) > 1]:
-        notes.append(f"skipped, as they hold no numbers: {', '.join(words[:20])}")
-    return signals, notes
-
-
-def _label_of(key: str, named: Meaning, table: Table) -> str:
-    """Return a column's joint; ``position0`` is that of the name in ``name0``, as rostopic writes it."""
-    if match := re.fullmatch(r"(.*?)[a-z]+(\d+)", key):
-        words = table.words.get(f"{match[1]}name{match[2]}", [])
-        if words and len(set(words)) == 1:
-            return meaning(words[0]).label or words[0].lower()
-    return named.label
-
-
-def _names_joints(key: str, words: Sequence[str]) -> bool:
-    parts = set(re.findall("[a-z]+", key.lower()))
-    wanted = parts & {"names", "joints", "name"} and not parts & {"body", "bodies", "link", "links", "foot", "feet"}
-    return bool(wanted) and len(set(words)) == len(words)
-
-
-def _lists_for(key: str, width: int, lists: Mapping[str, list[str]], table: Table) -> list[list[str]]:
-    """Return the lists of names in the file that fit a signal, those that share most words with its name."""
-    words = set(re.findall("[a-z]+", key.lower()))
-    fitting = {k: names for k, names in lists.items() if len(names) == width}
-    shared = {k: len(set(re.findall("[a-z]+", k.lower())) & words) for k in fitting}
-    best = [names for k, names in fitting.items() if shared[k] == max(shared.values())]
-    if len({tuple(names) for names in best}) > 1 and meaning(key).quantity in ("", "position"):
-        raise UsageError(
-            f"{', '.join(fitting)} in {table.path} name the columns of {key!r} in different orders",
-            hint="remove the list that does not belong to it, or write a mapping with the columns",
-        )
-    return best
 
 
 def _choose(
@@ -429,381 +249,6 @@ def _matched(
     return ordered, kind, measured.width == 1
 
 
-def _stamped(
-    signals: Sequence[Signal], of: Signal, side: str, node: str, table: Table, hints: ImportHints, draft: Proposal
-) -> tuple[dict[str, Any], np.ndarray]:
-    """Return the keys of a node's clock, and its stamps [s]."""
-    count = len(of.values)
-    generated = {"rate_hz": hints.rate_hz or 1.0}, np.arange(count) / (hints.rate_hz or 1.0)
-    if hints.rate_hz is not None:
-        draft.reasons[node, "", "rate_hz"] = "--rate-hz"
-        return generated
-    named = [s for s in signals if s.meaning.quantity == "stamp" and s.width == 1 and s.values.shape == (count, 1)]
-    fitting = [s for s in named if _increases(s.values[:, 0])]
-    chosen = [s for s in fitting if s.meaning.side == side] or [s for s in fitting if not s.meaning.side] or fitting
-    # In a bag, or of several files, use the stamps of the signal's own topic; prefer the header's stamp.
-    if group := _group(of.sources[0]):
-        chosen = [s for s in fitting if _group(s.sources[0]) == group] or chosen
-    chosen = (
-        [s for s in chosen if s.name.endswith("header.stamp")]
-        or [s for s in chosen if s.name.endswith("stamp")]
-        or chosen
-    )
-    if not chosen:
-        for key, unit in (("rate", 1.0), ("period", None)):
-            for s in signals:
-                if s.values.shape == (1,) and s.values[0] > 0 and s.meaning.quantity == key:
-                    rate_hz = (
-                        float(s.values[0]) if unit else 1.0 / float(s.values[0] * (1.0 if s.values[0] < 1.0 else 1e-3))
-                    )
-                    draft.reasons[node, "", "rate_hz"] = f"{s.name!r} in the file"
-                    return {"rate_hz": rate_hz}, np.arange(count) / rate_hz
-        why = f"the stamps {named[0].name!r} repeat or step back" if named else "the file has no time stamps"
-        draft.questions[node, "", "rate_hz"] = f"?  # samples per second: {why}; --rate-hz answers, too"
-        return generated
-    stamps = chosen[0]
-    if len(chosen) > 1:
-        listed = " or ".join(f'"{s.name}"' for s in chosen)
-        draft.questions[node, "", "stamps"] = (
-            f"{listed}?  # which clock has stamped the {'commands' if side == 'command' else 'positions'}"
-        )
-    unit, reason = _stamp_unit(stamps)
-    if unit is None:
-        draft.questions[node, "", "stamp_unit"] = (
-            f"{reason}?  # the stamps are {_period(stamps.values[:, 0]):.6g} apart"
-        )
-        unit = "s"
-    draft.reasons[node, "", "stamps"] = (
-        f"by its name; {reason}" if unit != "s" or stamps.meaning.unit else "by its name, in s"
-    )
-    keys: dict[str, Any] = {"stamps": stamps.sources[0], "stamp_unit": unit}
-    return keys, stamps.values[:, 0] * STAMP_UNITS[unit] * 1e-9
-
-
-def _stamp_unit(stamps: Signal) -> tuple[str | None, str]:
-    """Return the unit of stamps and the reason; None and the candidates."""
-    values = stamps.values[np.isfinite(stamps.values[:, 0]), 0]
-    if stamps.meaning.unit in STAMP_UNITS:
-        return stamps.meaning.unit, "unit by its name"
-    seconds = {unit: nanoseconds * 1e-9 for unit, nanoseconds in STAMP_UNITS.items()}
-    period = _period(values)
-    wall = [u for u, s in seconds.items() if _WALL_S[0] < values[0] * s < _WALL_S[1]]
-    likely = [u for u, s in seconds.items() if _RATES_HZ[0] <= 1 / (period * s) <= _RATES_HZ[1]]
-    for listed, why in (([u for u in wall if u in likely], "dates since 1970"), (likely, "")):
-        if len(listed) == 1:
-            return listed[0], why or f"{1 / (period * seconds[listed[0]]):.4g} samples a second"
-    return None, " or ".join(f'"{u}"' for u in likely or seconds)
-
-
-def _period(values: np.ndarray) -> float:
-    steps = np.diff(values[np.isfinite(values)])
-    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
-
-
-def _increases(values: np.ndarray) -> bool:
-    steps = np.diff(values[np.isfinite(values)])
-    return steps.size > 1 and float((steps > 0).mean()) > 0.9 and not (steps < 0).any()
-
-
-def _group(key: str) -> str:
-    """Return the topic of a signal in a bag, or the file of one of several; empty for others."""
-    return key.partition(".")[0] if key.startswith("/") else key.partition("/")[0] if "/" in key else ""
-
-
-def _agreeing_clocks(
-    table: Table, nodes: Mapping[str, dict[str, Any]], clocks: dict[str, np.ndarray], draft: Proposal
-) -> None:
-    """Take a bag's own clock where the headers of a sender disagree with it, and ask if streams do not overlap."""
-    for node, keys in nodes.items():
-        source = str(keys.get("stamps", ""))
-        other = f"{_group(source)}.log_time"
-        if not source.startswith("/") or source == other or other not in table.columns:
-            continue
-        own, log = clocks[node], table.columns[other] * 1e-9
-        if len(own) < 10 or (np.diff(log) < 0).any():
-            continue
-        # A clock that drifts is slow throughout; one that was set has the one odd step.
-        apart = own - log - (own[0] - log[0])
-        rate = float(np.polyfit(log - log[0], apart, 1)[0])
-        drift, odd = abs(rate) * np.ptp(log), [float(np.abs(np.diff(x) - _period(x)).max()) for x in (own, log)]
-        steady = np.abs(apart - np.polyval(np.polyfit(log - log[0], apart, 1), log - log[0])).max() < 0.2 * drift
-        limit = max(0.01, 2 * _period(log))
-        if drift > limit and steady:
-            what = f"runs {100 * abs(rate):.3g} % {'slow' if rate < 0 else 'fast'}, {drift:.2g} s in all"
-        elif np.ptp(apart) > 10 * limit and odd[0] > 2 * odd[1]:
-            what = f"steps by {odd[0]:.3g} s"
-        else:
-            continue
-        for name in nodes:
-            replaced = f"{_group(str(nodes[name].get('stamps', '')))}.log_time"
-            if replaced in table.columns:
-                nodes[name].update(stamps=replaced, stamp_unit="ns")
-                clocks[name] = table.columns[replaced] * 1e-9
-                draft.reasons[name, "", "stamps"] = "the recorder's clock"
-        draft.evidence.append(f"{source} {what} against the recorder's clock, which replaces the stamps of all streams")
-        break
-    t, c = (np.asarray(clocks[n])[np.isfinite(clocks[n])] for n in ("sensor", "actuator"))
-    if len(t) and len(c) and min(t[-1], c[-1]) - max(t[0], c[0]) < 0.5 * min(np.ptp(t), np.ptp(c)):
-        draft.questions["actuator", "", "stamp_offset"] = (
-            f"{t[0] - c[0]:.6g}?  # stamps of commands and positions hardly overlap: seconds to add to commands"
-        )
-
-
-def _position_unit(
-    measured: Signal, command: Signal, kind: str, clocks: Mapping[str, np.ndarray], signals: Sequence[Signal],
-    table: Table, hints: ImportHints, draft: Proposal,
-) -> tuple[str, float]:  # fmt: skip
-    """Return the unit of positions, and a turn if they jump at its end."""
-    at = "sensor", "position", "unit"
-    unit, reason = _unit(measured, table, hints)
-    q = measured.values
-    if unit is None and not reason:
-        # A jump at the end of a turn, a velocity or goals in a known unit, or the joints' ranges.
-        jumps = [u for u, turn in (("rad", 2 * np.pi), ("deg", 360.0)) if _jumps(q, turn)]
-        if len(jumps) == 1:
-            unit, reason = jumps[0], "jumps by a turn"
-        elif (found := _unit_by_rate(measured, clocks["sensor"], signals)) or (
-            kind == "position" and (found := _unit_by_goal(measured, command, clocks, table, hints))
-        ):
-            unit, reason = found
-        elif _only_rad(q, hints):
-            unit, reason = "rad", "by the joints' ranges: in degrees, one would be outside"
-    if unit is None:
-        spans = np.nanmax(q, axis=0) - np.nanmin(q, axis=0)
-        asked, why = (
-            reason or '"rad" or "deg"?',
-            f"they span up to {spans.max():.4g}, and no name has a unit; --unit answers, too",
-        )
-        draft.questions[at] = f"{asked}  # {why}"
-        return "", 0.0
-    draft.reasons[at] = reason
-    return unit, _turn(measured, unit, ("sensor", "position"), draft)
-
-
-def _unit(signal: Signal, table: Table, hints: ImportHints) -> tuple[str | None, str]:
-    """Return a signal's unit by flag, name or kind of file; None, and the candidates if rad and deg are none."""
-    names = tuple(table.names.get(signal.whole or "", ()))
-    of_columns = {meaning(name).unit for name in names}
-    named = signal.meaning.unit or (of_columns.pop() if len(of_columns) == 1 else "")
-    lerobots = lerobot.writes_hundredths(table.robot, names or signal.sources)
-    if hints.unit:
-        if hints.unit == "hundredths" and hints.calibration is None:
-            raise UsageError("hundredths of a joint's range need LeRobot's calibration", hint="--calibration FILE.json")
-        return hints.unit, "--unit"
-    if named in _NAMED:
-        return named, "by its name"
-    if named == "counts":
-        return None, '"counts:4096"?'
-    if named == "percent":
-        return None, '"counts:N" or "rad" with a scale, as percent of which angle?'
-    if lerobots:
-        return (
-            (found, "whole counts by LeRobot's calibration")
-            if (found := _lerobot_unit(signal, hints))
-            else (None, '"deg" or "hundredths" (with --calibration)?')
-        )
-    key = (signal.whole or signal.sources[0]).lower()
-    if table.format == "mcap" or re.search(r"joint_?states?|field\.(position|header)", key):
-        return "rad", "messages of ROS are in radians"
-    if re.search(r"qpos|dof_?pos", key):
-        return "rad", "MuJoCo and Isaac are in radians"
-    if hints.slides:
-        return None, '"m" or "mm"?' if len(hints.slides) == len(hints.joints) else '"rad" (and m) or another?'
-    return None, ""
-
-
-def _lerobot_unit(signal: Signal, hints: ImportHints) -> str | None:
-    """Return the unit in which positions are whole counts by LeRobot's calibration; None if unclear."""
-    if hints.calibration is None:
-        return None
-    fits = []
-    arm = [i for i, label in enumerate(signal.labels) if not lerobot.is_gripper(label)]
-    for unit in lerobot.UNITS:
-        scale, _ = lerobot.conversion(hints.calibration, [signal.labels[i] for i in arm], unit)
-        counts = signal.values[:, arm] * np.array(scale) * 4096 / (2 * np.pi)
-        off = np.abs(2 * counts - np.round(2 * counts))  # the middle of a range can be half a count
-        fits.append(float(np.quantile(off, 0.95)) < 0.05)
-    return lerobot.UNITS[fits.index(True)] if sum(fits) == 1 else None
-
-
-def _jumps(q: np.ndarray, turn: float) -> bool:
-    """Return whether columns jump by a turn, and lie within -half to half a turn, or within 0 to a turn."""
-    rows = q[np.isfinite(q).all(axis=1)]
-    over = checks.turns(rows, turn) if len(rows) > 2 else np.zeros(1, bool)
-    if not over.any():
-        return False
-    low, high = rows[:, over].min(axis=0) / turn, rows[:, over].max(axis=0) / turn
-    ends = ((-0.5, 0.5), (0.0, 1.0))
-    return any(bool((np.abs(low - a) < 0.02).all() and (np.abs(high - b) < 0.02).all()) for a, b in ends)
-
-
-def _unit_by_rate(measured: Signal, t_s: np.ndarray, signals: Sequence[Signal]) -> tuple[str, str] | None:
-    """Return the unit of positions by a velocity whose name has a unit."""
-    for v in signals:
-        if v.meaning.quantity != "velocity" or v.meaning.side == "command" or v.meaning.unit not in ("rad", "deg"):
-            continue
-        if v.values.shape == measured.values.shape and (slope := _rate_slope(measured.values, v.values, t_s)):
-            for unit, factor in (("rad", 1.0), ("deg", _DEG)):
-                if 0.8 < slope / (factor / (1.0 if v.meaning.unit == "rad" else _DEG)) < 1.25:
-                    return unit, f"its rate over {v.name!r} is {slope:.3g}"
-    return None
-
-
-def _rate_slope(q: np.ndarray, v: np.ndarray, t_s: np.ndarray) -> float | None:
-    """Return the slope of the rate of positions over velocities; None if they differ."""
-    rows = np.isfinite(q).all(axis=1) & np.isfinite(v).all(axis=1) & np.isfinite(t_s)
-    if rows.sum() < 50 or (np.diff(t_s[rows]) <= 0).any():
-        return None
-    rate = np.gradient(q[rows], t_s[rows], axis=0)
-    kernel = np.ones(5) / 5
-    rate, v = (np.stack([np.convolve(c, kernel, "same") for c in x.T], axis=1)[3:-3] for x in (rate, v[rows]))
-    moving = v.std(axis=0) > 1e-9
-    if not moving.any():
-        return None
-    x, y = v[:, moving].ravel(), rate[:, moving].ravel()
-    r = np.corrcoef(x, y)[0, 1]
-    return float((x @ y) / (x @ x)) if r > 0.8 else None
-
-
-def _unit_by_goal(
-    measured: Signal, command: Signal, clocks: Mapping[str, np.ndarray], table: Table, hints: ImportHints
-) -> tuple[str, str] | None:
-    """Return the unit of positions by that of goals and the slope between them."""
-    unit, _ = _unit(command, table, hints)
-    if (
-        unit is None
-        and command.meaning.unit == ""
-        and len(jumps := [u for u, turn in (("rad", 2 * np.pi), ("deg", 360.0)) if _jumps(command.values, turn)]) == 1
-    ):
-        unit = jumps[0]
-    if unit not in ("rad", "deg") or (slope := _slope(measured, command, clocks)) is None:
-        return None
-    for candidate, factor in (("rad", 1.0), ("deg", _DEG)):
-        ratio = slope * (1.0 if unit == "rad" else _DEG) / factor
-        if (0.6 if candidate == unit else 0.85) < ratio < (1.5 if candidate == unit else 1.15):
-            return candidate, f"its slope over {command.name!r} is {slope:.3g}"
-    return None
-
-
-def _slope(measured: Signal, command: Signal, clocks: Mapping[str, np.ndarray]) -> float | None:
-    """Return the median slope of positions over their commands, in their own units; None if they do not follow.
-
-    Raises:
-        UsageError: When a joint follows with a slope far from that of the others.
-    """
-    pairs = []
-    for signal, t_s in ((command, clocks["actuator"]), (measured, clocks["sensor"])):
-        rows = np.isfinite(signal.values).all(axis=1) & np.isfinite(t_s)
-        t, values = t_s[rows], signal.values[rows]
-        later = np.concatenate([[True], np.diff(t) > 0]) if len(t) else np.zeros(0, bool)
-        pairs.append((t[later], values[later]))
-    (t_c, c), (t_q, q) = pairs
-    if min(len(t_c), len(t_q)) < 50:
-        return None
-    c, q = (_counted_any(x) for x in (c, q))
-    # Compare in units of each side's usual spread, as the units are open.
-    spread = [max(float(np.median(x.std(axis=0))), 1e-9) for x in (c, q)]
-    found = checks.respond((t_c, t_q), c / spread[0], q / spread[1])
-    if found is None:
-        return None
-    slopes = {}
-    for i in np.flatnonzero((c.std(axis=0) > 0) & (q.std(axis=0) > 0)).tolist():
-        r, _, slope, _ = max((found.best(i, i, s) for s in (1.0, -1.0)), key=lambda b: abs(b[0]))
-        if abs(r) > 0.8:
-            slopes[i] = slope * spread[1] / spread[0]
-    if not slopes:
-        return None
-    median = float(np.median(np.abs(list(slopes.values()))))
-    if odd := [i for i, slope in slopes.items() if not 1 / 3 < abs(slope) / median < 3]:
-        listed = ", ".join(f"{measured.labels[i] or measured.sources[i]} {slopes[i]:.2g}" for i in odd)
-        raise UsageError(
-            f"joints follow {command.name!r} with a slope of {median:.3g}, but {listed}: another unit or scale",
-            hint="name the other joints with --joints, or give each column its scale in a mapping",
-        )
-    return median
-
-
-def _counted_any(values: np.ndarray) -> np.ndarray:
-    for turn in (2 * np.pi, 360.0):
-        if _jumps(values, turn):
-            return checks.counted(values, turn)
-    return values
-
-
-def _only_rad(q: np.ndarray, hints: ImportHints) -> bool:
-    """Return whether positions are within the joints' ranges in radians alone."""
-    if hints.ranges is None or len(hints.ranges) != q.shape[1] or hints.slides:
-        return False
-    limited = np.ptp(hints.ranges, axis=1) > 0
-    low, high = hints.ranges.T
-    inside = lambda x: ((np.nanmin(x, 0) > low - 0.2) & (np.nanmax(x, 0) < high + 0.2))[limited]  # noqa: E731
-    return bool(limited.any() and inside(q).all() and not inside(q / _DEG).all())
-
-
-def _goal_unit(
-    command: Signal, measured: Signal, unit: str, clocks: Mapping[str, np.ndarray], hints: ImportHints, draft: Proposal
-) -> str:
-    """Return the unit of goals: by name, else that of the positions if the slope between them agrees."""
-    at = "actuator", "goal", "unit"
-    if hints.unit:
-        draft.reasons[at] = "--unit"
-        return hints.unit
-    named = command.meaning.unit
-    if named in _NAMED:
-        draft.reasons[at] = "by its name"
-        return named
-    if named in ("counts", "percent"):
-        asked = '"counts:4096"?' if named == "counts" else '"rad" with a scale, as percent of which angle?'
-        draft.questions[at] = f"{asked}  # --unit answers, too"
-        return ""
-    if ("sensor", "position", "unit") in draft.questions:
-        draft.questions[at] = (
-            draft.questions["sensor", "position", "unit"].partition("  #")[0] + "  # as that of the positions?"
-        )
-        return ""
-    slope = _slope(measured, command, clocks)
-    factor, si = in_si(unit) if not unit.startswith("hundredths") else (1.0, "rad")
-    if slope is None:
-        if unit == "hundredths" or (command.whole and measured.whole and re.sub("action", "", command.whole) == ""):
-            draft.reasons[at] = "as the positions"
-            return unit
-        draft.questions[at] = (
-            f'"{unit}" or another?  # no position follows it, so its unit is open; --unit answers, too'
-        )
-        return ""
-    for candidate in dict.fromkeys((unit, "rad", "deg")):
-        other = 1.0 if candidate == "hundredths" else in_si(candidate)[0]
-        ratio = slope * factor / other
-        if (0.5 if candidate == unit else 0.85) < ratio < (1.6 if candidate == unit else 1.15):
-            draft.reasons[at] = f"positions follow it with a slope of {slope:.3g}"
-            return candidate
-    draft.questions[at] = (
-        f'"{si}" with a scale?  # positions follow it with a slope of {slope:.3g}: it is in another unit, or scaled'
-    )
-    return ""
-
-
-def _scales(signal: Signal, unit: str, hints: ImportHints) -> dict[str, Any]:
-    """Return scale and offset of a signal of LeRobot by the calibration."""
-    if hints.calibration is None or unit not in lerobot.UNITS:
-        return {}
-    scale, offset = lerobot.conversion(hints.calibration, signal.labels, unit)
-    return {"scale": tuple(scale), "offset": tuple(offset)}
-
-
-def _turn(signal: Signal, unit: str, at: tuple[str, str], draft: Proposal) -> float:
-    """Return a turn in the signal's unit if it jumps at its end, else 0."""
-    factor, si = in_si(unit)
-    if si != "rad" or unit == "hundredths":
-        return 0.0
-    turn = 2 * np.pi / factor
-    rows = signal.values[np.isfinite(signal.values).all(axis=1)]
-    if len(rows) < 3 or not checks.turns(rows, turn).any():
-        return 0.0
-    draft.reasons[(*at, "turn")] = "it jumps at the end of a turn: turns are counted"
-    return float(turn)
-
-
 def _extras(
     signals: Sequence[Signal], command: Signal, measured: Signal, places: Sequence[int], joints: Sequence[str],
     fields: dict[str, dict[str, FieldMapping]], clocks: Mapping[str, np.ndarray], draft: Proposal,
@@ -842,7 +287,7 @@ def _extras(
         if name in fields[node] or v.values.shape != of.values.shape or (goal and "goal" not in fields["actuator"]):
             continue
         how = fields["actuator"]["goal"] if goal else base
-        slope = _rate_slope(_counted_any(of.values), v.values, clocks[node])
+        slope = rate_slope(turns_counted(of.values), v.values, clocks[node])
         factor = in_si(how.unit)[0] if isinstance(how.scale, float) else None
         units = [
             u
@@ -999,10 +444,10 @@ def joint_motion(table: Table, joints: Sequence[str], unit: str) -> tuple[np.nda
     signal = min(motions)[3]
     draft, hints = Proposal(ImportMapping("", {})), ImportHints("", joints=tuple(joints))
     side = "command" if signal.meaning.side == "command" else "measured"
-    _, t_s = _stamped(signals, signal, side, "motion", table, hints, draft)
+    _, t_s = stamped(signals, signal, side, "motion", table, hints, draft)
     scale = 1.0
     if unit == "rad":
-        own, _ = _unit(signal, table, hints)
+        own, _ = stated_unit(signal, table, hints)
         if own is None:
             draft.questions["motion", "", "unit"] = f"of {signal.name}: rad or deg? End the names with it"
         else:

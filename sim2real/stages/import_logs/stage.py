@@ -14,8 +14,9 @@ from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log.importing import importer
 from sim2real.log.importing.mapping import ImportMapping, load_mapping
-from sim2real.log.importing.propose import ImportHints, Proposal, check_mapping, hint_for, propose
+from sim2real.log.importing.propose import check_mapping, hint_for, propose
 from sim2real.log.importing.readers import Table, joined, open_tables
+from sim2real.log.importing.signals import ImportHints, Proposal
 from sim2real.robots.from_model.mjcf import joints_of, read_model, slides_of
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot
 from sim2real.stages.import_logs.config import ImportConfig
