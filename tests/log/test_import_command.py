@@ -13,6 +13,9 @@ import pytest
 from sim2real import cli
 from sim2real.artifacts.run.run_folder import newest
 from sim2real.log import import_file, read_log
+from sim2real.view.page.stage_verdicts import record_banner
+from sim2real.view.page.timing_blocks import timing_blocks, timing_tiles
+from sim2real.view.signals import Signals
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
@@ -49,6 +52,16 @@ def test_each_file_becomes_a_run_with_the_pipelines_mapping(workplace, capsys):
     episode = read_log(stage.output("log"))
     assert episode.metadata["pipeline"] == "rig"
     np.testing.assert_array_equal(episode.steps["sensor"].start, foreign_files.STAMPS_US)
+
+
+def test_the_page_of_an_imported_log_claims_nothing_that_was_not_measured(workplace):
+    assert cli.main(["import", "one.npz", "--pipeline", "rig", "--out", "log.mcap"]) == 0
+    episode = read_log("log.mcap")
+    assert set(episode.metadata["log"]["session_end"]) == {"status", "exit_code", "messages"}
+    assert list(timing_tiles([episode])) == []
+    assert timing_blocks(episode, "record") == []
+    banner = record_banner(Signals(episode, [], [], {}))
+    assert (banner.tone, "suspicious" in str(banner.reasons)) == ("good", False)
 
 
 def test_a_mapping_of_ones_own_a_range_and_a_name_for_the_log(workplace, capsys):
