@@ -131,3 +131,32 @@ def effects(problem, values, factor=0.1):
     residuals = np.asarray(run({n: jnp.asarray(r) for n, r in rows.items()}))
     moved = np.abs(residuals[1:] - residuals[0]).reshape(len(names), -1).max(axis=1)
     return dict(zip(names, moved, strict=True))
+
+
+class RecordedRobotConformance:
+    """Tests of every robot that its recordings alone describe.
+
+    A module inherits it with its pipeline, a state to start from, and a fixture ``problem``: of a recording that is
+    simulated at its true values, ``truth``.
+    """
+
+    pipeline, start, truth = None, (0.7, -4.0), None
+
+    def model(self):
+        delay_s = self.pipeline.identify.max_delay_s
+        return self.pipeline.load().identifiable(delay_s), delay_s
+
+    def test_all_parameters_have_a_place(self):
+        check_leaves(*self.model())
+
+    def test_the_sensor_reads_the_measured_start(self):
+        state, params = check_start(*self.model(), list(self.start))
+        self.check_state(state, params)
+
+    def check_state(self, state, params):
+        """Compare the world's first state with the measured one, which is the joints' own unless an encoder is off."""
+        np.testing.assert_allclose(np.ravel([state.position, state.velocity]), self.start, rtol=1e-6)
+
+    def test_every_parameter_acts(self, problem):
+        moved = effects(problem, self.truth)
+        assert not {n: m for n, m in moved.items() if m < 1.0}

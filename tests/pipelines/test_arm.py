@@ -1,9 +1,9 @@
 """The arm's geometry, parameters, aims and score; its embedded robot has tests of its own."""
 
 import jax
-import mujoco
 import numpy as np
 import pytest
+from arm_conformance import ArmConformance, task_on_c
 
 from sim2real import composer
 from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -20,41 +20,13 @@ STEP_S = 0.0025
 @pytest.fixture(scope="module")
 def env():
     """The task on C, which draws no targets."""
-    env = composer.Environment(ROBOT.model.make_task())
-    env.reset()
-    return env
+    return task_on_c(PIPELINE)
 
 
-def test_the_tip_is_where_mujoco_has_it(env):
-    task, physics = env.task, env.physics
-    rng = np.random.default_rng(0)
-    plant = PLANT.ArmPlant()
-    for angles in (np.zeros(3), *rng.uniform(-1.6, 1.6, (20, 3))):
-        physics.bind(task.joints).qpos = angles
-        physics.forward()
-        tip = TASK.tip_of(np, angles)
-        np.testing.assert_allclose(physics.bind(task.robot.tip).xpos, tip, atol=1e-12)
-        plant.data.qpos[:] = angles
-        np.testing.assert_allclose([plant.state()[f"tip[{i}]"] for i in range(3)], tip, atol=1e-12)
-    many = rng.uniform(-1, 1, (4, 5, 3))
-    np.testing.assert_array_equal(TASK.tip_of(np, many)[2, 3], TASK.tip_of(np, many[2, 3]))
-
-
-def test_model_and_embedded_robot_weigh_the_same(env):
-    """The plant's geometry is written down a second time: gravity and inertia at random angles."""
-    plant, physics = PLANT.ArmPlant(armature=1.0), env.physics
-    model, data = physics.model.ptr, physics.data.ptr
-    for angles in np.random.default_rng(1).uniform(-1.4, 1.4, (5, 3)):
-        for m, d in ((model, data), (plant.model, plant.data)):
-            d.qpos[:], d.qvel[:] = angles, 0.0
-            mujoco.mj_forward(m, d)
-        np.testing.assert_allclose(data.qfrc_bias, plant.data.qfrc_bias, atol=1e-10)
-        inertias = []
-        for m, d in ((model, data), (plant.model, plant.data)):
-            inertias.append(np.zeros((3, 3)))
-            for row, unit in zip(inertias[-1], np.eye(3), strict=True):
-                mujoco.mj_mulM(m, d, row, unit)
-        np.testing.assert_allclose(*inertias, atol=1e-10)
+@pytest.fixture(scope="module")
+def plant():
+    """The embedded robot's physics."""
+    return PLANT.ArmPlant()
 
 
 def test_parameters_stand_where_c_keeps_them(env):
@@ -102,35 +74,18 @@ def test_aims_can_be_reached():
     np.testing.assert_array_equal(ROBOT.task.aim.draw(jax.random.key(7)), ROBOT.task.aim.draw(jax.random.key(7)))
 
 
-def trajectory(angles, target):
-    """Return times and states for joint angles ``(N, 3)`` at 100 Hz, as a deployment has them."""
-    states = {f"position[{i}]": angles[:, i] for i in range(3)}
-    return 0.01 * np.arange(len(angles)), {**states, **{f"aim[{i}]": np.full(40, target[i]) for i in range(3)}}
+class TestArm(ArmConformance):
+    pipeline, there = PIPELINE, (0.5, 0.4, 0.3)
 
-
-def test_the_score_of_an_arm_that_arrives_and_stays():
-    there = np.array([0.5, 0.4, 0.3])
-    angles = np.tile(there, (401, 1))
-    angles[:150] += [0.6, 0.0, 0.0]
-    score = ROBOT.task.score(*trajectory(angles, TASK.tip_of(np, there)))
-    assert score == {
-        "success": 1.0,
-        "reached": 1.0,
-        "distance_m": pytest.approx(0.0, abs=1e-12),
-        "first_reached_s": pytest.approx(1.5),
-    }
-
-
-def test_the_score_of_an_arm_that_passes_by():
-    there = np.array([0.5, 0.4, 0.3])
-    angles = np.tile(there + np.array([0.0, 0.5, 0.0]), (401, 1))
-    angles[200:250] = there
-    score = ROBOT.task.score(*trajectory(angles, TASK.tip_of(np, there)))
-    off = np.linalg.norm(TASK.tip_of(np, angles[0]) - TASK.tip_of(np, there))
-    assert score["success"] == pytest.approx(50 / 201)
-    assert score["reached"] == 0.0
-    assert score["distance_m"] == pytest.approx(off)
-    assert score["first_reached_s"] == pytest.approx(2.0)
+    def test_an_arm_that_passes_by_has_the_share_of_its_time_there(self):
+        angles = np.tile(np.add(self.there, [0.0, 0.5, 0.0]), (401, 1))
+        angles[200:250] = self.there
+        aim = TASK.tip_of(np, np.array(self.there))
+        score = self.score(angles, aim)
+        assert score["success"] == pytest.approx(50 / 201)
+        assert score["reached"] == 0.0
+        assert score["distance_m"] == pytest.approx(np.linalg.norm(TASK.tip_of(np, angles[0]) - aim))
+        assert score["first_reached_s"] == pytest.approx(2.0)
 
 
 def test_a_task_that_draws_its_target_draws_one_that_can_be_reached():

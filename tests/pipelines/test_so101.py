@@ -7,6 +7,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from arm_conformance import ArmConformance, task_on_c
 
 from sim2real import composer
 from sim2real.errors import UsageError
@@ -25,29 +26,13 @@ STEP_S = 0.01 / 3
 @pytest.fixture(scope="module")
 def env():
     """The task on C."""
-    env = composer.Environment(ROBOT.model.make_task())
-    env.reset()
-    return env
+    return task_on_c(PIPELINE)
 
 
 @pytest.fixture(scope="module")
 def plant():
     """The embedded robot's physics."""
     return PLANT.SO101Plant()
-
-
-def test_the_tip_is_where_mujoco_has_it(env, plant):
-    task, physics = env.task, env.physics
-    rng = np.random.default_rng(0)
-    for angles in (np.zeros(6), *rng.uniform(-1.6, 1.6, (20, 6))):
-        physics.bind(task.joints).qpos = angles
-        physics.forward()
-        tip = TASK.tip_of(np, angles)
-        np.testing.assert_allclose(physics.bind(task.robot.tip).xpos, tip, atol=1e-12)
-        plant.data.qpos[:] = angles
-        np.testing.assert_allclose([plant.state()[f"tip[{i}]"] for i in range(3)], tip, atol=1e-12)
-    many = rng.uniform(-1, 1, (4, 5, 6))
-    np.testing.assert_allclose(TASK.tip_of(np, many)[2, 3], TASK.tip_of(np, many[2, 3]), rtol=1e-12)
 
 
 def test_the_arm_is_as_long_as_the_public_description_says():
@@ -57,23 +42,6 @@ def test_the_arm_is_as_long_as_the_public_description_says():
     np.testing.assert_allclose(up, [0.0388 + 0.0304 + 0.0280 - 0.0052, 0, 0.2292 + 0.2941], atol=2e-4)
     turned = TASK.tip_of(np, np.array([np.pi / 2, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(turned, [0.0388, -0.3526, 0.2344], atol=2e-4)
-
-
-def test_model_and_embedded_robot_weigh_the_same(env, plant):
-    """The plant's geometry is written down a second time: gravity and inertia at random angles."""
-    physics = env.physics
-    rotors = physics.model.ptr.dof_armature[0] - plant.model.dof_armature[0]
-    for angles in np.random.default_rng(1).uniform(LOW, HIGH, (5, 6)):
-        bias, inertia = [], []
-        for m, d in ((physics.model.ptr, physics.data.ptr), (plant.model, plant.data)):
-            d.qpos[:], d.qvel[:] = angles, 0.0
-            mujoco.mj_forward(m, d)
-            bias.append(d.qfrc_bias.copy())
-            inertia.append(np.zeros((6, 6)))
-            for row, unit in zip(inertia[-1], np.eye(6), strict=True):
-                mujoco.mj_mulM(m, d, row, unit)
-        np.testing.assert_allclose(*bias, atol=1e-10)
-        np.testing.assert_allclose(inertia[0] - rotors * np.eye(6), inertia[1], atol=1e-10)
 
 
 def lowest(plant, angles):
@@ -148,32 +116,14 @@ def test_what_is_true_goes_by_the_same_names_and_lies_within_the_bounds():
         assert p.low < truth[p.name] < p.high, p.name
 
 
-def trajectory(angles, aim):
-    """Return times and states for joint angles ``(N, 6)`` at 100 Hz, as a deployment has them."""
-    states = {f"position[{i}]": angles[:, i] for i in range(6)}
-    return 0.01 * np.arange(len(angles)), {**states, **{f"aim[{i}]": np.full(40, aim[i]) for i in range(4)}}
+class TestSO101(ArmConformance):
+    pipeline, there, aim = PIPELINE, (0.5, -0.8, 1.0, -1.2, 0.3, 0.2), (0.25,)
+    scores = (("opening_off_rad", pytest.approx(0.05)),)
 
-
-def test_the_score_of_an_arm_that_arrives_and_stays():
-    there = np.array([0.5, -0.8, 1.0, -1.2, 0.3, 0.2])
-    angles = np.tile(there, (401, 1))
-    angles[:150, 0] += 0.6
-    aim = [*TASK.tip_of(np, there), 0.25]
-    assert ROBOT.task.score(*trajectory(angles, aim)) == {
-        "success": 1.0,
-        "reached": 1.0,
-        "distance_m": pytest.approx(0.0, abs=1e-12),
-        "opening_off_rad": pytest.approx(0.05),
-        "first_reached_s": pytest.approx(1.5),
-    }
-
-
-def test_the_score_of_an_arm_whose_jaw_is_not_as_it_is_told():
-    there = np.array([0.5, -0.8, 1.0, -1.2, 0.3, 0.2])
-    score = ROBOT.task.score(*trajectory(np.tile(there, (401, 1)), [*TASK.tip_of(np, there), -0.2]))
-    assert (score["success"], score["reached"]) == (0.0, 0.0)
-    assert score["distance_m"] < 0.001
-    assert np.isnan(score["first_reached_s"])
+    def test_a_jaw_that_is_not_as_it_was_commanded_is_no_success(self):
+        score = self.score(np.tile(self.there, (401, 1)), [*TASK.tip_of(np, np.array(self.there)), -0.2])
+        assert (score["success"], score["reached"]) == (0.0, 0.0)
+        assert score["distance_m"] < 0.001
 
 
 def test_tip_and_jaw_count_in_the_reward():

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recorded_robots import check_leaves, check_start, effects, episode, predictions, public, rmse
+from recorded_robots import RecordedRobotConformance, episode, predictions, public, rmse
 
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
@@ -77,14 +77,14 @@ def synthetic():
     return log, free_run(log)
 
 
-def test_all_parameters_have_a_place():
-    check_leaves(PIPELINE.load().identifiable(MAX_DELAY_S), MAX_DELAY_S)
+@pytest.fixture(scope="module")
+def problem(synthetic):
+    return synthetic[1]
 
 
-def test_the_sensor_reads_the_measured_start():
-    start = [0.1, -0.2, 0.3, -0.4, 0.5, -0.6, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    state, _ = check_start(PIPELINE.load().identifiable(MAX_DELAY_S), MAX_DELAY_S, start)
-    np.testing.assert_allclose(np.concatenate([state.position, state.velocity]), start, rtol=1e-6)
+class TestSO101Log(RecordedRobotConformance):
+    pipeline, truth = PIPELINE, TRUTH
+    start = (0.1, -0.2, 0.3, -0.4, 0.5, -0.6, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 
 def test_every_channel_is_a_joint_of_its_own():
@@ -109,11 +109,6 @@ def test_a_joint_at_its_stop_stands_there_and_the_others_move_on():
     stopped = model.ArmWorld("world", 200.0).confine(model.nominal(), state)
     np.testing.assert_allclose(stopped.position, low + np.array([0.1, 0.0, 0.0, 0.1, 0.0, 0.1]), rtol=1e-6)
     np.testing.assert_array_equal(stopped.velocity, [-3.0, 0.0, -1.0, 0.0, 0.0, 2.0])
-
-
-def test_every_parameter_acts(synthetic):
-    moved = effects(synthetic[1], TRUTH)
-    assert not {n: m for n, m in moved.items() if m < 1.0}
 
 
 def test_a_real_arm_is_where_the_model_says_rather_than_where_it_was_told_to_be():

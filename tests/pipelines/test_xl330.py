@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from recorded_robots import check_leaves, check_start, effects, episode, predictions, public, rmse
+from recorded_robots import RecordedRobotConformance, episode, predictions, public, rmse
 
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
@@ -82,13 +82,13 @@ def synthetic():
     return SimpleNamespace(runs=made, problem=free_runs([m.episode for m in made], substeps=5))
 
 
-def test_all_parameters_have_a_place():
-    check_leaves(PIPELINE.load().identifiable(MAX_DELAY_S), MAX_DELAY_S)
+@pytest.fixture(scope="module")
+def problem(synthetic):
+    return synthetic.problem
 
 
-def test_the_sensor_reads_the_measured_start():
-    state, _ = check_start(PIPELINE.load().identifiable(MAX_DELAY_S), MAX_DELAY_S, [0.7, -4.0])
-    assert (float(state.position), float(state.velocity)) == pytest.approx((0.7, -4.0))
+class TestXL330(RecordedRobotConformance):
+    pipeline, truth = PIPELINE, TRUTH
 
 
 def test_the_model_is_the_loop(synthetic):
@@ -99,11 +99,6 @@ def test_the_model_is_the_loop(synthetic):
         assert np.ptp(run.angle) > 1.0
         assert rmse(model - measured) < 0.0012
         assert rmse(np.diff(model - measured, axis=0)) < 0.0001  # samples lie between ticks, and are read there
-
-
-def test_every_parameter_acts(synthetic):
-    moved = effects(synthetic.problem, TRUTH)
-    assert not {n: m for n, m in moved.items() if m < 1.0}
 
 
 def test_no_seed_decides():
