@@ -49,7 +49,7 @@ MARKS = {
     "sim2real.identify": [NIGHT],
     "sim2real.runtime": [NIGHT, PROCESS],
 }
-TINY_FIT = '{"generations": 2, "population": 8, "refine": 1, "refine_steps": 3, "folds": 0, "free_run_s": 0.0}'
+TINY_FIT = '{"generations": 2, "population": 8, "refine_steps": 3, "folds": 0, "free_run_s": 0.0}'
 TINY_PPO = '{"episode_s": 2.0, "timelines": 4, "ppo": {"total_steps": 512, "num_envs": 16, "minibatches": 2}}'
 SMALLER = {
     "README.md": {"(pendulum, model)": f"(pendulum, model, {TINY_PPO})"},
