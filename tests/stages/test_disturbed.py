@@ -49,21 +49,6 @@ def test_the_environment_has_what_is_shown(made):
     assert made.env.task.start == (0.3, 0.0)
 
 
-def test_without_any_of_it_nothing_is_shown_or_done(prepared):
-    plain = prepared()
-    assert disturbance_rows(plain.episodes) == {}
-    assert plain.env.pushes is None
-    assert plain.env.curriculum is None
-    assert plain.episodes.parameters == ()
-
-
 def test_a_curriculum_of_nothing_is_refused(prepared):
     with pytest.raises(UsageError, match="all episodes are equal"):
         prepared(curriculum=(0.0, 1.0))
-
-
-def test_a_curriculum_that_follows_success_is_shown_as_such(prepared):
-    made = prepared(uniform=0.2, curriculum=(0.3, 1.0), follow=0.6)
-    assert (made.env.curriculum, made.env.follow) == ((0.3, 1.0), 0.6)
-    told = disturbance_rows(made.episodes)["curriculum"]
-    assert told == "0.3 of these differences at the first update, up to 1 while success is above 0.6"

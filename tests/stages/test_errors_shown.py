@@ -39,24 +39,10 @@ def test_notes_stand_between_message_and_hint(say):
     assert say(error, 4) == expected
 
 
-def test_notes_without_a_hint(say):
-    assert (
-        say(named(HardwareLost("no answer"), "sensor", "startup"), 4) == "error: no answer\n  node 'sensor', startup\n"
-    )
-
-
 def test_wrapped_errors_name_their_node(say):
     error = named(KeyError("x"), "agent", "step 3")
     assert isinstance(error, NodeFailed)
     assert say(error, 1) == "error: node 'agent' failed in its step 3: KeyError: 'x'\n"
-
-
-def test_unexpected_errors_show_their_notes_too(say):
-    error = ZeroDivisionError("division by zero")
-    error.add_note("then: the log has no end")
-    said = say(error, 1)
-    assert said.startswith("error: ZeroDivisionError: division by zero (traceback in ")
-    assert said.endswith("  then: the log has no end\n")
 
 
 def test_signals_are_named(say):

@@ -50,12 +50,6 @@ def slide(params, slope, steps, start=(0.25, 0.0), world=None):
     return np.asarray(states.position), np.asarray(states.velocity)
 
 
-def test_a_term_whose_coefficients_are_0_is_not_there():
-    p = FrictionParams()
-    assert [float(friction.damping(p, v)) for v in (0.0, -3.0)] == [0.0, 0.0]
-    assert [float(friction.dry(p, v, 7.0)) for v in (0.0, -3.0)] == [0.0, 0.0]
-
-
 @given(speed=speeds, viscous=coefficients, drag=coefficients)
 def test_damping_is_viscous_and_drag(speed, viscous, drag):
     found = friction.damping(FrictionParams(viscous=viscous, drag=drag), jnp.float32(speed))
@@ -74,16 +68,6 @@ def test_dry_friction_is_coulomb_stribeck_and_a_share_of_the_load(speed, load, c
     p = FrictionParams(coulomb=coulomb, static=static, stribeck_rad_s=stribeck, load=share)
     expected = coulomb + static * math.exp(-abs(speed) / stribeck) + share * abs(load)
     assert float(friction.dry(p, jnp.float32(speed), load)) == pytest.approx(expected, rel=1e-5, abs=1e-5)
-
-
-def test_stribeck_falls_from_static_and_coulomb_to_coulomb():
-    p = FrictionParams(coulomb=2.0, static=1.5, stribeck_rad_s=0.3)
-    found = np.asarray(friction.dry(p, jnp.array([0.0, 0.3, 0.6, 0.9, 30.0])))
-    assert found[0] == pytest.approx(3.5)
-    assert found[1] == pytest.approx(2.0 + 1.5 / math.e, rel=1e-6)
-    assert np.all(np.diff(found) < 0)
-    assert found[-1] == pytest.approx(2.0, rel=1e-6)
-    np.testing.assert_array_equal(found, friction.dry(p, -jnp.array([0.0, 0.3, 0.6, 0.9, 30.0])))
 
 
 @given(speed=speeds, most=st.floats(0.0, 100.0, width=32))
