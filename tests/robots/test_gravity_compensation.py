@@ -5,8 +5,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from recorded_on_c import play
 
-from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.fit import fit
 from sim2real.identify.problem import thinned
 from sim2real.identify.problem.segments import Span
@@ -36,25 +36,13 @@ def recorded(tmp_path_factory):
     for body in spec.bodies[1:]:
         body.gravcomp = SHARE
     model = spec.compile()
-    data = mujoco.MjData(model)
-    count = round(SECONDS / STEP_S / PERIOD)
-    t = STEP_S * PERIOD * np.arange(count)
+    t = STEP_S * PERIOD * np.arange(round(SECONDS / STEP_S / PERIOD))
     goals = (0.8 * np.sin(2.1 * t) + 0.4 * np.sin(5.3 * t))[:, None]
-    data.qpos[:] = goals[0]
-    angles = []
-    for goal in goals:
-        angles.append(data.qpos.copy())
-        for _ in range(PERIOD):
-            data.qfrc_applied[:] = KP * (goal - data.qpos)
-            mujoco.mj_step(model, data)
-    at = np.arange(count) * round(1e6 * STEP_S * PERIOD)
-    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
-    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
-    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals}}
+    episode = play(model, goals, lambda k, _, data: KP * (goals[k] - data.qpos), PERIOD, NOISE)
     terms = (ParameterPattern("kp"), ParameterPattern("damping"))
     config = RobotConfig(path, ("shoulder",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=terms)
     config = replace(config, sigma_rad=NOISE)
-    return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+    return MjcfRobot(config), episode
 
 
 @pytest.mark.night

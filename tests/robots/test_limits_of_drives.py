@@ -5,9 +5,9 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from recorded_on_c import play
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
 from sim2real.identify.problem.segments import Span
@@ -34,23 +34,17 @@ def recorded(tmp_path, torque=np.inf, speed=np.inf):
     path = tmp_path / "arm.xml"
     path.write_text(XML)
     model = mujoco.MjModel.from_xml_string(XML)
-    data = mujoco.MjData(model)
     count = round(SECONDS / STEP_S / PERIOD)
     goals = np.repeat(np.random.default_rng(3).uniform(-1.2, 1.2, 1 + count // 50), 50)[:count, None]
-    data.qpos[:], angles = goals[0], []
-    for goal in goals:
-        angles.append(data.qpos.copy())
-        for _ in range(PERIOD):
-            wanted = np.clip(KP / KD * (goal - data.qpos), -speed, speed)
-            data.qfrc_applied[:] = np.clip(KD * (wanted - data.qvel), -torque, torque)
-            mujoco.mj_step(model, data)
-    at = np.arange(count) * round(1e6 * STEP_S * PERIOD)
-    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
-    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
-    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals}}
+
+    def push(k, _, data):
+        wanted = np.clip(KP / KD * (goals[k] - data.qpos), -speed, speed)
+        return np.clip(KD * (wanted - data.qvel), -torque, torque)
+
+    episode = play(model, goals, push, PERIOD, NOISE)
     terms = tuple(map(ParameterPattern, ("kp", "kd", "armature")))
     config = RobotConfig(path, ("elbow",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=terms, sigma_rad=NOISE)
-    return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+    return MjcfRobot(config), episode
 
 
 def fitted(robot, episode, terms):

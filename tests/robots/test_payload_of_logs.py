@@ -3,9 +3,10 @@
 import mujoco
 import numpy as np
 import pytest
+from recorded_on_c import play
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.graph.episode import Episode, Steps
+from sim2real.graph.episode import Episode
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
 from sim2real.identify.problem.problem import Problem
@@ -27,21 +28,14 @@ COMMANDS = ("goal", "payload", "payload_reach")
 def recorded(kg: float, reach: float) -> Episode:
     model = mujoco.MjModel.from_xml_string(RIG.format(held=HELD.format(at=-reach, kg=kg)))
     model.opt.timestep = STEP_S / FINE  # a robot has no time steps
-    data = mujoco.MjData(model)
     t = STEP_S * PERIOD * np.arange(round(SECONDS / STEP_S / PERIOD))
     goals = (0.8 * np.sin(3.1 * t) + 0.3 * np.sin(9.3 * t))[:, None]
-    data.qpos[:], angles = goals[0], []
-    for before, goal in zip((goals[0], *goals), goals, strict=False):
-        angles.append(data.qpos.copy())
-        for step in range(PERIOD * FINE):
-            data.qfrc_applied[:] = KP * ((before if step < DELAY * FINE else goal) - data.qpos)
-            mujoco.mj_step(model, data)
-    at = np.arange(len(t)) * round(1e6 * STEP_S * PERIOD)
-    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
-    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
+
+    def push(k, step, data):  # goals act two time steps late
+        return KP * (goals[max(k - 1, 0) if step < DELAY * FINE else k] - data.qpos)
+
     held = {"payload": np.full_like(goals, kg), "payload_reach": np.full_like(goals, reach)}
-    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals, **held}}
-    return Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+    return play(model, goals, push, PERIOD * FINE, NOISE, **held)
 
 
 def robot(tmp_path, commands=COMMANDS, **changes) -> MjcfRobot:

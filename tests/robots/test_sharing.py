@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 import pytest
+from recorded_on_c import play
 
-from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
 from sim2real.identify.problem.segments import Span
@@ -49,22 +49,12 @@ def recorded(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "arm.xml"
     path.write_text(XML)
     model = mujoco.MjModel.from_xml_string(XML)
-    data = mujoco.MjData(model)
     t = STEP_S * PERIOD * np.arange(round(SECONDS / STEP_S / PERIOD))
     goals = np.stack([0.8 * np.sin(3.1 * t) + 0.3 * np.sin(9.3 * t), 0.7 * np.sin(4.0 * t + 1.0)], axis=1)
-    data.qpos[:], angles = goals[0], []
-    for goal in goals:
-        angles.append(data.qpos.copy())
-        for _ in range(PERIOD):
-            data.qfrc_applied[:] = np.array(KP) * (goal - data.qpos)
-            mujoco.mj_step(model, data)
-    at = np.arange(len(t)) * round(1e6 * STEP_S * PERIOD)
-    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
-    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
-    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals}}
+    episode = play(model, goals, lambda k, _, data: np.array(KP) * (goals[k] - data.qpos), PERIOD, NOISE)
     terms = (ParameterPattern("kp"), ParameterPattern("damping"))
     config = RobotConfig(path, ("pan", "lift"), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=terms, sigma_rad=NOISE)
-    return MjcfRobot(config), Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+    return MjcfRobot(config), episode
 
 
 @pytest.mark.night

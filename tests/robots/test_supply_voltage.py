@@ -5,8 +5,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from recorded_on_c import play
 
-from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
 from sim2real.identify.problem.segments import Span
@@ -26,21 +26,12 @@ def test_the_share_that_follows_the_voltage_is_found(tmp_path, share):
     path = tmp_path / "arm.xml"
     path.write_text(XML)
     model = mujoco.MjModel.from_xml_string(XML)
-    data = mujoco.MjData(model)
     t = STEP_S * PERIOD * np.arange(round(SECONDS / STEP_S / PERIOD))
     goals = (0.8 * np.sin(3.1 * t) + 0.3 * np.sin(9.3 * t))[:, None]
     volts = (VOLTS * (1.0 - 0.15 * np.sin(1.9 * t) ** 2))[:, None]
-    data.qpos[:], angles = goals[0], []
-    for goal, supply in zip(goals, volts, strict=True):
-        angles.append(data.qpos.copy())
-        for _ in range(PERIOD):
-            data.qfrc_applied[:] = KP * (1.0 + share * (supply / VOLTS - 1.0)) * (goal - data.qpos)
-            mujoco.mj_step(model, data)
-    at = np.arange(len(t)) * round(1e6 * STEP_S * PERIOD)
-    steps = Steps(at, at, at, 0 * at - 1, at + 10, 0 * at)
-    measured = np.array(angles) + NOISE * np.random.default_rng(0).normal(size=goals.shape)
-    outputs = {"sensor": {"position": measured}, "actuator": {"goal": goals, "volts": volts}}
-    episode = Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
+    strength = 1.0 + share * (volts / VOLTS - 1.0)
+    push = lambda k, _, data: KP * strength[k] * (goals[k] - data.qpos)  # noqa: E731
+    episode = play(model, goals, push, PERIOD, NOISE, volts=volts)
     terms = tuple(map(ParameterPattern, ("kp", "damping", "voltage")))
     config = RobotConfig(path, ("servo",), ("goal", "volts"), step_s=STEP_S, rate_hz=100.0, terms=terms)
     model = MjcfRobot(replace(config, sigma_rad=NOISE, volts_unit=VOLTS)).identifiable(0.02)
