@@ -112,6 +112,13 @@ def test_a_leap_names_joint_value_and_limit(index, by_rad, after_s, unsure_s, me
         check.check(position, 1.0 + after_s, unsure_s, FREED)
 
 
+def test_a_joint_outside_of_its_envelope_is_named():
+    check = Plausibility(GateConfig(envelope_rad=(-0.5, 0.5), joints=("pan", "tilt")))
+    check.check(np.array([0.5, -0.5]), 0.0, 0.0, PUSHED)
+    with pytest.raises(SafetyStop, match=r"joint 'tilt' is at -0\.51 rad, outside of its envelope, -0\.5 to 0\.5"):
+        check.check(np.array([0.5, -0.51]), 0.02, 0.0, PUSHED)
+
+
 def test_limits_that_make_no_sense():
     for limits in ({"freeze_s": 0.0}, {"freeze_rad_s": -1.0}, {"max_speed_rad_s": (1.0, 0.0)}):
         with pytest.raises(UsageError, match="must be larger than 0"):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.errors import HardwareLost, SafetyStop
+from sim2real.errors import HardwareLost
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
@@ -59,31 +59,12 @@ def test_commands_are_volts_and_come_back_as_sent(open_rig):
     assert volts(rig, 2.5) == 2.5
     assert volts(rig, 9.0) == 4.0
     run(rig, 2.5, 0.4)
-    assert rig.measure().velocity_rad_s[0] == pytest.approx(3.0, rel=0.1)
+    reading = rig.measure()
+    assert (reading.velocity_rad_s[0], reading.load[0]) == (pytest.approx(3.0, rel=0.1), pytest.approx(0.5, abs=0.002))
     rig.stop()
     assert rig.device.read(1, reg.TORQUE_ENABLE) == 0
     assert rig.gate.counts.clamped == 1
     assert rig.timeouts == 0
-
-
-def test_stale_commands_become_zero(open_rig):
-    rig, _ = open_rig()
-    rig.start()
-    volts(rig, 2.0)
-    assert rig.command(np.array([2.0]), 0.2, 1e-9 * rig.clock.now_ns()) == 0.0
-    assert rig.gate.counts.stale == 1
-
-
-def test_too_fast_is_a_safety_stop_that_lasts(open_rig):
-    rig, robot = open_rig(max_speed_rad_s=2.0)
-    rig.start()
-    with pytest.raises(SafetyStop, match="beyond the limit of 2 rad/s"):
-        run(rig, 4.0, 1.0)
-    with pytest.raises(SafetyStop, match="beyond the limit"):
-        volts(rig, 0.0)
-    rig.stop()
-    _, modes, _ = effects(robot)
-    assert modes[-1] == OperatingMode.OFF
 
 
 def test_a_rig_serves_several_episodes(open_rig):
@@ -143,25 +124,3 @@ def test_a_soft_stop_fades_the_voltage_before_the_torque_goes_off(open_rig):
     assert not rig.eased
     rig.stop()
     assert effects(robot)[1][-1] == OperatingMode.OFF
-
-
-def test_nothing_is_commanded_on_old_measurements(open_rig):
-    rig, _ = open_rig(max_sample_age_s=0.15)
-    rig.start()
-    rig.require_fresh()  # nothing was measured yet, nothing has moved
-    rig.measure()
-    rig.require_fresh()
-    rig.clock.sleep(0.2)
-    with pytest.raises(SafetyStop, match=r"(?s)newest measurement is 0\.\d+ s old, 0\.15 s are allowed.*hint: "):
-        rig.require_fresh()
-    rig.stop()
-
-
-def test_a_joint_that_leaves_its_envelope_stops_the_robot(open_rig):
-    rig, _ = open_rig(envelope_rad=(-0.5, 0.5), joints=("hinge",))
-    rig.start()
-    with pytest.raises(
-        SafetyStop, match=r"(?s)joint 'hinge' is at 0\.5\d* rad, outside of its envelope, -0\.5 to 0\.5"
-    ):
-        run(rig, 2.5, 2.0)
-    rig.stop_quietly()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.errors import SafetyStop, UsageError
+from sim2real.errors import SafetyStop
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
@@ -20,12 +20,11 @@ START_RAD = np.array([0.5, -0.8, 0.3])
 def open_rig(start_robot):
     rigs = []
 
-    def open_(drive, plant, ids, withhold=True, **gate):
+    def open_(drive, plant, ids, **gate):
         robot = start_robot(plant)
         bus = BusConfig(robot.port, silence_s=1.0)
         rigs.append(Rig(DynamixelServos(bus, ids, drive), GateConfig(command_timeout_s=0.1, **gate)))
-        if withhold:
-            rigs[-1].withhold_torque()
+        rigs[-1].withhold_torque()
         return rigs[-1], robot
 
     yield open_
@@ -82,18 +81,3 @@ def test_the_guardian_watches_as_well(start_robot, open_bus):
     with pytest.raises(SafetyStop, match="the guardian has taken the torque off"):
         bus.read_state()
     assert robot.truth().of(Kind.EFFECT).size == 0
-
-
-def test_it_is_for_good_and_before_torque(open_rig):
-    rig, _ = open_rig(VoltageDrive(5.0), "FirstOrder", (1,), withhold=False, limit=4.0)
-    assert not rig.torque_withheld
-    rig.start()
-    with pytest.raises(
-        UsageError, match=r"torque cannot be withheld: it is on(.|\n)*hint: call withhold_torque before"
-    ):
-        rig.withhold_torque()
-    rig.stop()
-    rig.withhold_torque()
-    rig.start()
-    rig.stop()
-    assert rig.torque_withheld

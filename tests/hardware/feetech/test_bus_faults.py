@@ -1,13 +1,14 @@
 """Faults of buses in this process: two servos of one id, which both answer and both obey; alarms of DYNAMIXELs."""
 
 import pytest
+from families import STS, VOLTS
 
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.feetech import registers as sts
 from sim2real.hardware.feetech.emulation import StsEmulation
-from sim2real.hardware.plant import OperatingMode
 
 
 def answer_twice(robot, servo_id, place, join):
@@ -57,21 +58,32 @@ def test_dynamixels_too(serve):
             bus.handshake({1: None})
 
 
-ALARMS = {"input voltage": 0, "overheating": 2, "motor encoder": 3, "electrical shock": 4, "overload": 5}
+ALARMS = {
+    VOLTS: ("input voltage", "", "overheating", "motor encoder", "electrical shock", "overload"),
+    STS: ("input voltage", "encoder", "overheating", "overcurrent", "", "overload"),
+}
+CASES = [(family, bit) for family, names in ALARMS.items() for bit, name in enumerate(names) if name]
 
 
-@pytest.mark.parametrize("bit", ALARMS.values(), ids=ALARMS)
-def test_an_alarm_in_motion_is_named_and_torque_ends_off(serve, bit):
+@pytest.mark.parametrize(("family", "bit"), CASES, ids=[f"{f.name}-{ALARMS[f][bit]}" for f, bit in CASES])
+def test_an_alarm_in_motion_is_named_and_torque_ends_off(family, bit):
     """As when the supply breaks down under load."""
-    robot = serve("FirstOrder", EmulatorConfig(), ids=(1, 2))
-    with ServoBus(BusConfig(robot.port, silence_s=1.0)) as bus:
-        bus.handshake({1: None, 2: None})
-        bus.setup(OperatingMode.PWM)
-        bus.torque(True)
-        bus.write_goal_pwm({1: 0.5, 2: 0.5})
-        bus.read_state()
-        robot.bus.servos[2].put(reg.HARDWARE_ERROR_STATUS, 1 << bit)
-        (name,) = (name for name, number in ALARMS.items() if number == bit)
-        with pytest.raises(SafetyStop, match=f"servo 2 has stopped itself: {name}"):
-            bus.read_state()
-    assert [robot.bus.servos[i].get(reg.TORQUE_ENABLE) for i in (1, 2)] == [0, 0]
+    robot = family.robot()
+    with family.rig(robot) as rig:
+        rig.start()
+        rig.command(family.moving, 0.0, 1e-9 * robot.now_ns())
+        rig.measure()
+        robot.bus.servos[2].put(reg.HARDWARE_ERROR_STATUS if family is VOLTS else sts.STATUS, 1 << bit)
+        with pytest.raises(SafetyStop, match=f"servo 2 .*: {ALARMS[family][bit]}"):
+            rig.measure()
+    assert family.on(robot) == []
+
+
+def test_a_host_that_dies_while_its_cable_is_out_leaves_the_torque_on(serve, connect):
+    """The guardian reaches no servo either, and says so."""
+    robot = serve()
+    connect(robot, silence_s=0.1).enable()
+    robot.strike(silent_after_s=0.0)
+    robot.kill_host()
+    assert STS.on(robot) == [1, 2, 3]
+    assert "could NOT be confirmed" in robot.reports[0]
