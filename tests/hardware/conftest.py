@@ -1,11 +1,9 @@
 import pytest
 from virtual_bus import PLANTS, VirtualBus
 
-from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.emulation import EmulatedBus, EmulatorConfig
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.emulation.virtual import VirtualRobot
-from sim2real.hardware.plant import OperatingMode
 
 
 @pytest.fixture
@@ -43,27 +41,13 @@ def open_bus():
         bus.close()
 
 
-class Bench(VirtualBus):
-    """DYNAMIXEL servos on it."""
-
-    def __init__(self, *arguments, **plant_args):
-        super().__init__(EmulatedBus, *arguments, **plant_args)
-
-    def start_turning(self, servo_id=1, pwm=885, watchdog=0):
-        """Put a servo into PWM mode with torque on, past the wire."""
-        servo = self.servos[servo_id]
-        servo.put(reg.OPERATING_MODE, OperatingMode.PWM)
-        for register, value in ((reg.TORQUE_ENABLE, 1), (reg.BUS_WATCHDOG, watchdog), (reg.GOAL_PWM, pwm)):
-            servo.write(register.address, register.encode(value))
-
-
 @pytest.fixture
 def make_bench(tmp_path):
     benches = []
 
     def make(plant="FirstOrder", config=None, **plant_args):
         config = config or EmulatorConfig(return_delay_us=0)
-        benches.append(Bench(tmp_path / "truth.bin", plant, config, **plant_args))
+        benches.append(VirtualBus(tmp_path / "truth.bin", plant, config, **plant_args))
         return benches[-1]
 
     yield make

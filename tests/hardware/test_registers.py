@@ -4,10 +4,12 @@ import math
 import pytest
 
 from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.feetech import registers as sts
 
 
-def test_registers_do_not_overlap():
-    ordered = list(reg.TABLE.registers.values())
+@pytest.mark.parametrize("table", [reg.TABLE, sts.TABLE])
+def test_registers_do_not_overlap_and_their_defaults_are_allowed(table):
+    ordered = list(table.registers.values())
     assert all(a.end <= b.address for a, b in itertools.pairwise(ordered))
     assert all(r.minimum <= r.default <= r.maximum for r in ordered if r.writable)
 

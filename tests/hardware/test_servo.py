@@ -50,59 +50,12 @@ def test_writes_that_are_refused(servo, address, data, error):
     assert servo.write(address, data)[0] == error
 
 
-def test_pwm_limit(servo):
-    assert write(servo, reg.PWM_LIMIT, 400) == StatusError.NONE
-    assert write(servo, reg.GOAL_PWM, -401) == StatusError.DATA_LIMIT
-    assert write(servo, reg.GOAL_PWM, -400) == StatusError.NONE
-
-
-def test_extended_position_mode_knows_no_position_limit(servo):
-    in_mode(servo, OperatingMode.EXTENDED_POSITION)
-    assert write(servo, reg.GOAL_POSITION, -5000) == StatusError.NONE
-    assert servo.command() == (OperatingMode.POSITION, pytest.approx(-5000 * reg.RAD_PER_COUNT))
-
-
 def test_a_write_of_several_registers_is_all_or_nothing(servo):
     led_on_torque_wrong = b"\x02\x01"
     assert servo.write(reg.TORQUE_ENABLE.address, led_on_torque_wrong)[0] == StatusError.DATA_RANGE
     assert servo.get(reg.LED) == 0
     assert servo.write(reg.TORQUE_ENABLE.address, b"\x01\x01") == (StatusError.NONE, True)
     assert servo.get(reg.LED) == 1
-
-
-def test_eeprom_is_locked_while_torque_is_on(servo):
-    in_mode(servo, OperatingMode.PWM)
-    assert write(servo, reg.OPERATING_MODE, OperatingMode.POSITION) == StatusError.ACCESS
-    assert write(servo, reg.RETURN_DELAY_TIME, 0) == StatusError.ACCESS
-    write(servo, reg.TORQUE_ENABLE, 0)
-    assert write(servo, reg.OPERATING_MODE, OperatingMode.POSITION) == StatusError.NONE
-
-
-def test_goals_move_nothing_while_torque_is_off(servo):
-    write(servo, reg.OPERATING_MODE, OperatingMode.PWM)
-    assert servo.write(reg.GOAL_PWM.address, reg.GOAL_PWM.encode(500)) == (StatusError.NONE, False)
-    assert servo.command() == (OperatingMode.OFF, 0.0)
-    write(servo, reg.TORQUE_ENABLE, 1)
-    assert servo.command() == (OperatingMode.PWM, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("mode", "register", "value", "goal"),
-    [
-        (OperatingMode.PWM, reg.GOAL_PWM, -885, -1.0),
-        (OperatingMode.VELOCITY, reg.GOAL_VELOCITY, 100, 100 * reg.RAD_S_PER_COUNT),
-        (OperatingMode.POSITION, reg.GOAL_POSITION, 2048, math.pi),
-    ],
-)
-def test_commands_in_the_plants_units(servo, mode, register, value, goal):
-    in_mode(servo, mode)
-    write(servo, register, value)
-    assert servo.command() == (mode, pytest.approx(goal))
-
-
-def test_torque_on_holds_the_present_position(servo):
-    in_mode(servo, OperatingMode.POSITION)
-    assert servo.command()[1] == pytest.approx(1.0, abs=reg.RAD_PER_COUNT)
 
 
 def test_homing_offset_shifts_present_and_goal_alike(servo):
@@ -126,41 +79,6 @@ def test_present_registers():
     assert servo.get(reg.REALTIME_TICK) == 40_000 - 32_768
 
 
-def test_tripped_watchdog_blocks_goals_until_zero_is_written(servo):
-    in_mode(servo, OperatingMode.PWM)
-    write(servo, reg.GOAL_PWM, 300)
-    write(servo, reg.BUS_WATCHDOG, 5)
-    servo.heard_ns = 7
-    assert servo.watchdog_deadline_ns() == 100_000_007
-    servo.trip_watchdog()
-    assert servo.read(reg.BUS_WATCHDOG.address, 1) == (StatusError.NONE, b"\xff")
-    assert servo.command() == (OperatingMode.PWM, 0.0)
-    assert servo.watchdog_deadline_ns() is None
-    assert write(servo, reg.GOAL_PWM, 300) == StatusError.DATA_RANGE
-    assert write(servo, reg.BUS_WATCHDOG, 0) == StatusError.NONE
-    assert servo.command() == (OperatingMode.PWM, 0.0)
-    assert write(servo, reg.GOAL_PWM, 300) == StatusError.NONE
-
-
-@pytest.mark.parametrize(("model", "stops", "goal"), [(1200, None, 300), (1200, True, 0), (1060, False, 300)])
-def test_a_330_that_has_tripped_refuses_goals_but_turns_on_until_torque_is_off(model, stops, goal):
-    servo = EmulatedServo(1, model, watchdog_stops=stops)
-    in_mode(servo, OperatingMode.PWM)
-    write(servo, reg.GOAL_PWM, 300)
-    write(servo, reg.BUS_WATCHDOG, 5)
-    servo.trip_watchdog()
-    assert servo.read(reg.BUS_WATCHDOG.address, 1) == (StatusError.NONE, b"\xff")
-    assert servo.command() == (OperatingMode.PWM, reg.fraction_from_pwm(goal))
-    assert write(servo, reg.GOAL_PWM, 0) == StatusError.DATA_RANGE
-    assert write(servo, reg.TORQUE_ENABLE, 0) == StatusError.NONE
-    assert servo.command() == (OperatingMode.OFF, 0.0)
-
-
-def test_watchdog_watches_only_while_torque_is_on(servo):
-    write(servo, reg.BUS_WATCHDOG, 5)
-    assert servo.watchdog_deadline_ns() is None
-
-
 def test_overload_takes_torque_off_until_reboot(servo):
     in_mode(servo, OperatingMode.PWM)
     servo.overload()
@@ -171,14 +89,6 @@ def test_overload_takes_torque_off_until_reboot(servo):
     assert write(servo, reg.TORQUE_ENABLE, 1) == StatusError.NONE
 
 
-def test_reboot_keeps_eeprom_only(servo):
-    write(servo, reg.RETURN_DELAY_TIME, 0)
-    write(servo, reg.LED, 1)
-    servo.reboot()
-    assert servo.get(reg.RETURN_DELAY_TIME) == 0
-    assert servo.get(reg.LED) == 0
-
-
 def test_action_needs_a_registered_write(servo):
     assert servo.action() == (StatusError.INSTRUCTION, False)
     servo.register_write(reg.LED.address, b"\x01")
@@ -187,5 +97,67 @@ def test_action_needs_a_registered_write(servo):
     assert servo.get(reg.LED) == 1
 
 
-def test_reading_past_the_table(servo):
+OK, OFF = StatusError.NONE, (OperatingMode.OFF, 0.0)
+PWM, VELOCITY, POSITION, EXTENDED = (OperatingMode[n] for n in ("PWM", "VELOCITY", "POSITION", "EXTENDED_POSITION"))
+
+
+@pytest.mark.parametrize(
+    ("mode", "writes", "command"),
+    [
+        (PWM, [(reg.GOAL_PWM, -885, OK)], (PWM, -1.0)),
+        (VELOCITY, [(reg.GOAL_VELOCITY, 100, OK)], (VELOCITY, 100 * reg.RAD_S_PER_COUNT)),
+        (POSITION, [(reg.GOAL_POSITION, 2048, OK)], (POSITION, math.pi)),
+        (EXTENDED, [(reg.GOAL_POSITION, -5000, OK)], (POSITION, -5000 * reg.RAD_PER_COUNT)),
+        (POSITION, [], (POSITION, reg.count_from_rad(1.0) * reg.RAD_PER_COUNT)),  # torque on holds the position
+        # Settings are locked while torque is on.
+        (PWM, [(reg.OPERATING_MODE, POSITION, StatusError.ACCESS), (reg.RETURN_DELAY_TIME, 0, StatusError.ACCESS)],
+         (PWM, 0.0)),
+        (PWM, [(reg.TORQUE_ENABLE, 0, OK), (reg.OPERATING_MODE, POSITION, OK)], OFF),
+        # Goals move nothing while torque is off, and are not kept.
+        (PWM, [(reg.TORQUE_ENABLE, 0, OK), (reg.GOAL_PWM, 500, OK)], OFF),
+        (PWM, [(reg.TORQUE_ENABLE, 0, OK), (reg.GOAL_PWM, 500, OK), (reg.TORQUE_ENABLE, 1, OK)], (PWM, 0.0)),
+        (PWM, [(reg.TORQUE_ENABLE, 0, OK), (reg.PWM_LIMIT, 400, OK), (reg.GOAL_PWM, -401, StatusError.DATA_LIMIT),
+               (reg.GOAL_PWM, -400, OK)], OFF),
+    ],
+)  # fmt: skip
+def test_what_is_written_drives_the_motor(servo, mode, writes, command):
+    in_mode(servo, mode)
+    assert [write(servo, register, value) for register, value, _ in writes] == [answer for *_, answer in writes]
+    assert servo.command() == (command[0], pytest.approx(command[1]))
+
+
+@pytest.mark.parametrize(
+    ("model", "stops", "fraction", "off_by"),
+    [
+        (1060, None, 0.0, reg.BUS_WATCHDOG),
+        (1200, True, 0.0, reg.TORQUE_ENABLE),
+        (1060, False, reg.fraction_from_pwm(300), reg.TORQUE_ENABLE),
+        (1200, None, reg.fraction_from_pwm(300), reg.TORQUE_ENABLE),  # a 330 turns on
+    ],
+)
+def test_a_watchdog_that_has_tripped_refuses_goals(model, stops, fraction, off_by):
+    servo = EmulatedServo(1, model, watchdog_stops=stops)
+    write(servo, reg.BUS_WATCHDOG, 5)
+    assert servo.watchdog_deadline_ns() is None, "it watches only while torque is on"
+    in_mode(servo, PWM)
+    write(servo, reg.GOAL_PWM, 300)
+    write(servo, reg.BUS_WATCHDOG, 5)
+    servo.heard_ns = 7
+    assert servo.watchdog_deadline_ns() == 100_000_007
+    servo.trip_watchdog()
+    assert servo.watchdog_deadline_ns() is None
+    assert servo.read(reg.BUS_WATCHDOG.address, 1) == (OK, b"\xff")
+    assert servo.command() == (PWM, fraction)
+    assert write(servo, reg.GOAL_PWM, 0 if fraction else 300) == StatusError.DATA_RANGE
+    assert write(servo, off_by, 0) == OK
+    assert servo.command() == ((PWM, 0.0) if off_by is reg.BUS_WATCHDOG else OFF)
+    if off_by is reg.BUS_WATCHDOG:
+        assert write(servo, reg.GOAL_PWM, 300) == OK
+
+
+def test_reboot_keeps_eeprom_only_and_no_read_goes_past_the_table(servo):
+    write(servo, reg.RETURN_DELAY_TIME, 0)
+    write(servo, reg.LED, 1)
+    servo.reboot()
+    assert (servo.get(reg.RETURN_DELAY_TIME), servo.get(reg.LED)) == (0, 0)
     assert servo.read(140, 100) == (StatusError.ACCESS, b"")

@@ -165,33 +165,6 @@ def test_a_host_that_is_killed_leaves_no_torque(family, in_the_middle):
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=[f.name for f in FAMILIES])
-@pytest.mark.parametrize("way", ["stop", "stop_quietly", "the end of the context", "an exception", "make_safe"])
-def test_a_sound_robot_is_safe_on_every_way_out(family, way):
-    robot = family.robot()
-
-    def leave(rig):
-        with rig:
-            rig.start()
-            loop(family, robot, rig, 10)
-            if way == "an exception":
-                raise ZeroDivisionError
-            if way == "make_safe":
-                rig.device.make_safe()
-                for call in (lambda: step(family, robot, rig), rig.start):
-                    with pytest.raises(SafetyStop):
-                        call()
-            elif way != "the end of the context":
-                getattr(rig, way)()
-
-    with pytest.raises(ZeroDivisionError) if way == "an exception" else nullcontext():
-        leave(family.rig(robot))
-    assert family.on(robot) == []
-    left_ns = robot.now_ns()
-    robot.sleep(0.1)
-    assert (safe_ns(robot.truth()) - left_ns) * 1e-9 < 0.001
-
-
-@pytest.mark.parametrize("family", FAMILIES, ids=[f.name for f in FAMILIES])
 def test_a_stalled_policy_gets_the_fallback_while_measuring_goes_on(family):
     robot = family.robot()
     with family.rig(robot, {"command_timeout_s": 0.1}, silence_s=0.5) as rig:

@@ -2,18 +2,23 @@
 
 import math
 import struct
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from plants import lateness_s, mean_latencies
 
 from sim2real.errors import UsageError
-from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
+from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, PacketFormat
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.dynamixel.protocol import PROTOCOL
 from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.plant import ConfigurablePlant
+from sim2real.hardware.feetech import registers as sts_reg
+from sim2real.hardware.feetech.emulation import StsEmulation
+from sim2real.hardware.feetech.protocol import PROTOCOL as STS_PROTOCOL
+from sim2real.hardware.plant import ConfigurablePlant, OperatingMode
 
 MS = 1_000_000
 STEP_NS = 500_000
@@ -21,66 +26,122 @@ build = PROTOCOL.build
 READ_POSITION = build(1, Instruction.READ, b"\x84\x00\x04\x00")
 
 
+class Line(NamedTuple):
+    """What a read of positions names, and where its answer has the id, the position and its end."""
+
+    settings: type
+    protocol: PacketFormat
+    registers: ModuleType
+    position: bytes
+    id_at: int
+    data: slice
+    answer_bytes: int
+
+    def read(self):
+        return self.protocol.build(1, Instruction.READ, self.position)
+
+    def goals(self):
+        return self.protocol.write_each(self.registers.GOAL_POSITION, {i: 2000 + i for i in (1, 2, 3)})
+
+
+LINES = [
+    pytest.param(Line(EmulatorConfig, PROTOCOL, reg, b"\x84\x00\x04\x00", 4, slice(9, 13), 15), id="DYNAMIXEL"),
+    pytest.param(Line(StsEmulation, STS_PROTOCOL, sts_reg, b"\x38\x02", 2, slice(5, 7), 8), id="Feetech"),
+]
+
+
+@pytest.mark.parametrize("baud_rate", [1_000_000, 57_600])
+@pytest.mark.parametrize("line", LINES)
+def test_an_answer_takes_the_time_of_its_bytes_and_the_return_delay(make_bench, line, baud_rate):
+    bench = make_bench("Ramp", line.settings(return_delay_us=100, baud_rate=baud_rate))
+    bench.send(50 * MS, line.read())
+    bench.run_until(80 * MS)
+    ((t_ns, answer),) = bench.sent
+    assert len(answer) == line.answer_bytes
+    assert t_ns == pytest.approx(50 * MS + (len(line.read()) + len(answer)) * 1e10 / baud_rate + 100_000, abs=2)
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_several_servos_answer_one_after_the_other_in_the_order_asked(make_bench, line):
+    bench = make_bench("Ramp", line.settings(return_delay_us=0), ids=[1, 2, 3])
+    packet = line.protocol.build(BROADCAST_ID, Instruction.SYNC_READ, line.position + bytes([3, 9, 1]))
+    bench.send(50 * MS, packet)
+    bench.run_until(60 * MS)
+    begin_ns, each_ns = 50 * MS + len(packet) * 10_000, line.answer_bytes * 10_000
+    assert [(t_ns, answer[line.id_at]) for t_ns, answer in bench.sent] == [
+        (begin_ns + each_ns, 3),
+        (begin_ns + 2 * each_ns, 1),
+    ]
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.0001, 0.0037, 0.02])
+@pytest.mark.parametrize("line", LINES)
+def test_a_sample_is_as_old_as_the_sensing_latency(make_bench, line, latency_s):
+    bench = make_bench("Ramp", line.settings(return_delay_us=0, sensing_latency_s=latency_s))
+    bench.send(3_000 * MS + 123_457, line.read())
+    bench.run_until(3_010 * MS)
+    (sample,) = bench.truth().of(Kind.SAMPLE)
+    assert sample["t_ns"] == 3_000 * MS + 123_457 + len(line.read()) * 10_000 - round(latency_s * 1e9)
+    # The plant's position is a ramp: what was read tells when it was sampled.
+    shown = line.registers.PRESENT_POSITION.decode(bench.sent[0][1][line.data])
+    assert shown == round(0.4 * sample["t_ns"] * 1e-9 / reg.RAD_PER_COUNT)
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.006, 0.03])
+@pytest.mark.parametrize("line", LINES)
+def test_goals_take_effect_after_the_actuation_latency_at_all_servos_at_once(make_bench, line, latency_s):
+    config = line.settings(return_delay_us=0, actuation_latency_s=latency_s, actuation_jitter_s=latency_s / 2, seed=1)
+    bench = make_bench("Joints", config)
+    for servo in bench.servos.values():
+        servo.put(line.registers.TORQUE_ENABLE, 1)
+    sent_ns = np.array([50 * MS + i * 47_123_457 for i in range(20)])
+    for t_ns in sent_ns.tolist():
+        bench.send(t_ns, line.goals())
+    bench.run_until(1_100 * MS)
+    effects = bench.truth().of(Kind.EFFECT)
+    instants_ns = effects["t_ns"].reshape(20, 3)
+    assert np.all(instants_ns == instants_ns[:, :1])
+    assert effects["values"][:3, 1] / reg.RAD_PER_COUNT == pytest.approx([2001, 2002, 2003])
+    assert np.array_equal(effects["t_host_ns"].reshape(20, 3)[:, 0], sent_ns)
+    # On the plant's grid, after the bytes and the latency, which is drawn for each instruction.
+    assert np.all(effects["t_ns"] % STEP_NS == 0)
+    assert np.all(np.abs(effects["late_ns"]) <= STEP_NS / 2)
+    took_s = 1e-9 * ((effects["t_ns"] - effects["late_ns"]).reshape(20, 3)[:, 0] - sent_ns - len(line.goals()) * 10_000)
+    assert np.all(np.abs(took_s - latency_s) <= latency_s / 2 + 1e-9)
+    assert np.ptp(took_s) >= 0.5 * latency_s
+
+
+def start_turning(bench, servo_id=1, pwm=885, watchdog=0):
+    """Put a servo into PWM mode with torque on, past the wire."""
+    servo = bench.servos[servo_id]
+    servo.put(reg.OPERATING_MODE, OperatingMode.PWM)
+    for register, value in ((reg.TORQUE_ENABLE, 1), (reg.BUS_WATCHDOG, watchdog), (reg.GOAL_PWM, pwm)):
+        servo.write(register.address, register.encode(value))
+
+
+@pytest.mark.parametrize(
+    ("packet", "tripped"),
+    [
+        (build(2, Instruction.PING), [1]),
+        (build(BROADCAST_ID, Instruction.SYNC_WRITE, b"\x41\x00\x01\x00\x02\x01"), []),
+    ],
+    ids=["for another servo", "broadcast"],
+)
+def test_traffic_that_feeds_the_watchdog(make_bench, packet, tripped):
+    bench = make_bench(ids=[1, 2])
+    start_turning(bench, watchdog=5)
+    for i in range(30):
+        bench.send(50 * MS + i * 9 * MS, packet)
+    assert [row["servo_id"] for row in bench.truth().of(Kind.WATCHDOG)] == tripped
+
+
 def goal_pwm(value, servo_id=1):
     return build(servo_id, Instruction.WRITE, b"\x64\x00" + value.to_bytes(2, "little", signed=True))
 
 
-def position_rad(answer):
-    return int.from_bytes(answer[9:13], "little", signed=True) * reg.RAD_PER_COUNT
-
-
-def test_read_takes_the_time_of_its_bytes_and_the_return_delay(make_bench):
-    bench = make_bench("Ramp", EmulatorConfig(return_delay_us=100))
-    bench.send(50 * MS, READ_POSITION)
-    bench.run_until(60 * MS)
-    ((t_ns, answer),) = bench.sent
-    assert len(READ_POSITION) == 14
-    assert len(answer) == 15
-    assert t_ns == 50 * MS + (14 + 15) * 10_000 + 100_000
-
-
-def test_baud_rate_stretches_every_byte(make_bench):
-    bench = make_bench("Ramp", EmulatorConfig(return_delay_us=0, baud_rate=57_600))
-    bench.send(50 * MS, READ_POSITION)
-    bench.run_until(80 * MS)
-    assert bench.sent[0][0] == pytest.approx(50 * MS + (14 + 15) * 1e10 / 57_600, abs=2)
-
-
-@pytest.mark.parametrize("latency_s", [0.0, 0.0001, 0.0037, 0.02])
-def test_sample_is_as_old_as_the_sensing_latency(make_bench, latency_s):
-    bench = make_bench("Ramp", EmulatorConfig(return_delay_us=0, sensing_latency_s=latency_s))
-    bench.send(3_000 * MS + 123_457, READ_POSITION)
-    bench.run_until(3_010 * MS)
-    complete_ns = 3_000 * MS + 123_457 + 14 * 10_000
-    (sample,) = bench.truth().of(Kind.SAMPLE)
-    assert sample["t_ns"] == complete_ns - round(latency_s * 1e9)
-    # The plant's position is a ramp: what was read tells when it was sampled.
-    expected_rad = bench.plant.speed_rad_s * sample["t_ns"] * 1e-9
-    assert sample["values"][0] == pytest.approx(expected_rad, abs=1e-9)
-    assert position_rad(bench.sent[0][1]) == pytest.approx(expected_rad, abs=reg.RAD_PER_COUNT / 2 * 1.001)
-
-
-@pytest.mark.parametrize("latency_s", [0.0, 0.0049, 0.03])
-def test_goal_takes_effect_after_the_actuation_latency(make_bench, latency_s):
-    bench = make_bench("FirstOrder", EmulatorConfig(return_delay_us=0, actuation_latency_s=latency_s))
-    bench.start_turning(pwm=0)
-    sent_ns = [50 * MS + i * 7_123_457 for i in range(40)]
-    for i, t_ns in enumerate(sent_ns):
-        bench.send(t_ns, goal_pwm(20 * i))
-    bench.run_until(sent_ns[-1] + 60 * MS)
-    effects = bench.truth().of(Kind.EFFECT)
-    planned_ns = np.array(sent_ns) + len(goal_pwm(0)) * 10_000 + round(latency_s * 1e9)
-    assert np.array_equal(effects["t_host_ns"], sent_ns)
-    assert np.allclose(effects["values"][:, 1], 20 * np.arange(40) / 885)
-    assert np.array_equal(effects["t_ns"] - effects["late_ns"], planned_ns)
-    assert np.all(effects["t_ns"] % STEP_NS == 0)
-    assert np.all(np.abs(effects["late_ns"]) <= STEP_NS / 2)
-    assert abs(effects["late_ns"].mean()) < 0.1 * STEP_NS
-
-
 def test_true_speed_answers_from_the_effect_on(make_bench):
     bench = make_bench(config=EmulatorConfig(return_delay_us=0, actuation_latency_s=0.0200))
-    bench.start_turning(pwm=0)
+    start_turning(bench, pwm=0)
     bench.send(100 * MS, goal_pwm(885))
     bench.run_until(400 * MS)
     truth = bench.truth()
@@ -95,7 +156,7 @@ def test_true_speed_answers_from_the_effect_on(make_bench):
 def test_jitter_is_uniform_and_keeps_the_order(make_bench):
     config = EmulatorConfig(actuation_latency_s=0.01, actuation_jitter_s=0.01, sensing_latency_s=0.004, seed=3)
     bench = make_bench(config=EmulatorConfig(**{**config.__dict__, "sensing_jitter_s": 0.002}))
-    bench.start_turning()
+    start_turning(bench)
     for i in range(300):
         bench.send((50 + 4 * i) * MS, goal_pwm(i), READ_POSITION)
     bench.run_until(1400 * MS)
@@ -108,16 +169,6 @@ def test_jitter_is_uniform_and_keeps_the_order(make_bench):
     assert age_s.min() == pytest.approx(0.002, abs=1e-4)
     assert age_s.max() == pytest.approx(0.006, abs=1e-4)
     assert age_s.mean() == pytest.approx(0.004, abs=3e-4)
-
-
-def test_sync_read_answers_in_the_order_asked_one_after_the_other(make_bench):
-    bench = make_bench("Ramp", ids=[1, 2, 3])
-    packet = build(BROADCAST_ID, Instruction.SYNC_READ, b"\x84\x00\x04\x00" + bytes([3, 9, 1]))
-    bench.send(50 * MS, packet)
-    bench.run_until(60 * MS)
-    begin_ns = 50 * MS + len(packet) * 10_000
-    assert [answer[4] for _, answer in bench.sent] == [3, 1]
-    assert [t_ns for t_ns, _ in bench.sent] == [begin_ns + 150_000, begin_ns + 300_000]
 
 
 def test_bulk_read(make_bench):
@@ -137,17 +188,9 @@ def test_half_duplex_wire_makes_instructions_wait(make_bench):
     assert [t_ns for t_ns, _ in bench.sent] == [50 * MS + 290_000, 50 * MS + 580_000]
 
 
-def test_two_instructions_in_one_chunk_are_complete_one_after_the_other(make_bench):
-    bench = make_bench("Ramp")
-    bench.send(50 * MS, READ_POSITION, READ_POSITION)
-    bench.run_until(60 * MS)
-    samples = bench.truth().of(Kind.SAMPLE)
-    assert np.diff(samples["t_ns"]).tolist() == [140_000]
-
-
 def test_watchdog_trips_exactly_when_nothing_was_heard(make_bench):
     bench = make_bench(config=EmulatorConfig(return_delay_us=0, actuation_latency_s=0.01))
-    bench.start_turning(watchdog=5)
+    start_turning(bench, watchdog=5)
     for i in range(10):
         bench.send((50 + 90 * i) * MS, goal_pwm(100 + i))
     last_ns = (50 + 90 * 9) * MS + len(goal_pwm(0)) * 10_000
@@ -160,25 +203,9 @@ def test_watchdog_trips_exactly_when_nothing_was_heard(make_bench):
     assert final["t_host_ns"] == 0
 
 
-def test_traffic_for_others_does_not_feed_the_watchdog(make_bench):
-    bench = make_bench(ids=[1, 2])
-    bench.start_turning(watchdog=5)
-    for i in range(30):
-        bench.send(50 * MS + i * 9 * MS, build(2, Instruction.PING))
-    assert [row["servo_id"] for row in bench.truth().of(Kind.WATCHDOG)] == [1]
-
-
-def test_broadcasts_feed_the_watchdog(make_bench):
-    bench = make_bench(ids=[1, 2])
-    bench.start_turning(watchdog=5)
-    for i in range(30):
-        bench.send(50 * MS + i * 9 * MS, build(BROADCAST_ID, Instruction.SYNC_WRITE, b"\x41\x00\x01\x00\x02\x01"))
-    assert bench.truth().of(Kind.WATCHDOG).size == 0
-
-
 def test_watchdog_drops_what_the_host_still_had_on_the_way(make_bench):
     bench = make_bench(config=EmulatorConfig(actuation_latency_s=0.05))
-    bench.start_turning(watchdog=1)
+    start_turning(bench, watchdog=1)
     bench.send(10 * MS, goal_pwm(885))
     bench.run_until(200 * MS)
     assert bench.truth().of(Kind.EFFECT)["values"][:, 1].tolist() == [0.0]
@@ -186,7 +213,7 @@ def test_watchdog_drops_what_the_host_still_had_on_the_way(make_bench):
 
 def test_a_late_emulator_trips_no_watchdog(make_bench):
     bench = make_bench()
-    bench.start_turning(watchdog=5)
+    start_turning(bench, watchdog=5)
     bench.send(50 * MS, goal_pwm(100))
     bench.run_until(60 * MS)
     # The process slept for 200 ms; the bytes found then may have come at any time in between.
@@ -199,7 +226,7 @@ def test_a_late_emulator_trips_no_watchdog(make_bench):
 
 def test_lost_answers_are_logged_and_instructions_still_work(make_bench):
     bench = make_bench(config=EmulatorConfig(reply_loss=0.5, seed=1))
-    bench.start_turning()
+    start_turning(bench)
     for i in range(200):
         bench.send((50 + i) * MS, goal_pwm(i))
     bench.run_until(300 * MS)
@@ -211,7 +238,7 @@ def test_lost_answers_are_logged_and_instructions_still_work(make_bench):
 
 def test_silent_servos_hear_nothing(make_bench):
     bench = make_bench(config=EmulatorConfig(silent_after_s=0.1))
-    bench.start_turning(watchdog=5)
+    start_turning(bench, watchdog=5)
     bench.send(50 * MS, goal_pwm(100))
     bench.run_until(90 * MS)
     bench.send(110 * MS, goal_pwm(200))
@@ -292,26 +319,6 @@ def test_plants_are_told_of_their_controllers_when_those_change(make_bench):
         (1, 640, 4000, math.inf),
     ]
     assert [told[0] for told in bench.plant.told] == pytest.approx([0.05, 0.05, 0.06, 0.07, 0.1, 0.11], abs=1e-3)
-
-
-def test_plants_need_not_care_for_controllers(make_bench):
-    bench = make_bench("FirstOrder")
-    assert not isinstance(bench.plant, ConfigurablePlant)
-    bench.send(50 * MS, write(reg.POSITION_P_GAIN, 1))
-    bench.run_until(60 * MS)
-    assert len(bench.sent) == 1
-
-
-def test_goals_of_one_instruction_take_effect_at_one_instant(make_bench):
-    bench = make_bench("Joints", EmulatorConfig(actuation_latency_s=0.01, actuation_jitter_s=0.008, seed=1))
-    bench.send(20 * MS, sync_write(reg.TORQUE_ENABLE, {1: 1, 2: 1, 3: 1}))
-    for i in range(20):
-        bench.send((50 + 20 * i) * MS, sync_write(reg.GOAL_POSITION, {1: 2048 + i, 2: 2000, 3: 2100}))
-    bench.run_until(500 * MS)
-    effects = bench.truth().of(Kind.EFFECT)
-    instants_ns = effects["t_ns"].reshape(21, 3)
-    assert np.all(instants_ns == instants_ns[:, :1])
-    assert np.ptp(instants_ns[1:, 0] - effects["t_host_ns"][3::3]) > 5 * MS
 
 
 def test_torque_on_in_position_mode_moves_nothing_until_a_goal_comes(make_bench):

@@ -13,13 +13,13 @@ PLANTS = Path(__file__).parent / "plants.py"
 class VirtualBus:
     """An emulated bus in virtual time: no process, no waiting, every instant exact."""
 
-    def __init__(self, bus_type, path, plant, config, **plant_args):
+    def __init__(self, path, plant, config, **plant_args):
         self.plant = load_plant(f"{PLANTS}:{plant}", plant_args)
         self.now_ns = 0
         self.sent = []
         self._path = path
         self._log = TruthLog(path, truth_header(self.plant, config, 0))
-        self.bus = bus_type(self.plant, config, self._log, self._take, 0, lambda: self.now_ns)
+        self.bus = type(config).bus_type(self.plant, config, self._log, self._take, 0, lambda: self.now_ns)
         self.servos = self.bus.servos
 
     def _take(self, answer):
@@ -38,6 +38,13 @@ class VirtualBus:
         self.run_until(t_ns)
         self.bus.feed(b"".join(packets), t_ns)
         self.bus.run_until(t_ns)
+
+    def ask(self, packet, wait_ns=20_000_000):
+        """Send a packet and return what is answered until a while later, in one piece."""
+        self.send(self.now_ns, packet)
+        self.run_until(self.now_ns + wait_ns)
+        answers, self.sent = b"".join(answer for _, answer in self.sent), []
+        return answers
 
     def close(self):
         self._log.close()

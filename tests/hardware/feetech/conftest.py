@@ -1,26 +1,17 @@
 import pytest
-from sts_bench import IDS, PLANTS, Bench
+from families import IDS
 
-from sim2real.hardware.emulation.virtual import VirtualRobot
 from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.emulation import StsEmulation
 
+STS = StsEmulation(return_delay_us=0)
+
 
 @pytest.fixture
-def serve(tmp_path):
+def serve(start_robot):
     """Start emulated servos in virtual time; stopped at the end of the test."""
-    served = []
-
-    def start(plant="Joints", config=None, **plant_args):
-        path = tmp_path / f"truth{len(served)}.bin"
-        config = config or StsEmulation(return_delay_us=0)
-        served.append(VirtualRobot(f"{PLANTS}:{plant}", config, plant_args, path))
-        return served[-1]
-
-    yield start
-    for robot in served:
-        robot.stop()
+    return lambda plant="Joints", config=STS, **plant_args: start_robot(plant, config, **plant_args)
 
 
 @pytest.fixture
@@ -41,14 +32,5 @@ def connect():
 
 
 @pytest.fixture
-def make_bench(tmp_path):
-    benches = []
-
-    def make(plant="Joints", config=None, **plant_args):
-        config = config or StsEmulation(return_delay_us=0)
-        benches.append(Bench(tmp_path / "truth.bin", plant, config, **plant_args))
-        return benches[-1]
-
-    yield make
-    for bench in benches:
-        bench.close()
+def make_sts(make_bench):
+    return lambda plant="Joints", config=STS, **plant_args: make_bench(plant, config, **plant_args)

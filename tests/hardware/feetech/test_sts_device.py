@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from sts_bench import IDS
+from families import IDS
 
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone

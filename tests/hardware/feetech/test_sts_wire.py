@@ -39,8 +39,8 @@ def at(*counts):
     return [count * reg.RAD_PER_COUNT - math.pi for count in counts]
 
 
-def test_answers_are_those_of_the_manuals_examples(make_bench):
-    bench = make_bench(ids=[1, 2], start_rad=at(2048, 2047))
+def test_answers_are_those_of_the_manuals_examples(make_sts):
+    bench = make_sts(ids=[1, 2], start_rad=at(2048, 2047))
     for servo_id, voltage, temperature in ((1, 0x79, 0x1E), (2, 0x77, 0x23)):
         bench.servos[servo_id].put(reg.PRESENT_VOLTAGE, voltage)
         bench.servos[servo_id].put(reg.PRESENT_TEMPERATURE, temperature)
@@ -53,55 +53,9 @@ def test_answers_are_those_of_the_manuals_examples(make_bench):
     )
 
 
-def test_a_position_as_in_the_manuals_example(make_bench):
-    bench = make_bench(ids=[1], start_rad=at(1304))
-    assert bench.ask(bytes.fromhex("FFFF0104023802BE")) == bytes.fromhex("FFFF0104001805DD")
-
-
-@pytest.mark.parametrize("baud_rate", [1_000_000, 57_600])
-def test_an_answer_takes_the_time_of_its_bytes_and_the_return_delay(make_bench, baud_rate):
-    bench = make_bench("Ramp", StsEmulation(return_delay_us=100, baud_rate=baud_rate))
-    bench.send(50 * MS, READ_STATE)
-    bench.run_until(80 * MS)
-    ((t_ns, answer),) = bench.sent
-    assert (len(READ_STATE), len(answer)) == (8, 12)
-    assert t_ns == pytest.approx(50 * MS + (8 + 12) * 1e10 / baud_rate + 100_000, abs=2)
-
-
-def test_several_servos_answer_one_after_the_other_in_the_order_asked(make_bench):
-    bench = make_bench()
-    packet = build(BROADCAST_ID, Instruction.SYNC_READ, b"\x38\x02" + bytes([3, 9, 1]))
-    bench.send(50 * MS, packet)
-    bench.run_until(60 * MS)
-    begin_ns = 50 * MS + len(packet) * 10_000
-    assert [(t_ns, answer[2]) for t_ns, answer in bench.sent] == [(begin_ns + 80_000, 3), (begin_ns + 160_000, 1)]
-
-
-@pytest.mark.parametrize("latency_s", [0.0, 0.0037])
-def test_a_sample_is_as_old_as_the_sensing_latency(make_bench, latency_s):
-    bench = make_bench("Ramp", StsEmulation(return_delay_us=0, sensing_latency_s=latency_s))
-    bench.send(3_000 * MS + 123_457, READ_STATE)
-    bench.run_until(3_010 * MS)
-    shown = reg.PRESENT_POSITION.decode(bench.sent[0][1][5:7])
-    (sample,) = bench.truth().of(Kind.SAMPLE)
-    assert sample["t_ns"] == 3_000 * MS + 123_457 + 80_000 - round(latency_s * 1e9)
-    assert shown == round(0.4 * sample["t_ns"] * 1e-9 / reg.RAD_PER_COUNT)
-
-
-def test_a_goal_takes_effect_after_the_actuation_latency_at_all_servos_at_once(make_bench):
-    bench = make_bench(config=StsEmulation(actuation_latency_s=0.006))
-    goal = PROTOCOL.write_each(reg.GOAL_POSITION, {i: 2000 + i for i in (1, 2, 3)})
-    bench.send(50 * MS, goal)
-    bench.run_until(100 * MS)
-    effects = bench.truth().of(Kind.EFFECT)
-    assert np.all(effects["t_ns"] - effects["late_ns"] == 50 * MS + len(goal) * 10_000 + 6 * MS)
-    assert effects["values"][:, 0].tolist() == [OperatingMode.POSITION] * 3
-    assert effects["values"][:, 1] / reg.RAD_PER_COUNT == pytest.approx([2001, 2002, 2003])
-
-
 @pytest.mark.parametrize("wakes", [True, False])
-def test_torque_and_goals(make_bench, wakes):
-    bench = make_bench("Joints", StsEmulation(goal_wakes=wakes), ids=[1], start_rad=at(2000))
+def test_torque_and_goals(make_sts, wakes):
+    bench = make_sts("Joints", StsEmulation(goal_wakes=wakes), ids=[1], start_rad=at(2000))
     stiffen(bench)
     bench.ask(write(reg.GOAL_POSITION, 2100))
     assert read(bench, reg.TORQUE_ENABLE) == wakes
@@ -112,8 +66,8 @@ def test_torque_and_goals(make_bench, wakes):
     assert bench.truth().of(Kind.EFFECT)[-1]["values"][0] == OperatingMode.OFF
 
 
-def test_what_is_written_while_the_lock_is_on_is_forgotten_without_power(make_bench):
-    bench = make_bench(ids=[1], start_rad=at(2000))
+def test_what_is_written_while_the_lock_is_on_is_forgotten_without_power(make_sts):
+    bench = make_sts(ids=[1], start_rad=at(2000))
     for lock, p_gain in ((0, 20), (1, 40)):
         bench.ask(write(reg.LOCK, lock))
         bench.ask(write(reg.P_GAIN, p_gain))
@@ -126,8 +80,8 @@ def test_what_is_written_while_the_lock_is_on_is_forgotten_without_power(make_be
     assert bench.plant.told[-1][2:4] == (20, 32)
 
 
-def test_the_offset_moves_what_is_read_and_where_goals_are(make_bench):
-    bench = make_bench("Joints", StsEmulation(homing_offset=-500), ids=[1], start_rad=at(1500))
+def test_the_offset_moves_what_is_read_and_where_goals_are(make_sts):
+    bench = make_sts("Joints", StsEmulation(homing_offset=-500), ids=[1], start_rad=at(1500))
     assert read(bench, reg.PRESENT_POSITION) == 2000
     stiffen(bench)
     bench.ask(write(reg.GOAL_POSITION, 2048))
@@ -136,15 +90,15 @@ def test_the_offset_moves_what_is_read_and_where_goals_are(make_bench):
     assert read(bench, reg.PRESENT_POSITION) == pytest.approx(2048, abs=1)
 
 
-def test_positions_wrap_unless_turns_are_counted(make_bench):
-    bench = make_bench("Joints", StsEmulation(homing_offset=300), ids=[1], start_rad=at(200))
+def test_positions_wrap_unless_turns_are_counted(make_sts):
+    bench = make_sts("Joints", StsEmulation(homing_offset=300), ids=[1], start_rad=at(200))
     assert read(bench, reg.PRESENT_POSITION) == 3996
     bench.ask(write(reg.PHASE, reg.PHASE.default | reg.PHASE_FULL_ANGLE))
     assert read(bench, reg.PRESENT_POSITION) == -100
 
 
-def test_goals_are_cut_to_the_limits_and_bad_values_dropped_without_a_word(make_bench):
-    bench = make_bench(ids=[1], start_rad=at(2000))
+def test_goals_are_cut_to_the_limits_and_bad_values_dropped_without_a_word(make_sts):
+    bench = make_sts(ids=[1], start_rad=at(2000))
     stiffen(bench)
     bench.ask(write(reg.MAX_POSITION, 2050))
     assert bench.ask(write(reg.GOAL_POSITION, 3000)) == OK
@@ -155,8 +109,8 @@ def test_goals_are_cut_to_the_limits_and_bad_values_dropped_without_a_word(make_
     assert read(bench, reg.PRESENT_POSITION) == pytest.approx(2050, abs=1)
 
 
-def test_other_modes(make_bench):
-    bench = make_bench("FirstOrder")
+def test_other_modes(make_sts):
+    bench = make_sts("FirstOrder")
     for mode, register, value in ((reg.Mode.PWM, reg.GOAL_TIME, -500), (1, reg.GOAL_SPEED, 1000)):
         bench.ask(write(reg.OPERATING_MODE, mode))
         bench.ask(write(register, value))
@@ -170,8 +124,8 @@ def test_other_modes(make_bench):
             assert read(bench, reg.MOVING) == 1
 
 
-def test_the_response_level_and_broken_or_strange_instructions(make_bench):
-    bench = make_bench()
+def test_the_response_level_and_broken_or_strange_instructions(make_sts):
+    bench = make_sts()
     bench.ask(write(reg.RESPONSE_LEVEL, 0))
     assert bench.ask(write(reg.ACCELERATION, 3)) == b""
     assert read(bench, reg.ACCELERATION) == 3
@@ -183,8 +137,8 @@ def test_the_response_level_and_broken_or_strange_instructions(make_bench):
     assert bench.ask(build(2, Instruction.PING)) == bytes.fromhex("FFFF020200FB")
 
 
-def test_an_alarm_is_in_every_answer_and_the_motor_off_until_the_servo_restarts(make_bench):
-    bench = make_bench("Joints", StsEmulation(overload_after_s=0.1, alarms=0x21), ids=[1], start_rad=at(2000))
+def test_an_alarm_is_in_every_answer_and_the_motor_off_until_the_servo_restarts(make_sts):
+    bench = make_sts("Joints", StsEmulation(overload_after_s=0.1, alarms=0x21), ids=[1], start_rad=at(2000))
     bench.ask(write(reg.GOAL_POSITION, 2048))
     bench.run_until(120 * MS)
     answer = bench.ask(READ_STATE)
@@ -197,8 +151,8 @@ def test_an_alarm_is_in_every_answer_and_the_motor_off_until_the_servo_restarts(
     assert modes.tolist() == [OperatingMode.POSITION] + [OperatingMode.OFF] * 3
 
 
-def test_wrong_ids_and_cut_answers(make_bench):
-    bench = make_bench("Ramp", StsEmulation(wrong_id=0.3, cut=0.3, seed=1))
+def test_wrong_ids_and_cut_answers(make_sts):
+    bench = make_sts("Ramp", StsEmulation(wrong_id=0.3, cut=0.3, seed=1))
     answers = [bench.ask(READ_STATE) for _ in range(60)]
     assert 10 < sum(len(answer) == 4 for answer in answers) < 30
     assert 10 < sum(answer[2] == 0x41 for answer in answers) < 30
