@@ -286,13 +286,15 @@ def score(
             for seconds in sorted({min(most_s, length) for length in lengths}):
                 those = [r for r, length in enumerate(lengths) if min(most_s, length) == seconds]
                 windows = _segments(model, good, those, fitting, seconds, kind == FREE_RUN)
-                for r, row in _predicted(windows, values, measured, those, fitting.settle_s, kind, seconds):
-                    bound = expected.get((row.joint, kind))
+                rows = _predicted(windows, values, measured, those, fitting.settle_s, kind, seconds)
+                for r in those:
                     spans = [s for s in windows.spans if s.recording == r]
                     seen = ranges(model, [log.episode for log in good], spans, windows.segment_s)
-                    wider = stretches(identification.ranges, seen, measured).get(row.joint, 1.0)
-                    limit = None if bound is None else wider * bound.bound
-                    errors.append(replace(row, log=good[r].path.name, expected=limit, wider=wider))
+                    wider = stretches(identification.ranges, seen, measured)
+                    for row in (row for log, row in rows if log == r):
+                        bound, factor = expected.get((row.joint, kind)), wider.get(row.joint, 1.0)
+                        limit = None if bound is None else factor * bound.bound
+                        errors.append(replace(row, log=good[r].path.name, expected=limit, wider=factor))
     # A joint that rests is not compared: "no motion" would always be best.
     moved = {(e.log, e.joint) for e in errors if e.kind == AHEAD}
     resting = {log.path.name: [p.name for p in measured if (log.path.name, p.column) not in moved] for log in good}
