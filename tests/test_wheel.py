@@ -51,7 +51,7 @@ def outside(tmp_path):
 def test_wheel_carries_the_pipelines_inside_the_package(wheel):
     names = zipfile.ZipFile(wheel).namelist()
     assert "sim2real/_pipelines/pendulum/__init__.py" in names
-    assert "sim2real/cli.py" in names
+    assert {"sim2real/cli.py", "sim2real/SKILL.md"} <= set(names)
     top = {name.split("/")[0] for name in names}
     assert {name for name in top if not name.endswith(".dist-info")} == {"sim2real"}
 

@@ -56,9 +56,11 @@ def ended_by(number: int) -> int:
 def leave(code: int) -> NoReturn:
     """End this process at once, without the interpreter's shutdown; for commands that ended early.
 
-    The project's own clean-up is done by now. A compiled program that is still running in XLA's threads would make the
-    interpreter's shutdown wait for it, or end in a segmentation fault.
+    A compiled program that is still running in XLA's threads would make the interpreter's shutdown wait for it, or end
+    in a segmentation fault. Open logs are closed before: their status is ``aborted``.
     """
+    if writer := sys.modules.get("sim2real.log.writer"):
+        writer.close_open_logs()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()

@@ -381,7 +381,7 @@ class McapRecorder:
         # Start the thread; at exit it writes the rest of the queue.
         self._thread = threading.Thread(target=self._run, name="log-writer", daemon=True)
         self._thread.start()
-        atexit.register(self._close_at_exit)
+        _open_logs.add(self)
 
     @property
     def behind_s(self) -> float:
@@ -443,7 +443,7 @@ class McapRecorder:
             if self._closed:
                 return
             self._closed = True
-        atexit.unregister(self._close_at_exit)
+        _open_logs.discard(self)
         # Wait for the queue, then write the end of the session.
         self._queue.put(None)
         self._wait(report)
@@ -560,10 +560,16 @@ class McapRecorder:
         if self._queue.empty():
             self._at_s = None
 
-    def _close_at_exit(self) -> None:
-        # The interpreter is exiting: a failure could not be reported.
-        with contextlib.suppress(Sim2RealError):
-            self.close("aborted", ERROR)
+
+_open_logs: set[McapRecorder] = set()
+
+
+@atexit.register
+def close_open_logs() -> None:
+    """Close the logs that are still open, as ``aborted``: the interpreter, or a command, ends."""
+    for recorder in list(_open_logs):
+        with contextlib.suppress(Sim2RealError):  # nobody could read it any more
+            recorder.close("aborted", ERROR)
 
 
 def _max_queue_bytes() -> int:

@@ -232,6 +232,11 @@ def read_weights(folder: str | Path) -> dict[str, np.ndarray]:
 def _read_about(folder: Path) -> dict[str, Json]:
     """Return the content of ``policy.json``, after checking its format version."""
     path = folder / CONTRACT
+    if folder.is_file():
+        raise Sim2RealError(
+            f"{folder} is a file; a policy bundle is a folder, whose {CONTRACT} lists observations, units and limits",
+            hint="name the folder; an ONNX file alone, such as another program's policy, cannot be run",
+        )
     # Read the contract's file.
     try:
         about = json.loads(path.read_text())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -119,13 +119,18 @@ def with_contract(graph: bytes, contract: PolicyContract) -> bytes:
 
     model = onnx.load_from_string(graph)
     properties = {entry.key: entry.value for entry in model.metadata_props} | {
-        "observation_names": ",".join(contract.observation_names),
-        "action_names": ",".join(term.name for term in contract.action),
+        "observation_names": comma_list(contract.observation_names),
+        "action_names": comma_list(term.name for term in contract.action),
         "rate_hz": repr(contract.rate_hz),
         "contract": json.dumps(contract.to_dict()),
     }
     onnx.helper.set_model_props(model, properties)
     return model.SerializeToString()
+
+
+def comma_list(names: Iterable[str]) -> str:
+    """Return names as other programs read them from a policy: between commas. A comma in a name becomes a semicolon."""
+    return ",".join(name.replace(",", ";") for name in names)
 
 
 def _gru_nodes() -> list[NodeProto]:

@@ -1,9 +1,14 @@
-"""How old the messages were that steps used, as a log tells it."""
+"""How old the messages were that steps used, as a log tells it; the status of a log that nobody closed."""
+
+import subprocess
+import sys
+import textwrap
 
 import numpy as np
 import pytest
 
 from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord
+from sim2real.log.reader import read_log
 from sim2real.log.session import input_ages, oldest_input
 
 STEPS = {"sensor": [0, 10, 20, 30], "agent": [2, 12, 22, 32, 42]}
@@ -40,3 +45,18 @@ def test_a_part_of_a_log_begins_with_what_it_holds(episode):
     np.testing.assert_allclose(1e6 * input_ages(part, "agent")["sensor"], [1, 11, 21])
     holes = Episode({"agent": steps}, episode.messages, {}, {"log": {**log, "missing_steps": {"agent": 1}}})
     assert input_ages(holes, "agent") == {}, "which step used what is not known"
+
+
+def test_a_log_that_is_open_when_a_command_ends_is_aborted(tmp_path):
+    """A command that failed ends its process without the interpreter's shutdown."""
+    path = tmp_path / "session.mcap"
+    program = textwrap.dedent("""
+        import sys
+        from sim2real.commands.exit_code import leave
+        from sim2real.log import McapRecorder
+        log = McapRecorder(sys.argv[1], {}, {}, {"a": {"x": 0.0}}, [])
+        log.start(10**18, 0)
+        leave(3)
+    """)
+    assert subprocess.run([sys.executable, "-c", program, str(path)], check=False).returncode == 3
+    assert read_log(path).metadata["log"]["session_end"]["status"] == "aborted"

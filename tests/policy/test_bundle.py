@@ -1,6 +1,7 @@
 """A policy that leaves one machine and arrives on another."""
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import json
@@ -113,6 +114,22 @@ def test_onnx_carries_the_contract(bundle, contract):
     assert properties["action_names"] == "voltage,brake"
     assert properties["observation_names"].split(",") == contract.observation_names
     assert [d.dim_value for d in model.graph.input[0].type.tensor_type.shape.dim] == [1, 5]
+
+
+def test_names_with_commas_stay_apart_in_onnx(tmp_path, contract, weights, observations):
+    onnx = pytest.importorskip("onnx")
+    terms = [dataclasses.replace(term, name=f"cos, sin, {term.name}") for term in contract.observation]
+    renamed = dataclasses.replace(contract, observation=tuple(terms))
+    save_bundle(tmp_path / "renamed", weights, renamed, observations)
+    properties = {entry.key: entry.value for entry in onnx.load(tmp_path / "renamed" / "policy.onnx").metadata_props}
+    names = [name.replace(";", ",") for name in properties["observation_names"].split(",")]
+    assert names == renamed.observation_names
+
+
+def test_a_file_is_no_bundle(bundle):
+    for name in ("policy.onnx", "policy.json"):
+        with pytest.raises(Sim2RealError, match="is a file; a policy bundle is a folder"):
+            load_bundle(bundle / name)
 
 
 def test_wrong_observations_are_refused(runner):

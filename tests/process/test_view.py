@@ -124,7 +124,7 @@ def test_without_a_screen_the_recording_goes_on_and_names_another_viewer(tmp_pat
 
 
 def test_the_flag_takes_a_viewer():
-    for view in (None, "window", "web", "a/b.rrd", "rerun+http://laptop:9876/proxy"):
+    for view in (None, "window", "web", "web:0.0.0.0", "a/b.rrd", "rerun+http://laptop:9876/proxy"):
         check_view(view)
     with pytest.raises(UsageError, match="--view screen is no viewer"):
         check_view("screen")

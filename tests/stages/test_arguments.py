@@ -62,6 +62,7 @@ def pendulum():
         (lambda p: sim2real.export("arm", FOUND, "out.json", "json"), "of pipeline 'pendulum', not of 'arm'"),
         (lambda p: sim2real.export(p, FOUND, "out.json", "sdf"), "cannot export to 'sdf'. Available: mjcf"),
         (lambda p: sim2real.report("no_such_run"), "no file, pipeline or run 'no_such_run'"),
+        (lambda p: sim2real.report(__file__), "is a file, where a run, a folder of a stage, or a pipeline is expected"),
         (lambda p: sim2real.run(p, record=TrainConfig()), "record must be of type RecordConfig"),
     ],
 )  # fmt: skip

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from pathlib import Path
 
 import pytest
 
@@ -28,6 +29,11 @@ def test_a_run_is_served_to_browsers_until_ctrl_c(run_copy, follow):
             said += line
         address = re.search(r"open http://[^:]+:(\d+)/\?url=rerun%2Bhttp://[^:]+:(\d+)/proxy", said)
         assert address, said
+        listening = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+        ports = {f"{int(port):04X}" for port in address.groups()}
+        places = [fields[1].split(":") for fields in listening if fields[3] == "0A"]
+        hosts = {host for host, port in places if port in ports}
+        assert hosts == {"0100007F"}, "the page and its data are served on 127.0.0.1 alone"
         with contextlib.closing(urllib.request.urlopen(f"http://127.0.0.1:{address[1]}", timeout=10)) as page:
             assert "rerun" in page.read().decode().lower()
         time.sleep(0.5)

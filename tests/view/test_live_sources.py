@@ -1,5 +1,7 @@
 """What a live view shows: rows of growing files, each once, in time; and a model in 3-D."""
 
+import io
+import json
 import math
 from types import SimpleNamespace
 
@@ -7,7 +9,9 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.progress import BEST_FIT, PROGRESS, write_best_fit, write_progress
+from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
+from sim2real.stages.live import viewer_process
 from sim2real.view.live.follower import Follower
 from sim2real.view.live.log_source import LogSource, _thinned
 from sim2real.view.live.stage_sources import FitSource, ProgressSource
@@ -180,3 +184,15 @@ def test_a_model_moves_as_its_joints_do(tmp_path):
     )
     np.testing.assert_allclose(at, [[0, 0, 2.0], [0, 0, 2.5]], atol=1e-6)
     np.testing.assert_allclose(turned[1], [0, np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
+
+
+def test_the_process_of_a_viewer_reports_an_error_and_its_hint_once(monkeypatch, capsys):
+    def missing():
+        raise Sim2RealError("Rerun is not installed", hint="install it")
+
+    monkeypatch.setattr(viewer_process, "rerun_module", missing)
+    monkeypatch.setattr(viewer_process.os, "nice", lambda increment: 0)
+    monkeypatch.setattr(viewer_process.os, "sched_setscheduler", lambda *args: None, raising=False)
+    monkeypatch.setattr("sys.stdin", io.StringIO('{"name": "a", "target": "window", "folder": "."}\n'))
+    viewer_process.main()
+    assert json.loads(capsys.readouterr().out) == {"error": "Rerun is not installed", "hint": "install it"}

@@ -17,9 +17,13 @@ def check_view(view: str | None) -> None:
     Raises:
         UsageError: It is neither ``window`` nor ``web``, an address or a file of Rerun.
     """
-    if view is not None and view not in (WINDOW, "web") and "://" not in view and not view.endswith(".rrd"):
+    is_known = (
+        view is None or view == WINDOW or view.partition(":")[0] == "web" or "://" in view or view.endswith(".rrd")
+    )
+    if not is_known:
         raise UsageError(
             f"--view {view} is no viewer",
-            hint="--view alone opens a window, --view web a page for browsers; an address such as "
-            "rerun+http://HOST:9876/proxy is a viewer elsewhere, and FILE.rrd a file",
+            hint="--view alone opens a window, --view web a page for browsers of this computer, --view web:0.0.0.0 one "
+            "for the network; an address such as rerun+http://HOST:9876/proxy is a viewer elsewhere, and FILE.rrd a "
+            "file",
         )

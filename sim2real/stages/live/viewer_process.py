@@ -35,7 +35,7 @@ def main() -> None:
         line = open_viewer(recording, order["target"])
         follower = Follower(recording, lambda: [Path(order["folder"])], drawn(order))
     except Sim2RealError as error:
-        _report(error=str(error), hint=error.hint)
+        _report(error=error.args[0], hint=error.hint)
         return
     _report(line=line)
     try:
@@ -44,7 +44,7 @@ def main() -> None:
         follower.poll()
         _report(dropped=follower.close())
     except Sim2RealError as error:
-        _report(error=str(error), hint=error.hint)
+        _report(error=error.args[0], hint=error.hint)
 
 
 def _report(**message: Json) -> None:

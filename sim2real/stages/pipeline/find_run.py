@@ -46,6 +46,11 @@ def _nothing_there(root: Path, target: str) -> UsageError:
     pipelines = sorted(available())
     names = [f"{f.parent.name}/{f.name}" for p in sorted(Path(root).glob("*")) for f in run_folders(root, p.name)]
     listed = f"Pipelines: {', '.join(pipelines) or 'none'}. Runs in {root}: {', '.join(names[-5:]) or 'none'}"
+    if Path(target).is_file():
+        return UsageError(
+            f"{target} is a file, where a run, a folder of a stage, or a pipeline is expected. {listed}",
+            hint="name the folder of the run",
+        )
     if target in pipelines:
         hint = f"make a run with `sim2real run {target}`, or name another folder with --runs DIR"
     elif close := difflib.get_close_matches(target, [*pipelines, *(n.partition("/")[2] for n in names)], n=1):
