@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -129,10 +128,13 @@ class HingeDrive(RobotDrive):
             rig.start()
             try:
                 for _ in range(round(_PUSH_S * self.rate_hz)):
-                    rig.command(np.array([_PUSH_V]), 0.0, time.monotonic())
-                    time.sleep(1 / self.rate_hz)
-            finally:
-                rig.stop()
+                    rig.measure()  # the limits of speed, jump and envelope need it
+                    rig.command(np.array([_PUSH_V]), 0.0, 1e-9 * rig.clock.now_ns())
+                    rig.clock.sleep(1 / self.rate_hz)
+            except BaseException:
+                rig.stop_quietly()  # a failure here must not replace the reason
+                raise
+            rig.stop()
         raise SafetyStop(
             f"the pendulum does not hang down after {_PUSHES} pushes of {_PUSH_V} V",
             hint="free it, or check its encoder",

@@ -1,0 +1,37 @@
+"""A pendulum that friction holds upright is pushed over, under the gate's limits, in virtual time."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from sim2real.errors import SafetyStop
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.dynamixel.bus import BusConfig
+from sim2real.hardware.dynamixel.device import DynamixelServos
+from sim2real.hardware.dynamixel.drive import VoltageDrive
+from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+from sim2real.hardware.emulation.virtual import VirtualRobot
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.rig import Rig
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+PLANT = f"{Path(__file__).parents[1] / 'hardware' / 'plants.py'}:FirstOrder"
+"""It turns at 1.8 rad/s under the push, and stays where it is without torque."""
+
+
+@pytest.mark.parametrize(
+    ("gate", "noun"),
+    [
+        ({"max_speed_rad_s": 1.0}, "limit of 1 rad/s"),
+        ({"envelope_rad": (-0.1, 0.1)}, "envelope"),
+        ({}, "does not hang down after 5 pushes"),
+    ],
+)
+def test_a_push_is_measured_and_its_reason_is_kept(gate, noun):
+    robot = VirtualRobot(PLANT, EmulatorConfig(), {"ids": [1]})
+    device = DynamixelServos(BusConfig(robot.port, silence_s=1.0), [1], VoltageDrive(5.0))
+    with Rig(device, GateConfig(2.0, **gate)) as rig:
+        with pytest.raises(SafetyStop, match=noun):
+            load_pipeline("pendulum").load().drive.prepare(SimpleNamespace(rig=rig), 2.0)
+        assert robot.bus.servos[1].get(reg.TORQUE_ENABLE) == 0
