@@ -2,14 +2,11 @@
 
 import math
 
-import jax
 import numpy as np
 import pytest
-from flax import struct
 from virtual_bus import IdleDevice
 
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.graph.base import Base
 from sim2real.hardware.device import (
     Alone,
     CommandColumn,
@@ -33,26 +30,6 @@ COLUMNS = (
     CommandColumn("tau", "N m", "zero"),
 )
 LOW, HIGH = np.tile([-1.5, -20.0, 0.0, 0.0, -20.0], (N, 1)), np.tile([1.5, 20.0, 100.0, 5.0, 20.0], (N, 1))
-UNITS = {column.name: column.unit for column in COLUMNS}
-
-
-@struct.dataclass
-class JointCommands(Base):
-    """A command for motors that add a controller's torque and a torque: ``kp (q - position) + kd (dq - speed) + tau``.
-
-    Attributes:
-        q: Shape ``(joints,)`` [rad].
-        dq: Shape ``(joints,)`` [rad/s].
-        kp: Shape ``(joints,)`` [N m/rad].
-        kd: Shape ``(joints,)`` [N m s/rad].
-        tau: Shape ``(joints,)`` [N m].
-    """
-
-    q: jax.Array
-    dq: jax.Array
-    kp: jax.Array
-    kd: jax.Array
-    tau: jax.Array
 
 
 class Legs(IdleDevice):

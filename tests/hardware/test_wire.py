@@ -361,22 +361,6 @@ def read_state(bench, t_ns):
     return *struct.unpack("<ii", answer[9:17]), arrived_ns
 
 
-def test_an_encoder_stands_still_while_the_plant_goes_on(make_bench):
-    bench = make_bench("Ramp", EmulatorConfig(frozen_after_s=0.1))
-    before, at, after = (read_state(bench, t * MS) for t in (60, 120, 300))
-    assert 0 < before[1] < at[1] == after[1]
-    assert before[0] > 0 == at[0] == after[0]
-    assert bench.truth().of(Kind.SAMPLE)["values"][-1, 0] == pytest.approx(0.4 * 0.3, abs=1e-3)
-
-
-def test_wild_positions_have_a_good_checksum_and_no_motor_reaches_them(make_bench):
-    bench = make_bench("Ramp", EmulatorConfig(wild=0.5))
-    counts = np.array([read_state(bench, 20 * i * MS)[1] for i in range(1, 30)])
-    wild = np.abs(counts * reg.RAD_PER_COUNT) > 10_000.0
-    assert 5 < wild.sum() < 25
-    assert np.all(np.abs(counts[~wild]) < 1000)
-
-
 def test_late_answers_come_in_order(make_bench):
     bench = make_bench("Ramp", EmulatorConfig(return_delay_us=0, late=0.3, late_s=0.009))
     arrived_ms = np.array([read_state(bench, 20 * i * MS)[2] / MS - 20 * i for i in range(1, 30)])

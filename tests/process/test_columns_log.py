@@ -3,8 +3,10 @@
 import jax
 import numpy as np
 import pytest
-from test_columns_rig import UNITS, JointCommands, Legs, N, gate
+from flax import struct
+from test_columns_rig import COLUMNS, Legs, N, gate
 
+from sim2real.graph.base import Base
 from sim2real.hardware.clock import SYSTEM_CLOCK
 from sim2real.hardware.safety.rig import Rig
 from sim2real.log.reader import read_log
@@ -17,6 +19,26 @@ from sim2real.robots.walking.drive import BodySensor
 from sim2real.runtime.asynchronous import AsyncGraph
 
 pytestmark = pytest.mark.process
+UNITS = {column.name: column.unit for column in COLUMNS}
+
+
+@struct.dataclass
+class JointCommands(Base):
+    """A command for motors that add a controller's torque and a torque: ``kp (q - position) + kd (dq - speed) + tau``.
+
+    Attributes:
+        q: Shape ``(joints,)`` [rad].
+        dq: Shape ``(joints,)`` [rad/s].
+        kp: Shape ``(joints,)`` [N m/rad].
+        kd: Shape ``(joints,)`` [N m s/rad].
+        tau: Shape ``(joints,)`` [N m].
+    """
+
+    q: jax.Array
+    dq: jax.Array
+    kp: jax.Array
+    kd: jax.Array
+    tau: jax.Array
 
 
 class RealLegs(Legs):

@@ -178,7 +178,6 @@ def test_usage_that_makes_no_sense(serve, connect):
         StsServos(bus, [Joint("a", 1)]).open()
     with pytest.raises(HardwareLost, match="not open"):
         StsServos(bus, [Joint("a", 1)]).measure()
-    StsServos(bus, [Joint("a", 1)]).close()
     robot = serve()
     device = connect(robot)
     with pytest.raises(UsageError, match="open already"):
