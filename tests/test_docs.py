@@ -42,6 +42,7 @@ MARKS = {
     "README.md": [NIGHT],
     "docs/graph.md": [PROCESS],
     "docs/guides/compose.md": [NIGHT],
+    "docs/guides/identify.md": [NIGHT],
     "docs/guides/interop.md": [NIGHT],
     "docs/guides/notebook.md": [NIGHT, PROCESS],
     "docs/reference/runs.md": [NIGHT],

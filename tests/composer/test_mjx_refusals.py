@@ -131,6 +131,7 @@ def test_writes_into_arrays_are_refused_with_the_way_to_do_it(write):
         made(**start(write))
 
 
+@pytest.mark.night
 def test_writes_by_name_and_column_work():
     def write(task, physics):
         physics.named.data.qpos["hinge"] = 0.3
@@ -243,6 +244,7 @@ def test_rewards_may_be_arrays():
     assert state.reward.shape == after.reward.shape == (2,)
 
 
+@pytest.mark.night
 def test_states_keyframes_colours_and_choices():
     """What hooks of dm_control's call; the same numbers as on C where nothing is drawn."""
 

@@ -62,6 +62,7 @@ def test_a_module_of_flax_is_trained(learnt):
     assert learnt.best.spec == NetworkSpec(f"{__name__}:Normalised")
 
 
+@pytest.mark.night
 def test_its_bundle_runs_without_jax_and_without_its_code(learnt, tmp_path):
     pytest.importorskip("onnxruntime")
     policy = learnt.best

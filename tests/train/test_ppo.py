@@ -191,6 +191,7 @@ def test_pendulum_with_delays_swings_up():
     assert result.history["success"].max() > 0.7
 
 
+@pytest.mark.night
 def test_training_ends_where_the_best_seed_reaches_the_target(bandit):
     full, _, config = bandit
     at = int(np.flatnonzero(full.history["success"].max(1) >= 0.5)[0])
@@ -200,6 +201,7 @@ def test_training_ends_where_the_best_seed_reaches_the_target(bandit):
     np.testing.assert_array_equal(found.history["success"], full.history["success"][: at + 1])
 
 
+@pytest.mark.night
 def test_training_ends_at_the_first_evaluation_behind_its_time():
     found = train(Bandit(), dataclasses.replace(SMALL, minutes=1e-6), jax.random.key(0))
     assert len(found.env_steps) == 1
@@ -216,6 +218,7 @@ def test_evaluations_of_few_copies_judge_the_same_policies(bandit):
     assert found.history["success"][-1].min() > 0.9
 
 
+@pytest.mark.night
 def test_a_caller_that_ends_the_training_keeps_the_best_policy():
     kept = []
 

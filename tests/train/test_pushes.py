@@ -177,6 +177,7 @@ def interrupted(tmp_path_factory):
     return train(Growing(), CONFIG, KEY, keep, checkpoint=path), path.with_suffix(".first")
 
 
+@pytest.mark.night
 def test_differences_grow_evenly_from_update_to_update(interrupted):
     whole, _ = interrupted
     widths = np.linspace(0.2, 0.7, CONFIG.updates)
