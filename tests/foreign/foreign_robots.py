@@ -218,9 +218,9 @@ def _write(log, written, commanded, vendor, rng):
         log.columns["kd"] = np.zeros(len(written))
 
 
-def save(log, folder):
-    """Write a log as CSV where its columns are single ones, else as npz, and return the path."""
-    if not log.named:
+def save(log, folder, text=True):
+    """Write a log as CSV where its columns are single ones and text is wanted, else as npz, and return the path."""
+    if not log.named or not text:
         np.savez(folder / "log.npz", **log.columns)
         return folder / "log.npz"
     rows = np.column_stack(list(log.columns.values()))

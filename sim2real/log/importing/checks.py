@@ -460,16 +460,18 @@ def copied(t_goal: np.ndarray, t_position: np.ndarray, goal: np.ndarray, positio
             continue
         exact = 1e-5 * q.std() + 1.1e-6 * np.abs(q).max()
         limit = max(exact, 0.51 * max(_step(c), _step(q)))
-        for shift in range(-most, most + 1):
-            allowed = limit if abs(shift) <= 1 else exact
-            for some, share in ((rows[:: max(len(rows) // 40, 1)], 0.9), (rows, 0.98)):
-                at = newest[some] + shift
-                inside = (at >= 0) & (at < len(c))
-                if inside.sum() < 20 or np.mean(np.abs(q[some[inside]] - c[at[inside]]) <= allowed) < share:
-                    break
-            else:
-                copies[i] = True
-                break
+        # Look at a few rows at all shifts, and at all rows of the shifts at which the few are equal.
+        shifts = np.arange(-most, most + 1)
+        allowed = np.where(np.abs(shifts) <= 1, limit, exact)
+        few = rows[:: max(len(rows) // 40, 1)]
+        for some, share in ((few, 0.9), (rows, 0.98)):
+            at = newest[some][:, None] + shifts
+            inside = (at >= 0) & (at < len(c))
+            off = np.abs(q[some][:, None] - c[np.clip(at, 0, len(c) - 1)]) <= allowed
+            equal = (off & inside).sum(axis=0) >= share * np.maximum(inside.sum(axis=0), 1)
+            keep = equal & (inside.sum(axis=0) >= min(20, len(few)))
+            shifts, allowed = shifts[keep], allowed[keep]
+        copies[i] = len(shifts) > 0
     return copies
 
 

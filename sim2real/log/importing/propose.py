@@ -400,6 +400,8 @@ def _check(table: Table, draft: Proposal, by_name: bool, hints: ImportHints) -> 
 def hint_for(findings: Sequence[Finding]) -> str:
     """Return what to do about findings that refuse an import."""
     hints = {
+        "sign": "change the sign of that joint's scale, such as scale = [1, -1]",
+        "order": "list the sources in the order of the positions",
         "copy": "log the commands that were sent, not the measurements",
         "clock": "stamp both streams with one clock, such as a recorder's",
         "zero": "cut the file where the zero moves: --samples A:B",
