@@ -36,7 +36,7 @@ _COLUMNS = ("t", "into", "segment", "recording", "held_out")
 _NO_LIMIT = 1e6
 """Value of an absent limit: ``worlds.drive_terms.NO_LIMIT``, whose module takes a second to import."""
 _AGAIN = "run `sim2real identify` again"
-UNFINISHED = {"interrupted": "was interrupted", "not converged": "did not converge"}
+UNFINISHED = {"not finished": "did not finish"}
 """Verdict on an identification without intervals -> the reason as text."""
 
 
@@ -50,8 +50,8 @@ class Estimate:
         nominal: The data sheet's value.
         low95: Lower end of the 95 % interval.
         lower: Lower bound of the search.
-        verdict: ``accepted``, ``negligible``, ``not reached``, ``fixed``, ``at a bound``, ``not identifiable`` or
-            ``not converged``, or ``interrupted``.
+        verdict: ``ok``, ``at a bound``, ``not determined`` or ``fixed``; in a fit that is not accepted no parameter is
+            ``ok``.
         truth: The value in the embedded robot.
     """
 
@@ -77,7 +77,13 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict on an identification: its status, the reasons, and the command to run next."""
+    """The verdict on an identification.
+
+    Attributes:
+        status: ``accepted``, ``record again``, ``change the model`` or ``not finished``; "" before it is judged.
+        reasons: Sentences; the first one decided.
+        next: The command to run next; "": there is none.
+    """
 
     status: str
     reasons: tuple[str, ...]
@@ -317,157 +323,78 @@ class Quantity:
         check(self.estimates.shape == self.standard_errors.shape, f"{self.name}: estimates without errors")
 
 
-Reach = Literal["ahead", "free run"]
-AHEAD: Reach = "ahead"
-FREE_RUN: Reach = "free run"
+ErrorKind = Literal["ahead", "free run"]
+AHEAD: ErrorKind = "ahead"
+FREE_RUN: ErrorKind = "free run"
 MAX_ERROR_RATIO = 1.25
-"""Largest ratio of an error to its bound at which the promise is not broken: one error in twenty may exceed its bound,
-and it seldom exceeds it by this."""
-
-PROMISE_BROKEN = "promise broken"
-"""The verdict on an identification whose errors on held-out data exceed their bounds."""
+"""Largest ratio of an error to the expected error that does not count as exceeded."""
 
 
 @dataclass(frozen=True)
-class Growth:
-    """How errors grow with the motion of a log: in proportion to a power of one size of the motion.
-
-    Attributes:
-        size: The name of the size, such as ``largest step`` of the goal; see ``growth.sizes``.
-        power: The exponent of the size.
-        usual: Its median over the recordings.
-        low, high: Its least and largest values; the bound for a motion below ``low`` is that for ``low``.
-        bound: The bound for a usual motion; 0 before it is computed.
-    """
-
-    size: str
-    power: float
-    usual: float
-    low: float
-    high: float
-    bound: float = 0.0
-
-    def factor(self, sizes: Mapping[str, float], stretch: float) -> float:
-        """Return the factor of a log's bound over that for a usual motion.
-
-        Args:
-            sizes: The sizes of the log's motion; without this size the motion counts as the largest.
-            stretch: Factor of a motion that leaves the range of all fitted ones; see ``predicted_logs.stretches``.
-        """
-        value = max(sizes.get(self.size, self.high), self.low)
-        return max((value / self.usual) ** self.power, (min(value, self.high) / self.usual) ** self.power * stretch)
-
-
-@dataclass(frozen=True)
-class Bound:
-    """A promise: 95 % of the errors of a position on later logs stay below ``bound``.
+class ExpectedError:
+    """The error to expect of a position on later data: 1.25 times its worst error on held-out data.
 
     Attributes:
         column: The position among the measured fields, such as ``position[1]``.
         name: Its name for people.
-        reach: ``ahead``: windows of a horizon, each from a state of its own; ``free run``: one run.
+        kind: ``ahead``: windows of a horizon, each from a state of its own; ``free run``: one run.
         seconds: The horizon, or the length of the run [s].
-        scope: What the bound is about: ``this recording`` or ``recordings like these``.
-        growth: How the bound of a single log follows its motion; None if errors do not depend on the motion.
+        error: Root mean square, for motion like the fitted one.
     """
 
     column: str
     name: str
     unit: str
-    reach: Reach
+    kind: ErrorKind
     seconds: float
-    bound: float
-    scope: str
-    growth: Growth | None = None
+    error: float
 
-    def on(self, sizes: Mapping[str, float], stretch: float) -> tuple[float, float]:
-        """Return the bound for a log, and its factor over the bound for a usual motion; see ``Growth.factor``."""
-        if self.growth is None or self.growth.size not in sizes:
-            return stretch * self.bound, stretch
-        factor = self.growth.factor(sizes, stretch)
-        return factor * self.growth.bound, factor
+    def __str__(self) -> str:
+        """Return the error with its unit and horizon."""
+        how = f"{self.seconds:.3g} s ahead" if self.kind == AHEAD else f"in a free run of {self.seconds:.3g} s"
+        return f"{self.name} {with_small_unit(self.error, self.unit)} {how}"
 
 
 @dataclass(frozen=True)
-class Promise:
-    """An error beside the bound that was given before the prediction.
+class ComparedError:
+    """An error on held-out data beside the error that the held-out parts let expect.
 
     Attributes:
-        source: The predicted data: a held-out part, the held-out quarter, or a log.
-        fresh: Whether the estimates never depended on this data; held-out parts are fitted afterwards.
-        seconds: The horizon, or the length of the run [s]; 0 for a part in older files.
+        source: The predicted data: the held-out end of a log, or a log.
         error: Root mean square error; None if it is infinite.
-        bound: None if too few parts gave one.
-        stretch: Factor of this data in ``bound``, which needs no prediction: more than 1 if the motion is faster or
-            reaches further than the fitted one. Where errors grow with the motion, its bound over that for a usual one.
+        expected: None if too few parts let expect one.
+        wider: Factor in ``expected`` for a motion that is faster or goes further than the fitted one.
     """
 
     source: str
-    fresh: bool
     column: str
     name: str
     unit: str
-    reach: Reach
+    kind: ErrorKind
     seconds: float
     error: float | None
-    bound: float | None = None
-    stretch: float = 1.0
+    expected: float | None = None
+    wider: float = 1.0
 
     @property
     def ratio(self) -> float | None:
-        """The error over its bound; None without a bound."""
-        return None if self.bound is None else math.inf if self.error is None else self.error / self.bound
+        """The error over the expected error; None without one."""
+        return None if self.expected is None else math.inf if self.error is None else self.error / self.expected
 
     @property
-    def broken(self) -> bool:
-        """Whether the error exceeds its bound by more than ``MAX_ERROR_RATIO``."""
+    def exceeded(self) -> bool:
+        """Whether the error is above the expected error by more than ``MAX_ERROR_RATIO``."""
         return self.ratio is not None and self.ratio > MAX_ERROR_RATIO
 
-    @property
-    def kept(self) -> str:
-        """Whether the promise is kept, as text; an error above its bound by less is ``within`` the ratio."""
-        if self.ratio is None:
-            return "none was made"
-        return "no" if self.broken else "yes" if self.ratio <= 1.0 else f"within {MAX_ERROR_RATIO:g}"
-
-    @property
-    def horizon(self) -> str:
-        """How far the prediction reaches, as text."""
-        if not self.seconds:
-            return self.reach
-        return f"{self.seconds:.3g} s ahead" if self.reach == AHEAD else f"free run of {self.seconds:.3g} s"
-
-    def sentence(self) -> str:
-        """Return the error and its bound as text."""
-        unit, where = f" {self.unit}".rstrip(), self.source
-        how = f"up to {self.seconds:.3g} s ahead" if self.reach == AHEAD else f"in a free run of {self.seconds:.3g} s"
-        size = "diverges" if self.error is None else f"is off by {self.error:.2g}{unit}"
-        ratio = "" if self.ratio is None or self.error is None else f", {self.ratio:.2f} times as much"
-        bound = "" if self.bound is None else f"; promised was {self.bound:.2g}{unit}{ratio and f': {ratio[2:]}'}"
-        wider = f" ({self.stretch:.2g} times the usual bound, for its motion)" if bound and self.stretch != 1.0 else ""
-        return f"{self.name} {size} {how} on {where}{bound}{wider}"
-
-
-def too_many_broken(rows: Sequence[Promise]) -> bool:
-    """Return whether promises about data that no estimate depended on are broken; of twenty alike, one may be.
-
-    Bounds are for 95 % of the errors, so of many some are exceeded although each bound is right.
-    """
-    counts: dict[tuple[str, Reach], list[bool]] = {}
-    for r in rows:
-        if r.fresh and r.ratio is not None:
-            counts.setdefault((r.column, r.reach), []).append(r.broken)
-    return any(sum(those) > len(those) // 20 for those in counts.values())
-
-
-def promises_table(rows: Sequence[Promise]) -> ArtifactTable:
-    """Return a row for each error with a bound, the largest ratio first."""
-    cells = []
-    for r in sorted(rows, key=lambda row: -(row.ratio or 0.0)):
-        if r.ratio is not None:
-            error = math.inf if r.error is None else r.error
-            cells.append([r.name, r.source, r.horizon, r.bound, error, r.unit, f"{r.ratio:.2f}", r.kept])
-    return ArtifactTable(("position", "predicted", "horizon", "promised", "shown", "unit", "ratio", "kept"), cells)
+    def __str__(self) -> str:
+        """Return the error and the expected error as a sentence."""
+        how = f"{self.seconds:.3g} s ahead" if self.kind == AHEAD else f"in a free run of {self.seconds:.3g} s"
+        size = "diverges" if self.error is None else f"is off by {with_small_unit(self.error, self.unit)}"
+        if self.expected is None or self.ratio is None:
+            return f"{self.name} {size} {how} on {self.source}"
+        times = "" if self.error is None else f", {self.ratio:.2f} times as much"
+        expected = with_small_unit(self.expected, self.unit)
+        return f"{self.name} {size} {how} on {self.source}, where {expected} were expected{times}"
 
 
 _WINDOW_S = 1.0
@@ -627,7 +554,8 @@ class Identification(Shown):
         worst: The second in which the model explains a joint worst; None without samples, and in older files.
         aggregate: Quantities estimated from each recording alone; empty unless configured.
         left_out: A fit for each held-out part; empty without folds.
-        promises: The ledger: each error on a held-out part or on held-out data, beside the bound that was given before.
+        expected_error: The error to expect of each position on later data, ahead and in a free run.
+        compared: Errors on held-out data, beside the errors that the held-out parts let expect.
         ranges: Signal -> its range in the fitted segments; see ``segments.ranges``.
         tried: What optional terms gain on held-out parts; empty if none was tried.
         terms: Optional terms of the model in the fit; None if the model has no optional terms.
@@ -661,8 +589,8 @@ class Identification(Shown):
     free_run: tuple[FreeRun, ...] = ()
     aggregate: tuple[Quantity, ...] = ()
     left_out: tuple[HeldOutPart, ...] = ()
-    promises: tuple[Promise, ...] = ()
-    bounds: tuple[Bound, ...] = ()
+    expected_error: tuple[ExpectedError, ...] = ()
+    compared: tuple[ComparedError, ...] = ()
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     tried: tuple[TriedTerm, ...] = ()
     terms: tuple[str, ...] | None = None
@@ -724,9 +652,21 @@ class Identification(Shown):
         horizon = f"held-out RMSE, {self.held_out[0].horizon_s:g} s ahead" if self.held_out else ""
         return ArtifactTable((horizon, *models, "unit", "no better than"), rows)
 
-    def promises_table(self) -> ArtifactTable:
-        """Return the ledger: a row for each error and the bound that was given before it."""
-        return promises_table(self.promises)
+    def expected_of(self, column: str, kind: ErrorKind) -> ExpectedError | None:
+        """Return the expected error of a position; None if there is none."""
+        return next((e for e in self.expected_error if (e.column, e.kind) == (column, kind)), None)
+
+    def compared_table(self) -> ArtifactTable:
+        """Return a row for each error on held-out data beside the expected one, the largest ratio first."""
+        cells = [
+            [
+                *(r.name, r.source, f"{r.seconds:.3g} s {'ahead' if r.kind == AHEAD else r.kind}"),
+                *(math.inf if r.error is None else r.error, r.expected, f"{r.ratio:.2f}", r.unit),
+            ]
+            for r in sorted(self.compared, key=lambda row: -(row.ratio or 0.0))
+            if r.ratio is not None
+        ]
+        return ArtifactTable(("joint", "held out", "predicted", "error", "expected", "ratio", "unit"), cells)
 
     @property
     def values(self) -> dict[str, float]:

@@ -47,7 +47,7 @@ def identified(values, deviation=0.005):
     posterior = Posterior(
         tuple(names), ("log",) * len(names), at, np.eye(len(names)) * deviation**2, at - 1.0, at + 1.0
     )
-    rows = tuple(Estimate(n, "1", "dynamics", "", None, float(v), "accepted") for n, v in values.items())
+    rows = tuple(Estimate(n, "1", "dynamics", "", None, float(v), "ok") for n, v in values.items())
     return Identification("go2", (), Judgement("accepted", ()), rows, posterior=posterior)
 
 
@@ -72,7 +72,7 @@ def test_the_load_has_an_interval_and_training_draws_it_beside_the_strengths(sta
     before = identified(values)
     found = weighing.weighed(ROBOT, before, episode, {"payload": load})
     row = found.parameters[-1]
-    assert (row.name, row.unit, row.verdict, row.truth) == ("payload", "kg", "accepted", load)
+    assert (row.name, row.unit, row.verdict, row.truth) == ("payload", "kg", "ok", load)
     assert row.low95 < load < row.high95
     assert 0.03 < row.high95 - row.low95 < 0.6
     assert found.posterior.names == (*before.posterior.names, "payload")

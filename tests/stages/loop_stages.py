@@ -17,7 +17,7 @@ from sim2real.commands.loop import run_loop
 from sim2real.errors import Sim2RealError
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "accepted")
+TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "ok")
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
 WIDER = "sim2real identify pendulum --bounds friction 0.1 80 --max-delay-s 0.1"
 
@@ -62,11 +62,11 @@ class Stages:
                 opened.output("log", "session.mcap").write_text(content)
             if stage == "identify":
                 status = self.judgements.pop(0) if number and self.judgements else "accepted"
-                status = "not identifiable" if number in self.lacking else status
+                status = "record again" if number in self.lacking else status
                 if status == "fails":
                     raise Sim2RealError("nothing could be simulated")
                 logs = tuple(Source.of(path, opened.run_dir) for path in inputs.values())
-                told = Judgement(status, (content,), WIDER if status == "hit a bound" else "")
+                told = Judgement(status, (content,), WIDER if status == "change the model" else "")
                 Identification("pendulum", logs, told, (TRIP,)).write(opened.output("parameters", "parameters.json"))
             if stage == "train":
                 opened.output("bundle", "bundle").mkdir()

@@ -93,7 +93,7 @@ def test_python_files_are_python(arm, here, monkeypatch):
 
 
 def test_a_world_that_is_not_mujocos_is_refused_but_for_json(here, capsys):
-    file = save(identified("disk", "hit a bound"), here / "found")
+    file = save(identified("disk", "change the model"), here / "found")
     for to in ("mjcf", "mjlab", "isaaclab"):
         assert cli.main(["export", "identified", str(file), "--to", to]) == errors.USAGE
         told = capsys.readouterr().err
@@ -103,15 +103,13 @@ def test_a_world_that_is_not_mujocos_is_refused_but_for_json(here, capsys):
         assert "damping" not in told.split("nothing for:")[1].split("hint")[0]
         assert "--to json" in told
     assert cli.main(["export", "identified", str(file), "--to", "json"]) == 0
-    assert "verdict: hit a bound" in capsys.readouterr().err
+    assert "verdict: change the model" in capsys.readouterr().err
     document = json.loads((here / "disk_identified.json").read_text())
     assert document["mujoco"] is None
-    assert document["verdict"]["status"] == "hit a bound"
+    assert document["verdict"]["status"] == "change the model"
 
 
-@pytest.mark.parametrize(
-    ("status", "said"), [("interrupted", "was interrupted"), ("not converged", "did not converge")]
-)
+@pytest.mark.parametrize(("status", "said"), [("not finished", "did not finish")])
 def test_an_identification_without_intervals_is_refused(arm, here, capsys, status, said):
     verdict = Judgement(status, ("why",), "sim2real identify arm --begin parameters.json")
     file = save(replace(arm, posterior=None, verdict=verdict), here / "found")

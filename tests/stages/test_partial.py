@@ -56,13 +56,13 @@ def test_the_best_so_far_is_left_and_says_what_it_is(pendulum, tmp_path, monkeyp
     assert (stage.manifest["status"], stage.manifest["exit_code"]) == ("interrupted", code)
     path = stage.output("partial")
     document = json.loads(path.read_text())
-    assert document["verdict"]["status"] == "interrupted"
+    assert document["verdict"]["status"] == "not finished"
     assert "75% of search" in document["verdict"]["reasons"][0]
     rows = {p["name"]: p for p in document["parameters"]}
     assert rows["gain"]["estimate"] == pytest.approx(21.0, rel=1e-4)
-    assert rows["gain"]["verdict"] == "interrupted"
+    assert rows["gain"]["verdict"] == "not determined"
     assert document["search"]["loss"] == 1.0
-    with pytest.raises(Sim2RealError, match="was interrupted"):
+    with pytest.raises(Sim2RealError, match="did not finish"):
         open_identification(path, pendulum)
 
 
@@ -142,11 +142,11 @@ def test_a_kill_while_a_fit_is_judged_loses_the_judgement_alone(tmp_path):
     (path,) = tmp_path.rglob("partial.json")
     assert not (path.parent / "parameters.json").exists()
     left = Identification.load(path)
-    assert left.verdict.status == "interrupted"
+    assert left.verdict.status == "not finished"
     assert f"--begin {path}" in left.verdict.next
     again = [*own, "--begin", str(path), "--generations", "0"]
     subprocess.run(again, check=True, capture_output=True, cwd=ROOT)
     found = Identification.load(next(tmp_path.rglob("parameters.json")))
-    assert found.verdict.status == "promise broken"  # as without the kill: the held-out end goes far beyond
+    assert found.verdict.status == "change the model"  # as without the kill: the held-out end goes far beyond
     assert found.values["gain"] == pytest.approx(left.values["gain"], rel=1e-3)
     assert not (next(tmp_path.rglob("parameters.json")).parent / "partial.json").exists()

@@ -71,7 +71,7 @@ def test_the_verdict_says_what_is_done_again_and_from_which_logs(world, found, s
 
 
 def test_an_estimate_at_a_bound_is_identified_once_more_with_wider_ones(world, capsys):
-    world.judgements = ["hit a bound"]
+    world.judgements = ["change the model"]
     again, rows = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
     assert again == ["identify", "identify", "train", "deploy"]
     own, wider = (config for stage, config in world.calls[4:] if stage == "identify")
@@ -82,7 +82,7 @@ def test_an_estimate_at_a_bound_is_identified_once_more_with_wider_ones(world, c
 
 def test_an_estimate_that_stays_at_a_bound_leads_to_a_recording_and_then_to_an_end(world):
     """The model may be wrong: bounds are not moved for ever."""
-    world.judgements = ["hit a bound"] * 6
+    world.judgements = ["change the model"] * 6
     again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
     assert again == ["identify"] * 2 + ["record"] + ["identify"] * 2 + ["train", "deploy"]
 
@@ -119,7 +119,7 @@ def test_a_robot_that_became_later_is_recorded_and_trained_for_anew(world):
     assert dict(world.calls[4:])["identify"].log == ()
 
 
-@pytest.mark.parametrize("judgement", ["not identifiable", "fails"])
+@pytest.mark.parametrize("judgement", ["record again", "fails"])
 def test_where_the_deployment_shows_too_little_the_robot_is_recorded(world, capsys, judgement):
     world.judgements = [judgement]
     again, rows = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim2real.artifacts.identification import AHEAD, FREE_RUN, Bound, Estimate, Identification, Judgement
+from sim2real.artifacts.identification import AHEAD, FREE_RUN, Estimate, ExpectedError, Identification, Judgement
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
 from sim2real.stages.pipeline.open_log import open_recording
@@ -62,12 +62,12 @@ def identification(upper_s=0.06, world=None, expected=1.0, horizon_s=1.0):
     pipeline = load_pipeline("pendulum")
     parameters = tuple(
         Estimate(p.name, p.unit, p.kind, "", p.nominal, p.nominal, "accepted", lower=p.low,
-                 upper=upper_s if p.kind == "delay" else p.high)
+                 upper=2 * upper_s if p.name == "actuator_delay" else p.high)
         for p in pipeline.load().identifiable(0.06).parameters
     )  # fmt: skip
-    bounds = (Bound("th", "th", "rad", AHEAD, horizon_s, expected, "this recording"),)
+    error = (ExpectedError("th", "th", "rad", AHEAD, horizon_s, expected),)
     return pipeline, Identification(
-        "pendulum", (), Judgement("accepted", ()), parameters, bounds=bounds, settle_s=0.3, world=world
+        "pendulum", (), Judgement("accepted", ()), parameters, expected_error=error, settle_s=0.3, world=world
     )
 
 

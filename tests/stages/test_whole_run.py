@@ -90,14 +90,14 @@ def test_training_on_what_is_not_accepted_must_be_asked_for(finished_run_dir, tm
     copied(finished_run_dir, run_dir)
     file = run_dir / "identify" / "parameters.json"
     document = json.loads(file.read_text())
-    document["verdict"] = {"status": "hit a bound", "reasons": ["friction is at its bound"], "next": "widen it"}
-    document["parameters"][0]["verdict"] = "not identifiable"
+    document["verdict"] = {"status": "change the model", "reasons": ["friction is at its bound"], "next": "widen it"}
+    document["parameters"][0]["verdict"] = "not determined"
     file.write_text(json.dumps(document))
     home = ["train", "pendulum", "--run", str(run_dir), "--runs", str(tmp_path), "--timelines=4", "--explain"]
     assert cli.main(home) == 1
     said = capsys.readouterr().err
     assert all(
-        part in said for part in ("not accepted: hit a bound", "friction is at its bound", "widen it", "--force")
+        part in said for part in ("not accepted: change the model", "friction is at its bound", "widen it", "--force")
     )
     assert not (run_dir / "explain").exists()
     assert cli.main([*home, "--force"]) == 0

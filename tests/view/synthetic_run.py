@@ -86,7 +86,7 @@ def entry(
         "name": name, "unit": unit, "kind": kind, "about": f"about {name}", "nominal": nominal,
         "estimate": estimate, "standard_error": se, "low95": low, "high95": high,
         "lower": 0.0 if kind != "dynamics" else nominal / 4, "upper": 0.06 if unit == "s" else nominal * 4,
-        "verdict": "accepted", "truth": truth,
+        "verdict": "ok", "truth": truth,
     }  # fmt: skip
 
 
@@ -97,7 +97,7 @@ def parameters(truth: bool = True) -> dict[str, Any]:
         "format": 3,
         "pipeline": "pendulum",
         "logs": [{"path": "../record/session.mcap", "sha256": "0" * 64}],
-        "verdict": {"status": "hit a bound", "reasons": ["at a bound: friction", "sensor_delay is <b>loose</b>"]},
+        "verdict": {"status": "change the model", "reasons": ["at a bound: friction", "sensor_delay is <b>loose</b>"]},
         "check": {
             "condition": 123.4,
             "undetermined": [["sensor_delay", EVIL]],

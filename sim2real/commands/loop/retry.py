@@ -52,7 +52,7 @@ def retry_config(config: Any, folder: StageFolder) -> tuple[Any, str]:
 
 def with_wider_bounds(config: IdentifyConfig, identification: Identification) -> IdentifyConfig | None:
     """Return a configuration with the bounds that the verdict proposes; None if it proposes none."""
-    if identification.verdict.status != "hit a bound":
+    if identification.verdict.status != "change the model":
         return None
     words, wider = shlex.split(identification.verdict.next), config
     for i, word in enumerate(words):
@@ -72,7 +72,7 @@ def why_insufficient(identification: Identification) -> str:
     if identification.verdict.status != "accepted":
         return identification.verdict.status
     round_trip = next((p for p in identification.parameters if p.name == ROUND_TRIP), None)
-    if round_trip is None or round_trip.verdict in ("accepted", "fixed"):
+    if round_trip is None or round_trip.verdict in ("ok", "fixed"):
         return ""
     return f"the sum of the delays is {round_trip.verdict}"
 

@@ -246,7 +246,7 @@ def _unknown(identification: Identification, described: set[str]) -> list[str]:
     Args:
         described: Parameters whose intervals are figures of the card.
     """
-    sentences = [_doubt(p) for p in identification.parameters if p.kind != "derived" and p.verdict != "accepted"]
+    sentences = [_doubt(p) for p in identification.parameters if p.kind != "derived" and p.verdict != "ok"]
     if others := [p.name for p in identification.parameters if p.low95 != p.high95 and p.name not in described]:
         sentences.append(
             f"the intervals of {', '.join(others)} are no figures of this card: bounds cut them, or the search widened "

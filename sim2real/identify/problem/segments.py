@@ -287,14 +287,15 @@ _MOST_BEYOND = 6
 """Most sentences about signals outside their fitted range."""
 
 
-def range_of(signals: Mapping[str, Signal], column: str) -> Signal:
-    """Return the range of a measured position."""
-    return next((r for label, r in signals.items() if label.startswith(f"{column!r} of ")), (0.0, 0.0))
+def range_of(signals: Mapping[str, Signal], column: str, before: str = "") -> Signal:
+    """Return the range of a measured position; the only entry of a field has no index in its label."""
+    names = [f"{before}{name!r} of " for name in (column, column.removesuffix("[0]"))]
+    return next((r for name in names for label, r in signals.items() if label.startswith(name)), (0.0, 0.0))
 
 
 def speed_range_of(signals: Mapping[str, Signal], column: str) -> Signal:
     """Return the range of a measured position's speed."""
-    return next((r for label, r in signals.items() if label.startswith(f"the speed of {column!r} of ")), (0.0, 0.0))
+    return range_of(signals, column, "the speed of ")
 
 
 def ranges(

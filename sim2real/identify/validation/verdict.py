@@ -1,7 +1,7 @@
 """The verdict on an identification: judged on held-out data, position by position."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,12 +9,16 @@ import numpy as np
 
 from sim2real.artifacts.identification import Determined, HeldOut, Judgement, Prediction
 from sim2real.identify.model import IdentifiableModel, position_of
-from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty.bounds import is_physical, way_out
 from sim2real.identify.uncertainty.uncertainty import Uncertainty
 from sim2real.log.schema import unit_of
 
-Status = Literal["accepted", "not converged", "no improvement on held-out data", "not identifiable", "hit a bound"]
+Status = Literal["accepted", "record again", "change the model", "not finished"]
+ACCEPTED: Status = "accepted"
+RECORD: Status = "record again"
+CHANGE: Status = "change the model"
+NOT_FINISHED: Status = "not finished"
 _BETTER = 0.95
 """Largest ratio of the held-out error to that of a baseline with which the estimate is better."""
 NOISE = 2.0
@@ -101,6 +105,7 @@ def judge(
     check: Determined,
     *,
     max_delay_s: float = 1.0,
+    widened: Collection[str] = (),
     beyond: Sequence[str] = (),
     left: float | None = None,
 ) -> Judgement:
@@ -110,36 +115,47 @@ def judge(
         held_out: Errors of the positions, the worst first.
         x: Shape ``(P,)``: the estimate, on the parameters' scales.
         max_delay_s: Longest delay of the model [s].
+        widened: Parameters whose bounds the user has set: wider ones would not help again.
         beyond: Sentences about held-out data outside the range of the fitted data.
         left: Length of the next step of a fit that did not converge [standard errors]; None if it converged.
     """
     improves, errors = _on_held_out(held_out)
-    reasons = [*errors, *beyond]
     if left is not None:
-        return Judgement("not converged", (_not_converged(left), *reasons))
+        return Judgement(NOT_FINISHED, (_not_converged(left), *errors, *beyond))
     # Collect the reasons: estimates at bounds, absent parameters, undetermined groups.
     determined = [i for i, n in enumerate(table.names) if not any(n in group for group in check.undetermined)]
-    bounded, at_zero, flags = _at_bounds(table, x, spread, determined, max_delay_s)
-    reasons += bounded
-    reasons += _absent(table, spread)
-    reasons += [f"{name} is estimated at its lowest possible value, 0; the fit is the same with 0" for name in at_zero]
+    bounded, at_zero, flags = _at_bounds(table, x, spread, determined, max_delay_s, widened)
     undetermined = list(check.messages)
+    reasons = [*errors, *beyond, *bounded, *_absent(table, spread)]
+    reasons += [f"{name} is estimated at its lowest possible value, 0; the fit is the same with 0" for name in at_zero]
     reasons += undetermined
     if spread.misfit > 3.0:
         reasons.append(
             f"residuals are {spread.misfit:.2g} times the measurement's deviation: the model explains the data only in "
             "part, and intervals follow how much estimates vary from block to block"
         )
-    # The first of these defects is the status, and its sentences come first.
-    status: Status = "accepted"
+    # The first of these defects decides.
+    status: Status = ACCEPTED
     deciding = errors
     if not improves:
-        status = "no improvement on held-out data"
+        status = CHANGE
     elif bounded:
-        status, deciding = "hit a bound", bounded
+        status, deciding = CHANGE, bounded
     elif undetermined:
-        status, deciding = "not identifiable", undetermined
+        status, deciding = RECORD, undetermined
     return Judgement(status, tuple(dict.fromkeys([*deciding, *reasons])), flags)
+
+
+def state_of(verdict: str, p: Parameter, upper: bool) -> str:
+    """Return the state of a parameter of an accepted fit: ``ok``, ``at a bound`` or ``not determined``.
+
+    Args:
+        verdict: That of ``Uncertainty``.
+        upper: Whether the estimate is in the upper half of its bounds.
+    """
+    if verdict == "at a bound":
+        return "ok" if is_physical(p, upper) else verdict
+    return "ok" if verdict in ("accepted", "negligible") else "not determined"
 
 
 def _not_converged(left: float) -> str:
@@ -213,10 +229,12 @@ def _at_bounds(
     spread: Uncertainty,
     determined: Sequence[int],
     max_delay_s: float,
+    widened: Collection[str],
 ) -> tuple[list[str], list[str], str]:
     """Return sentences about estimates at a bound, names of those at their lowest possible value, and flags to widen.
 
-    Only parameters in ``determined`` count: wider bounds do not help a parameter that the data does not determine.
+    Only parameters in ``determined`` count: wider bounds do not help a parameter that the data does not determine. Nor
+    do they help again where they were ``widened`` before.
     """
     messages, at_zero, flags = [], [], []
     for i in determined:
@@ -227,11 +245,17 @@ def _at_bounds(
         if is_physical(p, upper):
             at_zero.append(label)
         else:
-            flags.append(way_out(p, upper, max_delay_s))
+            flags.append("" if p.name in widened else way_out(p, upper, max_delay_s))
             messages.append(_bound(label, upper, f"{p.high if upper else p.low:.4g} {p.unit}", flags[-1]))
     return messages, at_zero, " ".join(dict.fromkeys(f for f in flags if f))
 
 
+_CAUSES = (
+    "wider bounds do not help: look for a gear or a unit of the command, the direction of gravity, an encoder's zero, "
+    "or commands that are logged more seldom than they act"
+)
+
+
 def _bound(name: str, upper: bool, bound: str, flags: str) -> str:
-    what = f"identify again with {flags}, or doubt the model" if flags else "no flag moves it: doubt the model"
+    what = f"identify again with {flags}, or doubt the model" if flags else _CAUSES
     return f"at a bound: {name} is at its {'upper' if upper else 'lower'} one, {bound.rstrip()}; {what}"

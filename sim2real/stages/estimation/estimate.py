@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sim2real.artifacts.identification import (
-    PROMISE_BROKEN,
     ROUND_TRIP,
     Determined,
     Estimate,
@@ -16,16 +15,18 @@ from sim2real.artifacts.identification import (
     Identification,
     Judgement,
     Matrix,
-    too_many_broken,
 )
 from sim2real.artifacts.posterior import Posterior
 from sim2real.identify.fit import Fit
 from sim2real.identify.uncertainty import identifiability, noise, uncertainty
 from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
-from sim2real.identify.validation.verdict import judge, positions, scores
+from sim2real.identify.validation.verdict import ACCEPTED, CHANGE, judge, positions, scores, state_of
 from sim2real.identify.validation.worst_second import worst_second
-from sim2real.stages.estimation import held_out_parts, promises
+from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.free_run import Lack
+
+_MOST = 3
+"""Most errors above the expected ones that are named."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +118,14 @@ def judged(
     max_delay_s: float,
     outside: Sequence[str],
     lack: Lack,
+    widened: Collection[str] = (),
 ) -> Identification:
     """Return the document with its verdict, whose ``next`` are flags with which to identify again.
 
     Args:
         units: Field -> unit.
         max_delay_s: Longest delay of the model [s].
+        widened: Parameters whose bounds the user has set.
         outside: Sentences about held-out data outside the range of the fitted data.
     """
     measured = positions(findings.fit.problem.model, units)
@@ -137,27 +140,33 @@ def judged(
         findings.spread,
         findings.check,
         max_delay_s=max_delay_s,
+        widened=widened,
         beyond=outside,
         left=None if fit.converged else fit.left,
     )
-    # Add broken promises, free runs and the bounds on later errors; the reason for the status comes first.
+    # Add errors above the expected ones, and what the free runs show; the reason for the status comes first.
     status, reasons = verdict.status, list(verdict.reasons)
-    broken = promises.broken_sentences(document.promises)
-    bounds = promises.sentences(document, measured)
-    if status != "accepted":
-        reasons += [*broken, *bounds, *lack.reasons]
-    elif lack.flags:
-        status, reasons = "lacks a term", [*lack.reasons, *broken, *bounds, *reasons]
+    exceeded = [str(row) for row in sorted(document.compared, key=lambda r: -(r.ratio or 0.0)) if row.exceeded]
+    more = exceeded[:_MOST] + [f"{len(exceeded) - _MOST} more errors are above"] * (len(exceeded) > _MOST)
+    if status == ACCEPTED and lack.flags:
+        status, reasons = CHANGE, [*lack.reasons, *more, *reasons]
+    elif status == ACCEPTED and exceeded:
+        status, reasons = CHANGE, [*more, *reasons, *lack.reasons]
     else:
-        status = PROMISE_BROKEN if too_many_broken(document.promises) else status
-        reasons = [*broken, *bounds, *reasons, *lack.reasons]
+        reasons += [*more, *lack.reasons]
     flags = " ".join(f for f in (verdict.next, lack.flags) if f)
     # A fault in fitted data changes no held-out error, so it does not change the status.
     worst = worst_second(document.samples, measured, document.settle_s)
     if worst is not None and worst.unexplained:
         where = f"the model does not explain {worst.name} in the second from {worst.begin_s:.1f} s on: {worst.error}"
-        reasons.insert(0 if status == "accepted" else len(verdict.reasons), f"{where}; look at the log there")
-    return replace(document, verdict=Judgement(status, tuple(reasons), flags), held_out=tuple(rows), worst=worst)
+        reasons.append(f"{where}; look at the log there")
+    # In a fit that is not accepted no parameter is ok.
+    parameters = document.parameters
+    if status != ACCEPTED:
+        doubted = {"ok": "not determined"}
+        parameters = tuple(replace(p, verdict=doubted.get(p.verdict, p.verdict)) for p in parameters)
+    judgement = Judgement(status, tuple(reasons), flags)
+    return replace(document, verdict=judgement, parameters=parameters, held_out=tuple(rows), worst=worst)
 
 
 def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
@@ -168,6 +177,7 @@ def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
     for i, column in enumerate(parameters.columns):
         p = column.parameter
         value = np.ravel(findings.fit.values[p.name])[column.recording or 0]
+        upper = bool(parameters.high[i] - findings.x[i] < findings.x[i] - parameters.low[i])
         rows.append(
             Estimate(
                 name=column.label,
@@ -181,7 +191,7 @@ def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
                 high95=float(spread.high[i]),
                 lower=p.low,
                 upper=p.high,
-                verdict=spread.verdict[i],
+                verdict=state_of(spread.verdict[i], p, upper),
                 truth=own_truth(p),
             )
         )
@@ -196,7 +206,7 @@ def _without_interval(row: Estimate) -> Estimate:
     """Return the row of a parameter of a fit that did not converge."""
     if row.verdict == "fixed":
         return row
-    return replace(row, standard_error=None, low95=None, high95=None, verdict="not converged")
+    return replace(row, standard_error=None, low95=None, high95=None, verdict="not determined")
 
 
 def round_trip(rows: Sequence[Estimate], truth: Mapping[str, float]) -> list[Estimate]:

@@ -9,7 +9,6 @@ import numpy as np
 
 from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import FreeRun, Identification
-from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode
 from sim2real.identify.fit import Fit, OnProgress, fit
 from sim2real.identify.model import IdentifiableModel
@@ -17,7 +16,6 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation import prediction
-from sim2real.identify.validation.draws import intervals
 from sim2real.identify.validation.replays import replays
 from sim2real.identify.validation.verdict import Position
 from sim2real.robots.contract import RecordedRobot
@@ -47,14 +45,12 @@ def free_runs(
     fitted: int,
     config: IdentifyConfig,
     models: Mapping[str, Any],
-    posterior: Posterior | None = None,
 ) -> tuple[list[FreeRun], dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Simulate the held-out part of each log in one run; return its errors, its columns, and its commands and starts.
 
     Args:
         fitted: Number of fitted logs; the later ones are held out whole.
         models: Model -> values of all parameters.
-        posterior: Adds the intervals of its draws.
     """
     splits = [split_of(episode, r < fitted, config) for r, episode in enumerate(episodes)]
     ends = [reach(episode, config)[1] for episode in episodes]
@@ -67,12 +63,7 @@ def free_runs(
     problem = estimate.windows.recut(held_out, max(lengths_s), ends_s=lengths_s)
     columns = prediction.samples(problem, models, config.settle_s)
     rows = prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s)
-    bands, errors = intervals(problem, columns, models["identified"], posterior, config.settle_s)
-    segment_of = {s.recording: k for k, s in enumerate(held_out)}
-    for i, row in enumerate(rows):
-        if row.model == "identified" and (ends_of_error := errors.get((segment_of[row.recording], row.field))):
-            rows[i] = replace(row, low95=ends_of_error[0], high95=ends_of_error[1])
-    return rows, {**columns, **bands}, replays(problem, estimate.values, config.settle_s, "free")
+    return rows, columns, replays(problem, estimate.values, config.settle_s, "free")
 
 
 def fitted_to(

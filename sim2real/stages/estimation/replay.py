@@ -11,12 +11,13 @@ from sim2real.artifacts.identification import UNFINISHED, Identification, Noise
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identify.drift import drift_test
+from sim2real.identify.expected import expected_at
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.search.refine import refine
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.verdict import positions
 from sim2real.robots.worlds import in_world
-from sim2real.stages.estimation import held_out_parts, promises
+from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.replay_problem import longest_delay_s, problem_of_logs
 from sim2real.stages.pipeline.pipeline import Pipeline
 
@@ -72,7 +73,7 @@ def tested(
         rmse = {m: e if e is not None and math.isfinite(e) else None for m, e in rmse.items()}
         promise, moved, now = held_out.get(position.column), held.get(position.column), rmse.get("hold")
         if promise is not None:  # a model's error grows with the motion
-            promise *= promises.room(identification, position.column)
+            promise = expected_at(identification, position.column, promise)
             promise = max(promise, _NOISE * position.sigma) * max(1.0, now / moved if now and moved else 1.0)
             promise = math.hypot(promise, alike.get(position.column, 0.0))
             # A model that diverges on its own motion bounds nothing.

@@ -116,7 +116,7 @@ def left_behind(
 
 
 def _unfinished(pipeline: str, logs: tuple[Source, ...], best: Best, again: str) -> Identification:
-    """Return the best values as an identification with the verdict ``interrupted``."""
+    """Return the best values as an identification with the verdict ``not finished``."""
     # The best values so far, without intervals.
     table = best.table or ParameterTable([])
     values = as_numbers(table, np.asarray(best.z))
@@ -132,7 +132,7 @@ def _unfinished(pipeline: str, logs: tuple[Source, ...], best: Best, again: str)
             estimate=float(value),
             lower=p.low,
             upper=p.high,
-            verdict="interrupted" if p.free else "fixed",
+            verdict="not determined" if p.free else "fixed",
         )
         for p in table
         for name, value in _each(p.name, values[p.name])
@@ -140,7 +140,7 @@ def _unfinished(pipeline: str, logs: tuple[Source, ...], best: Best, again: str)
     return Identification(
         pipeline=pipeline,
         logs=logs,
-        verdict=Judgement("interrupted", (reason,), again),
+        verdict=Judgement("not finished", (reason,), again),
         parameters=tuple(rows),
         search=Search(loss=best.loss, done=best.done),
     )

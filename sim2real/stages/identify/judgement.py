@@ -1,24 +1,25 @@
 """From a fit to an identification: intervals, predictions, free runs and the verdict."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import HeldOutPart, Identification
 from sim2real.identify.delays.links import links
+from sim2real.identify.expected import wider_for, with_expected_errors
 from sim2real.identify.fit import Fit, Value, as_numbers, refit
+from sim2real.identify.problem.segments import beyond, ranges
 from sim2real.identify.uncertainty import ensemble
 from sim2real.identify.uncertainty.per_recording import compare_recordings
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.replays import replays
-from sim2real.identify.validation.verdict import NO_DELAY
+from sim2real.identify.validation.verdict import NO_DELAY, positions
 from sim2real.stages.estimation import estimate, held_out_parts
 from sim2real.stages.estimation.free_run import free_runs
 from sim2real.stages.identify.fitting import Fits, determined
 from sim2real.stages.identify.inputs import Inputs
-from sim2real.stages.identify.ledger import with_promises
 from sim2real.stages.identify.missing_terms import lack, of_selection
 from sim2real.stages.identify.true_values import true_values
 from sim2real.stages.terminal.console import note, progress, shown
@@ -77,10 +78,28 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
             document = replace(document, tried=of_selection(fits.selection, fits.widest.problem.table))
         document, lacks = patiently(lambda: lack(document, inputs, fit))
     document = inputs.weighed(document, truth)
-    document, outside = with_promises(document, inputs, fit, parts)
+    document, outside = _compared(document, inputs, fit, parts)
     names = [n for n in inputs.undetermined if n not in document.values]
+    # A pipeline's own bounds may be widened once.
+    widened = {n for n, both in config.bounds.items() if inputs.pipeline.identify.bounds.get(n) != both}
     open_ = [f"not determined by this log: {', '.join(names)}"] if names else []
-    return estimate.judged(document, findings, inputs.units, config.max_delay_s, [*outside, *held, *open_], lacks)
+    doubts = [*outside, *held, *open_]
+    return estimate.judged(document, findings, inputs.units, config.max_delay_s, doubts, lacks, widened)
+
+
+def _compared(
+    document: Identification, inputs: Inputs, fit: Fit, parts: Sequence[HeldOutPart]
+) -> tuple[Identification, list[str]]:
+    """Return the document with expected errors and ranges, and sentences about held-out data outside the ranges."""
+    names, measured = [log.path.stem for log in inputs.logs], positions(inputs.model, inputs.units)
+    fitted = [s for s in inputs.windows if s.fitted]
+    held_out = [[s for s in inputs.windows if s.recording == r and not s.fitted] for r in range(len(inputs.logs))]
+    before, *later = (ranges(inputs.model, inputs.episodes, s, fit.windows.segment_s) for s in (fitted, *held_out))
+    document = replace(document, ranges=before)
+    wider = [wider_for(before, log, measured) for log in later]
+    document = with_expected_errors(document, measured, parts, names, inputs.fitted, wider)
+    outside = dict.fromkeys(text for log in later for text in beyond(before, log))
+    return document, [f"held-out data extrapolates: {text}" for text in outside]
 
 
 def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identification:
@@ -90,8 +109,7 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
     models: dict[str, Mapping[str, Value]] = {"identified": fit.values, **_without_delays(fit), "nominal": nominal}
     samples = prediction.samples(problem, models, config.settle_s)
     horizons = [round(share * config.horizon_s, 3) for share in _HORIZONS]
-    posterior = document.posterior
-    runs, columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, models, posterior)
+    runs, columns, long = free_runs(fit, inputs.episodes, inputs.fitted, config, models)
     return replace(
         document,
         samples=samples,

@@ -4,11 +4,21 @@ import numpy as np
 
 from sim2real.artifacts.files import number
 from sim2real.artifacts.identification import ROUND_TRIP, Identification, links_table, tried_table
-from sim2real.stages.terminal.console import MOST_PROMISES, artifact_table, note
+from sim2real.stages.terminal.console import artifact_table, note
+
+_USE = {
+    "accepted": "accepted: these parameters may be used",
+    "record again": "record again: this log does not determine all parameters",
+    "change the model": "change the model: do not use these parameters yet",
+    "not finished": "not finished: these parameters are no estimates yet",
+}
+"""Status -> whether the parameters may be used."""
+_MOST_ROWS = 12
+"""Rows of a table of errors on the console; 120 logs have 480."""
 
 
 def show(identification: Identification) -> None:
-    """Print the estimates, held-out errors, links and the verdict."""
+    """Print the estimates, held-out errors and links, then the verdict: may I use it, how far off, what next."""
     print(artifact_table(identification.rows()))
     if identification.aggregate:
         print(artifact_table(identification.recordings_table().without("s.e.")))
@@ -18,17 +28,29 @@ def show(identification: Identification) -> None:
         print(artifact_table(tried_table(identification.tried)))
     if identification.held_out:
         print(artifact_table(identification.held_out_table().without("no better than")))
-    if (promises := identification.promises_table()).rows:
-        print(artifact_table(promises, MOST_PROMISES))
+    if (compared := identification.compared_table()).rows:
+        print(artifact_table(compared, _MOST_ROWS))
     if identification.links:
         print(artifact_table(links_table(identification.links)))
-    note(f"verdict: {identification.verdict.status}")
-    for reason in identification.verdict.reasons:
+    verdict = identification.verdict
+    note(f"verdict: {_USE.get(verdict.status, verdict.status)}")
+    note(f"expected error: {_expected(identification)}")
+    note(f"next: {verdict.next or 'nothing that a flag changes: see the reasons'}")
+    for reason in verdict.reasons:
         note(f"  {reason}")
     if identification.worst is not None:
         note(f"worst: {identification.worst.text(identification.logs)}")
-    if identification.verdict.next:
-        note(f"next: {identification.verdict.next}")
+
+
+def _expected(identification: Identification) -> str:
+    """Return the expected errors of the joint with the largest one beside its noise, as text."""
+    expected, sigma = identification.expected_error, identification.sigma
+    if not expected:
+        return "unknown, as there are too few held-out parts, or a prediction of one diverged"
+    worst = max(expected, key=lambda e: e.error / sigma.get(e.column, 1.0)).column
+    joints = {e.column for e in expected}
+    which = f", the worst of {len(joints)} joints" if len(joints) > 1 else ""
+    return ", ".join(str(e) for e in expected if e.column == worst) + which
 
 
 def summary(identification: Identification) -> dict[str, str]:

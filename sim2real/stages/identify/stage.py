@@ -105,7 +105,7 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
             stage.output("refits", REFITS)
         # Complete the verdict's flags to a command, and name the logs by their paths in the run folder.
         again = recording_advice.again(pipeline, config, root, identification.verdict.next)
-        if identification.verdict.status == "not converged":
+        if identification.verdict.status == "not finished":
             again = recording_advice.onward(pipeline, config, root, stage.folder / PARAMETERS)
         verdict = replace(identification.verdict, next=again)
         identification = replace(identification, logs=inputs.sources(stage.run_dir), verdict=verdict)

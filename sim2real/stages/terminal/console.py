@@ -102,10 +102,6 @@ def table(rows: Iterable[Sequence[Any]], headers: Sequence[str] | None = None) -
     )
 
 
-MOST_PROMISES = 12
-"""Rows of the ledger of promises on the console; 120 logs have 480."""
-
-
 def artifact_table(content: ArtifactTable, most: int | None = None) -> str:
     """Return a table of an artifact as aligned plain text; a last line counts the rows beyond ``most``."""
     text, more = table(content.rows[:most], content.headers), len(content.rows) - len(content.rows[:most])

@@ -76,7 +76,7 @@ def episodes_of(
     estimates = {p.name: p for p in identification.parameters} if identification is not None else {}
     columns = {n: d for n, d in draws.items() if n not in DELAYS}
     rows = [
-        Varied(n, p.unit, values[n], p.low95, p.high95, p.verdict == "not identifiable")
+        Varied(n, p.unit, values[n], p.low95, p.high95, p.verdict == "not determined")
         if (p := estimates.get(n)) is not None
         else Varied(n, "", values[n])
         for n in columns

@@ -14,6 +14,7 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import Sim2RealError, UsageError
+from sim2real.identify.expected import wider_for
 from sim2real.identify.model import IdentifiableModel, measured_channels
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span, check_log, ranges
@@ -23,9 +24,8 @@ from sim2real.identify.validation.verdict import Position, positions, scores
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.robots.contract import RecordedRobot
 from sim2real.robots.worlds import in_world
-from sim2real.stages.estimation import held_out_parts, promises
+from sim2real.stages.estimation import held_out_parts
 from sim2real.stages.estimation.fitted_logs import require_new
-from sim2real.stages.estimation.predicted_logs import stretches
 from sim2real.stages.estimation.replay_problem import longest_delay_s
 from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
@@ -276,7 +276,7 @@ def score(
         raise UsageError("; ".join(f"{path}: {reason}" for path, reason in refused.items()) or "no log was given")
 
     # Predict windows of the horizon, and a free run of each log; a short log has shorter ones.
-    expected = {(column, str(kind)): bound for (column, kind), bound in promises.of(identification).items()}
+    expected = {(e.column, str(e.kind)): e for e in identification.expected_error}
     horizon_s = config.horizon_s or next((row.horizon_s for row in identification.held_out), fitting.horizon_s)
     run_s = config.free_run_s or max((b.seconds for k, b in expected.items() if k[1] == FREE_RUN), default=_FREE_RUN_S)
     errors, measured = list[LaterError](), positions(model, robot.units)
@@ -290,10 +290,10 @@ def score(
                 for r in those:
                     spans = [s for s in windows.spans if s.recording == r]
                     seen = ranges(model, [log.episode for log in good], spans, windows.segment_s)
-                    wider = stretches(identification.ranges, seen, measured)
+                    wider = wider_for(identification.ranges, seen, measured)
                     for row in (row for log, row in rows if log == r):
                         bound, factor = expected.get((row.joint, kind)), wider.get(row.joint, 1.0)
-                        limit = None if bound is None else factor * bound.bound
+                        limit = None if bound is None else factor * bound.error
                         errors.append(replace(row, log=good[r].path.name, expected=limit, wider=factor))
     # A joint that rests is not compared: "no motion" would always be best.
     moved = {(e.log, e.joint) for e in errors if e.kind == AHEAD}

@@ -67,9 +67,6 @@ def free_runs(result: Identification, name: str) -> str:
         t_s = result.free["t"][rows]
         models = [m for m in ("measured", "no delay", "identified") if f"{quantity}_{m}" in result.free]
         lines = [Line(t_s, result.free[f"{quantity}_{m}"][rows].astype(float), _LABELS[m], m) for m in models]
-        if f"{quantity}_low95" in result.free:
-            ends = [result.free[f"{quantity}_{end}"][rows].astype(float) for end in ("low95", "high95")]
-            lines += [Line(t_s, end, "95 % of draws of the posterior", "interval") for end in ends]
         settled = t_s[result.free["into"][rows] <= result.settle_s]
         spans = [(float(settled[0]), float(settled[-1]))] if len(settled) else []
         errors = _errors_of(result, recording, quantity)

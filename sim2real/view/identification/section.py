@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim2real.artifacts.identification import Estimate, Identification, Quantity
+from sim2real.artifacts.identification import MAX_ERROR_RATIO, Estimate, Identification, Quantity
 from sim2real.artifacts.posterior import from_scale
 from sim2real.artifacts.run.run_folder import StageFolder
 from sim2real.log.schema import unit_of
@@ -34,15 +34,12 @@ from sim2real.view.provenance import about
 
 _TITLES: dict[str, tuple[Tone, str]] = {
     "accepted": ("good", "Accepted"),
-    "hit a bound": ("doubt", "Hit a bound: an estimate is at a bound of the search"),
-    "not identifiable": ("doubt", "Not identifiable: the data does not determine every parameter"),
-    "lacks a term": ("doubt", "Lacks a term: errors are large, and one more term of the model halves them"),
-    "promise broken": ("doubt", "Promise broken: an error on held-out data is above its bound"),
-    "no improvement on held-out data": ("bad", "No improvement on held-out data: do not use these parameters"),
+    "record again": ("doubt", "Record again: the data does not determine every parameter"),
+    "change the model": ("bad", "Change the model: do not use these parameters yet"),
+    "not finished": ("doubt", "Not finished: these values are no estimates yet"),
 }
-_KEPT: dict[str, Tone] = {"yes": "good", "no": "bad"}
-_MOST_PROMISES = 12
-"""Rows of the ledger that are not folded."""
+_MOST_COMPARED = 12
+"""Rows of errors beside the expected ones that are not folded."""
 _STRONG = 0.9
 """Correlations above this are listed."""
 _NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower", "upper", "truth")
@@ -54,7 +51,7 @@ def identify_section(artifact: StageFolder) -> PageSection:
     opening = worst_figure(result, "identify-worst")
     # Order the blocks from the results to the details.
     blocks = [
-        *_promises(result),
+        *_expected(result),
         *_parameters(result),
         *_aggregate(result),
         *_parts(result),
@@ -91,14 +88,18 @@ def _banner(result: Identification) -> Banner | None:
     return Banner(tone, title, reasons)
 
 
-def _promises(result: Identification) -> list[Block]:
-    """Return the ledger, the largest ratios first; further rows are folded."""
-    table = TableBlock.of("Promises: each error on held-out parts beside the bound before it", result.promises_table())
-    tones = [_KEPT.get(row[-1], "doubt") for row in table.rows]
-    first = replace(table, rows=table.rows[:_MOST_PROMISES], tones=tones[:_MOST_PROMISES])
-    more = replace(table, rows=table.rows[_MOST_PROMISES:], tones=tones[_MOST_PROMISES:], folded=True)
-    more = replace(more, caption=f"Promises with smaller ratios ({len(more.rows)})")
-    return [block for block in (first, more) if block.rows]
+def _expected(result: Identification) -> list[Block]:
+    """Return the expected errors, and the errors on held-out data beside them, the largest ratios first."""
+    items = [sentence(str(e), [h.name for h in result.held_out]) for e in result.expected_error]
+    lead = ListBlock("The errors to expect on later data, for motion like the fitted one", items)
+    blocks: list[Block] = [lead] if items else []
+    table = TableBlock.of("Errors on held-out data beside the expected errors", result.compared_table())
+    ratios = [r.ratio or 0.0 for r in result.compared if r.ratio is not None]
+    tones: list[Tone] = ["bad" if r > MAX_ERROR_RATIO else "good" for r in sorted(ratios, reverse=True)]
+    first = replace(table, rows=table.rows[:_MOST_COMPARED], tones=tones[:_MOST_COMPARED])
+    more = replace(table, rows=table.rows[_MOST_COMPARED:], tones=tones[_MOST_COMPARED:], folded=True)
+    more = replace(more, caption=f"Errors with smaller ratios ({len(more.rows)})")
+    return [*blocks, *(block for block in (first, more) if block.rows)]
 
 
 def _parameters(result: Identification) -> list[Block]:

@@ -93,7 +93,7 @@ def weighed(
     # A load that only its error may have put outside of its bounds lies on one of them.
     require_load(load, row.low, row.high, 1.96 * deviation)
     load, left, right = np.clip(load + 1.96 * deviation * np.array([0.0, -1.0, 1.0]), row.low, row.high).tolist()
-    known = row.unit, "dynamics", row.about, row.nominal, load, "accepted", deviation, left, right, row.low, row.high
+    known = row.unit, "dynamics", row.about, row.nominal, load, "ok", deviation, left, right, row.low, row.high
     estimate = Estimate(PAYLOAD, *known, truth.get(PAYLOAD))
     return replace(identification, parameters=(*identification.parameters, estimate), posterior=posterior)
 

@@ -1,0 +1,153 @@
+"""The error to expect of an identification on later data, and the errors on held-out data beside it.
+
+The expected error of a joint is 1.25 times its worst error on the held-out parts of the recordings, each of a fit
+without that part. A motion that is faster, or goes further, than the fitted one has larger errors: for it the expected
+error is wider.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sim2real.artifacts.identification import (
+    AHEAD,
+    FREE_RUN,
+    ComparedError,
+    ErrorKind,
+    ExpectedError,
+    HeldOutPart,
+    Identification,
+)
+from sim2real.identify.problem.segments import Signal, range_of, speed_range_of
+from sim2real.identify.validation.folds import MOVES
+from sim2real.identify.validation.verdict import NOISE, Position
+
+_MARGIN = 1.25
+"""The expected error over the worst error on held-out parts."""
+_LEAST_PARTS = 2
+"""Fewest held-out parts from which an error of another part is expected."""
+_WIDEST = 4.0
+"""Largest factor for a motion beyond the fitted range: an error of one that differs more is not known."""
+
+
+def wider_for(
+    fitted: Mapping[str, Signal], later: Mapping[str, Signal], positions: Sequence[Position]
+) -> dict[str, float]:
+    """Return column -> factor of the expected error, for data whose motion goes beyond the fitted one.
+
+    The factor is the ratio of the largest speeds, or one more than the excess of the range of any position as a share
+    of its fitted range, if that is larger. A hinge has been everywhere after a whole turn.
+
+    Args:
+        fitted: Ranges of the fitted segments; see ``segments.ranges``.
+        later: Ranges of the data.
+    """
+    if not fitted or not later:
+        return {p.column: 1.0 for p in positions}
+    excess, faster = 0.0, dict[str, float]()
+    for p in positions:
+        (low, high), (lowest, highest) = (range_of(r, p.column) for r in (fitted, later))
+        further = max(low - lowest, 0.0) + max(highest - high, 0.0)
+        if p.unit == "rad":
+            further = min(further, max(2 * math.pi - (high - low), 0.0))
+        if high > low:
+            excess = max(excess, further / (high - low))
+        before, now = (max(map(abs, speed_range_of(r, p.column))) for r in (fitted, later))
+        faster[p.column] = now / before if before > 0.0 else 1.0
+    return {column: min(max(ratio, 1.0 + excess), _WIDEST) for column, ratio in faster.items()}
+
+
+def with_expected_errors(
+    document: Identification,
+    positions: Sequence[Position],
+    parts: Sequence[HeldOutPart],
+    names: Sequence[str],
+    fitted: int,
+    wider: Sequence[Mapping[str, float]],
+) -> Identification:
+    """Return an identification with the expected errors, and its errors on held-out data beside them.
+
+    Held-out data is compared with what the held-out parts alone let expect. What comes after a single recording may
+    differ from its parts, in time and in temperature, so the error on it counts as a part in the expected error.
+
+    Args:
+        document: With predictions and free runs.
+        names: A name for each log; those that are held out whole come last.
+        fitted: Number of fitted logs.
+        wider: For each log the result of ``wider_for`` for its held-out data.
+    """
+    compared, expected = list[ComparedError](), list[ExpectedError]()
+    kinds: tuple[ErrorKind, ...] = (AHEAD, FREE_RUN)
+    for p in positions:
+        for kind in kinds:
+            # A joint that rests in a part has no error there.
+            those = [(part.ahead if kind == AHEAD else part.free).get(p.column) for part in parts]
+            errors = [e if math.isfinite(e) else math.inf for e in those if e is not None]
+            limit, rows = _expected(errors, p), list[ComparedError]()
+            for r, error, seconds in _on_held_out(document, p, kind, len(names)):
+                factor = wider[r].get(p.column, 1.0)
+                expects = None if limit is None or not math.isfinite(limit) else factor * limit
+                source, size = _source(names, r, fitted), error if math.isfinite(error) else None
+                rows.append(ComparedError(source, p.column, p.name, p.unit, kind, seconds, size, expects, factor))
+            compared += rows
+            later = [math.inf if row.error is None else row.error / row.wider for row in rows]
+            everything = _expected([*errors, *later], p) if len(errors) >= _LEAST_PARTS else None
+            if everything is not None and math.isfinite(everything):
+                runs = [part.run_s for part in parts] if kind == FREE_RUN else []
+                seconds = max([*(row.seconds for row in rows), *runs], default=0.0)
+                expected.append(ExpectedError(p.column, p.name, p.unit, kind, seconds, everything))
+    return replace(document, expected_error=tuple(expected), compared=tuple(compared))
+
+
+def expected_at(document: Identification, column: str, error_at_horizon: float) -> float:
+    """Return the expected error of a position at a shorter horizon than the longest one.
+
+    It has the ratio to the error on held-out data that it has at the longest horizon.
+
+    Args:
+        error_at_horizon: The error on held-out data at the shorter horizon.
+    """
+    expected = document.expected_of(column, AHEAD)
+    longest = next((row.rmse["identified"] for row in document.held_out if row.column == column), None)
+    if expected is None or not longest:
+        return error_at_horizon
+    return error_at_horizon * max(1.0, expected.error / longest)
+
+
+def _expected(errors: Sequence[float], p: Position) -> float | None:
+    """Return the expected error; infinite if a part diverged, None with too few parts."""
+    if len(errors) < _LEAST_PARTS:
+        return None
+    return max(_MARGIN * max(errors), NOISE * p.sigma)
+
+
+def _source(names: Sequence[str], recording: int, fitted: int) -> str:
+    if recording >= fitted:
+        return names[recording]
+    return f"the held-out end of {names[recording]}" if fitted > 1 else "the held-out end"
+
+
+def _on_held_out(
+    document: Identification, p: Position, kind: ErrorKind, recordings: int
+) -> Iterator[tuple[int, float, float]]:
+    """Yield recording, error of a position on its held-out data, and length of the prediction [s].
+
+    A recording in which the joint rests is left out: "no motion" would always be best.
+    """
+    columns = document.samples if kind == AHEAD else document.free
+    if not columns:
+        return
+    counted = columns["held_out"].astype(bool) & (columns["into"] > document.settle_s)
+    horizons = {prediction.horizon_s for prediction in document.prediction}
+    for r in range(recordings):
+        pick = counted & (columns["recording"] == r)
+        measured = columns[f"{p.column}_measured"][pick]
+        if not measured.size or np.ptp(measured) <= MOVES * p.sigma:
+            continue
+        off = columns[f"{p.column}_identified"][pick] - measured
+        length_s = float(columns["into"][pick].max()) - document.settle_s
+        if kind == AHEAD:  # the last sample is up to a period before the horizon
+            length_s = min((h for h in horizons if h >= length_s), default=length_s)
+        yield r, float(np.sqrt(np.mean(off**2))), length_s

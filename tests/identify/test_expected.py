@@ -1,0 +1,86 @@
+"""The expected error: 1.25 times the worst held-out part, wider for motion beyond the fitted one."""
+
+import numpy as np
+import pytest
+
+from sim2real.artifacts.identification import AHEAD, FREE_RUN, HeldOutPart, Identification, Judgement, Prediction
+from sim2real.identify.expected import wider_for, with_expected_errors
+from sim2real.identify.validation.verdict import Position
+
+JOINT = Position("position[0]", "pan", "rad", 0.001)
+NO_MOTION = np.zeros(40)
+
+
+def part(name, ahead, free):
+    return HeldOutPart(name, (), {}, {}, {JOINT.column: ahead}, {JOINT.column: free}, run_s=4.0)
+
+
+def samples(error, measured=None):
+    """Return the columns of one held-out segment with a constant error."""
+    measured = np.sin(np.linspace(0.0, 6.0, 40)) if measured is None else measured
+    columns = {"t": np.arange(40) * 0.05, "into": np.arange(40) * 0.05, "segment": np.zeros(40, int)}
+    columns |= {"recording": np.zeros(40, int), "held_out": np.ones(40, bool)}
+    return columns | {"position[0]_measured": measured, "position[0]_identified": measured + error}
+
+
+def judged(parts, error=0.01, wider=1.0, measured=None):
+    rows = samples(error, measured)
+    document = Identification(
+        "robot",
+        (),
+        Judgement("", ()),
+        (),
+        samples=rows,
+        free=rows,
+        prediction=(Prediction("identified", 2.0, True, {}, {}),),
+    )
+    return with_expected_errors(document, [JOINT], parts, ["log"], 1, [{JOINT.column: wider}])
+
+
+def test_it_is_the_worst_part_and_a_quarter():
+    found = judged([part("a", 0.01, 0.02), part("b", 0.03, 0.04), part("c", None, None)])
+    assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(1.25 * 0.03)
+    assert found.expected_of(JOINT.column, FREE_RUN).error == pytest.approx(1.25 * 0.04)
+    ahead = found.compared[0]
+    assert (ahead.expected, ahead.ratio) == (pytest.approx(1.25 * 0.03), pytest.approx(0.01 / (1.25 * 0.03)))
+    assert not ahead.exceeded
+
+
+def test_an_error_on_held_out_data_is_compared_and_expected_from_then_on():
+    found = judged([part("a", 0.01, 0.01), part("b", 0.02, 0.01)], error=0.08, wider=2.0)
+    ahead = found.compared[0]
+    assert (ahead.expected, ahead.wider) == (pytest.approx(2.0 * 1.25 * 0.02), 2.0)
+    assert ahead.ratio == pytest.approx(1.6)
+    assert ahead.exceeded
+    assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(1.25 * 0.08 / 2.0)
+
+
+@pytest.mark.parametrize("parts", [[part("a", 0.01, 0.01)], [part("a", 0.01, np.inf), part("b", np.nan, 0.01)]])
+def test_too_few_parts_or_one_that_diverged_let_expect_nothing(parts):
+    found = judged(parts)
+    assert found.expected_error == ()
+    assert [row.expected for row in found.compared] == [None, None]
+
+
+def test_it_is_not_below_the_noise_and_a_joint_at_rest_is_not_compared():
+    found = judged([part("a", 1e-5, 1e-5), part("b", 1e-5, 1e-5)], error=0.0, measured=NO_MOTION)
+    assert found.compared == ()
+    assert found.expected_of(JOINT.column, AHEAD).error == pytest.approx(2.0 * JOINT.sigma)
+
+
+def ranges(low, high, speed):
+    """Return the ranges of a robot with one joint, whose labels have no index."""
+    return {"'position' of 'sensor'": (low, high), "the speed of 'position' of 'sensor'": (-speed, speed)}
+
+
+@pytest.mark.parametrize(
+    ("later", "factor"),
+    [
+        (ranges(-1.0, 1.0, 2.0), 1.0),
+        (ranges(-0.5, 0.5, 6.0), 3.0),
+        (ranges(-1.0, 2.0, 2.0), 1.5),
+        (ranges(-1.0, 1.0, 90.0), 4.0),
+    ],
+)
+def test_the_motion_of_a_single_joint_widens_it(later, factor):
+    assert wider_for(ranges(-1.0, 1.0, 2.0), later, [JOINT]) == {"position[0]": pytest.approx(factor)}
