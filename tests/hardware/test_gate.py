@@ -52,27 +52,25 @@ def test_command_that_is_no_number_stops_by_name_and_stays_stopped(bad):
     assert gate.apply(np.array([0.0, 0.0]), 0.0, 0.2).tolist() == [0.0, 0.0]
 
 
-def test_stale_does_not_hide_a_command_that_is_no_number():
-    with pytest.raises(SafetyStop):
-        SafetyGate(GateConfig()).apply(np.array([float("nan")]), 1.0, 0.0)
-
-
-def test_over_speed_stops():
-    gate = SafetyGate(GateConfig(max_speed_rad_s=10.0))
-    gate.apply(np.zeros(2), 0.0, 0.0, np.array([9.9, -9.9]))
-    with pytest.raises(SafetyStop, match=r"speed_rad_s\[1\] = -10.1"):
-        gate.apply(np.zeros(2), 0.0, 0.1, np.array([9.9, -10.1]))
-
-
-def test_speed_that_is_no_number_stops():
-    with pytest.raises(SafetyStop, match="speed_rad_s"):
-        SafetyGate(GateConfig(max_speed_rad_s=10.0)).apply(np.zeros(1), 0.0, 0.1, float("nan"))
-
-
 def test_output_is_the_callers_own():
     gate = SafetyGate(GateConfig(slew_per_s=1.0))
     gate.apply(np.ones(1), 0.0, 0.0)[:] = 100.0
     assert gate.apply(np.ones(1), 0.0, 0.1)[0] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("command", "age_s", "speeds", "message"),
+    [
+        ([0.0, 0.0], 0.0, [9.9, -10.1], r"speed_rad_s\[1\] = -10.1"),
+        ([0.0, 0.0], 0.0, [float("nan"), 0.0], "speed_rad_s"),
+        ([0.0, float("nan")], 1.0, [0.0, 0.0], r"command\[1\]"),  # stale, too
+    ],
+)
+def test_what_stops_the_robot(command, age_s, speeds, message):
+    gate = SafetyGate(GateConfig(max_speed_rad_s=10.0))
+    gate.apply(np.zeros(2), 0.0, 0.0, np.array([9.9, -9.9]))
+    with pytest.raises(SafetyStop, match=message):
+        gate.apply(np.array(command), age_s, 0.1, np.array(speeds))
 
 
 @pytest.mark.parametrize(
