@@ -23,7 +23,7 @@ from sim2real.composer.errors import EpisodeInitializationError as EpisodeInitia
 from sim2real.composer.errors import PhysicsError as PhysicsError
 from sim2real.composer.hooks import HOOK_NAMES as HOOK_NAMES
 from sim2real.composer.initializer import Initializer as Initializer
-from sim2real.composer.models.model import Model as Model
+from sim2real.composer.mjcf.model import RootElement
 from sim2real.composer.observables import Observables as Observables
 from sim2real.composer.physics.c.physics import Physics as Physics
 from sim2real.composer.prop_placer import PropPlacer as PropPlacer
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from sim2real.interop.brax_adapter import BraxEnv as BraxEnv
     from sim2real.interop.gymnasium_adapter import MjxVectorEnv as MjxVectorEnv
 
+Model = RootElement
 _LAZY = {
     "BraxEnv": "sim2real.interop.brax_adapter",
     "ComposedWorld": "sim2real.composer.world",

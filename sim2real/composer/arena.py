@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from typing import TYPE_CHECKING, Any
 
 from sim2real.composer.entity import Entity
-from sim2real.composer.models.element import Element
-from sim2real.composer.models.mjcf import parse
-from sim2real.composer.models.model import Model
+from sim2real.composer.mjcf import RootElement as Model
+from sim2real.composer.mjcf.element import Element
 
 if TYPE_CHECKING:
-    from sim2real.composer.types import MjSpec, RandomState
+    from sim2real.composer.types import RandomState
 
 BASE = """
 <mujoco model="base">
@@ -29,8 +29,8 @@ BASE = """
 
 
 @functools.cache
-def _base() -> MjSpec:
-    return parse.from_string(BASE)[0]
+def _base() -> Model:
+    return Model.from_xml_string(BASE)
 
 
 class Arena(Entity):
@@ -44,7 +44,7 @@ class Arena(Entity):
     def _build(self, *args: Any, **kwargs: Any) -> None:
         options = dict(zip(("name", "xml_path"), args, strict=False)) | kwargs
         path = options.get("xml_path")
-        self._mjcf_root = Model.from_path(path) if path else Model.owning(_base().copy())
+        self._mjcf_root = Model.from_path(path) if path else copy.copy(_base())
         if options.get("name"):
             self._mjcf_root.model = options["name"]
 
@@ -55,7 +55,7 @@ class Arena(Entity):
         return super().mjcf_model if root is None else root
 
     def _make_model(self) -> Model:
-        return Model.owning(_base().copy())
+        return copy.copy(_base())
 
     def add_free_entity(self, entity: Entity) -> Element:
         """Attach an entity that moves freely; return its frame."""

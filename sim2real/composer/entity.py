@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from sim2real.composer.errors import NotAttachedError
-from sim2real.composer.models.element import Element
-from sim2real.composer.models.model import Model
-from sim2real.composer.models.traversal import get_attachment_frame, get_frame_freejoint
+from sim2real.composer.mjcf import RootElement as Model
+from sim2real.composer.mjcf import get_attachment_frame, get_frame_freejoint
+from sim2real.composer.mjcf.element import Element
 from sim2real.composer.observables import Observables
 from sim2real.composer.physics.arrays import multiply_quaternions, namespace, rotate
 from sim2real.errors import UsageError
@@ -297,7 +297,10 @@ class ModelWrapperEntity(Entity):
     """An entity around a model, without any logic."""
 
     def _build(self, mjcf_model: Model | MjSpec) -> None:
-        self._mjcf_model = mjcf_model if isinstance(mjcf_model, Model) else Model(spec=mjcf_model)
+        if not isinstance(mjcf_model, Model):
+            mjcf_model.compile()  # MuJoCo writes compiled specs only
+            mjcf_model = Model.from_xml_string(mjcf_model.to_xml(), mjcf_model.assets)
+        self._mjcf_model = mjcf_model
 
     @property
     def mjcf_model(self) -> Model:

@@ -11,7 +11,7 @@ import numpy as np
 from sim2real.composer import variation
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.initializer import Initializer
-from sim2real.composer.models.traversal import get_frame_freejoint
+from sim2real.composer.mjcf import get_frame_freejoint
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

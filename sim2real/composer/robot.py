@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim2real.composer.entity import Entity
-from sim2real.composer.models.element import Element
+from sim2real.composer.mjcf.element import Element
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

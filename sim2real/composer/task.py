@@ -15,8 +15,8 @@ from dm_env import specs
 from sim2real.composer import define
 from sim2real.composer.arena import Arena
 from sim2real.composer.entity import Entity
-from sim2real.composer.models.layout import names_of
 from sim2real.composer.observation.observable.base import Generic
+from sim2real.composer.physics.layout import names_of
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ class Task(ABC):
     def physics_timestep(self) -> float:
         """Time step of the physics [s]."""
         self._check_root_entity("physics_timestep")
-        return self.root_entity.mjcf_model.option.timestep
+        return self.root_entity.mjcf_model.option.timestep or 0.002
 
     @physics_timestep.setter
     def physics_timestep(self, value: float) -> None:

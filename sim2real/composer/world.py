@@ -24,7 +24,7 @@ from sim2real.graph.node import BaseWorld
 if TYPE_CHECKING:
     from mujoco import mjx
 
-    from sim2real.composer.models.element import Elements
+    from sim2real.composer.mjcf.element import Elements
     from sim2real.composer.types import MjModel
     from sim2real.types import PyTree
 

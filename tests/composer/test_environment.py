@@ -153,7 +153,7 @@ def test_a_changed_model_is_compiled_and_a_changed_physics_is_forgotten():
     task.initialize_episode_mjcf = lambda random_state: geom.set_attributes(rgba=[1, 0, 0, 1])
     env.reset()
     np.testing.assert_array_equal(env.physics.bind(geom).rgba, [1, 0, 0, 1])
-    geom.native.rgba = [0, 1, 0, 1]  # behind the model's back
+    geom.rgba[:] = [0, 1, 0, 1]  # in the array that it holds
     task.initialize_episode_mjcf = lambda random_state: None
     env.reset()
     np.testing.assert_array_equal(env.physics.bind(geom).rgba, [0, 1, 0, 1])

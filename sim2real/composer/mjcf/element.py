@@ -1,6 +1,509 @@
-"""Models and elements under the module in which PyMJCF has them."""
+"""Elements of an MJCF tree: tags, explicit attributes and children, with the names that PyMJCF gives them."""
 
-from sim2real.composer.models.element import Element as Element
-from sim2real.composer.models.model import Model
+from __future__ import annotations
 
-RootElement = Model
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sim2real.composer.mjcf import files, schema
+from sim2real.composer.mjcf.schema import KIND_OF_TAG
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.mjcf.model import RootElement
+
+_POSE = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
+_UNITS = {unit: 1 << 10 * (i + 1) for i, unit in enumerate("kmgtpe")}
+
+
+class Element:
+    """One element of a model; made by ``find``, ``find_all`` and ``add``.
+
+    An attribute that is not explicit reads as None. Children are attributes too: ``body.geom``, ``option.flag``.
+    """
+
+    __slots__ = ("_attached", "_children", "_given", "_key_order", "_parent", "_root", "_spec", "is_removed")
+    _attached: RootElement | None
+    """The model that an attachment frame holds."""
+    _given: dict[str, Any]
+    _key_order: dict[str, list[Any]]
+    """Of a keyframe: attribute -> the elements that its numbers belong to."""
+    _root: RootElement
+    is_removed: bool
+
+    def __init__(self, spec: schema.Spec, parent: Element | None, root: RootElement | None = None) -> None:
+        made = (None, [], {}, {}, parent, root or getattr(parent, "_root", None), spec, False)
+        for name, value in zip(Element.__slots__, made, strict=True):
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"MJCF Element: {self.to_xml_string(self_only=True, pretty_print=False)}"
+
+    def __dir__(self) -> list[str]:
+        names = {"dclass" if name == "class" else name for name in self._spec.attributes}
+        return sorted({*object.__dir__(self), *names, *self._spec.children})
+
+    # -- what it is
+
+    @property
+    def tag(self) -> str:
+        """The tag in MJCF."""
+        return self._spec.tag
+
+    @property
+    def kind(self) -> str:
+        """What ``find`` calls it: ``actuator`` for a ``<motor>``; ``body`` for the world too."""
+        return "body" if self.tag == "worldbody" else self._spec.kind or self.tag
+
+    @property
+    def root(self) -> RootElement:
+        """The model."""
+        return self._root
+
+    @property
+    def parent(self) -> Element | None:
+        """The element that holds this one."""
+        return self._parent
+
+    @property
+    def is_worldbody(self) -> bool:
+        """Whether this is the model's world."""
+        return self.tag == "worldbody"
+
+    @property
+    def is_frame(self) -> bool:
+        """Whether this is the frame that another model is attached to."""
+        return self._attached is not None
+
+    @property
+    def full_identifier(self) -> str | None:
+        """The name in the compiled model, such as ``arm/hand/finger``; None where elements have no names."""
+        return self._root.identify(self)
+
+    def prefixed_identifier(self, prefix_root: RootElement | None = None) -> str | None:
+        """Return the name as seen from a model, this element's own by default."""
+        return self._root.identify(self, prefix_root or self._root)
+
+    @property
+    def _path(self) -> str:
+        parent = self._parent
+        return self.tag if parent is None or parent is self._root else f"{parent.tag}.{self.tag}"
+
+    # -- attributes
+
+    def _values(self, name: str) -> dict[str, Any]:
+        """Return where an attribute is kept: settings of attached models are those of the model at the top."""
+        top = self._root.root_model
+        if top is self._root or name in schema.OWN_SETTINGS or not self._is_setting:
+            return self._given
+        return self._in(top)._given
+
+    @property
+    def _is_setting(self) -> bool:
+        parent = self._parent
+        section = self if parent is self._root else parent
+        return section is not None and section.tag in ("compiler", "option", "size", "statistic", "visual")
+
+    def _in(self, model: RootElement) -> Element:
+        """Return the same setting of another model."""
+        parent = self._parent
+        holder = model if parent is self._root or parent is None else parent._in(model)
+        return holder._child(self.tag)
+
+    def _checked(self, name: str) -> str:
+        if self.is_removed:
+            raise UsageError(f"this {self.kind} was removed from model {self._root.model!r}")
+        name = "class" if name == "dclass" else name
+        if name not in self._spec.attributes:
+            available = ", ".join(sorted("dclass" if n == "class" else n for n in self._spec.attributes))
+            raise AttributeError(f"{name!r} is not a valid attribute for <{self.tag}>. Available: {available}")
+        return name
+
+    def _get(self, name: str) -> Any:
+        value = self._values(name).get(name)
+        return None if isinstance(value, Element) and value.is_removed else value
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        spec = self._spec
+        if name in spec.children and not self.is_removed:
+            if spec.children[name].repeated:
+                return ElementList(self, name)
+            return self._child(name) if spec.children[name].implicit else self._present(name)
+        if name not in spec.attributes and name != "dclass" and spec.children:
+            children = f"; children: {', '.join(sorted(spec.children))}"
+            attributes = ", ".join(sorted(spec.attributes))
+            raise AttributeError(f"<{self.tag}> has no attribute {name!r}. Available: {attributes}{children}")
+        return self._get(self._checked(name))
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        self._set(self._checked(name), value)
+
+    def __delattr__(self, name: str) -> None:
+        if name in self._spec.children:
+            if self._spec.children[name].repeated:
+                raise AttributeError(f"`{name}` is a list of elements. Did you mean to call `{name}.clear()`?")
+            child = self._child(name) if self._spec.children[name].implicit else self._present(name)
+            if child is not None:
+                child.remove()
+            return
+        self._set(self._checked(name), None)
+
+    def _set(self, name: str, value: Any) -> None:
+        values = self._values(name)
+        value = None if isinstance(value, str) and not value else value
+        if name == "name" or (name == "class" and self.tag == "default"):
+            self._root.rename(self, values.get(name), value)
+        if value is None:
+            values.pop(name, None)
+            if self.tag == "key":
+                self._key_order.pop(name, None)
+            return
+        values[name] = self._converted(name, value)
+        if self.tag == "key" and name in KEYED:
+            self._key_order[name] = self._root.keyed_elements(name)
+
+    def _converted(self, name: str, value: Any) -> Any:
+        """Return the value of an attribute as it is kept."""
+        target = schema.reference(self._path, self.tag, name)
+        if target is not None:
+            return self._converted_reference(name, target, value)
+        if isinstance(value, Element):
+            raise UsageError(f"{name} of <{self.tag}> names no element")
+        if name.startswith("file") and self.tag in files.TAGS:
+            return value if isinstance(value, files.Asset) else files.read(self, str(value))
+        form = schema.form(self._path, self.tag, name)
+        try:
+            if form in ("array", "ints"):
+                numbers = value.split() if isinstance(value, str) else value
+                array = np.atleast_1d(np.array(numbers, dtype=float if form == "array" else int))
+                if array.ndim > 1:
+                    raise ValueError("it has more than one dimension")
+                return array
+            if form == "int":
+                if float(value) != int(float(value)):
+                    raise ValueError("it is no whole number")
+                return int(float(value))
+            if form == "float":
+                return float(np.asarray(value, float).item())
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"{name}={value!r} of <{self.tag}> is not valid: {error}") from None
+        if isinstance(value, bool | np.bool_):
+            return str(bool(value)).lower()
+        if isinstance(value, str):
+            return value
+        if isinstance(value, np.ndarray | list | tuple):  # an attribute that is newer than the tables
+            return np.atleast_1d(np.array(value))
+        return str(value)
+
+    def _converted_reference(self, name: str, target: str, value: Any) -> Any:
+        by = self._given.get(target) if target in ("objtype", "reftype") else target
+        if not isinstance(value, Element):
+            if not isinstance(value, str | np.str_):
+                raise UsageError(f"{name} of <{self.tag}> names an element, got {value!r}")
+            return str(value)
+        if by is None:
+            self._given[target] = by = value.kind
+        by = KIND_OF_TAG.get(by, by)
+        if value.kind != by:
+            raise UsageError(f"{name} of <{self.tag}> names an element of kind {by}, got one of kind {value.kind}")
+        return value
+
+    @property
+    def dclass(self) -> Any:
+        """The class of defaults."""
+        return self._get(self._checked("class"))
+
+    @dclass.setter
+    def dclass(self, value: Any) -> None:
+        self._set(self._checked("class"), value)
+
+    def get_attributes(self) -> dict[str, Any]:
+        """Return the explicit attributes: name -> value."""
+        found = {name: self._get(name) for name in sorted(self._spec.attributes)}
+        return {"dclass" if name == "class" else name: v for name, v in found.items() if v is not None}
+
+    def set_attributes(self, **attrs: Any) -> None:
+        """Set several attributes, or none where one of them is not valid."""
+        attrs = {self._checked(k): v for k, v in attrs.items()}
+        before = {name: self._values(name).get(name) for name in attrs}
+        done = []
+        try:
+            for name in sorted(attrs, key=_types_first):
+                self._set(name, attrs[name])
+                done.append(name)
+        except Exception:
+            for name in done:
+                self._set(name, before[name])
+            raise
+
+    # -- children
+
+    def _present(self, tag: str) -> Element | None:
+        return next((c for c in self._children if c.tag == tag), None)
+
+    def _child(self, tag: str) -> Element:
+        """Return a child that is there without being added."""
+        child = self._present(tag)
+        if child is None:
+            child = Element(self._spec.children[tag], self)
+            self._children.append(child)
+        return child
+
+    def get_children(self, tag: str) -> Any:
+        """Return the children with a tag: a list, or the one child."""
+        if tag not in self._spec.children:
+            raise AttributeError(f"<{tag}> is not a valid child of <{self.tag}>")
+        return getattr(self, tag)
+
+    def add(self, tag: str, **attrs: Any) -> Element:
+        """Add an element behind the others.
+
+        Raises:
+            UsageError: When such an element cannot stand here, or an attribute is not valid.
+        """
+        return self.insert(tag, None, **attrs)
+
+    def insert(self, tag: str, position: int | None, **attrs: Any) -> Element:
+        """Add an element before another one, by its number; None: behind all."""
+        spec = self._spec.children.get(tag)
+        if spec is None or (self.is_frame and tag not in schema.FRAME_CHILDREN):
+            available = ", ".join(schema.FRAME_CHILDREN if self.is_frame else sorted(self._spec.children))
+            where = f"the attachment frame {self.full_identifier!r}" if self.is_frame else f"<{self.tag}>"
+            raise UsageError(f"<{tag}> is not a valid child of {where}. Available: {available or 'nothing'}")
+        if not spec.repeated and (spec.implicit or self._present(tag) is not None):
+            raise UsageError(f"A <{tag}> child already exists in <{self.tag}>, please access it directly.")
+        if tag == "freejoint" and not (self._parent is not None and self._parent.is_worldbody):
+            raise UsageError(
+                f"a free joint is only for bodies that stand in the world, {self.full_identifier!r} does not",
+                hint="attach the model to the world, or use hinge and slide joints",
+            )
+        element = Element(spec, self)
+        attrs = {("class" if k in ("dclass", "class_") else k): v for k, v in attrs.items()}
+        if tag in files.NAMED_AFTER and "name" not in attrs and isinstance(attrs.get("file"), str):
+            attrs["name"] = PurePath(attrs["file"]).stem
+        for name in attrs:
+            element._checked(name)
+        self._children.insert(len(self._children) if position is None else position, element)
+        try:
+            for name in sorted(attrs, key=_types_first):
+                element._set(name, attrs[name])
+            if self.is_frame and element.kind == "joint":
+                self._check_frame_joint(element)
+        except Exception:
+            self._root.rename(element, element._given.get("name"), None)
+            self._children.remove(element)
+            raise
+        return element
+
+    def _check_frame_joint(self, joint: Element) -> None:
+        same = [j for j in self._children if j is not joint and j.kind == "joint" and j.name == joint.name]
+        if same:
+            raise UsageError(
+                f"the attachment frame {self.full_identifier!r} has a joint {joint.full_identifier!r} already",
+                hint='give each of its joints a name: frame.add("joint", name="x", ...)',
+            )
+
+    def remove(self, affect_attachments: bool = False) -> None:
+        """Delete the element from its model, with its children.
+
+        Args:
+            affect_attachments: Whether models that are attached below it may be detached.
+        """
+        below = [e for e in self.walk(own=True) if e._attached is not None]
+        if below and not affect_attachments:
+            raise UsageError("please use remove(affect_attachments=True), as models are attached below this element")
+        for frame in below:
+            attached: Any = frame._attached
+            attached.detach()
+        for child in list(self._children):
+            child.remove()
+        name = self._given.get("class" if self.tag == "default" else "name")
+        self._root.rename(self, name, None)
+        self._given.clear()
+        self._key_order["name"] = name  # for messages
+        if self._parent is not None and (self._spec.repeated or not self._spec.implicit):
+            self._parent._children.remove(self)
+            object.__setattr__(self, "is_removed", True)
+
+    def all_children(self) -> list[Element]:
+        """Return the children, and those of the model that an attachment frame or a section holds too."""
+        return [*self._children, *self.attached_children()]
+
+    def attached_children(self) -> list[Element]:
+        """Return the children that belong to attached models."""
+        if self._attached is not None:
+            return self._attached.worldbody.all_children()
+        if self._parent is self._root and self.tag not in ("worldbody", "default") and not self._is_setting:
+            return [c for m in self._root.attached_models() for c in m._child(self.tag).all_children()]
+        return []
+
+    def walk(self, own: bool = False) -> Iterator[Element]:
+        """Yield this element and all below it, in the order of the document; ``own``: without attached models."""
+        yield self
+        for child in self._children if own else self.all_children():
+            yield from child.walk(own)
+
+    def find(self, kind: str, identifier: str | None = None, *, name: str | None = None) -> Any:
+        """Return the element of a kind with a name such as ``finger`` or ``hand/finger`` below this one, or None."""
+        found = self._root.look_up(kind, identifier if identifier is not None else name)
+        above = found
+        while isinstance(above, Element) and above is not self and self is not self._root:
+            above = above._parent
+        return found if above is self or self is self._root else None
+
+    def find_all(
+        self, kind: str, immediate_children_only: bool = False, exclude_attachments: bool = False
+    ) -> list[Element]:
+        """Return the elements of a kind below this one, in the order of the document."""
+        if kind not in schema.KINDS and kind not in KIND_OF_TAG:
+            raise UsageError(f"{kind!r} is not a valid namespace. Available: {', '.join(schema.KINDS)}")
+        kind = KIND_OF_TAG.get(kind, kind)
+        if immediate_children_only:
+            found: Iterable[Element] = self._children if exclude_attachments else self.all_children()
+        else:
+            found = (e for e in self.walk(exclude_attachments) if e is not self)
+        return [e for e in found if e._spec.kind == kind]
+
+    def enter_scope(self, scope_identifier: str) -> RootElement | None:
+        """Return the model attached under a name such as ``arm/hand``, or None."""
+        return self._root.look_up("attached_model", scope_identifier.rstrip("/"))
+
+    def attach(self, attachment: RootElement) -> Element:
+        """Attach a model at this site, or at the world; return the frame, an empty body to which joints are added."""
+        if self.tag not in ("site", "worldbody"):
+            raise UsageError(
+                f"a model is attached to a site or the world, not to the {self.kind} {self.full_identifier!r}"
+            )
+        self._root.adopt(attachment)
+        holder: Any = self if self.is_worldbody else self._parent
+        frame = Element(schema.root().children["worldbody"].children["body"], holder)
+        object.__setattr__(frame, "_attached", attachment)
+        self._root.frames[attachment] = frame
+        frame._given.update({k: v for k, v in self._given.items() if k in _POSE})
+        position = len(holder._children)
+        if not self.is_worldbody:
+            position = holder._children.index(self) + 1
+            while position < len(holder._children) and holder._children[position].is_frame:
+                position += 1
+        holder._children.insert(position, frame)
+        return frame
+
+    def is_same_as(self, other: Element | None) -> bool:
+        """Return whether another element has the same tag, attributes and children."""
+        if other is None or other.tag != self.tag:
+            return False
+        return self.to_xml_string() == other.to_xml_string()
+
+    def resolve_references(self) -> None:
+        """Let attributes that name elements by text hold the elements."""
+        for element in self.walk():
+            for name, value in element._given.items():
+                target = schema.reference(element._path, element.tag, name) if isinstance(value, str) else None
+                if target in ("objtype", "reftype"):
+                    target = KIND_OF_TAG.get(element._given.get(target, ""), element._given.get(target))
+                if target in schema.KINDS:
+                    element._given[name] = element._root.look_up(target, value) or value
+
+    def to_xml_string(
+        self, prefix_root: RootElement | None = None, self_only: bool = False, pretty_print: bool = True
+    ) -> str:
+        """Return this element as MJCF.
+
+        Args:
+            prefix_root: The model that names are relative to; default: the element's own.
+        """
+        from sim2real.composer.mjcf import compose  # which walks over elements
+
+        return compose.element_text(self, prefix_root or self._root, self_only, pretty_print)
+
+
+def _types_first(name: str) -> bool:
+    """Sort attributes that say what others name before those."""
+    return not name.endswith("type")
+
+
+KEYED = {"qpos": "joint", "qvel": "joint", "act": "actuator", "ctrl": "actuator", "mpos": "body", "mquat": "body"}
+"""Attribute of a keyframe -> the kind of element that its numbers belong to."""
+
+
+def bytes_of(text: str) -> int:
+    """Return the number of bytes that ``size.memory`` asks for."""
+    unit = _UNITS.get(text[-1:].lower(), 1)
+    return int(text[:-1] if unit > 1 else text) * unit
+
+
+class ElementList(Sequence[Element]):
+    """Children with one tag, such as ``body.geom`` and ``sensor.gyro``; always those that are there now."""
+
+    def __init__(self, parent: Element, tag: str) -> None:
+        self._parent, self.tag = parent, tag
+
+    def _find(self) -> list[Element]:
+        return [c for c in self._parent.all_children() if c.tag == self.tag]
+
+    def __len__(self) -> int:
+        return len(self._find())
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return an element by its number or its name, or a list of them for a slice."""
+        elements = self._find()
+        if not isinstance(key, str):
+            return elements[key]
+        top = self._parent._root
+        for element in elements:
+            if key in (element.dclass if self.tag == "default" else element.name, top.identify(element, top)):
+                return element
+        raise KeyError(
+            f"there is no <{self.tag}> {key!r}. Available: {', '.join(filter(None, (e.name for e in elements)))}"
+        )
+
+    def __delitem__(self, key: int | str | slice) -> None:
+        for element in self[key] if isinstance(key, slice) else [self[key]]:
+            element.remove()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sequence) and list(self) == list(other)
+
+    def __add__(self, other: Iterable[Element]) -> list[Element]:
+        return [*self, *other]
+
+    def __radd__(self, other: Iterable[Element]) -> list[Element]:
+        return [*other, *self]
+
+    def __repr__(self) -> str:
+        return repr(self._find())
+
+    def clear(self) -> None:
+        """Delete them all."""
+        for element in self._find():
+            element.remove()
+
+
+Elements = Element | Iterable[Element]
+"""An element, or several of one kind."""
+
+
+def as_elements(elements: Elements) -> tuple[tuple[Element, ...], bool]:
+    """Return elements as a tuple, and whether the argument was a single element.
+
+    Raises:
+        UsageError: When something in it is no element, or the kinds differ.
+    """
+    if elements is None:
+        raise UsageError("nothing to bind: the element is None", hint="find() returns None where it finds nothing")
+    if isinstance(elements, Element) or not isinstance(elements, Iterable):
+        sequence: tuple[Element, ...] = (elements,)
+    else:
+        sequence = tuple(elements)
+    for element in sequence:
+        if not isinstance(element, Element):
+            raise UsageError(f"expected an element of a model, got {type(element).__name__}: {element!r}")
+    kinds = sorted({e.kind for e in sequence})
+    if len(kinds) > 1:
+        raise UsageError(f"Cannot bind to a collection containing multiple element types: {', '.join(kinds)}")
+    return sequence, isinstance(elements, Element)

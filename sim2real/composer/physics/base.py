@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
-from sim2real.composer.models import layout
-from sim2real.composer.models.element import as_elements
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.element import as_elements
+from sim2real.composer.mjcf.schema import mj
+from sim2real.composer.physics import layout
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.models.element import Elements
+    from sim2real.composer.mjcf.element import Elements
     from sim2real.composer.physics.named import Named
     from sim2real.composer.types import ArrayLike, ArrayModule, Index, MjData, MjModel
     from sim2real.types import Array, PyTree

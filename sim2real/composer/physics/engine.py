@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.c.rendering import Graphics, new_scene
 from sim2real.errors import UsageError
 

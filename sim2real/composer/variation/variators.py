@@ -11,7 +11,7 @@ from sim2real.composer.physics.arrays import is_jax
 from sim2real.composer.variation.base import evaluate
 
 if TYPE_CHECKING:
-    from sim2real.composer.models.element import Element, Elements  # noqa: F401 - in a type as text
+    from sim2real.composer.mjcf.element import Element, Elements  # noqa: F401 - in a type as text
     from sim2real.composer.types import RandomState, Varying
     from sim2real.types import PyTree
 

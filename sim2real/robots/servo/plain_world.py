@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim2real.composer.hooks import Hooks
-from sim2real.composer.models import layout
+from sim2real.composer.physics import layout
 from sim2real.composer.physics.c.physics import Physics
 from sim2real.composer.physics.c.rollouts import Start, WorldParams
 from sim2real.composer.variation.variators import CONSTANTS

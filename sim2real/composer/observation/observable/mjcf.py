@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.models.element import Element
+from sim2real.composer.mjcf.element import Element
 from sim2real.composer.observation.observable.base import Observable
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
-    from sim2real.composer.models.element import Elements
+    from sim2real.composer.mjcf.element import Elements
     from sim2real.composer.physics.base import BasePhysics
     from sim2real.composer.types import Aggregate, Corrupt, MjvOption, Steps
     from sim2real.types import PyTree

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sim2real.composer.models import layout
+from sim2real.composer.physics import layout
 from sim2real.composer.physics.base import BaseBinding, BasePhysics
 
 if TYPE_CHECKING:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import copy
 from typing import TYPE_CHECKING
 
+from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.c.physics import Physics
 from sim2real.composer.task import Task
 
 if TYPE_CHECKING:
-    from sim2real.composer.models.model import Model
     from sim2real.composer.types import MjModel
 
 
@@ -18,13 +18,13 @@ class Compiler:
 
     def __init__(self, task: Task) -> None:
         self._task = task
-        self._key: list[tuple[Model, int | None]] | None = None
+        self._text = ""
         self._model: MjModel | None = None
 
     def start(self, legacy_step: bool) -> Physics:
         """Return the task's world in its initial state, in memory of its own: arrays of earlier episodes stay."""
         model = self._task.root_entity.mjcf_model.root_model
-        key = [(m, m.revision()) for m in model.all_models()]
-        if None in (revision for _, revision in key) or key != self._key:
-            self._model, self._key = model.compile(), key
+        text = model.to_xml_string()  # which names files by their contents
+        if text != self._text:
+            self._model, self._text = mj.MjModel.from_xml_string(text, model.get_assets()), text
         return Physics(copy.copy(self._model), legacy_step)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
-from sim2real.composer.models.element import as_elements
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.element import as_elements
+from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.base import EmptyBinding
 from sim2real.composer.physics.c.binding import Binding, BoundPhysics, Staleness
 from sim2real.composer.physics.c.rendering import Graphics
@@ -22,8 +22,8 @@ from sim2real.composer.physics.engine import Camera, TextOverlay
 from sim2real.composer.physics.named import Named
 
 if TYPE_CHECKING:
-    from sim2real.composer.models.element import Element, Elements
-    from sim2real.composer.models.model import Model
+    from sim2real.composer.mjcf import RootElement as Model
+    from sim2real.composer.mjcf.element import Element, Elements
     from sim2real.composer.types import ArrayLike, MjData, MjModel, MjvOption, MjvScene
     from sim2real.types import PyTree
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.schema import mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

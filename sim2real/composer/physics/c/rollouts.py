@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from sim2real import pytree
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.schema import mj
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, StepState
 

@@ -16,7 +16,7 @@ from flax import struct
 from mujoco import mjx
 
 from sim2real.composer.environment import ObservationPadding
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.c.physics import Physics
 from sim2real.composer.physics.mjx import gate, stepping, views
 from sim2real.composer.physics.mjx.physics import MjxPhysics

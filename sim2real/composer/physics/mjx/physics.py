@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from sim2real.composer.models import layout
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.schema import mj
+from sim2real.composer.physics import layout
 from sim2real.composer.physics.mjx import constants, stepping
 from sim2real.composer.physics.mjx.random import JaxRandomState
 from sim2real.composer.physics.mjx.views import MjxBinding, MjxDataView, MjxModelView, Traced, constant
@@ -24,7 +24,7 @@ from sim2real.types import PyTree
 if TYPE_CHECKING:
     from types import ModuleType
 
-    from sim2real.composer.models.element import Elements
+    from sim2real.composer.mjcf.element import Elements
     from sim2real.composer.physics.mjx.warp.warp import WarpEngine
     from sim2real.composer.types import ArrayLike, MjModel
 

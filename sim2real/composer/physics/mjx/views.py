@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2real.composer.models import layout
+from sim2real.composer.physics import layout
 from sim2real.composer.physics.base import BaseBinding, BaseModelView, BasePhysics
 from sim2real.errors import UsageError
 

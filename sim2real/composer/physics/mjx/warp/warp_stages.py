@@ -23,7 +23,7 @@ from mujoco.mjx.third_party.mujoco_warp._src.types import Contact, DisableBit, E
 from mujoco.mjx.warp import ffi
 from mujoco.mjx.warp import forward as generated
 
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.mjx.warp.warp_fields import varies
 
 if TYPE_CHECKING:

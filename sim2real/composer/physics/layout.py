@@ -11,7 +11,7 @@ import numpy as np
 from mujoco.introspect.ast_nodes import StructFieldDecl
 from mujoco.introspect.structs import STRUCTS
 
-from sim2real.composer.models.mjcf.translate import mj
+from sim2real.composer.mjcf.schema import mj
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:

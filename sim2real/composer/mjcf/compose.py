@@ -1,0 +1,406 @@
+"""A model with all attached models as one document, which MuJoCo's parser compiles.
+
+Names of attached models' elements and classes are prefixed with ``model/``; elements without a name get one. Every
+class of defaults has a name, as the defaults of one model are not for another: those at the top are called ``/``, those
+of an attached model ``model/``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from sim2real.composer.mjcf import files, schema
+from sim2real.composer.mjcf.schema import mj
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.mjcf.element import Element
+    from sim2real.composer.mjcf.model import RootElement
+    from sim2real.types import MjModel
+
+_COSMETIC = ("material", "texture")
+"""Attributes that an element can do without: they may name something that was removed."""
+_ANGLES = ("range", "ref", "springref")
+_FOLDERS = ("meshdir", "texturedir", "assetdir")
+
+
+def compile_model(model: RootElement) -> MjModel:
+    """Return the ``mujoco.MjModel`` of a model; ValueError with MuJoCo's own message when it does not compile."""
+    return mj.MjModel.from_xml_string(text(model), assets(model))
+
+
+def text(model: RootElement) -> str:
+    """Return a model as MJCF."""
+    return _Writer(model).document()
+
+
+def element_text(element: Element, top: RootElement, self_only: bool, pretty: bool) -> str:
+    """Return an element as MJCF, with names as seen from a model."""
+    writer = _Writer(top, element.root.root_model)
+    if self_only:
+        attributes = writer.attributes(element)
+        if not element._given.get("name") and not element.is_frame:
+            attributes = {k: v for k, v in attributes.items() if k != "name"}
+        inner = "...</" + element.tag + ">" if element.all_children() else ""
+        return _tag(element.tag, attributes, bool(inner)) + inner + "\n" * pretty
+    writer.element(element)
+    return "\n".join(writer.lines) + "\n" if pretty else "".join(line.strip() for line in writer.lines)
+
+
+def assets(model: RootElement) -> dict[str, bytes]:
+    """Return the contents of the files that a model and those attached to it name: name -> bytes."""
+    found = {}
+    for element in model.walk():
+        for value in element._given.values():
+            if isinstance(value, files.Asset):
+                asset = _asset(element, value, model)
+                found[asset.get_vfs_filename()] = asset.contents
+    return found
+
+
+def _asset(element: Element, asset: files.Asset, top: RootElement) -> files.Asset:
+    prefix = element.root.prefix(top)
+    if element.tag != "skin" or not prefix:
+        return asset
+    # A file names bones by the names in its own model, which may have changed since.
+    return files.renamed_skin(asset, lambda bone: prefix + bone)
+
+
+class _Writer:
+    """Writes elements line by line; names are as seen from the model at the top."""
+
+    def __init__(self, top: RootElement, world: RootElement | None = None) -> None:
+        self.top, self.world = top, world or top
+        self.lines: list[str] = []
+        self._unnamed: dict[RootElement, dict[Element, int]] = {}
+        self._factors: dict[RootElement, float] = {}
+
+    # -- documents
+
+    def document(self) -> str:
+        """Return the whole document."""
+        top = self.top
+        self.lines.append(f"<mujoco model={quoteattr(top.model)}>")
+        for tag in ("compiler", "option", "size", "statistic", "visual"):
+            section = top._present(tag)
+            if section is not None:
+                self.setting(section, 1)
+        self.lines.append("  <default>")
+        for model in top.all_models():
+            self.default(model._child("default"), 2)
+        self.lines.append("  </default>")
+        for tag in top._spec.children:
+            if tag not in ("compiler", "option", "size", "statistic", "visual", "default", "keyframe"):
+                children = top._child(tag).all_children()
+                if children:
+                    self.lines.append(f"  <{tag}>")
+                    for child in children:
+                        self.element(child, 2)
+                    self.lines.append(f"  </{tag}>")
+        keys = top.find_all("key")
+        if keys:
+            body = "\n".join(self.lines)
+            self.lines.append("  <keyframe>")
+            for key in keys:
+                self.lines.append("    " + _tag("key", self.attributes(key) | self._numbers(key, body)))
+            self.lines.append("  </keyframe>")
+        self.lines.append("</mujoco>\n")
+        return "\n".join(self.lines)
+
+    def setting(self, element: Element, depth: int) -> None:
+        """Write a section of settings, if there are any."""
+        attributes = self.attributes(element)
+        at = len(self.lines)
+        for child in element._children:
+            self.setting(child, depth + 1)
+        if attributes or len(self.lines) > at:
+            self._around(element.tag, attributes, at, depth)
+
+    def default(self, element: Element, depth: int) -> None:
+        """Write a class of defaults."""
+        at = len(self.lines)
+        for child in element._children:
+            if child.tag == "default":
+                self.default(child, depth + 1)
+            elif child._given or child._children:
+                self.element(child, depth + 1)
+        name = element.root.identify(element, self.top)
+        self._around("default", {"class": name or "/"}, at, depth)
+
+    def _around(self, tag: str, attributes: dict[str, str], at: int, depth: int) -> None:
+        space = "  " * depth
+        if len(self.lines) == at:
+            self.lines.append(space + _tag(tag, attributes))
+        else:
+            self.lines.insert(at, space + _tag(tag, attributes, True))
+            self.lines.append(f"{space}</{tag}>")
+
+    def element(self, element: Element, depth: int = 0) -> None:
+        """Write an element and all below it."""
+        space, tag = "  " * depth, element.tag
+        children = element.all_children()
+        attributes = self.attributes(element)
+        attached = element._attached
+        if attached is not None and free_body(attached) is not None:
+            parent = element._parent
+            if children[: len(element._children)] or attached.parent_model is not self.top or not parent.is_worldbody:
+                raise UsageError(
+                    f"model {attached.model!r} has a free joint of its own: it can only be attached to the world, "
+                    "without joints",
+                    hint="take the free joint out of the model and use add_free_entity",
+                )
+            tag = "frame"
+            attributes.pop("name")
+        self.lines.append(space + _tag(tag, attributes, bool(children)))
+        if children:
+            for child in children:
+                if not child._spec.implicit or child._given or child._children:
+                    self.element(child, depth + 1)
+            self.lines.append(f"{space}</{tag}>")
+
+    # -- attributes
+
+    def attributes(self, element: Element) -> dict[str, str]:
+        """Return the attributes of an element as text."""
+        made, spec = {}, element._spec
+        if spec.kind and spec.kind != "default" and "name" in spec.attributes:
+            made["name"] = self._name(element)
+        for name, value in element._given.items():
+            if name == "name" and "name" in made:
+                continue
+            if name in _FOLDERS or (element.tag == "default" and name == "class"):
+                continue
+            if element.tag == "key" and name in element._key_order:
+                continue
+            written = self._text(element, name, value)
+            if written is not None:
+                made[name] = written
+        if "class" in spec.attributes and "class" not in made and element.tag != "default":
+            inherited = self._class(element)
+            if inherited:
+                made["class"] = inherited
+        factor = self._factor(element.root)
+        if factor != 1.0:
+            made |= self._turned(element, factor)
+        return made
+
+    def _name(self, element: Element) -> str:
+        model = element.root
+        parent = element._parent
+        if element._given.get("name") or element.is_frame or (parent is not None and parent.is_frame):
+            return model.identify(element, self.top) or ""
+        numbers = self._unnamed.get(model)
+        if numbers is None:
+            counts: Counter[str] = Counter()
+            numbers = self._unnamed[model] = {}
+            for one in model.walk(own=True):
+                if one._spec.kind:
+                    numbers[one] = counts[one._spec.kind]
+                    counts[one._spec.kind] += 1
+        prefix = model.prefix(self.world)  # as PyMJCF does: the name in the compiled model
+        return f"{prefix or '/'}/unnamed_{element.kind}_{numbers[element]}"
+
+    def _class(self, element: Element) -> str | None:
+        """Return the class of an element that names none; None where its body has one for its children."""
+        above = element._parent
+        while above is not None:
+            if above._given.get("childclass"):
+                return None
+            above = above._parent
+        return element.root.identify(element.root._child("default"), self.top)
+
+    def _text(self, element: Element, name: str, value: Any) -> str | None:
+        """Return the value of an attribute as text; None where it is not written."""
+        model = element.root
+        if isinstance(value, files.Asset):
+            return _asset(element, value, self.top).get_vfs_filename()
+        if hasattr(value, "_given"):
+            return self._named(element, name, value)
+        target = schema.reference(element._path, element.tag, name)
+        if target == "default" and value == (model._child("default")._given.get("class") or "main"):
+            return model.identify(model._child("default"), self.top)
+        if target is not None:
+            return model.prefix(self.top) + value
+        if isinstance(value, np.ndarray):
+            return " ".join(map(repr, value.tolist())) if value.dtype.kind != "U" else " ".join(value.tolist())
+        return value if isinstance(value, str) else repr(value)
+
+    def _named(self, element: Element, name: str, target: Element) -> str | None:
+        if target.is_removed:
+            if name in _COSMETIC:
+                return None
+            removed = target._key_order.get("name", "")
+            raise UsageError(
+                f"{element.kind} {element._given.get('name') or element.full_identifier!r} of model "
+                f"{element.root.model!r} names the {target.kind} {removed!r}, which was removed",
+                hint=f"remove the {element.kind} as well, or let it name another {target.kind}",
+            )
+        return target.root.identify(target, self.top)
+
+    # -- angles
+
+    def _factor(self, model: RootElement) -> float:
+        """Return what angles of a model are multiplied by."""
+        if model not in self._factors:
+            one, other = model.is_degree, self.world.is_degree
+            self._factors[model] = 1.0 if one == other else math.pi / 180 if one else 180 / math.pi
+        return self._factors[model]
+
+    def _turned(self, element: Element, factor: float) -> dict[str, str]:
+        """Return the attributes of an element that are angles, in the unit of the model at the top."""
+        made, given = {}, element._given
+        if "euler" in given and element.tag != "compiler":
+            made["euler"] = " ".join(map(repr, (factor * given["euler"]).tolist()))
+        if "axisangle" in given:
+            made["axisangle"] = " ".join(map(repr, [*given["axisangle"][:3].tolist(), factor * given["axisangle"][3]]))
+        if element.tag == "joint" and "range" in element._spec.attributes:
+            scale = factor if turns(element) else 1.0
+            for name in _ANGLES:  # those of its classes too: a class may be for hinges and for slides
+                value = inherited(element, name)
+                if value is not None:
+                    made[name] = " ".join(map(repr, np.atleast_1d(scale * value).tolist()))
+        if element.tag == "compiler":
+            made.pop("angle", None)
+        return made
+
+    # -- keyframes
+
+    def _numbers(self, key: Element, body: str) -> dict[str, str]:
+        """Return the numbers of a keyframe of any model, for the whole world."""
+        alone = not self.top.frames
+        names = key._key_order
+        if alone and all(_same(order, key.root.keyed_elements(name)) for name, order in names.items()):
+            return {name: " ".join(map(repr, key._given[name].tolist())) for name in names}
+        if self.top.layout is None or self.top.layout[0] != body:
+            made = mj.MjModel.from_xml_string(f"{body}\n</mujoco>", assets(self.top))
+            object.__setattr__(self.top, "layout", (body, made))
+        return {name: self._spread(key, name, self.top.layout[1]) for name in names}
+
+    def _spread(self, key: Element, name: str, model: MjModel) -> str:
+        """Return the numbers of an attribute of a keyframe for the whole world: those that it has, else the usual."""
+        values, order = key._given[name], key._key_order[name]
+        everything = [entry for one in key.root.all_models() for entry in one.keyed_elements(name)]
+        own = self._placed(order, name, model)
+        world = self._placed(everything, name, model)
+        width = sum(w for _, w in own)
+        if width != values.size:
+            if sum(w for _, w in world) != values.size:
+                raise UsageError(
+                    f"keyframe {key.name!r} of model {key.root.model!r} has {values.size} values for {name}, its model "
+                    f"has {width}, and {sum(w for _, w in world)} with the attached ones"
+                )
+            own = sorted(world, key=lambda place: math.inf if place[0] is None else place[0])
+        usual = {"qpos": model.qpos0, "qvel": np.zeros(model.nv), "act": np.zeros(model.na)}
+        mocap = [i for i in range(model.nbody) if model.body_mocapid[i] >= 0]
+        usual |= {"ctrl": np.zeros(model.nu), "mpos": model.body_pos[mocap], "mquat": model.body_quat[mocap]}
+        numbers, at = np.ravel(usual[name]).copy(), 0
+        for place, size in own:
+            if place is not None:
+                numbers[place : place + size] = values[at : at + size]
+            at += size
+        return " ".join(map(repr, numbers.tolist()))
+
+    def _placed(self, order: list[Any], name: str, model: MjModel) -> list[tuple[int | None, int]]:
+        """Return where the numbers of elements are in the world, and how many; None for those that are gone.
+
+        An element that was removed gives its numbers to one of the same name.
+        """
+        places: list[tuple[int | None, int]] = []
+        for element, called, hint in order:
+            one = element
+            if one.is_removed and called:
+                one = element._root.look_up(KINDS_OF[name], called)
+            places.append((None, hint) if one is None or one.is_removed else self._place(one, name, model))
+        return places
+
+    def _place(self, element: Element, name: str, model: MjModel) -> tuple[int, int]:
+        called = self._name(element)
+        if name in ("qpos", "qvel"):
+            number = mj.mj_name2id(model, mj.mjtObj.mjOBJ_JOINT, called)
+            kind = int(model.jnt_type[number])
+            if name == "qpos":
+                return int(model.jnt_qposadr[number]), (7, 4, 1, 1)[kind]
+            return int(model.jnt_dofadr[number]), (6, 3, 1, 1)[kind]
+        if name in ("act", "ctrl"):
+            number = mj.mj_name2id(model, mj.mjtObj.mjOBJ_ACTUATOR, called)
+            if name == "act":
+                return int(model.actuator_actadr[number]), int(model.actuator_actnum[number])
+            return int(model.actuator_ctrladr[number]), int(model.actuator_ctrlnum[number])
+        width = 3 if name == "mpos" else 4
+        number = mj.mj_name2id(model, mj.mjtObj.mjOBJ_BODY, called)
+        return width * int(model.body_mocapid[number]), width
+
+
+KINDS_OF = {"qpos": "joint", "qvel": "joint", "act": "actuator", "ctrl": "actuator", "mpos": "body", "mquat": "body"}
+
+
+def _same(order: list[Any], now: list[Any]) -> bool:
+    return [e for e, *_ in order] == [e for e, *_ in now]
+
+
+def _tag(tag: str, attributes: dict[str, str], opens: bool = False) -> str:
+    inside = "".join(f" {name}={quoteattr(value)}" for name, value in attributes.items())
+    return f"<{tag}{inside}{'' if opens else '/'}>"
+
+
+def classes(element: Element) -> Iterator[Element]:
+    """Yield the classes of defaults of an element, the nearest first."""
+    model = element.root
+    name, above = element._given.get("class"), element._parent
+    while name is None and above is not None:
+        name, above = above._given.get("childclass"), above._parent
+    found = model.look_up("default", name) if isinstance(name, str) else name
+    found = model._child("default") if found is None else found
+    while found is not None and found.tag == "default":
+        yield found
+        found = found._parent
+
+
+def inherited(element: Element, name: str) -> Any:
+    """Return an attribute of an element: its own, or that of its classes of defaults; None where none has it."""
+    if name in element._given:
+        return element._given[name]
+    holders: Iterator[Element | None]
+    if element._parent is not None and element._parent.tag == "default":
+        holders = (c._present(element.tag) for c in _upwards(element._parent))
+    else:
+        holders = (c._present(element.tag) for c in classes(element))
+    return next((h._given[name] for h in holders if h is not None and name in h._given), None)
+
+
+def _upwards(default: Element | None) -> Iterator[Element]:
+    while default is not None and default.tag == "default":
+        yield default
+        default = default._parent
+
+
+def turns(joint: Element) -> bool:
+    """Return whether the range of a joint is one of angles."""
+    return joint.tag == "joint" and inherited(joint, "type") not in ("slide", "free")
+
+
+def width_of(element: Element, name: str) -> int:
+    """Return how many numbers of a keyframe an element has, as far as its model tells."""
+    if name in ("qpos", "qvel"):
+        kind = "free" if element.tag == "freejoint" else inherited(element, "type")
+        return {"free": 7, "ball": 4}.get(kind, 1) - (name == "qvel" and kind in ("free", "ball"))
+    if name == "act":
+        stateful = element.tag in ("intvelocity", "cylinder", "muscle") or inherited(element, "timeconst") is not None
+        return int(stateful or (inherited(element, "dyntype") or "none") != "none")
+    return {"ctrl": 1, "mpos": 3, "mquat": 4}[name]
+
+
+def free_body(model: RootElement) -> Element | None:
+    """Return the first body of a model's own world that has a free joint, or None."""
+    for body in model._child("worldbody")._children:
+        if body.tag == "body" and not body.is_frame:
+            for joint in body._children:
+                if joint.tag == "freejoint" or (joint.tag == "joint" and inherited(joint, "type") == "free"):
+                    return body
+    return None

@@ -1,0 +1,114 @@
+"""Files of meshes, textures and height fields: read when they are named, written beside an exported model."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim2real.errors import UsageError
+
+if TYPE_CHECKING:
+    from sim2real.composer.mjcf.element import Element
+    from sim2real.composer.mjcf.model import RootElement
+
+TAGS = ("mesh", "hfield", "texture", "skin", "model", "flexcomp")
+"""Elements that may come from files."""
+NAMED_AFTER = ("mesh", "hfield", "texture")
+"""Elements that are called after their files, where they have no name."""
+_NAME_BYTES = 40
+
+
+@dataclass(frozen=True)
+class Asset:
+    """The contents of a file: ``asset.add('texture', file=mjcf.Asset(png, '.png'))``.
+
+    Args:
+        extension: How the file's name ends, such as ``.stl``.
+    """
+
+    contents: bytes
+    extension: str
+    prefix: str = ""
+
+    def get_vfs_filename(self) -> str:
+        """Return a name that no file with other contents has."""
+        digest = hashlib.sha1(self.contents, usedforsecurity=False).hexdigest()
+        return "-".join(filter(None, (self.prefix, digest))) + self.extension
+
+
+def read(element: Element, file: str) -> Asset:
+    """Return the file that an element names: among the model's assets, or below the model's folder."""
+    model = element.root
+    compiler = model.compiler
+    folder = compiler.texturedir if element.tag == "texture" else compiler.meshdir
+    folder = folder or compiler.assetdir or ""
+    whole = os.path.normpath(os.path.join(folder, file))
+    path = Path(model.model_dir) / whole
+    for name in (file, whole, Path(file).name):
+        if name in model.assets:
+            contents = model.assets[name]
+            break
+    else:
+        if not path.is_file():
+            raise UsageError(
+                f"model {model.model!r} has no file {file!r}: it is neither among its assets nor at {path}"
+            )
+        contents = path.read_bytes()
+    asset = Asset(contents, Path(file).suffix)
+    digest = asset.get_vfs_filename().removesuffix(asset.extension)
+    stem = Path(file).stem
+    return Asset(contents, asset.extension, "" if stem == digest else stem.removesuffix(f"-{digest}"))
+
+
+def renamed_skin(asset: Asset, name: Callable[[str], str]) -> Asset:
+    """Return a skin whose bones have other names."""
+    contents = asset.contents
+    counts = struct.unpack("4i", contents[:16])
+    at = 16 + 4 * (3 * counts[0] + 2 * counts[1] + 3 * counts[2])
+    parts = [contents[:at]]
+    for _ in range(counts[3]):
+        new = name(contents[at : at + _NAME_BYTES].split(b"\0")[0].decode()).encode()
+        if len(new) >= _NAME_BYTES:
+            raise UsageError(f"the bone {new.decode()!r} of a skin has more than {_NAME_BYTES - 1} letters")
+        vertices = struct.unpack("i", contents[at + _NAME_BYTES + 28 : at + _NAME_BYTES + 32])[0]
+        end = at + _NAME_BYTES + 32 + 8 * vertices
+        parts += [new.ljust(_NAME_BYTES, b"\0"), contents[at + _NAME_BYTES : end]]
+        at = end
+    return Asset(b"".join(parts), asset.extension, asset.prefix)
+
+
+def export_with_assets(
+    mjcf_model: RootElement, out_dir: str | os.PathLike[str], out_file_name: str | None = None
+) -> None:
+    """Write a model, composed, as MJCF with all its files into a folder, which is made if it is not there.
+
+    Args:
+        out_file_name: Name of the MJCF file; default: the model's name with ``.xml``.
+    """
+    name = out_file_name or f"{mjcf_model.model}.xml"
+    if not name.lower().endswith(".xml"):
+        raise UsageError(f"out_file_name must end with '.xml': got {name!r}")
+    folder = Path(out_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, contents in mjcf_model.get_assets().items():
+        (folder / file).write_bytes(contents)
+    (folder / name).write_text(mjcf_model.to_xml_string(), encoding="utf-8")
+
+
+def export_with_assets_as_zip(
+    mjcf_model: RootElement, out_dir: str | os.PathLike[str], model_name: str | None = None
+) -> str:
+    """Write a model, composed, as MJCF with all its files into an archive; return its path."""
+    name = model_name or mjcf_model.model
+    Path(out_dir).mkdir(parents=True, exist_ok=True)
+    path = str(Path(out_dir) / f"{name}.zip")
+    with zipfile.ZipFile(path, "w") as archive:
+        for file, contents in (mjcf_model.get_assets() | {f"{name}.xml": mjcf_model.to_xml_string()}).items():
+            archive.writestr(f"{name}/{file}", contents)
+    return path

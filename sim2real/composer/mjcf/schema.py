@@ -1,0 +1,195 @@
+"""The tags of MJCF and their attributes, as MuJoCo's own parser prints them, and what the attributes hold."""
+
+from __future__ import annotations
+
+import functools
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+import mujoco
+
+mj: Any = mujoco
+_INDENT = 3
+_ENTRY = re.compile(r"^( *)(?:\(\w+\))?(\w+) \(([!?*R])\)\s*(.*)$")
+
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+@dataclass
+class Spec:
+    """What an element with a tag may have.
+
+    Attributes:
+        attributes: Names in MJCF.
+        children: Tag -> what that may have.
+        repeated: Whether there may be several in one parent.
+        implicit: Whether the element is there without being added, such as ``option`` or ``default.geom``.
+        kind: What ``find`` and ``find_all`` call it: its tag, or ``actuator``, ``sensor`` and so on; '' has no kind.
+    """
+
+    tag: str
+    attributes: frozenset[str]
+    repeated: bool
+    implicit: bool = False
+    kind: str = ""
+    children: dict[str, Spec] = field(default_factory=dict)
+
+
+GROUPS = ("actuator", "sensor", "tendon", "equality")
+"""Sections whose elements have one kind."""
+_KINDS = {
+    "asset": ("mesh", "hfield", "skin", "texture", "material", "model"), "contact": ("pair", "exclude"),
+    "custom": ("numeric", "text", "tuple"), "keyframe": ("key",), "deformable": ("flex", "skin"),
+}  # fmt: skip
+_TREE = ("body", "geom", "joint", "site", "camera", "light", "frame")
+KINDS = (*_TREE, *GROUPS, *(kind for kinds in _KINDS.values() for kind in kinds), "default", "attachment_frame")
+"""What ``find_all`` takes."""
+FRAME_CHILDREN = ("joint", "freejoint", "inertial")
+"""What an attachment frame may hold."""
+
+
+@functools.cache
+def root() -> Spec:
+    """Return what ``<mujoco>`` may have."""
+    stack: list[Spec] = []
+    names: dict[int, set[str]] = {}
+    for line in mj.mj_printSchema(False, False).splitlines():
+        entry = _ENTRY.match(line)
+        if entry is None:
+            names[id(stack[-1])].update(line.split())
+            stack[-1].attributes = frozenset(names[id(stack[-1])])
+            continue
+        depth, tag = len(entry[1]) // _INDENT, entry[2]
+        spec = Spec(tag, frozenset(entry[4].split()), entry[3] in "*R")
+        names[id(spec)] = set(entry[4].split())
+        del stack[depth:]
+        if stack:
+            stack[-1].children[tag] = spec
+        stack.append(spec)
+    top = stack[0]
+    # Bodies hold bodies; the world is the body at the top. MuJoCo's table leaves out frames and copies.
+    body = top.children.pop("body")
+    body.kind, body.children["body"] = "body", body
+    pose = {"pos", "quat", "axisangle", "xyaxes", "zaxis", "euler"}
+    frame = Spec("frame", frozenset({"name", "childclass", *pose}), True, kind="frame")
+    replicate = Spec("replicate", frozenset({"count", "offset", "euler", "sep", "childclass"}), True)
+    body.children |= {"frame": frame, "replicate": replicate}
+    frame.children = replicate.children = body.children
+    body.children["freejoint"].repeated = False
+    for tag in ("geom", "joint", "site", "camera", "light"):
+        body.children[tag].kind = tag
+    body.children["freejoint"].kind = "joint"
+    world_children = {k: v for k, v in body.children.items() if k not in ("inertial", "joint", "freejoint")}
+    top.children["worldbody"] = Spec("worldbody", frozenset(), False, True, children=world_children)
+    for name, section in top.children.items():
+        section.repeated, section.implicit = False, True
+        for tag, child in section.children.items():
+            if name in GROUPS:
+                child.kind = name
+            elif tag in _KINDS.get(name, ()):
+                child.kind = tag
+            elif name in ("compiler", "option", "visual"):
+                child.implicit = True
+    default = top.children["default"]
+    nested = Spec("default", default.attributes, True, False, "default", default.children)
+    for child in default.children.values():
+        child.implicit = True
+    default.kind = "default"
+    default.children["default"] = nested
+    return top
+
+
+ARRAYS = _words(
+    "act actrange actuatorfrcrange ambient anchor attenuation axis axisangle bias biasprm bindpos bindquat cell "
+    "center ctrl ctrlrange damping diaginertia diffuse dir dynprm elevation euler ffrange fluidcoef focal "
+    "focalpixel forcerange friction fromto fullinertia gainprm gear gravity grid gridrange id interval lengthrange "
+    "magnetic markrgb mpos mquat nodecoord normal o_friction o_solimp o_solref offset origin params point polycoef "
+    "pos principal principalpixel qpos quat qvel range rangefinder refpos refquat relpose rgb1 rgb2 rgba scale "
+    "sectionsize sensorsize size solimp solimpfix solimpfriction solimplimit solref solreffix solreffriction "
+    "solreflimit spacing specular springdamper springlength stiffness surfacevel texcoord texrepeat user velrange "
+    "vertex vertweight wind xyaxes zaxis "
+)
+"""Attributes that read as arrays of floats."""
+INTEGER_ARRAYS = _words(
+    "actuatorgroupdisable cellcount count elemtexcoord face gridsize inertiagrouprange resolution vertid "
+)
+INTEGERS = _words(
+    "actdim activelayers cameraid ccd_iterations conaffinity condim contype dim group height iterations "
+    "ls_iterations maxhullvert nchannel ncol nconmax njmax nkey noslip_iterations nrow nsample nstack num numquads "
+    "numslices numstacks nuser_actuator nuser_body nuser_cam nuser_geom nuser_jnt nuser_sensor nuser_site "
+    "nuser_tendon nuserdata offheight offsamples offwidth priority sdf_initpoints sdf_iterations shadowsize subgrid "
+)
+FLOATS = _words(
+    "accel actuatorlength actuatortendon actuatorwidth adhesion alpha area armature azimuth boundinertia boundmass "
+    "bulbradius ccd_tolerance coef contactheight contactwidth cranklength cutoff dampratio delay density diameter "
+    "divisor emission exponent extent fitscale fogend fogstart force forcewidth fovy fpmax framelength framewidth "
+    "frictionloss fvmax gain gap glow gravcomp impratio inertiabox inflate inheritrange intensity inttotal ipd "
+    "jointlength jointwidth kp kv linewidth lmax lmin ls_tolerance margin mass maxforce meaninertia meanmass "
+    "meansize metallic noise noslip_tolerance o_margin poisson prm radius random realtime ref reflectance roughness "
+    "settotalmass shadowclip shadowscale shininess sleep_tolerance softness solmix springref stiffnessrot tausmooth "
+    "thickness time timeconst timestep tolerance tolrange torque torquescale viscosity vmax width young zfar znear "
+)
+_OTHERWISE = {
+    ("option.flag", "*"): "text", ("visual.scale", "*"): "float", ("visual.rgba", "*"): "array",
+    ("visual.map", "stiffness"): "float", ("visual.global", "bvactive"): "text", ("visual.headlight", "active"): "int",
+    ("muscle", "timeconst"): "array", ("muscle", "scale"): "float", ("material", "specular"): "float",
+    ("light", "range"): "float", ("texture", "width"): "int", ("numeric", "size"): "int", ("numeric", "data"): "array",
+    ("lengthrange", "interval"): "float", ("lengthrange", "mode"): "text", ("visual.global", "elevation"): "float",
+    ("edge", "stiffness"): "float", ("edge", "damping"): "float", ("elasticity", "damping"): "float",
+    ("skin", "texcoord"): "array", ("flexcomp", "element"): "array", ("flex", "element"): "ints",
+    ("replicate", "count"): "int", ("text", "data"): "text",
+}  # fmt: skip
+
+
+@functools.cache
+def form(path: str, tag: str, name: str) -> str:
+    """Return what an attribute holds: ``array``, ``ints``, ``int``, ``float`` or ``text``.
+
+    Args:
+        path: Section and tag, for elements such as ``visual.map``.
+    """
+    for key in ((path, "*"), (path, name), (tag, name)):
+        if key in _OTHERWISE:
+            return _OTHERWISE[key]
+    for names, found in ((ARRAYS, "array"), (INTEGER_ARRAYS, "ints"), (INTEGERS, "int"), (FLOATS, "float")):
+        if name in names:
+            return found
+    return "text"
+
+
+_REFERENCES = {
+    **{name: name.rstrip("12") for name in (
+        "body", "body1", "body2", "geom", "geom1", "geom2", "joint", "joint1", "joint2", "site", "site1", "site2",
+        "tendon", "tendon1", "tendon2", "actuator", "camera", "material", "mesh", "hfield", "texture", "flex",
+    )},
+    **dict.fromkeys(("subtree1", "subtree2", "target"), "body"),
+    **dict.fromkeys(("cranksite", "refsite", "sidesite", "slidersite"), "site"),
+    "jointinparent": "joint", "objname": "objtype", "refname": "reftype", "class": "default", "childclass": "default",
+}  # fmt: skip
+
+
+def reference(path: str, tag: str, name: str) -> str | None:
+    """Return the kind of element that an attribute names, or the attribute that says it; None where it names none."""
+    if path.startswith(("visual", "option")) or (name, tag) in (("class", "default"), ("body", "flex")):
+        return None
+    return _REFERENCES.get(name)
+
+
+KIND_OF_TAG = {
+    "freejoint": "joint",
+    **{tag: "actuator" for tag in ("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder",
+                                   "muscle", "adhesion")},
+    **dict.fromkeys(("connect", "weld"), "equality"), **dict.fromkeys(("fixed", "spatial"), "tendon"),
+    "xbody": "body",
+}  # fmt: skip
+"""Other names of kinds."""
+SMALLER = _words("timestep tolerance ls_tolerance noslip_tolerance ccd_tolerance znear ")
+LARGER = _words(
+    "iterations ls_iterations noslip_iterations ccd_iterations sdf_iterations sdf_initpoints njmax nconmax zfar memory "
+)
+"""Settings of which the larger one holds where models differ; of ``SMALLER`` the smaller one; others must be equal."""
+OWN_SETTINGS = frozenset(("meshdir", "texturedir", "assetdir", "angle"))
+"""Settings of ``compiler`` that each model has for itself."""

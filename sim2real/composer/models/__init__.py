@@ -1,1 +1,0 @@
-"""Models that stay editable, and how they are composed and compiled. Machinery."""

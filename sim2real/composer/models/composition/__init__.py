@@ -1,1 +1,0 @@
-"""Models that are attached to each other, compiled as one."""

@@ -1,1 +1,0 @@
-"""MJCF: its schema, parsing, writing, files, and references between elements."""
