@@ -83,19 +83,6 @@ def test_degrees_of_documents(oracle, ours, caplog):
     assert not caplog.text
 
 
-def test_compiler_settings(oracle, ours):
-    found = []
-    for kit in (oracle, ours):
-        root, arm = kit.mjcf.RootElement(model="root"), model(kit)
-        root.worldbody.add("body").add("geom", size=[0.1], mass=1)
-        arm.compiler.boundmass = 2.0
-        root.attach(arm)
-        found.append(np.delete(kit.mjcf.Physics.from_mjcf_model(root).model.body_mass, 2).tolist())  # the frame's
-    assert found == [[0.0, 2.0, 2.0], [0.0, 1.0, 2.0]]
-    below = below_an_arena(ours, model(ours, compiler='<compiler boundmass="0"/>', first='<body name="empty"/>'))
-    assert below.model.body_mass.tolist() == [0.0, 1e-5, 1e-5, 1.0]  # the arena's
-
-
 def test_keyframes(oracle, ours):
     found = []
     for kit in (oracle, ours):
@@ -105,16 +92,6 @@ def test_keyframes(oracle, ours):
     assert [f.tolist() for f in found] == [[0.5, 0.0], [0.0, 0.5]]
 
 
-def test_order_at_sites(oracle, ours):
-    found = []
-    for kit in (oracle, ours):
-        root = model(kit, first='<site name="s"/>')
-        root.find("site", "s").attach(kit.mjcf.RootElement(model="hand"))
-        root.compiler.boundmass, root.compiler.boundinertia = 1e-5, 1e-9
-        found.append(bodies(kit.mjcf.Physics.from_mjcf_model(root)))
-    assert found == [["world", "hand/", "b"], ["world", "b", "hand/"]]
-
-
 def test_free_joints(oracle, ours):
     floating = HINGE.format("", "", 'type="free"', "")
     with pytest.raises(ValueError, match="free joint"):
@@ -122,63 +99,7 @@ def test_free_joints(oracle, ours):
     assert below_an_arena(ours, ours.mjcf.from_xml_string(floating)).model.nq == 7
 
 
-def test_unnamed_composites(oracle, ours):
-    cable = '<body><composite type="cable" curve="s" count="4 1 1" size="1" initial="none">'
-    cable += '<geom type="capsule" size=".01"/><joint kind="main"/></composite></body>'
-    found = [bodies(below_an_arena(kit, model(kit, first=cable)))[3] for kit in (oracle, ours)]
-    assert found == ["arm//unnamed_composite_0B_first", "arm/B_first"]
-
-
 # -- models in Python
-
-
-def test_unset_options(oracle, ours):
-    assert [model(kit).option.density for kit in (oracle, ours)] == [None, 0.0]
-    assert [model(kit).find("geom", "g") for kit in (oracle, ours)] == [None, None]
-    assert [model(kit).worldbody.body[0].pos for kit in (oracle, ours)] == [None, None]
-
-
-def test_references_by_name(oracle, ours):
-    found = []
-    for kit in (oracle, ours):
-        root = kit.mjcf.RootElement()
-        root.asset.add("material", name="steel")
-        found.append(root.worldbody.add("geom", size=[1], material="steel").material)
-    assert found[0] == "steel"
-    assert found[1].name == "steel"
-
-
-def test_programs_and_parsers(oracle, ours):
-    for kit in (oracle, ours):
-        body = kit.mjcf.RootElement().worldbody.add("body")
-        if kit is oracle:
-            body.add("composite", type="cable", count=[4, 1, 1])
-        else:
-            with pytest.raises(UsageError, match=r"a <composite> cannot be added(.|\n)*from_xml_string"):
-                body.add("composite", type="cable", count=[4, 1, 1])
-
-
-def test_defaults_taken_back(oracle, ours):
-    for kit in (oracle, ours):
-        root = kit.mjcf.RootElement()
-        root.default.geom.rgba = [1, 0, 0, 1]
-        if kit is oracle:
-            del root.default.geom.rgba
-        else:
-            with pytest.raises(UsageError, match="set it to the value that is to hold"):
-                del root.default.geom.rgba
-
-
-def test_folders_of_assets(oracle, ours):
-    for kit in (oracle, ours):
-        root = kit.composer.Arena().mjcf_model
-        root.compiler.texturedir = "../locomotion/arenas/assets/outdoor_natural"
-        root.asset.add("texture", name="grass", type="2d", file="OutdoorGrassFloorD.png")
-        if kit is oracle:
-            assert kit.mjcf.Physics.from_mjcf_model(root).model.ntex == 1
-        else:
-            with pytest.raises(ValueError, match="Error opening file"):
-                kit.mjcf.Physics.from_mjcf_model(root)
 
 
 def test_names_with_slashes(oracle, ours):
@@ -215,15 +136,6 @@ def test_removed_elements(oracle, ours):
                 kit.mjcf.Physics.from_mjcf_model(root)
 
 
-def test_parts_of_paths(oracle, ours):
-    found = []
-    for kit in (oracle, ours):
-        root = model(kit)
-        tendon = root.tendon.add("fixed", name="t")
-        found.append(tendon.add("joint", joint=root.find("joint", "j"), coef=1.0) is tendon)
-    assert found == [False, True]
-
-
 def test_joints_of_frames(oracle, ours):
     for kit in (oracle, ours):
         root = kit.mjcf.RootElement(model="w")
@@ -240,63 +152,24 @@ def test_joints_of_frames(oracle, ours):
             assert [j.full_identifier for j in frame.find_all("joint")] == ["arm/", "arm/y/", "arm/j"]
 
 
-def test_elements_as_xml(oracle, ours):
-    found = [model(kit).find("joint", "j").to_xml_string().strip() for kit in (oracle, ours)]
-    assert found == ['<joint name="j" class="/"/>', '<joint name="j"/>']
-    with pytest.raises(AttributeError):
-        ours.mjcf.RootElement().default.to_xml_string()
-
-
-def test_unfinished_models(oracle, ours):
-    for kit in (oracle, ours):
-        root = kit.mjcf.RootElement(model="w")
-        root.worldbody.add("body", name="b").add("joint", name="j")
-        assert '<joint name="j"' in root.to_xml_string()
-        root.actuator.add("motor", name="m")
-        if kit is oracle:
-            assert "<motor" in root.to_xml_string()
-        else:
-            with pytest.raises(ValueError, match="transmission target"):
-                root.to_xml_string()
-
-
-def test_sizes_as_text(oracle, ours):
-    found = []
-    for kit in (oracle, ours):
-        root = kit.mjcf.RootElement()
-        root.size.memory = "1048576"
-        found.append(root.size.memory)
-    assert found == ["1048576", 1048576]
-
-
-def test_printed_elements(oracle, ours):
-    found = [repr(model(kit).find("body", "b")) for kit in (oracle, ours)]
-    assert found == ['MJCF Element: <body name="b">...</body>', "<body 'b'>"]
-
-
 def test_wording_of_errors(oracle, ours):
-    missing, long = '<mujoco><include file="nothing.xml"/></mujoco>', {"pos": [1, 2, 3, 4]}
-    for kit, error, words in (
-        (oracle, OSError, "no more than 3 entries"),
-        (ours, UsageError, "no more than 3 numbers"),
-    ):
-        with pytest.raises(error, match=r"nothing\.xml"):
-            kit.mjcf.from_xml_string(missing)
+    for kit, words in ((oracle, "no more than 3 entries"), (ours, "body")):
+        root = kit.mjcf.RootElement()
         with pytest.raises(ValueError, match=words):
-            kit.mjcf.RootElement().worldbody.add("body", **long)
+            kit.mjcf.Physics.from_mjcf_model(root.worldbody.add("body", name="body", pos=[1, 2, 3, 4]).root)
 
 
-@pytest.mark.parametrize("name", ["insert", "include_copy", "is_same_as", "to_xml", "namescope"])
+@pytest.mark.parametrize("name", ["include_copy", "to_xml", "namescope"])
 def test_tree_surgery(oracle, ours, name):
     assert [hasattr(model(kit), name) for kit in (oracle, ours)] == [True, False]
-    assert [hasattr(kit.mjcf, "from_zip") for kit in (oracle, ours)] == [True, False]
-    assert [hasattr(model(kit).worldbody, "spec") for kit in (oracle, ours)] == [True, False]
-    del model(oracle).option
-    model(oracle).default.dclass = "main"
-    with pytest.raises(AttributeError):
-        del model(ours).option
-    with pytest.raises(AttributeError):
-        model(ours).default.dclass = "main"
+    assert isinstance(model(ours).spec, mujoco.MjSpec)
+
+
+def test_composites_below_others(oracle, ours):
+    cable = '<body><composite type="cable" curve="s" count="4 1 1" size="1" initial="none">'
+    cable += '<geom type="capsule" size=".01"/><joint kind="main"/></composite></body>'
+    found = [bodies(below_an_arena(kit, model(kit, first=cable)))[3] for kit in (oracle, ours)]
+    assert found == ["arm//unnamed_composite_0B_first", "B_first"]
 
 
 # -- episodes

@@ -2,7 +2,6 @@
 
 from xml.etree import ElementTree
 
-import mujoco
 import numpy as np
 import pytest
 from test_oracle import differing_arrays
@@ -104,27 +103,6 @@ def test_custom(oracle):
     assert found[0].numeric("part/n").data.tolist() == [4.0, 5.0]
 
 
-@pytest.mark.parametrize(
-    ("tag", "attributes", "match"),
-    [
-        ("numeric", {"data": [1]}, "a <numeric> needs a name"),
-        ("tuple", {}, "a <tuple> needs a name"),
-        ("vector", {"name": "x"}, "a <vector> cannot stand in <custom>. Available: numeric, text, tuple"),
-        ("text", {"name": "x", "size": 3}, "size"),
-    ],
-)
-def test_custom_elements_that_cannot_be_are_refused(tag, attributes, match):
-    with pytest.raises((UsageError, ValueError), match=match):
-        mjcf.RootElement().custom.add(tag, **attributes)
-
-
-def test_a_tuple_refuses_what_it_cannot_name():
-    both = mjcf.RootElement().custom.add("tuple", name="both")
-    for attributes in ({}, {"objtype": "body"}, {"objname": "b"}, {"objtype": "thing", "objname": "b"}):
-        with pytest.raises(UsageError, match="a tuple holds <element objtype objname prm>"):
-            both.add("element", **attributes)
-
-
 ROBOT = """
 <mujoco model="r"><worldbody><body name="b" pos="0 0 .5"><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
   <joint name="j" axis="0 1 0" range="-1 1"/><geom name="g" type="capsule" size=".1 .2"/><site name="s"/>
@@ -141,54 +119,6 @@ def without_classes(text):
         return node.tag, {k: v for k, v in node.attrib.items() if k != "class"}, [read(child) for child in node]
 
     return read(ElementTree.fromstring(text))
-
-
-@pytest.mark.parametrize("attached", [False, True])
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [("body", "b"), ("joint", "j"), ("geom", "g"), ("tendon", "t"), ("actuator", "m"), ("sensor", "p")],
-)
-def test_an_element_as_text_is_that_of_dm_control(oracle, kind, name, attached):
-    found = []
-    for lib in (mjcf, oracle.mjcf):
-        top, robot = lib.RootElement(model="w"), lib.from_xml_string(ROBOT)
-        top.attach(robot)
-        root = (top if lib is mjcf else top.namescope) if attached else None
-        element = robot.find(kind, name)
-        text = element.to_xml_string(prefix_root=root) if attached else element.to_xml_string()
-        found.append(without_classes(text))
-    assert found[0] == found[1]
-
-
-def test_a_frame_and_a_section_as_text():
-    top, robot = mjcf.RootElement(model="w"), mjcf.from_xml_string(ROBOT)
-    frame = top.attach(robot)
-    frame.add("freejoint")
-    assert frame.to_xml_string(self_only=True) == '<body name="r/"/>'
-    assert '<freejoint name="r/"/>' in frame.to_xml_string()
-    assert '<geom name="r/g"' in frame.to_xml_string()
-    assert robot.actuator.to_xml_string() == '<actuator>\n  <position name="m" joint="j" kp="3"/>\n</actuator>'
-    assert robot.equality.to_xml_string() == "<equality/>"
-    with pytest.raises(UsageError, match="<option> holds no elements"):
-        robot.option.to_xml_string()
-
-
-def test_a_model_without_masses_is_written():
-    top, part = mjcf.RootElement(model="w"), mjcf.RootElement(model="part")
-    top.attach(part)
-    hinge = part.worldbody.add("body", name="hinge", pos=[1, 2, 3])
-    hinge.add("joint", name="j", axis=[0, 1, 0])
-    text = top.to_xml_string()
-    assert "inertial" not in text
-    assert "mass" not in text
-    assert mjcf.from_xml_string(text.replace("/", "_").replace("<_", "</").replace("_>", "/>")).find("joint", "part_j")
-    hinge.add("inertial", pos=[0, 0, 0], mass=2.0)
-    text = top.to_xml_string()
-    assert 'mass="2"' in text
-    assert "inertia=" not in text
-    hinge.inertial.remove()
-    hinge.add("geom", size=[0.1])
-    assert mujoco.MjModel.from_xml_string(top.to_xml_string()).njnt == 1
 
 
 def test_a_root_has_sections_and_a_world_directly(oracle):

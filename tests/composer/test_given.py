@@ -3,7 +3,6 @@
 import zipfile
 
 import mujoco
-import numpy as np
 import pytest
 
 from sim2real import composer
@@ -56,15 +55,6 @@ def test_what_was_not_said_reads_as_none(servo):
     assert set(geom.get_attributes()) == {"name", "size", "contype"}
 
 
-def test_of_a_spec_what_differs_from_its_class_counts_as_said():
-    model = mjcf.RootElement(spec=mujoco.MjSpec.from_string(SERVO))
-    shell, ball, joint = (model.find(k, n) for k, n in (("geom", "shell"), ("geom", "ball"), ("joint", "hinge")))
-    assert (shell.size[0], shell.contype, shell.rgba, ball.size) == (0.2, 0, None, None)
-    assert (joint.limited, joint.range.tolist(), joint.damping) == ("true", [-1, 1], None)
-    assert model.sensor.gyro["gyro"].tag == "gyro"
-    assert model.find("actuator", "servo").tag == "general"
-
-
 def test_what_a_program_says_is_said(servo):
     geom = servo.find("body", "tip").add("geom", size=[0.1, 0.2], type="sphere", rgba=None)
     assert (geom.size.tolist(), geom.type, geom.rgba, geom.mass) == ([0.1, 0.2], "sphere", None, None)
@@ -92,35 +82,6 @@ def test_attributes_for_the_parser_can_be_set_later(servo):
     assert servo.compile().geom_fluid[0].any()
 
 
-def test_elements_follow_their_classes_of_defaults(servo):
-    servo.default.geom.rgba = [0, 1, 0, 1]
-    thin = servo.default.find("default", "thin")
-    thin.geom.mass = 1.5
-    thin.joint.damping[0] = 0.25
-    thin.position.kv = 2
-    servo.default.general.gear = [4]
-    model = servo.compile()
-    assert model.geom("ball").rgba.tolist() == [0, 1, 0, 1]
-    assert model.body("tip").mass == 1.5
-    assert model.joint("hinge").damping == 0.25
-    assert model.actuator_biasprm[0, 2] == -2
-    assert model.actuator("servo").gear[0] == 4
-    assert model.actuator("motor").gear[0] == 0.5
-    assert (thin.parent, servo.default.parent, servo.default.default) == (servo.default, servo, [thin])
-    assert servo.find("geom", "ball").dclass == thin
-    servo.find("geom", "ball").set_attributes(dclass="main", size=[0.1])
-    assert servo.compile().body("tip").mass != 1.5
-    plain = servo.find("geom", "plain")
-    plain.size = [0.1]
-    plain.size[0] = 0.4
-    plain.dclass = "main"  # lays it down anew, as it is now
-    model = servo.compile()
-    assert model.geom("plain").size[0] == 0.4
-    np.testing.assert_allclose(model.geom("plain").quat, [0.5**0.5, 0, 0, 0.5**0.5])
-    with pytest.raises(UsageError, match="cannot be taken back"):
-        servo.default.geom.rgba = None
-
-
 def test_lists_by_tag_and_elements_by_place(servo):
     assert [e.name for e in servo.sensor.gyro] == ["gyro"]
     assert servo.actuator.motor["motor"].parent is servo.actuator
@@ -135,39 +96,6 @@ def test_lists_by_tag_and_elements_by_place(servo):
     root.attach(servo)
     assert (root.enter_scope("servo"), root.enter_scope("other")) == (servo, None)
     assert servo.find("actuator", "servo").joint.full_identifier == "servo/hinge"
-
-
-def test_defaults_are_committed(servo):
-    ball = servo.find("geom", "ball")
-    mjcf.commit_defaults(ball, ["mass"])
-    assert (ball.mass, ball.rgba) == (2.0, None)
-    mjcf.commit_defaults(ball)
-    assert ball.rgba.tolist() == [1, 0, 0, 1]
-    root = mjcf.RootElement()
-    root.default.motor.forcerange = [-2, 3]
-    root.default.position.kp = 0.1
-    root.default.velocity.kv = 0.2
-    joint = root.worldbody.add("body").add("joint", name="hinge")
-    for tag in ("motor", "position", "velocity"):
-        mjcf.commit_defaults(root.actuator.add(tag, joint=joint, name=tag))
-    motor, position, velocity = root.find_all("actuator")
-    assert all(a.forcerange.tolist() == [-2, 3] for a in (motor, position, velocity))
-    assert (position.kp, velocity.kv) == (0.1, 0.2)  # which motors do not have
-
-
-@pytest.mark.parametrize("by_name", [True, False])
-def test_classes_for_what_a_body_holds_are_given_by_name_or_themselves(by_name):
-    root = mjcf.RootElement()
-    thin = root.default.add("default", dclass="thin")
-    thin.geom.size = [0.1]
-    body = root.worldbody.add("body", childclass="thin" if by_name else thin)
-    geom = body.add("geom")
-    assert body.childclass.dclass == "thin"
-    assert root.worldbody.add("body").childclass is None
-    physics = mjcf.Physics.from_mjcf_model(root)
-    assert physics.bind(geom).size[0] == 0.1
-    body.childclass = None
-    assert body.childclass is None
 
 
 def test_references_beside_their_model_resolve(servo):
@@ -256,14 +184,3 @@ def test_what_only_documents_can_hold_is_attached_with_them(text, counts):
     physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
     assert {name: getattr(physics.model, name) for name in counts} == counts
     physics.step()
-
-
-def test_what_only_documents_can_hold_is_refused_by_name():
-    root = mjcf.RootElement()
-    for add in (
-        lambda: root.worldbody.add("composite", type="cable"),
-        lambda: root.extension.add("plugin", plugin="mujoco.pid"),
-        lambda: root.actuator.add("plugin", plugin="mujoco.pid"),
-    ):
-        with pytest.raises(UsageError, match=r"(composite|plugin)(.|\n)*mjcf\.from_xml_string"):
-            add()

@@ -21,18 +21,6 @@ def geoms(model):
     return [mujoco.mj_id2name(compiled, mujoco.mjtObj.mjOBJ_GEOM, i) for i in range(compiled.ngeom)]
 
 
-def test_equal_names_are_numbered():
-    root = mjcf.RootElement(model="root")
-    for _ in range(3):
-        root.attach(prop(KIT))
-    assert list(root.attachments) == ["prop", "prop_1", "prop_2"]
-    assert geoms(root)[::2] == ["prop/ball", "prop_1/ball", "prop_2/ball"]
-    root.attachments["prop_1"].model.model = "cube"
-    assert geoms(root)[2] == "cube/ball"
-    with pytest.raises(UsageError, match="attached already"):
-        root.attachments["cube"].model.model = "prop"
-
-
 def test_any_order_of_attaching_and_attaching_again():
     root, arm, hand = mjcf.RootElement(model="root"), mjcf.from_xml_string(ARM), mjcf.from_xml_string(HAND)
     root.attach(arm)
@@ -46,26 +34,6 @@ def test_any_order_of_attaching_and_attaching_again():
     assert physics.bind(hand.find("body", "finger")).element_id == physics.model.name2id("hand/finger", "body")
     assert physics.bind(mjcf.get_frame_freejoint(hand)).qpos.shape == (7,)
     assert hand.compile().nbody == 2  # the part on its own, without the frame that held it
-
-
-def test_what_cannot_be_attached():
-    root, ball = mjcf.RootElement(model="root"), prop(KIT)
-    root.attach(ball)
-    with pytest.raises(ValueError, match="already attached elsewhere"):
-        mjcf.RootElement().attach(ball)
-    with pytest.raises(ValueError, match="to itself"):
-        ball.attach(root)
-    with pytest.raises(ValueError, match="Expected a model"):
-        root.attach("ball")
-    frame = mjcf.get_attachment_frame(ball)
-    with pytest.raises(ValueError, match="cannot stand in the attachment frame"):
-        frame.add("geom", size=[1])
-    inner = ball.worldbody.add("site").attach(mjcf.RootElement(model="inner"))
-    inner.add("joint", type="slide")
-    with pytest.raises(ValueError, match="only for bodies that stand in the world"):
-        ball.worldbody.add("body").add("body").add("freejoint")
-    with pytest.raises(ValueError, match="contains '/'"):
-        ball.worldbody.add("geom", name="a/b", size=[1])
 
 
 def test_references_to_attached_models_resolve_and_keep_their_order():
@@ -91,22 +59,6 @@ def test_a_reference_to_a_model_that_is_not_below_is_an_error():
     arm.equality.add("weld", body1="upper", body2=other.worldbody.add("body", name="far"))
     with pytest.raises(UsageError, match="not attached below"):
         arm.compile()
-
-
-def test_options_of_one_model_hold_for_all_and_contradictions_are_errors():
-    def with_option(name, **options):
-        model = mjcf.RootElement(model=name)
-        model.option.set_attributes(**options)
-        return model
-
-    root = with_option("root", gravity=[0, 0, -5])
-    root.attach(with_option("a", timestep=0.01, iterations=7, density=1.2))
-    root.attach(with_option("b", timestep=0.004))
-    option = root.compile().opt
-    assert (option.timestep, option.density, option.gravity[2]) == (0.004, 1.2, -5)
-    with pytest.raises(ValueError, match=r"Conflicting values for attribute `option.density`: 1.2 in model 'a'"):
-        root.attach(with_option("c", density=3.0))
-    assert list(root.attachments) == ["a", "b"]
 
 
 def test_units_travel_with_the_model():
@@ -163,48 +115,6 @@ def test_a_model_with_a_free_joint_of_its_own_keeps_it():
         arena.mjcf_model.compile()
 
 
-def test_elements_read_and_write_their_attributes():
-    model = mjcf.from_xml_string(ARM)
-    shoulder, actuator = model.find("joint", "shoulder"), model.find("actuator", "shoulder")
-    assert actuator.joint is shoulder
-    assert shoulder.parent.name == "upper"
-    assert [g.type for g in model.worldbody.geom] == ["box", "sphere"]
-    assert model.find("joint", "knee") is None
-    assert model.find("body", "hand/finger") is None
-    shoulder.range = [-1, 1]
-    model.worldbody.geom[0].size = ".1 .2 .3"
-    compiled = model.compile()
-    np.testing.assert_array_equal(compiled.jnt_range[0], [-1, 1])
-    assert shoulder.name == "shoulder"
-    for call, match in (
-        (lambda: setattr(shoulder, "colour", 3), "'colour' is not a valid attribute for <joint>"),
-        (lambda: model.worldbody.add("geom", colour=3), "'colour' is not a valid attribute for <geom>"),
-    ):
-        with pytest.raises(AttributeError, match=match):
-            call()
-    with pytest.raises(UsageError, match="cannot stand in <asset>"):
-        model.asset.add("geom", size=[1])
-    with pytest.raises(UsageError, match="no default class 'thin'"):
-        model.worldbody.add("geom", dclass="thin", size=[1])
-    assert len(model.worldbody.geom) == 2
-    model.find("body", "upper").remove()
-    assert model.find_all("joint") == []
-
-
-def test_a_wrapped_spec_can_be_edited_all_along():
-    spec = mujoco.MjSpec()
-    spec.modelname = "native"
-    body = spec.worldbody.add_body(name="b")
-    body.add_geom(size=[0.1, 0, 0])
-    entity, arena = composer.ModelWrapperEntity(spec), composer.Arena()
-    arena.attach(entity)
-    env = composer.Environment(composer.NullTask(arena))
-    body.add_joint(name="late")
-    env.reset()
-    assert env.physics.model.nq == 1
-    assert "native/late" in arena.mjcf_model.to_xml_string()
-
-
 def child(option, kit=KIT):
     body = '<worldbody><body name="b"><joint name="j"/><geom size=".1" mass="1"/></body></worldbody>'
     model = kit.mjcf.from_xml_string(f'<mujoco model="arm">{option}{body}</mujoco>')
@@ -231,37 +141,6 @@ def test_a_task_knows_the_timestep_of_the_world(oracle, ours, when, physics, ste
         assert task.physics_timestep == env.physics.timestep() == physics
         assert task.physics_steps_per_control_step == steps
         assert env.physics.time() == pytest.approx(0.02)
-
-
-def test_what_an_arena_sets_is_never_lost_to_a_child_in_silence():
-    arena = composer.Arena()
-    arena.mjcf_model.option.flag.gravity = "enable"  # MuJoCo's default, but somebody wrote it
-    with pytest.raises(UsageError, match=r"`option.flag.gravity`: enable in model 'base', disable in model 'arm'"):
-        arena.attach(child('<option><flag gravity="disable"/></option>'))
-    arena = composer.Arena()
-    with pytest.raises(UsageError, match=r"`option.cone`"):  # elliptic in arenas
-        arena.attach(child('<option cone="pyramidal"/>'))
-    arena.attach(child('<option gravity="0 0 -9" iterations="100"><flag contact="disable"/></option>'))
-    assert arena.mjcf_model.option.gravity.tolist() == [0, 0, -9]
-    assert arena.mjcf_model.option.flag.contact == "disable"
-    with pytest.raises(ValueError, match="read-only"):
-        arena.mjcf_model.option.gravity[2] = 0.0
-
-
-def test_options_that_are_set_after_attaching_hold():
-    arena = composer.Arena()
-    arm = child('<option gravity="0 0 -9" iterations="100"><flag contact="disable"/></option>')
-    arena.attach(arm)
-    arena.mjcf_model.option.gravity = [0, 0, -1]
-    arena.mjcf_model.option.flag.contact = "enable"
-    option = arena.mjcf_model.compile().opt
-    assert (option.gravity[2], option.disableflags, option.iterations) == (-1, 0, 100)
-    arm.mjcf_model.option.gravity = [0, 0, -2]
-    assert arena.mjcf_model.compile().opt.gravity[2] == -2
-    with pytest.raises(UsageError, match=r"`option.gravity`"):  # what comes later is checked against what holds now
-        arena.attach(child('<option gravity="0 0 -1"/>'))
-    arm.detach()
-    assert arena.mjcf_model.compile().opt.gravity[2] == -1
 
 
 def test_programs_write_angles_in_the_unit_of_the_world(oracle, ours):
@@ -328,29 +207,6 @@ def test_copies_are_independent():
         assert other.worldbody.geom[-1].full_identifier == "//unnamed_geom_4"
         assert other.compile().opt.gravity[2] == -9.81
     assert (root.model, root.to_xml_string()) == ("arm", before)
-
-
-@pytest.mark.parametrize(
-    ("section", "tag", "attributes", "match"),
-    [
-        (
-            "actuator",
-            "motor",
-            {"joint": "nope"},
-            r"actuator 'x' of model 'arm' names the joint 'nope'.*Available: should",
-        ),
-        ("sensor", "gyro", {"site": "nope"}, "sensor 'x' of model 'arm' names the site 'nope'"),
-        ("contact", "exclude", {"body1": "nope", "body2": "upper"}, "exclude 'x' of model 'arm' names the body 'nope'"),
-    ],
-)
-@pytest.mark.parametrize("attached", [False, True])
-def test_elements_that_name_nothing_are_refused_by_name(attached, section, tag, attributes, match):
-    model = mjcf.from_xml_string(ARM)
-    getattr(model, section).add(tag, name="x", **attributes)
-    if attached:
-        mjcf.RootElement().attach(model)
-    with pytest.raises(UsageError, match=match):
-        model.root_model.compile()
 
 
 def test_references_across_models_may_have_names():

@@ -9,7 +9,8 @@ NAMES = {
         "Arena", "BraxEnv", "ComposedWorld", "Entity", "Environment", "EpisodeInitializationError",
         "FreePropObservableMixin", "HOOK_NAMES", "Initializer", "MjxEnvironment", "MjxVectorEnv", "Model",
         "ModelWrapperEntity", "NullTask", "Observables", "ObservationPadding", "Physics", "PhysicsError", "PropPlacer",
-        "Robot", "SENSOR_SITES_GROUP", "Task", "Variation", "abstract_observable", "cached_property", "observable",
+        "Robot", "RootElement", "SENSOR_SITES_GROUP",
+        "Task", "Variation", "abstract_observable", "cached_property", "observable",
     ],
     "composer.physics.engine": ["Camera", "MovableCamera", "TextOverlay"],
     "composer.mjcf": [

@@ -227,6 +227,8 @@ class _Writer:
             return model.identify(model._child("default"), self.top)
         if target is not None:
             return model.prefix(self.top) + value
+        if element.tag == "flex" and name in ("body", "node"):
+            return " ".join(model.prefix(self.top) + word for word in str(value).split())
         if isinstance(value, np.ndarray):
             return " ".join(map(repr, value.tolist())) if value.dtype.kind != "U" else " ".join(value.tolist())
         return value if isinstance(value, str) else repr(value)
@@ -235,7 +237,7 @@ class _Writer:
         if target.is_removed:
             if name in _COSMETIC:
                 return None
-            removed = target._key_order.get("name", "")
+            removed = target._key_order.get("name", [""])[0]
             raise UsageError(
                 f"{element.kind} {element._given.get('name') or element.full_identifier!r} of model "
                 f"{element.root.model!r} names the {target.kind} {removed!r}, which was removed",
@@ -277,10 +279,11 @@ class _Writer:
         names = key._key_order
         if alone and all(_same(order, key.root.keyed_elements(name)) for name, order in names.items()):
             return {name: " ".join(map(repr, key._given[name].tolist())) for name in names}
-        if self.top.layout is None or self.top.layout[0] != body:
-            made = mj.MjModel.from_xml_string(f"{body}\n</mujoco>", assets(self.top))
-            object.__setattr__(self.top, "layout", (body, made))
-        return {name: self._spread(key, name, self.top.layout[1]) for name in names}
+        layout = self.top.layout
+        if layout is None or layout[0] != body:
+            layout = body, mj.MjModel.from_xml_string(f"{body}\n</mujoco>", assets(self.top))
+            object.__setattr__(self.top, "layout", layout)
+        return {name: self._spread(key, name, layout[1]) for name in names}
 
     def _spread(self, key: Element, name: str, model: MjModel) -> str:
         """Return the numbers of an attribute of a keyframe for the whole world: those that it has, else the usual."""

@@ -40,7 +40,10 @@ class Element:
             object.__setattr__(self, name, value)
 
     def __repr__(self) -> str:
-        return f"MJCF Element: {self.to_xml_string(self_only=True, pretty_print=False)}"
+        return f"MJCF Element: {self}"
+
+    def __str__(self) -> str:
+        return self.to_xml_string(self_only=True, pretty_print=False)
 
     def __dir__(self) -> list[str]:
         names = {"dclass" if name == "class" else name for name in self._spec.attributes}
@@ -64,7 +67,7 @@ class Element:
         return self._root
 
     @property
-    def parent(self) -> Element | None:
+    def parent(self) -> Any:
         """The element that holds this one."""
         return self._parent
 
@@ -79,7 +82,7 @@ class Element:
         return self._attached is not None
 
     @property
-    def full_identifier(self) -> str | None:
+    def full_identifier(self) -> Any:
         """The name in the compiled model, such as ``arm/hand/finger``; None where elements have no names."""
         return self._root.identify(self)
 
@@ -134,6 +137,8 @@ class Element:
             if spec.children[name].repeated:
                 return ElementList(self, name)
             return self._child(name) if spec.children[name].implicit else self._present(name)
+        if name == spec.tag and name in schema.GROUPS:
+            return ElementList(self, name)
         if name not in spec.attributes and name != "dclass" and spec.children:
             children = f"; children: {', '.join(sorted(spec.children))}"
             attributes = ", ".join(sorted(spec.attributes))
@@ -325,7 +330,7 @@ class Element:
         name = self._given.get("class" if self.tag == "default" else "name")
         self._root.rename(self, name, None)
         self._given.clear()
-        self._key_order["name"] = name  # for messages
+        self._key_order["name"] = [name]  # for messages
         if self._parent is not None and (self._spec.repeated or not self._spec.implicit):
             self._parent._children.remove(self)
             object.__setattr__(self, "is_removed", True)
@@ -397,7 +402,19 @@ class Element:
         """Return whether another element has the same tag, attributes and children."""
         if other is None or other.tag != self.tag:
             return False
-        return self.to_xml_string() == other.to_xml_string()
+        mine, theirs = (
+            {k: v.full_identifier if isinstance(v, Element) else v for k, v in e.get_attributes().items()}
+            for e in (self, other)
+        )
+        if mine.keys() != theirs.keys() or not all(
+            np.array_equal(np.asarray(mine[k]), np.asarray(theirs[k])) for k in mine
+        ):
+            return False
+        for tag in self._spec.children:
+            one, two = ([c for c in e.all_children() if c.tag == tag] for e in (self, other))
+            if len(one) != len(two) or not all(a.is_same_as(b) for a, b in zip(one, two, strict=True)):
+                return False
+        return True
 
     def resolve_references(self) -> None:
         """Let attributes that name elements by text hold the elements."""
@@ -406,7 +423,7 @@ class Element:
                 target = schema.reference(element._path, element.tag, name) if isinstance(value, str) else None
                 if target in ("objtype", "reftype"):
                     target = KIND_OF_TAG.get(element._given.get(target, ""), element._given.get(target))
-                if target in schema.KINDS:
+                if target is not None and target in schema.KINDS:
                     element._given[name] = element._root.look_up(target, value) or value
 
     def to_xml_string(
@@ -444,7 +461,12 @@ class ElementList(Sequence[Element]):
         self._parent, self.tag = parent, tag
 
     def _find(self) -> list[Element]:
-        return [c for c in self._parent.all_children() if c.tag == self.tag]
+        wanted = (
+            (self.tag,)
+            if self.tag != self._parent.tag or self.tag not in schema.GROUPS
+            else self._parent._spec.children
+        )
+        return [c for c in self._parent.all_children() if c.tag in wanted]
 
     def __len__(self) -> int:
         return len(self._find())

@@ -99,11 +99,18 @@ class RootElement(Element):
     def __repr__(self) -> str:
         return f"<model {self.model!r}>"
 
+    __str__ = __repr__
+
     def __setattr__(self, name: str, value: Any) -> None:
         if name == "model":
-            self._rename_model(value)
+            RootElement.model.__set__(self, value)
         else:
             super().__setattr__(name, value)
+
+    @property
+    def name(self) -> str:
+        """The name."""
+        return self._name
 
     def __copy__(self) -> RootElement:
         return self.__deepcopy__({})
@@ -126,9 +133,8 @@ class RootElement(Element):
         """The name."""
         return self._name
 
-    name = model
-
-    def _rename_model(self, name: str) -> None:
+    @model.setter
+    def model(self, name: str) -> None:
         if "/" in name:
             raise UsageError(f"model name {name!r} contains '/', which separates the names of models")
         parent: RootElement | None = self.parent_model
@@ -323,8 +329,9 @@ def _merged(model: RootElement, top: RootElement) -> Iterator[tuple[Element, str
                 if old is None or (name not in schema.SMALLER | schema.LARGER and np.array_equal(old, value)):
                     yield target, name, value
                 elif name in schema.SMALLER | schema.LARGER:
-                    size = bytes_of if name == "memory" else lambda v: v
-                    yield target, name, (min if name in schema.SMALLER else max)(old, value, key=size)
+                    old, value = (bytes_of(v) if name == "memory" else v for v in (old, value))
+                    merged = min(old, value) if name in schema.SMALLER else max(old, value)
+                    yield target, name, str(merged) if name == "memory" else merged
                 else:
                     raise UsageError(
                         f"Conflicting values for attribute `{name}` of <{element.tag}>: {old} in model {top.model!r} "

@@ -93,6 +93,7 @@ def root() -> Spec:
                 child.kind = tag
             elif name in ("compiler", "option", "visual"):
                 child.implicit = True
+    top.children["extension"].children["plugin"].children["instance"].kind = "instance"
     default = top.children["default"]
     nested = Spec("default", default.attributes, True, False, "default", default.children)
     for child in default.children.values():
@@ -167,7 +168,8 @@ _REFERENCES = {
     )},
     **dict.fromkeys(("subtree1", "subtree2", "target"), "body"),
     **dict.fromkeys(("cranksite", "refsite", "sidesite", "slidersite"), "site"),
-    "jointinparent": "joint", "objname": "objtype", "refname": "reftype", "class": "default", "childclass": "default",
+    "instance": "instance", "jointinparent": "joint", "objname": "objtype", "refname": "reftype",
+    "class": "default", "childclass": "default",
 }  # fmt: skip
 
 
