@@ -179,9 +179,15 @@ def open_questions(proposal: Proposal, path: Path, text: str, out: Path | None) 
     if file.is_file() and file.read_text(encoding="utf-8", errors="replace") != text:
         hint = f"{file} exists with other content: answer there, or remove it"
     else:
-        file.write_text(text, encoding="utf-8")
-        words = [w for w in sys.argv[1:] if w != "--"]
-        command = shlex.join(["sim2real", *words]) if words[:1] == ["import"] else f"sim2real import {path}"
+        try:
+            file.write_text(text, encoding="utf-8")
+        except OSError as error:
+            return UsageError(
+                f"the names in {path} leave open: {lines}", hint=f"{file} cannot be written: {error.strerror}"
+            )
+        words = sys.argv[1:]
+        taking = words[:1] and words[0] in ("import", "identify", "check", "new")
+        command = shlex.join(["sim2real", *words]) if taking else f"sim2real import {path}"
         hint = f"answer in {file}, then {command} --mapping {file}"
     return UsageError(f"the names in {path} leave open: {lines}", hint=hint)
 
