@@ -25,7 +25,6 @@ TABLES = {
     "so101_time": ("runs.arm.sentence", "so101_cpu"),
     "real": ("recorded.identify.table", "identify_disk", "identify_xl330", "identify_so101"),
     "league": ("recorded.league.table", "league"),
-    "league_bounds": ("recorded.league.bounds", "league"),
     "worst_joint": ("recorded.league.worst_joint", "league"),
     "carried": ("carried.table", "carried"),
     "latency": ("latency.table", "latency_league"),

@@ -79,7 +79,7 @@ TRUE = {
         "heights[0] < -0.5 and heights.max() > 0.9",  # pushing in the direction of motion swings it up
         "abs(float(estimate.parameters['mass']) / 0.0509 - 1.0) < 0.1 and estimate.loss < 0.1 * estimate.start",
     ],
-    "docs/guides/compose.md": ["arm.joints[0].full_identifier == 'arm/shoulder'"],
+    "docs/guides/compose.md": ["task.arm.joints[0].full_identifier == 'arm/shoulder'"],
     "docs/guides/import.md": ["len(episode.outputs['sensor']['th']) == len(episode.steps['sensor'].start) == 20_000"],
     "docs/guides/interop.md": ["robot.length == 249"],
     "docs/guides/robot_computer.md": [

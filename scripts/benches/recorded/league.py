@@ -363,19 +363,6 @@ def table(report: Report) -> str:
     return markdown(head, lines) + f"\n{about_budget(report)}{about_broken(report)}{lost}"
 
 
-def bounds(report: Report) -> str:
-    """Return each error of sim2real beside its bound, the largest ratio first."""
-    rows = [(LABELS.get(n, n), unit_of(report, n), p) for n in sets_of(report) for p in parts(report, n) if p.bound]
-    rows.sort(key=lambda line: -line[2].error / line[2].bound)
-    lines = [
-        (label, p.name, f"{short(p.bound)} {unit}", f"{short(p.error)} {unit}", f"{p.error / p.bound:.2f}")
-        for label, unit, p in rows
-    ]
-    below = sum(p.error <= p.bound for _, _, p in rows)
-    head = ("held out", "part", "95 % bound", "error", "ratio")
-    return markdown(head, lines, "llrrr") + f"\n{below} of {len(rows)} errors are below their bounds.\n"
-
-
 def worst_joint(report: Report) -> str:
     """Return the range over all entrants of the worst joint of the SO-101."""
     rows = values(report, "league/so101/").items()
