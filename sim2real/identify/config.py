@@ -13,7 +13,7 @@ class FitConfig:
     """From segments of recordings to an estimate: search, then refine."""
 
     max_delay_s: float = 0.06
-    """Upper bound of each identified delay [s]."""
+    """Upper bound of the delay on either side of the world [s]; the round trip is at most twice as long."""
     initial_state: Literal["free", "measured", "rest"] = "free"
     """State at a segment's start: 'free' fits it, 'measured' reads it off the samples, 'rest' has no velocity."""
     skip_s: float = 0.0

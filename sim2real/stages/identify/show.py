@@ -13,6 +13,12 @@ _USE = {
     "not finished": "not finished: these parameters are no estimates yet",
 }
 """Status -> whether the parameters may be used."""
+_NEXT = {
+    "accepted": "sim2real train, or sim2real export",
+    "record again": "sim2real check --plan shows which motion determines them",
+    "change the model": "look at the first reason; no flag changes it",
+}
+"""Status -> what to do where no command follows from the reasons."""
 _MOST_ROWS = 12
 """Rows of a table of errors on the console; 120 logs have 480."""
 
@@ -35,7 +41,7 @@ def show(identification: Identification) -> None:
     verdict = identification.verdict
     note(f"verdict: {_USE.get(verdict.status, verdict.status)}")
     note(f"expected error: {_expected(identification)}")
-    note(f"next: {verdict.next or 'nothing that a flag changes: see the reasons'}")
+    note(f"next: {verdict.next or _NEXT.get(verdict.status, '')}")
     for reason in verdict.reasons:
         note(f"  {reason}")
     if identification.worst is not None:
