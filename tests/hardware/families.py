@@ -24,7 +24,6 @@ from sim2real.hardware.safety.rig import Rig
 
 PLANTS = Path(__file__).parent / "plants.py"
 IDS = (1, 2, 3)
-MODES = {0: "off", 1: "speed", 3: "position", 16: "voltage"}
 
 
 @dataclass(frozen=True, eq=False)

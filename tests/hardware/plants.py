@@ -139,15 +139,6 @@ class Still:
     servo_ids: tuple[int, ...] = (1,)
 
 
-class Breaks(Ramp):
-    """A plant with a bug that shows after 0.5 s."""
-
-    def advance(self, t_s):
-        super().advance(t_s)
-        if t_s > 0.5:
-            raise RuntimeError("the plant broke")
-
-
 def mean_latencies(truth) -> dict[str, float]:
     """Return the session's mean latencies [s]; NaN without samples, or without effects.
 

@@ -48,7 +48,7 @@ class Channel(Protocol):
 
 
 class Process:
-    """A guardian's process, which shares a socket with this one.
+    """A guardian's process, which shares a socket with this one; a `Channel`.
 
     Args:
         program: Arguments of Python that start the process: flags, then a file or a module. It gets the file descriptor
@@ -86,11 +86,9 @@ class Process:
         self._link.setblocking(False)
 
     def send(self, message: bytes) -> None:
-        """Send a message, without waiting; OSError if the guardian has died, or does not read."""
         self._link.send(message)
 
     def receive(self, until_ns: int) -> bytes | None:
-        """Return messages; None if there are none until a time [ns]; b"" if the guardian has died."""
         left_s = max(0.0, 1e-9 * (until_ns - self.clock.now_ns()))
         try:
             if left_s and not select.select([self._link], [], [], left_s)[0]:
@@ -102,7 +100,6 @@ class Process:
             return b""
 
     def close(self, wait_s: float) -> None:
-        """Close the connection; then wait for the guardian's end, and kill it after a time [s]; 0: do not wait."""
         self._link.close()
         if not wait_s:
             return
