@@ -7,20 +7,25 @@ from collections.abc import Sequence
 
 from sim2real.commands import exit_code
 from sim2real.commands.command_kinds import DEMO_PIPELINE, EXIT_CODES
-from sim2real.commands.table import COMMANDS
+from sim2real.commands.table import COMMANDS, OTHERS
 from sim2real.errors import ERROR, OK, Sim2RealError, UsageError, did_you_mean
 from sim2real.installation import require_one
 from sim2real.later import not_installed
 from sim2real.runtime import compilation_cache
 from sim2real.stages.terminal.interruption import SignalHandling
 
-_LIST = "\n".join(f"  {name:9} {command.help}" for name, command in COMMANDS.items())
+_LINES = {name: f"  {name:9} {command.help}" for name, command in COMMANDS.items()}
+_LIST = "\n".join(line for name, line in _LINES.items() if name not in OTHERS)
+_OTHERS = "\n".join(_LINES[name] for name in OTHERS)
 HELP = f"""\
 From a robot's log to a policy that works on that robot
 
 usage: sim2real COMMAND [PIPELINE] [FLAGS]
 
 {_LIST}
+
+also
+{_OTHERS}
 
 examples
   sim2real demo --seed 1

@@ -77,7 +77,7 @@ def test_every_command_has_help(capsys, command):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["recrod"], "record, identify, train, deploy, run, demo, view, report, info"),
+        (["recrod"], "record, identify, train, deploy, run, report, info"),
         (["record", "no_such_robot"], "pendulum"),
         (["record", "pendulum", "--durations-s", "3"], "did you mean --duration-s?"),
         (["record", "pendulum", "--gate.limt", "3"], "--gate.limit?"),

@@ -1,4 +1,4 @@
-"""The commands by name, in the order of ``sim2real --help``. A new stage is one more row."""
+"""The commands by name, in the order of ``sim2real --help``: those of every robot, then the others."""
 
 from sim2real.commands.command_kinds import Command, CommandGroup, ConfigCommand, FunctionCommand, PipelineStage
 
@@ -6,6 +6,8 @@ _BASELINES = (
     "Ends with code 1 if an error exceeds the expected one, a baseline predicts as well, or a log is not scored."
 )
 
+OTHERS = ("compare", "latency", "view", "demo", "play")
+"""Commands that ``sim2real --help`` lists last: other views of a run, and examples."""
 # fmt: off
 COMMANDS: dict[str, Command] = {
     "record": PipelineStage("record the robot under an excitation", "record.RecordConfig"),
@@ -17,8 +19,6 @@ COMMANDS: dict[str, Command] = {
     "run": FunctionCommand(
         "all four, one after the other; --resume RUN continues an interrupted run", "commands.run_commands.run"
     ),
-    "demo": FunctionCommand("run on the embedded pendulum, with its defaults", "commands.run_commands.demo"),
-    "view": FunctionCommand("open a run in the Rerun viewer, or save a file for it", "commands.run_commands.view"),
     "report": FunctionCommand("write a run's report as one HTML page", "commands.run_commands.report"),
     "info": FunctionCommand("about the installation, a pipeline, a log or a run", "commands.run_commands.info"),
     "check": FunctionCommand(
@@ -28,22 +28,9 @@ COMMANDS: dict[str, Command] = {
         "score an identification on a later log", "stages.validate.stage", "stages.validate.config.ValidateConfig",
         examples=("validate runs/NAME/TIME/identify --log b.mcap",), note=_BASELINES,
     ),
-    "compare": ConfigCommand(
-        "parameters with intervals, errors and success of several runs side by side",
-        "stages.compare", "stages.compare.CompareConfig",
-        examples=("compare runs/NAME/MONDAY runs/NAME/FRIDAY",),
-    ),
-    "latency": PipelineStage(
-        "measure the delay from motion to motion: the shares of host, bus and device", "latency.LatencyConfig"
-    ),
     "import": ConfigCommand(
         "convert files of other recorders into logs", "stages.import_logs.stage",
         "stages.import_logs.config.ImportConfig", examples=("import data.npz --mjcf robot.xml", "info LOG"),
-    ),
-    "play": ConfigCommand(
-        "let a walking policy follow velocities on a twin: in a window, with keys, or into a picture",
-        "commands.play", "commands.config.PlayConfig",
-        examples=("play go2", "play go2 --command 0.5 0 0.4 --video walk.gif", "play go2 --window"),
     ),
     "new": ConfigCommand(
         "write the files of a pipeline for a robot that has a model", "commands.new", "commands.config.NewConfig",
@@ -66,6 +53,21 @@ COMMANDS: dict[str, Command] = {
                 examples=("export policy pendulum --to policy",),
             ),
         },
+    ),
+    "compare": ConfigCommand(
+        "parameters with intervals, errors and success of several runs side by side",
+        "stages.compare", "stages.compare.CompareConfig",
+        examples=("compare runs/NAME/MONDAY runs/NAME/FRIDAY",),
+    ),
+    "latency": PipelineStage(
+        "measure the delay from motion to motion: the shares of host, bus and device", "latency.LatencyConfig"
+    ),
+    "view": FunctionCommand("open a run in the Rerun viewer, or save a file for it", "commands.run_commands.view"),
+    "demo": FunctionCommand("run on the embedded pendulum, with its defaults", "commands.run_commands.demo"),
+    "play": ConfigCommand(
+        "let a walking policy follow velocities on a twin: in a window, with keys, or into a picture",
+        "commands.play", "commands.config.PlayConfig",
+        examples=("play go2", "play go2 --command 0.5 0 0.4 --video walk.gif", "play go2 --window"),
     ),
 }
 # fmt: on
