@@ -22,8 +22,6 @@ _MEMBERS = {"composer": "sim2real", "mjcf": "sim2real.composer", "locomotion": "
 
 def _moved(match):
     space, word, module, names = match[1], match[2], match[3], match[4] or ""
-    if module == "dm_control.mujoco" and names == " import engine":
-        module = "sim2real.composer.physics"
     if module == "dm_control":
         module = _MEMBERS.get(names.removeprefix(" import ").split(" ")[0], module)
     for old, new in _MOVED.items():

@@ -14,7 +14,6 @@ import pytest
 from mujoco import mjx
 
 from sim2real.composer import mjcf
-from sim2real.composer.physics import engine
 from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.variation import PhysicsVariator, noises
 from sim2real.errors import UsageError
@@ -447,21 +446,42 @@ def test_starting_values():
 # -- images
 
 
-def test_rendering_contexts(ours):
-    assert below_an_arena(ours, model(ours)).contexts is None
+class Fake:
+    """A renderer that draws nothing: OpenGL may not be there."""
+
+    def __init__(self, model, height, width):
+        self.shape, self.modes, self.scene = (height, width), [], type("Scene", (), {"flags": np.zeros(10, int)})()
+
+    def update_scene(self, data, camera, option):
+        self.seen = camera
+
+    def render(self):
+        self.drawn = self.scene.flags.copy()
+        return np.zeros(self.shape)
+
+    def __getattr__(self, name):
+        return lambda: self.modes.append(name)
 
 
-def test_other_physics(ours):
-    assert not hasattr(engine, "Physics")
-    xml = HINGE.format("", "", "", "")
-    assert ours.mjcf.Physics.from_xml_string(xml).model.nq == 1
-
-
-def test_poses_of_cameras(ours):
-    camera = engine.MovableCamera(below_an_arena(ours, model(ours)))
-    pose = camera.get_pose()
-    camera.set_pose(pose.lookat + 1.0, *pose[1:])
-    np.testing.assert_array_equal(camera.get_pose().lookat, pose.lookat + 1.0)
+def test_cameras_of_the_engine(ours, monkeypatch):
+    made = []
+    monkeypatch.setattr(mujoco, "Renderer", lambda *args: made.append(Fake(*args)) or made[-1])
+    physics = below_an_arena(ours, model(ours, first='<camera name="eye"/>'))
+    for _ in range(2):
+        assert physics.render(20, 30, "arm/eye", depth=True, render_flag_overrides={"shadow": True}).shape == (20, 30)
+    assert len(made) == 1
+    assert made[0].seen == "arm/eye"
+    assert made[0].modes[-1] == "enable_depth_rendering"
+    assert made[0].drawn.sum() == 1
+    assert made[0].scene.flags.sum() == 0
+    physics.render(20, 30, segmentation=True)
+    assert made[0].modes[-1] == "enable_segmentation_rendering"
+    for wrong in ({"depth": True, "segmentation": True}, {"camera_id": 5}, {"width": 5000},
+                  {"render_flag_overrides": {"no": 1}}):  # fmt: skip
+        with pytest.raises(UsageError):
+            physics.render(20, **wrong)
+    physics.free()
+    assert made[0].modes[-1] == "close"
 
 
 @pytest.mark.usefixtures("opengl")

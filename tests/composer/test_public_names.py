@@ -12,7 +12,6 @@ NAMES = {
         "Robot", "RootElement", "SENSOR_SITES_GROUP",
         "Task", "Variation", "abstract_observable", "cached_property", "observable",
     ],
-    "composer.physics.engine": ["Camera", "MovableCamera", "TextOverlay"],
     "composer.mjcf": [
         "Asset", "Binding", "Element", "PREFIX_SEPARATOR", "Physics", "RootElement", "commit_defaults", "element",
         "export_with_assets", "export_with_assets_as_zip", "from_file", "from_path", "from_xml_string",

@@ -6,7 +6,7 @@ import contextlib
 import copy
 import logging
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,9 +16,8 @@ from sim2real.composer.mjcf.element import as_elements
 from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.base import EmptyBinding
 from sim2real.composer.physics.c.binding import Binding, BoundPhysics, Staleness
-from sim2real.composer.physics.c.rendering import Graphics
 from sim2real.composer.physics.c.views import DataView, ModelView
-from sim2real.composer.physics.engine import Camera, TextOverlay
+from sim2real.composer.physics.images import Images
 from sim2real.composer.physics.named import Named
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ class Physics(BoundPhysics):
         self.data = DataView(data)
         self.named = Named(model, model, self.data.ptr)
         self._bindings: dict[Element | tuple[Element, ...], Binding | EmptyBinding] = {}
-        self.graphics = Graphics(model)
+        self.images = Images(model)
         self.staleness = Staleness()
         self._warnings = self.data.ptr.warning.number
         self._warned = self._warnings.tobytes()
@@ -250,7 +249,7 @@ class Physics(BoundPhysics):
         height: int = 240,
         width: int = 320,
         camera_id: int | str = -1,
-        overlays: Sequence[TextOverlay] = (),
+        *,
         depth: bool = False,
         segmentation: bool = False,
         scene_option: MjvOption | None = None,
@@ -259,29 +258,27 @@ class Physics(BoundPhysics):
     ) -> np.ndarray:
         """Return an image: uint8 ``(height, width, 3)``; float32 ``(height, width)`` [m]; int32 ``(.., .., 2)``.
 
-        See ``engine.Camera`` and its ``render``.
-
         Args:
             height: Of the image [pixels].
             width: Of the image [pixels].
             camera_id: Number or name of one of the model's cameras; -1 is the free camera.
-            segmentation: Return numbers and types (``mjtObj``) of objects instead.
+            segmentation: Return numbers and types (``mjtObj``) of objects instead; (-1, -1) is none.
             scene_option: The ``MjvOption`` of the image.
-            render_flag_overrides: Flags of ``mjtRndFlag`` -> value, for this image.
+            render_flag_overrides: Flags of ``mjtRndFlag``, by name in small letters or by number -> value.
             scene_callback: Called with the physics and the ``MjvScene`` before it is drawn, to add shapes.
         """
-        scene = None if scene_callback else self.graphics.scene()  # what a callback changes is not for the next image
-        camera = Camera(self, height, width, camera_id, scene_callback=scene_callback, scene=scene)
-        return camera.render(overlays, depth, segmentation, scene_option, render_flag_overrides)
+        add = None if scene_callback is None else lambda scene: scene_callback(self, scene)
+        data, chosen = self.data.ptr, (depth, segmentation, scene_option, render_flag_overrides, add)
+        return self.images.draw(data, height, width, camera_id, *chosen)
 
     @property
     def contexts(self) -> None:
-        """None: images follow the model without a rendering context that the caller updates."""
+        """None: there is no rendering context that the caller updates."""
         return
 
     def free(self) -> None:
         """Drop the model and the state."""
-        self.graphics.close()
+        self.images.close()
         for binding in self._bindings.values():
             binding.free()
         self._bindings.clear()
