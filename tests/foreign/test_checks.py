@@ -101,6 +101,7 @@ def test_commands_that_are_too_slow_for_the_motion_are_said():
 def test_a_joint_that_rests_is_said_and_one_held_elsewhere_is_asked():
     rest = np.array([1, 0, 1])
     assert findings(GOAL * rest, Q * rest) == [("still", 1, "warn")]
+    assert findings(0 * GOAL, 0 * Q) == [("still", i, "warn") for i in range(3)]
     away = np.array([0, 1.0, 0])
     assert findings(GOAL * rest + away, Q * rest - away) == [("sign", 1, "ask")]
 

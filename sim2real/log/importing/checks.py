@@ -272,7 +272,7 @@ def _clock(
     """Return a finding if the lag grows: two clocks run at different rates."""
     begin, end = max(t[0] for t in t_s), min(t[-1] for t in t_s)
     count = min(10, int((end - begin) / 3.0))
-    if count < 4:
+    if count < 4 or not joints:
         return []
     edges = np.linspace(begin, end, count + 1)
     middles, lags = [], []
