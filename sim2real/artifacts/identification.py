@@ -153,11 +153,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class FreeRun:
-    """Errors of one model in one field, with all held-out data of a recording simulated from one initial state.
-
-    Attributes:
-        low95: Lower end of the 95 % interval of ``rmse`` over draws of the posterior; None for other models.
-    """
+    """Errors of one model in one field, with all held-out data of a recording simulated from one initial state."""
 
     model: str
     recording: int
@@ -167,8 +163,6 @@ class FreeRun:
     field: str
     rmse: float | None
     mae: float | None
-    low95: float | None = None
-    high95: float | None = None
 
 
 @dataclass(frozen=True)
@@ -548,7 +542,6 @@ class Identification(Shown):
 
     Attributes:
         logs: The fitted recordings, then the recordings that are held out whole.
-        residual_inflation: Factor on the variance of the estimates, as residuals are correlated in time.
         misfit: Root mean square of the residuals, in deviations of the measurement.
         held_out: Errors of each position on held-out data, the largest first.
         worst: The second in which the model explains a joint worst; None without samples, and in older files.
@@ -580,7 +573,6 @@ class Identification(Shown):
     search: Search = field(default_factory=Search)
     covariance: Matrix | None = None
     correlation: Matrix | None = None
-    residual_inflation: float | None = None
     misfit: float | None = None
     check: Determined | None = None
     prediction: tuple[Prediction, ...] = ()

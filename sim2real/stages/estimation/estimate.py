@@ -103,7 +103,6 @@ def document(
         search=search,
         covariance=Matrix(names, spread.covariance),
         correlation=Matrix(names, spread.correlation),
-        residual_inflation=spread.inflation,
         misfit=spread.misfit,
         check=check,
         posterior=posterior,
