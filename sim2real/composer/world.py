@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sim2real.composer.physics.c.rollouts import Start, StepLaw, WorldParams, check_steps
 from sim2real.composer.physics.mjx import constants, open_loop, stepping
 from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.physics.mjx.physics import MjxPhysics
@@ -20,6 +19,7 @@ from sim2real.composer.variation.variators import CONSTANTS
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseWorld
+from sim2real.worlds.rollouts import Start, StepLaw, WorldParams, check_steps
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -171,7 +171,7 @@ class ComposedWorld(BaseWorld):
 
         return lawful
 
-    # -- physics that runs elsewhere, see ``composer.c.rollouts.OpenLoop``
+    # -- physics that runs elsewhere, see ``worlds.rollouts.OpenLoop``
 
     @property
     def substeps(self) -> int:

@@ -12,7 +12,6 @@ import numpy as np
 from flax import struct
 from jax.core import Tracer
 
-from sim2real.composer.physics.c.rollouts import Start, StepLaw, check_steps
 from sim2real.composer.physics.mjx import gate, stepping
 from sim2real.composer.physics.mjx.import_mjx import mjx
 from sim2real.composer.physics.mjx.warp import warp
@@ -20,6 +19,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base, Empty, GraphState, StepState
 from sim2real.graph.node import BaseWorld
 from sim2real.types import MjModel, PyTree
+from sim2real.worlds.rollouts import Start, StepLaw, check_steps
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -155,7 +155,7 @@ class MjxWorld(BaseWorld):
         del params
         return {}
 
-    # -- physics that runs elsewhere, see ``composer.c.rollouts.OpenLoop``
+    # -- physics that runs elsewhere, see ``worlds.rollouts.OpenLoop``
 
     def open_loop(self) -> MjModel:
         """Take the physics out and return the ``MjModel``; UsageError where a subclass steps in its own way."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sim2real.composer.physics.c.rollouts import StepLaw
 from sim2real.types import Array, PyTree, Scalar
+from sim2real.worlds.rollouts import StepLaw
 
 
 class WornFriction(StepLaw):

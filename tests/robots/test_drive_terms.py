@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2real.composer.physics.c.rollouts import Rollouts, Start
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
@@ -32,6 +31,7 @@ from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.from_model.usual_parameters import usual_terms
 from sim2real.stages.estimation import held_out_parts
 from sim2real.worlds.drive_terms import NO_LIMIT, DriveLaw, DriveTerms
+from sim2real.worlds.rollouts import Rollouts, Start
 
 MASS, LENGTH, STEP_S = 0.5, 0.12, 0.001
 XML = f"""<mujoco><option timestep="{STEP_S}"/><worldbody><body>

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sim2real.composer.physics.c.rollouts import Rollouts, Start
+from sim2real.worlds.rollouts import Rollouts, Start
 from sim2real.worlds.worn import WornFriction
 
 INERTIA, DAMPING, STEP_S, FAST = 0.01, 0.02, 0.0005, 4.0

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sim2real import pytree
-from sim2real.composer.physics.c.rollouts import OpenLoop, Rollouts, Start, StepLaw
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, BaseWorld
@@ -17,6 +16,7 @@ from sim2real.installation import has_jax
 from sim2real.later import jax, jnp
 from sim2real.runtime.compilation.open_loop import OpenLoopGraph, Tables
 from sim2real.types import Array, MjModel, PyTree
+from sim2real.worlds.rollouts import OpenLoop, Rollouts, Start, StepLaw
 
 _NEEDED = ("open_loop", "fields", "start", "controls", "message")
 

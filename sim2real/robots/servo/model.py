@@ -27,8 +27,8 @@ from sim2real.robots.servo.task import NO_AIM, Aim
 from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
-    from sim2real.composer.physics.c.rollouts import WorldParams
     from sim2real.hardware.emulation.emulated_bus import BusEmulation
+    from sim2real.worlds.rollouts import WorldParams
 
 mj: Any = mujoco
 

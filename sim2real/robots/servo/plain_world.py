@@ -12,7 +12,6 @@ import numpy as np
 from sim2real.composer.hooks import Hooks
 from sim2real.composer.physics import layout
 from sim2real.composer.physics.c.physics import Physics
-from sim2real.composer.physics.c.rollouts import Start, WorldParams
 from sim2real.composer.variation.variators import CONSTANTS
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
@@ -23,6 +22,7 @@ from sim2real.robots.control_loop.messages import JointReading
 from sim2real.robots.servo.parameters import STRIBECK
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.types import Key, MjModel, PyTree
+from sim2real.worlds.rollouts import Start, WorldParams
 from sim2real.worlds.worn import WornFriction
 
 if TYPE_CHECKING:

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from sim2real.composer.physics.c import rollouts
-from sim2real.composer.physics.c.rollouts import Rollouts, Start
 from sim2real.errors import UsageError
+from sim2real.worlds import rollouts
+from sim2real.worlds.rollouts import Rollouts, Start
 
 XML = """
 <mujoco>
