@@ -21,6 +21,11 @@ def test_a_right_recording_has_no_finding(by_name):
     assert findings(by_name=by_name) == []
 
 
+@pytest.mark.parametrize("count", [51, 60, 120, 300])
+def test_a_short_recording_is_checked_too(count):
+    assert {f[2] for f in findings(GOAL[:count], Q[:count], T[:count], T[:count])} <= {"warn", "ask"}
+
+
 def test_joints_that_follow_other_goals_are_refused():
     assert findings(GOAL[:, [1, 0, 2]]) == [("order", 0, "refuse"), ("order", 1, "refuse")]
 

@@ -315,10 +315,10 @@ def _zero(
     n, period_s = len(grid), float(grid[1] - grid[0])
     # Predict the position from the last goals; the rest shows the zero.
     span = max(1, round((lag_s + 0.3) / period_s / 12))
+    if n - 12 * span < 200:
+        return []
     taps = np.stack([held[12 * span - k * span : n - k * span, 0] for k in range(13)], axis=1)
     q, at = joined[12 * span :, 0], grid[12 * span :]
-    if len(q) < 200:
-        return []
     taps, centred = taps - taps.mean(axis=0), q - q.mean()
     gram = taps.T @ taps
     gram += 1e-9 * (np.trace(gram) / len(gram) + 1e-12) * np.eye(len(gram))
