@@ -12,63 +12,12 @@ import jax
 import numpy as np
 import numpy.typing as npt
 from mujoco._render import MjrContext as MjrContext
-from mujoco._specs import (
-    MjsActuator,
-    MjsBody,
-    MjsCamera,
-    MjsDefault,
-    MjsEquality,
-    MjsExclude,
-    MjsGeom,
-    MjsHField,
-    MjsJoint,
-    MjsKey,
-    MjsLight,
-    MjsMaterial,
-    MjsMesh,
-    MjsNumeric,
-    MjsPair,
-    MjsSensor,
-    MjsSite,
-    MjsSkin,
-    MjsTendon,
-    MjsText,
-    MjsTexture,
-    MjsTuple,
-)
 from mujoco._specs import MjSpec as MjSpec
 from mujoco._structs import MjData as MjData
 from mujoco._structs import MjModel as MjModel
 from mujoco._structs import MjrRect as MjrRect
 from mujoco._structs import MjvOption as MjvOption
 from mujoco._structs import MjvScene as MjvScene
-
-Native: TypeAlias = (
-    MjsActuator
-    | MjsBody
-    | MjsCamera
-    | MjsEquality
-    | MjsExclude
-    | MjsGeom
-    | MjsHField
-    | MjsJoint
-    | MjsKey
-    | MjsLight
-    | MjsMaterial
-    | MjsMesh
-    | MjsNumeric
-    | MjsPair
-    | MjsSensor
-    | MjsSite
-    | MjsSkin
-    | MjsTendon
-    | MjsText
-    | MjsTexture
-    | MjsTuple
-)
-"""An element of an ``MjSpec``."""
-NativeDefault: TypeAlias = MjsDefault
-"""A class of defaults of an ``MjSpec``."""
 
 Array: TypeAlias = np.ndarray | jax.Array
 """Arrays of an engine: numpy's arrays on C, arrays and tracers of JAX on MJX."""

@@ -69,3 +69,26 @@ def test_an_optional_reference_to_a_removed_element_is_refused(reference, attach
     robot.find(kind, name).remove()
     with pytest.raises(UsageError, match=f"names the {kind} '{name}', which was removed"):
         mjcf.Physics.from_mjcf_model(model)
+
+
+@pytest.mark.parametrize("attached", [False, True])
+def test_numbers_of_a_keyframe_stay_with_elements_that_move(attached):
+    motors = '<actuator><motor name="u" joint="j"/><motor name="v" joint="k"/></actuator>'
+    robot = mjcf.from_xml_string(ROBOT % ("", f'{motors}<keyframe><key name="home" ctrl="1 2"/></keyframe>'))
+    robot.find("actuator", "u").remove()
+    robot.actuator.add("motor", name="u", joint="j")
+    top = robot
+    if attached:
+        top = mjcf.from_xml_string(WORLD)
+        top.attach(robot)
+    model = top.compile()
+    names = [model.actuator(i).name.removeprefix("r/") for i in range(2)]
+    assert dict(zip(names, model.key_ctrl[0].tolist(), strict=True)) == {"u": 1.0, "v": 2.0}
+
+
+def test_a_derived_attribute_is_refused_and_a_misspelt_one_names_those_that_exist():
+    site = mjcf.from_xml_string(ROBOT % ("", "")).find("site", "s")
+    with pytest.raises(AttributeError, match="pos"):
+        site.xpos = [0, 0, 1]
+    with pytest.raises(AttributeError, match="rgba"):
+        _ = site.rgbaa

@@ -215,3 +215,40 @@ def test_references_across_models_may_have_names():
     root.equality.add("weld", name="w", body1="upper", body2=hand.find("body", "finger"))
     model = root.compile()
     assert model.equality("w").obj2id == model.body("hand/finger").id
+
+
+def test_a_comment_does_not_decide_the_unit(caplog):
+    part = """<mujoco model="p"><!-- <compiler angle="radian"/> --><worldbody><body>
+      <joint range="-90 90" limited="true"/>      <geom size=".1"/></body></worldbody></mujoco>"""
+    world = composer.Arena().mjcf_model
+    world.attach(mjcf.from_xml_string(part))
+    assert world.compile().jnt_range[0, 1] == pytest.approx(np.pi / 2)
+    assert "unit" in caplog.text
+
+
+def test_classes_for_hinges_and_slides_keep_their_units_below_another_unit():
+    part = """<mujoco model="p"><default><joint range="-9 9" limited="true"/></default><worldbody>
+      <body euler="0 90 0"><joint name="h"/><joint name="s" type="slide"/><geom size=".1"/></body>
+      </worldbody></mujoco>"""
+    world = composer.Arena().mjcf_model
+    world.attach(mjcf.from_xml_string(part))
+    model = world.compile()
+    assert model.jnt_range[:, 1].tolist() == pytest.approx([np.radians(9), 9.0])
+    assert model.body("p/").id + 1 == model.jnt_bodyid[0]
+    np.testing.assert_allclose(model.body_quat[model.jnt_bodyid[0]], [0.5**0.5, 0, 0.5**0.5, 0], atol=1e-12)
+
+
+def test_a_copy_is_deep_and_keeps_attached_models_and_references():
+    top, arm, hand = (mjcf.RootElement(model=name) for name in ("top", "arm", "hand"))
+    for one in (arm, hand):
+        one.worldbody.add("body", name="b").add("geom", name="g", size=[0.1])
+    arm.attach(hand)
+    arm.equality.add("weld", body1=arm.find("body", "b"), body2=hand.find("body", "b"))
+    twin = copy.deepcopy(arm)
+    twin.find("geom", "hand/g").size = [0.3]
+    assert hand.find("geom", "g").size.tolist() == [0.1]
+    for one in (arm, twin):
+        top.attach(one)
+    model = top.compile()
+    assert model.neq == 2
+    assert model.geom("arm_1/hand/g").size[0] == 0.3
