@@ -143,14 +143,12 @@ def load_bundle(folder: str | Path, backend: str | None = None) -> PolicyRunner:
 
     Raises:
         UsageError: The backend is unknown, not installed or does not run this network.
-        Sim2RealError: A file is missing, damaged or of an unknown format, or the policy is a
-            teacher.
+        Sim2RealError: A file is missing, damaged or of an unknown format.
     """
     _check_backend(backend)
     contract, spec = read_contract(folder)
     weights, folder = read_weights(folder), Path(folder)
     if backend == "onnx" or (backend is None and not spec.built_in):
-        spec.refuse_teacher()
         return PolicyRunner(contract, OnnxBackend(_read_file(folder, GRAPH, _read_about(folder))))
     return make_runner(weights, contract, "numpy", spec)
 
@@ -166,11 +164,10 @@ def make_runner(
 
     Raises:
         UsageError: The backend is unknown, not installed or does not run this network.
-        Sim2RealError: Weights and contract do not fit each other, or the policy is a teacher.
+        Sim2RealError: Weights and contract do not fit each other.
     """
     _check_backend(backend)
     spec = spec or NetworkSpec()
-    spec.refuse_teacher()
     weights = {name: np.ascontiguousarray(value, np.float32) for name, value in weights.items()}
     _check_fit(weights, contract, spec)
     if spec.built_in and backend != "onnx":
@@ -320,8 +317,7 @@ def _check_fit(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
                 f"the policy's {name} holds values up to {np.abs(weights[name]).max():.3g}; {MAX_WEIGHT:g} is the most",
                 hint="no training ends there: train the policy again, and scale observations that are this large",
             )
-    # Privileged entries, at the end, are parameters of any order of magnitude.
-    smallest = weights["std"][: size - spec.privileged].min()
+    smallest = weights["std"].min()
     if smallest < MIN_STD:
         raise Sim2RealError(
             f"the policy divides by standard deviations down to {smallest:g}; {MIN_STD:g} is the least",

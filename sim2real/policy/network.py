@@ -19,13 +19,10 @@ class NetworkSpec:
     Attributes:
         name: ``"mlp"``, ``"gru"``, or ``"package.module:Class"`` of a user's network.
         squash: Whether the action is bounded by tanh; else it is clipped.
-        privileged: Number of entries at the end of the observation that only the simulation has: above 0 for a
-            teacher, which runs on no robot.
     """
 
     name: str = "mlp"
     squash: bool = False
-    privileged: int = 0
 
     @property
     def built_in(self) -> bool:
@@ -44,19 +41,10 @@ class NetworkSpec:
             Sim2RealError: A part is missing or of the wrong type.
         """
         if isinstance(data, Mapping):
-            name, squash, privileged = (data.get(part) for part in ("name", "squash", "privileged"))
-            valid = isinstance(name, str) and isinstance(squash, bool) and type(privileged) is int
-            if valid and isinstance(name, str) and isinstance(privileged, int) and privileged >= 0:
-                return cls(name, bool(squash), privileged)
+            name, squash = data.get("name"), data.get("squash")
+            if isinstance(name, str) and isinstance(squash, bool):
+                return cls(name, squash)
         raise Sim2RealError(
-            f"the policy's network is described by {data!r}: name, squash and privileged are needed",
+            f"the policy's network is described by {data!r}: name and squash are needed",
             hint="export the policy again: sim2real train",
         )
-
-    def refuse_teacher(self) -> None:
-        """Raise a ``Sim2RealError`` for a teacher, which only a simulation can run."""
-        if self.privileged:
-            raise Sim2RealError(
-                f"this policy is a teacher: {self.privileged} entries of its observation exist only in simulation",
-                hint="train a student from it, sim2real train PIPELINE --distil RUN, and deploy that one",
-            )

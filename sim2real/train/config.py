@@ -73,9 +73,6 @@ class PPOConfig:
     privileged: bool = False
     """Give the value function the world's true state and the episode's parameters besides the observation. Only the
     policy, which gets the observation alone, runs on the robot."""
-    teacher: bool = False
-    """Give the policy the true state and the parameters, too: a teacher, to distil a student from; no robot can run
-    it."""
     log_std_init: float = -0.5
     """Logarithm of the exploration noise at the start, in units of half the action range."""
     evaluations: int = 10

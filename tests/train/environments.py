@@ -189,6 +189,3 @@ class Sign:
         new = {**state, "row": state["row"] + 1, "said": said}
         no = jnp.bool_(False)
         return Step(new, jnp.zeros(2), jnp.where(late, -error, 0.0), no, new["row"] >= 6, ~no, {"success": said})
-
-    def privileged(self, state):
-        return state["sign"][None]

@@ -80,6 +80,6 @@ def why_insufficient(identification: Identification) -> str:
 def with_more_steps(config: TrainConfig, history: History) -> TrainConfig | None:
     """Return a configuration with more policy steps; None if the policy succeeds in simulation."""
     target = MIN_SUCCESS if config.ppo.target is None else min(MIN_SUCCESS, config.ppo.target)
-    if config.distil is not None or np.nanmax(history.success, initial=0.0) >= target:
+    if np.nanmax(history.success, initial=0.0) >= target:
         return None
     return replace(config, ppo=replace(config.ppo, total_steps=_STEPS_FACTOR * config.ppo.total_steps))

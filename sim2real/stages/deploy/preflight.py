@@ -58,9 +58,8 @@ def require_fit(robot: Robot, bundle: Bundle) -> None:
     """Refuse a bundle for another robot, or one that exceeds the limits of this robot.
 
     Raises:
-        Sim2RealError: Names the difference; or the policy is a teacher.
+        Sim2RealError: Names the difference.
     """
-    bundle.spec.refuse_teacher()
     contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
     for verb, in_bundle, of_robot in (
         ("sees", _observations(contract.observation), _observations(robot.agent.observation)),

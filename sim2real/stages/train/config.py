@@ -23,9 +23,6 @@ class LearningConfig:
     sweep: Annotated[tuple[str, ...], UseAppendAction] = ()
     """Settings of PPO to try side by side, such as learning_rate=1e-3,3e-3, one flag a setting; every combination with
     every seed, the best policy of all is saved."""
-    distil: str | None = None
-    """Teacher to imitate, in place of learning from rewards: a run in which one was trained with --ppo.teacher, or a
-    bundle."""
     checkpoint: bool = True
     """Write the whole training into a file after each evaluation, to continue from with --resume."""
     view: ViewFlag = None
@@ -38,14 +35,9 @@ class LearningConfig:
     """The learning algorithm."""
 
     def __post_init__(self) -> None:
-        """Check the viewer, the sweep and the teacher."""
+        """Check the viewer and the sweep."""
         check_view(self.view)
         Sweep.parse(self.sweep).configs(self.ppo)
-        if self.distil is not None and self.ppo.teacher:
-            raise UsageError(
-                "a student observes only what a robot measures, not the simulation's true state",
-                hint="train it without --ppo.teacher, or a teacher without --distil",
-            )
 
 
 @dataclass(frozen=True)

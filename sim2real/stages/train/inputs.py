@@ -1,4 +1,4 @@
-"""Inputs of a training: the identification, the teacher, the interrupted training; found and checked."""
+"""Inputs of a training: the identification and the interrupted training; found and checked."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +18,6 @@ from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.resume import CHECKPOINT, check_same_parameters, find_interrupted
-from sim2real.stages.train.teacher_bundle import find_teacher
 
 
 @dataclass(frozen=True)
@@ -27,14 +26,12 @@ class TrainInputs:
 
     Attributes:
         identification: None for the nominal model.
-        teacher: None: the policy learns from rewards.
         resume: The checkpoint to continue from; None: a new training.
         files: Input files by name, for the manifest.
         run_dir: Run folder to write into; None: a new one.
     """
 
     identification: Identification | None
-    teacher: Bundle | None
     resume: Path | None
     files: Mapping[str, Path]
     run_dir: Path | None
@@ -61,11 +58,8 @@ def find_inputs(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Pa
         check_same_parameters(interrupted, path)
     identification = _open_identification(pipeline, config, path)
     files = {} if path is None else {"parameters": path}
-    teacher = None
-    if config.distil is not None:
-        teacher, files["teacher"] = find_teacher(pipeline.name, config.distil, root)
     resume = None if interrupted is None else interrupted.folder / CHECKPOINT
-    return TrainInputs(identification, teacher, resume, files, run_dir)
+    return TrainInputs(identification, resume, files, run_dir)
 
 
 def find_parameters(

@@ -5,13 +5,10 @@ from pathlib import Path
 
 import jax
 
-from sim2real.artifacts.bundle import Bundle
-from sim2real.policy.contract import PolicyContract
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.show import Watch, show_progress
-from sim2real.stages.train.teacher_bundle import teacher_policy
 from sim2real.stages.train.training_setup import TrainingSetup
 from sim2real.train.ppo.trainer import Progress, TrainResult, train
 from sim2real.train.scale.processes import leads, lost_process_errors, require_neighbours
@@ -21,14 +18,11 @@ from sim2real.train.sweep import Sweep
 def learn_policy(
     setup: TrainingSetup,
     config: TrainConfig,
-    contract: PolicyContract,
     checkpoint: Path | None,
     resume: Path | None,
     watch: Watch | None,
-    teacher: Bundle | None,
 ) -> TrainResult:
     """Train by PPO, with a progress bar; ``checkpoint`` is written after each evaluation, ``resume`` is continued."""
-    master = None if teacher is None else teacher_policy(teacher, contract)
     ppo = replace(config.ppo, eval_steps=setup.env.length + 1)
     key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
     with progress(ppo.evaluations, "train (compiling)", leads()) as bar, lost_process_errors():
@@ -37,6 +31,6 @@ def learn_policy(
             show_progress(bar, evaluation, watch)
 
         return patiently(
-            lambda: train(setup.env, ppo, key, show, checkpoint, resume, sweep=sweep, teacher=master),
+            lambda: train(setup.env, ppo, key, show, checkpoint, resume, sweep=sweep),
             require_neighbours,
         )

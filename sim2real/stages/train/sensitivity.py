@@ -24,7 +24,6 @@ from sim2real.train.config import PPOConfig
 from sim2real.train.environment.graph_environment import GraphEnvironment, TrainingTask
 from sim2real.train.networks.policy import Policy
 from sim2real.train.ppo.rollout import evaluate
-from sim2real.train.ppo.teacher import environment_for
 from sim2real.types import Array
 
 TIMELINES = 8
@@ -178,7 +177,7 @@ def sensitivity(
     key = jax.random.key(seed)
 
     def play(values: dict[str, jax.Array]) -> jax.Array:
-        environment = environment_for(policy, GraphEnvironment(env.graph, moved_task(env.task, values)))
+        environment = GraphEnvironment(env.graph, moved_task(env.task, values))
         return evaluate(environment, config, policy, key)["success"]
 
     # The first model has the estimates; the others are those of the moves, in order.

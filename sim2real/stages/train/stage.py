@@ -12,12 +12,10 @@ from sim2real.robots.contract import Robot
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import (
-    AnyBundle,
     AnyIdentification,
     AnyPath,
     AnyRecording,
     AnyTiming,
-    bundle_of,
     config_of,
     identification_of,
     recording_of,
@@ -45,7 +43,6 @@ def train(
     checkpoint: AnyPath | None = None,
     resume: AnyPath | None = None,
     watch: Watch | None = None,
-    teacher: AnyBundle | None = None,
     log: AnyRecording | None = None,
 ) -> Bundle:
     """Train a policy.
@@ -58,7 +55,6 @@ def train(
         timing: The robot's timing; default: that of the identification's recording. The nominal model has no delays.
         checkpoint: File that receives the whole training after each evaluation; None: none is written.
         resume: A checkpoint of the same training, to continue from.
-        teacher: A policy to imitate; None: learn from rewards.
         log: A recording; the bundle's policy is compared with JAX on the observations in it.
 
     Returns:
@@ -75,7 +71,6 @@ def train(
     config = config_of(config, pipeline.train)
     identification = None if identification is None else identification_of(identification)
     timing = None if timing is None else python_arguments.timing_of(timing)
-    teacher = None if teacher is None else bundle_of(teacher, "teacher")
     recording = None if log is None else recording_of(log, pipeline, "log")
 
     # Draw the episodes.
@@ -85,7 +80,7 @@ def train(
 
     # Train.
     write, read = (None if path is None else Path(path) for path in (checkpoint, resume))
-    result = learn_policy(setup, config, contract, write, read, watch, teacher)
+    result = learn_policy(setup, config, write, read, watch)
 
     # Move each parameter, and play the policy.
     weakness = None
@@ -126,7 +121,7 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     with open_stage(root, pipeline.name, "train", config, inputs.files, inputs.run_dir) as stage:
         with resumable(stage.folder) as checkpoint, watching(stage, config) as watch:
             file, log = checkpoint if config.checkpoint else None, load_recording(identification, stage.run_dir)
-            bundle = train(pipeline, identification, config, None, file, resume, watch, inputs.teacher, log)
+            bundle = train(pipeline, identification, config, None, file, resume, watch, log)
         bundle = inputs.with_hashes(bundle)
         for name, saved in bundle.save(stage.folder).items():
             stage.output(name, saved)

@@ -17,7 +17,6 @@ from sim2real.robots.control_loop.loop import DELAYS
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.parity import MAX_OBSERVATIONS, observations_of, reference_of
 from sim2real.stages.train.show import training_summary
-from sim2real.stages.train.teacher_bundle import policy_contract
 from sim2real.stages.train.training_setup import TrainingSetup
 from sim2real.train.environment.graph_environment import TrainingTask
 from sim2real.train.networks.onnx_export import export_graph
@@ -35,11 +34,11 @@ def bundle_of_training(
 ) -> Bundle:
     """Return the best policy as a bundle, with JAX's actions on observations of training and log to compare with."""
     policy, weights = result.best, result.best.to_weights()
-    contract, graph = policy_contract(contract, policy), export_graph(policy)
+    graph = export_graph(policy)
 
-    # Observations: the last ones of the training, and those of a robot's recording. A teacher runs on no robot.
-    observations = {} if policy.spec.privileged else {"training": result.observations[:MAX_OBSERVATIONS]}
-    if observations and recording is not None:
+    # Observations: the last ones of the training, and those of a robot's recording.
+    observations = {"training": result.observations[:MAX_OBSERVATIONS]}
+    if recording is not None:
         runner = make_runner(weights, contract, None, policy.spec, graph)
         observations["log"] = observations_of(setup.robot, recording, runner)
     references = {name: reference_of(policy, array) for name, array in observations.items()}

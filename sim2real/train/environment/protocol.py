@@ -91,18 +91,14 @@ def get_privileged(env: TrainingEnvironment, config: PPOConfig) -> Callable[[PyT
     Raises:
         UsageError: The environment has no privileged entries.
     """
-    return require_privileged(env).privileged if config.privileged else None
-
-
-def require_privileged(env: TrainingEnvironment) -> PrivilegedEnvironment:
-    """Return the environment if it has privileged entries, otherwise raise a ``UsageError``."""
+    if not config.privileged:
+        return None
     if not isinstance(env, PrivilegedEnvironment):
         raise UsageError(
-            f"a {type(env).__name__} has no privileged entries for a value function or a teacher: it has no "
-            "`privileged`",
-            hint="give it a method privileged(state) -> (P,), or train without --ppo.privileged and --ppo.teacher",
+            f"a {type(env).__name__} has no privileged entries for a value function: it has no `privileged`",
+            hint="give it a method privileged(state) -> (P,), or train without --ppo.privileged",
         )
-    return env
+    return env.privileged
 
 
 @runtime_checkable

@@ -46,16 +46,9 @@ def update_normaliser(normaliser: Normaliser, observations: jax.Array, valid: ja
     return Normaliser(total, normaliser.mean + delta * count / total, squares / total)
 
 
-def deviations(normaliser: Normaliser, privileged: int) -> jax.Array:
-    """Return the standard deviations that a policy divides by, shape ``(O,)``.
-
-    Args:
-        privileged: Number of entries at the end that are physical parameters; see ``normalise_parameters``.
-    """
-    if not privileged:
-        return jnp.sqrt(normaliser.var + _MIN_VARIANCE)
-    of_parameters = jnp.arange(normaliser.var.shape[0]) >= normaliser.var.shape[0] - privileged
-    return jnp.sqrt(normaliser.var + jnp.where(of_parameters, _min_variance(normaliser), _MIN_VARIANCE))
+def deviations(normaliser: Normaliser) -> jax.Array:
+    """Return the standard deviations that a policy divides by, shape ``(O,)``."""
+    return jnp.sqrt(normaliser.var + _MIN_VARIANCE)
 
 
 def normalise_parameters(normaliser: Normaliser, values: jax.Array) -> jax.Array:
@@ -64,10 +57,5 @@ def normalise_parameters(normaliser: Normaliser, values: jax.Array) -> jax.Array
     They have any order of magnitude, and some are equal in all episodes. So the smallest deviation is a thousandth of
     the mean, not a constant.
     """
-    std = jnp.sqrt(normaliser.var + _min_variance(normaliser))
+    std = jnp.sqrt(normaliser.var + (1e-3 * normaliser.mean) ** 2 + 1e-20)
     return jnp.clip((values - normaliser.mean) / std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
-
-
-def _min_variance(normaliser: Normaliser) -> Array:
-    """Return the smallest variance of physical parameters, shape ``(O,)``."""
-    return (1e-3 * normaliser.mean) ** 2 + 1e-20

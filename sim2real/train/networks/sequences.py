@@ -7,7 +7,6 @@ import jax
 
 from sim2real.train.environment.protocol import select
 from sim2real.train.networks.architectures import Network, is_recurrent
-from sim2real.train.networks.policy import Policy
 from sim2real.train.ppo.rollout import repeat
 from sim2real.types import PyTree
 
@@ -19,13 +18,11 @@ class ActorCritic(NamedTuple):
         actor: Computes the mean of the actions.
         critic: Computes the value.
         name: The actor's name in a bundle.
-        teacher: The policy that the actor imitates; None: it learns from rewards.
     """
 
     actor: Network
     critic: Network
     name: str
-    teacher: Policy | None = None
 
 
 class Unrolled(NamedTuple):

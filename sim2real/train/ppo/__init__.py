@@ -35,7 +35,6 @@ Files:
 - ``update.py``: ``TrainState``, ``prepare``, ``update``
 - ``losses.py``: ``gae``, ``loss``
 - ``optimiser.py``: Adam, its step size
-- ``teacher.py``: teachers, and imitation of them
 - ``health.py``: errors for figures that are not finite
 - ``result.py``: ``Progress``, ``TrainResult``
 """

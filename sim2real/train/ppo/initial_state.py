@@ -9,15 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, first_reached
+from sim2real.train.environment.protocol import TrainingEnvironment, first_reached, get_privileged
 from sim2real.train.networks.architectures import Factory, make_network, name_of
 from sim2real.train.networks.normaliser import Normaliser
-from sim2real.train.networks.policy import Policy
 from sim2real.train.networks.sequences import ActorCritic
 from sim2real.train.ppo.optimiser import make_optimiser, set_rate
 from sim2real.train.ppo.rollout import Copies
-from sim2real.train.ppo.teacher import check_teacher, count_privileged
 from sim2real.train.ppo.update import TrainState
 from sim2real.train.sweep import Sweep
 from sim2real.types import Array, PyTree
@@ -66,24 +65,17 @@ def swept_numbers(sweep: Sweep, num_seeds: int) -> dict[str, Array]:
 
 
 def make_networks(
-    env: TrainingEnvironment,
-    config: PPOConfig,
-    actor: Factory | None = None,
-    critic: Factory | None = None,
-    teacher: Policy | None = None,
+    env: TrainingEnvironment, config: PPOConfig, actor: Factory | None = None, critic: Factory | None = None
 ) -> ActorCritic:
     """Return the networks of a training.
 
     Args:
         actor: Default: ``config.network``.
         critic: Default: ``config.critic``, or the actor's network.
-        teacher: A policy to imitate; None: learn from rewards.
 
     Raises:
         UsageError: There is no such network, or it does not fit.
     """
-    if teacher is not None:
-        check_teacher(env, config, teacher)
     kind = actor or config.network
     critic_kind = critic or config.critic or kind
     size, actions = env.observation_size, np.shape(env.action_low)[0]
@@ -92,13 +84,19 @@ def make_networks(
         actor=make_network(kind, config.hidden, size, actions),
         critic=make_network(critic_kind, config.hidden, critic_size, 1, exported=False),
         name=name_of(kind),
-        teacher=teacher,
     )
 
 
 def privileged_size(env: TrainingEnvironment, config: PPOConfig) -> int | None:
     """Return the number of the value function's further inputs; None if ``config`` has none."""
-    return count_privileged(env) if config.privileged else None
+    privileged = get_privileged(env, config)
+    if privileged is None:
+        return None
+    state = jax.eval_shape(env.reset, jax.eval_shape(lambda: jax.random.key(0)))[0]
+    shape = jax.eval_shape(privileged, state).shape
+    if len(shape) != 1:
+        raise UsageError(f"the environment's `privileged` must return a vector, it has shape {shape}")
+    return shape[0]
 
 
 def _repeated(carry: T, count: tuple[int, ...]) -> T:

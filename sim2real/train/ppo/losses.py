@@ -12,9 +12,6 @@ from sim2real.train.networks.sequences import ActorCritic, unroll
 from sim2real.train.ppo.rollout import Rows
 from sim2real.types import PyTree
 
-MIN_LOG_STD = -3.0
-"""Smallest logarithm of a student's noise: the likelihood of perfectly imitated actions has no upper bound."""
-
 
 class Batch(NamedTuple):
     """T rows of each of N copies, as the loss takes them.
@@ -27,7 +24,6 @@ class Batch(NamedTuple):
         value: Shape ``(N, T)``: value estimates before the update.
         advantage: Shape ``(N, T)``.
         weight: Shape ``(N, T)``: 1 in rows with a policy step, else 0.
-        advice: Shape ``(N, T, A)``: the teacher's actions, within [-1, 1]; None without a teacher.
         noise: Shape ``(N, T, A)``: ``u`` in deviations from its mean; None if actions are not squashed.
         end: Shape ``(N, T)``, bool: rows that end an episode.
         actor_carry: The actor's carry before the first row; leaves of shape ``(N, ...)``.
@@ -41,7 +37,6 @@ class Batch(NamedTuple):
     value: jax.Array
     advantage: jax.Array
     weight: jax.Array
-    advice: jax.Array | None
     noise: jax.Array | None
     end: jax.Array
     actor_carry: PyTree
@@ -88,7 +83,7 @@ def gae(rows: Rows, value: jax.Array, following: jax.Array, gamma: float, gae_la
 def loss(
     params: dict[str, PyTree], batch: Batch, config: PPOConfig, networks: ActorCritic
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return the clipped PPO loss (Schulman et al. 2017) over the valid rows; with a teacher, the imitation loss.
+    """Return the clipped PPO loss (Schulman et al. 2017) over the valid rows.
 
     Returns:
         The loss, and its parts by name; each of shape ``()``.
@@ -111,9 +106,6 @@ def loss(
         drawn = mean + jnp.exp(params["log_std"]) * batch.noise
         bonus = bonus + jnp.sum(weight * jax.vmap(log_slope)(drawn))
     parts = {"entropy": bonus, "kl": jnp.sum(weight * (ratio - 1.0 - log_ratio))}
-    if batch.advice is not None:
-        guess = jnp.tanh(mean) if squashed else mean
-        return _imitation(guess, batch.advice, jnp.maximum(params["log_std"], MIN_LOG_STD), weight, parts)
 
     # Clipped surrogate of the policy, with advantages of mean 0 and deviation 1.
     centred = batch.advantage - jnp.sum(weight * batch.advantage)
@@ -132,19 +124,6 @@ def loss(
         "clip_share": jnp.sum(jnp.where(jnp.abs(ratio - 1.0) > config.clip, weight, 0.0)),
     }
     return policy_loss + config.value_coef * value_loss - config.entropy_coef * bonus, parts
-
-
-def _imitation(
-    guess: jax.Array, advice: jax.Array, log_std: jax.Array, weight: jax.Array, parts: dict[str, jax.Array]
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Return the negative log likelihood of a teacher's actions (DAgger, Ross et al. 2011, on the newest rollout).
-
-    The student acts, so the teacher corrects the student's own mistakes. The student's noise becomes as large as its
-    remaining error.
-    """
-    likelihood = jax.vmap(lambda a, g: log_prob(a, g, log_std))(advice, guess)
-    error = jnp.sqrt(jnp.sum(weight * jnp.mean((guess - advice) ** 2, -1)))
-    return -jnp.sum(weight * likelihood), parts | {"imitation_error": error}
 
 
 def _outputs(network: Network, params: PyTree, carry: PyTree, x: jax.Array, batch: Batch) -> jax.Array:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from sim2real.train.config import PPOConfig
 from sim2real.train.environment.protocol import TrainingEnvironment, get_privileged, get_reset, metric_names, select
 from sim2real.train.networks.policy import Policy
-from sim2real.train.ppo.teacher import advice
 from sim2real.types import PyTree
 
 T = TypeVar("T")
@@ -45,7 +44,6 @@ class Rows(NamedTuple):
         metrics: Name -> shape ``(T, N)``: the environment's, after the row.
         privileged: Shape ``(T, N, P)``: the value function's further inputs; None if it has none.
         privileged_following: Shape ``(T, N, P)``: the same after the row.
-        advice: Shape ``(T, N, A)``: the teacher's actions; None without a teacher.
     """
 
     observation: jax.Array
@@ -58,7 +56,6 @@ class Rows(NamedTuple):
     metrics: dict[str, jax.Array]
     privileged: jax.Array | None = None
     privileged_following: jax.Array | None = None
-    advice: jax.Array | None = None
 
 
 class PolicyEvaluation(NamedTuple):
@@ -88,7 +85,6 @@ def collect(
     copies: Copies,
     update: jax.Array,
     key: jax.Array,
-    teacher: Policy | None = None,
     evaluating: jax.Array | bool = False,
     reached: jax.Array | None = None,
 ) -> tuple[Copies, Rows]:
@@ -97,7 +93,6 @@ def collect(
     Args:
         copies: The copies after the last rollout; if ``update`` is 0 all of them are reset.
         update: Shape ``()``, int32: number of updates so far; in an evaluation, of rollouts.
-        teacher: Its actions are recorded in every row, while the policy acts.
         evaluating: Shape ``()``, bool: play without exploration noise, cut no episode, and draw episodes as at the end
             of the curriculum.
         reached: Shape ``()``: the share of a curriculum that follows success; None without such a curriculum.
@@ -121,7 +116,7 @@ def collect(
     # Cut the first episodes after different numbers of rows. Otherwise all copies would stay at the same time of their
     # episodes, and each update would learn from only one phase of the task.
     cut = jnp.where(evaluating, 0, 1 + jnp.arange(count) * config.eval_steps // count)
-    row = partial(_play_row, env, config, policy, teacher, fresh, cut)
+    row = partial(_play_row, env, config, policy, fresh, cut)
     numbers = update * rows + jnp.arange(1, rows + 1)
     return jax.lax.scan(row, copies, (noise, jax.random.split(key_step, (rows, count)), numbers))
 
@@ -130,7 +125,6 @@ def _play_row(
     env: TrainingEnvironment,
     config: PPOConfig,
     policy: Policy,
-    teacher: Policy | None,
     fresh: Copies,
     cut: jax.Array,
     now: Copies,
@@ -150,7 +144,7 @@ def _play_row(
     step = jax.vmap(env.step)(now.state, jax.vmap(policy.to_action)(u), keys)
     truncated = step.truncated | (number == cut)
 
-    # Record the row, with the further inputs of the value function and the teacher's actions if they are used.
+    # Record the row, with the further inputs of the value function if they are used.
     privileged = get_privileged(env, config)
     out = Rows(
         observation=now.observation,
@@ -163,7 +157,6 @@ def _play_row(
         metrics=step.metrics,
         privileged=None if privileged is None else jax.vmap(privileged)(now.state),
         privileged_following=None if privileged is None else jax.vmap(privileged)(step.state),
-        advice=None if teacher is None else jax.vmap(partial(advice, env, teacher))(now.state, now.observation),
     )
 
     # Start another episode where this one ended; a row without a policy step leaves the actor's memory unchanged.

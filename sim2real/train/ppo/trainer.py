@@ -28,7 +28,6 @@ from sim2real.train.ppo.result import Progress as Progress
 from sim2real.train.ppo.result import TrainResult as TrainResult
 from sim2real.train.ppo.result import find_best, history_of
 from sim2real.train.ppo.rollout import Copies, PolicyEvaluation, add_rows, averages, collect, evaluate, new_evaluation
-from sim2real.train.ppo.teacher import TeacherEnvironment
 from sim2real.train.ppo.update import TrainState, keys, make_policy, update
 from sim2real.train.scale.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
 from sim2real.train.scale.compilation import compile_lowered, small_random_numbers
@@ -54,7 +53,6 @@ def train(
     sweep: Sweep | None = None,
     actor: Factory | None = None,
     critic: Factory | None = None,
-    teacher: Policy | None = None,
 ) -> TrainResult:
     """Train ``num_seeds`` policies, with each of the settings of a sweep.
 
@@ -68,7 +66,6 @@ def train(
             machine.
         actor: Makes the actor, a module of flax.linen or a ``Network``, with the given number of outputs; default: the
             network that ``config`` names.
-        teacher: A policy to imitate, in place of learning from rewards; it may observe the simulation's true state.
 
     Raises:
         UsageError: The environment breaks its protocol, several processes have a time budget, no evaluation episode
@@ -78,7 +75,7 @@ def train(
     start = time.perf_counter()
     require_one_clock(config)
     key = key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
-    session = _Session.of(env, config, key, sweep or Sweep({}), (actor, critic, teacher))
+    session = _Session.of(env, config, key, sweep or Sweep({}), (actor, critic))
 
     # Start from the initial state, or continue from a checkpoint of the same training.
     training = Checkpoint(session.state, None, None, [])
@@ -130,12 +127,11 @@ class _Session(NamedTuple):
         config: PPOConfig,
         key: jax.Array,
         sweep: Sweep,
-        makers: tuple[Factory | None, Factory | None, Policy | None],
+        makers: tuple[Factory | None, Factory | None],
     ) -> _Session:
         """Check the environment, make the networks and the first state, and trace the program."""
         # Check the environment, and make networks and the first state.
         check_environment(env)
-        env = TeacherEnvironment(env) if config.teacher else env
         check_target(env, config)
         networks = make_networks(env, config, *makers)
         state = make_initial_state(env, sweep.configs(config), key, networks)
@@ -179,7 +175,7 @@ def _train_until_evaluation(
         number = jnp.where(evaluating, i - count, state.update)
         policy = make_policy(env, config, networks, state.params, state.normaliser)
         copies = choose(evaluating, evaluated_copies, state.copies)
-        copies, rows = collect(env, config, policy, copies, number, key, networks.teacher, evaluating, state.reached)
+        copies, rows = collect(env, config, policy, copies, number, key, evaluating, state.reached)
 
         # Update the networks, or add the rows to the evaluation.
         def learn() -> tuple[TrainState, PolicyEvaluation, _Figures]:

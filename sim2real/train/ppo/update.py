@@ -17,7 +17,6 @@ from sim2real.train.networks.sequences import ActorCritic, unroll
 from sim2real.train.ppo.losses import Batch, gae, loss
 from sim2real.train.ppo.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
 from sim2real.train.ppo.rollout import Copies, Rows
-from sim2real.train.ppo.teacher import TeacherEnvironment
 from sim2real.train.scale.mesh import divide_minibatches
 from sim2real.types import PyTree
 
@@ -55,16 +54,15 @@ def make_policy(
     normaliser: Normaliser,
 ) -> Policy:
     """Return the policy with parameters as in ``TrainState``."""
-    privileged = env.privileged_size if isinstance(env, TeacherEnvironment) else 0
     return Policy(
         params=params["actor"],
         log_std=params["log_std"],
         mean=jnp.asarray(normaliser.mean),
-        std=deviations(normaliser, privileged),
+        std=deviations(normaliser),
         low=jnp.asarray(env.action_low, jnp.float32),
         high=jnp.asarray(env.action_high, jnp.float32),
         network=networks.actor,
-        spec=NetworkSpec(networks.name, config.squash, privileged),
+        spec=NetworkSpec(networks.name, config.squash),
     )
 
 
@@ -98,7 +96,6 @@ def prepare(
         value=value,
         advantage=gae(rows, value, following, config.gamma, config.gae_lambda),
         weight=rows.valid.astype(jnp.float32),
-        advice=rows.advice,
         noise=(rows.u - mean) * jnp.exp(-policy.log_std) if squash else None,
         end=end,
         actor_carry=(),
