@@ -20,7 +20,7 @@ test: $(READY)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports --no-cache --no-logo
-	$(BIN)/pyright
+	$(BIN)/pyright --threads 2
 	$(PYTEST) -m "not process and not night" --numprocesses 2 --dist loadfile
 	$(PROCESS) || $(PROCESS) --last-failed --last-failed-no-failures none
 

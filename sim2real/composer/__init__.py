@@ -35,14 +35,14 @@ from sim2real.composer.variation.base import Variation as Variation
 
 if TYPE_CHECKING:
     from sim2real.composer.physics.mjx.environment import MjxEnvironment as MjxEnvironment
-    from sim2real.composer.world import ComposedWorld as ComposedWorld
     from sim2real.interop.brax_adapter import BraxEnv as BraxEnv
     from sim2real.interop.gymnasium_adapter import MjxVectorEnv as MjxVectorEnv
+    from sim2real.worlds.composed import ComposedWorld as ComposedWorld
 
 Model = RootElement
 _LAZY = {
     "BraxEnv": "sim2real.interop.brax_adapter",
-    "ComposedWorld": "sim2real.composer.world",
+    "ComposedWorld": "sim2real.worlds.composed",
     "MjxEnvironment": "sim2real.composer.physics.mjx.environment",
     "MjxVectorEnv": "sim2real.interop.gymnasium_adapter",
 }

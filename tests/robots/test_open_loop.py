@@ -4,12 +4,12 @@ import jax
 import pytest
 from small_robot import PairRobot, PairTask
 
-from sim2real.composer.world import ComposedWorld, Observations
 from sim2real.errors import UsageError
 from sim2real.identify.problem.engine import choose
 from sim2real.robots.servo.parts import GOAL
 from sim2real.robots.servo.simulated_world import ServoWorld
 from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.worlds.composed import ComposedWorld, Observations
 
 
 class Steered(PairTask):

@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sim2real.composer.world import ComposedWorld, WorldParams
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, Value
 from sim2real.robots.control_loop.messages import JointReading
@@ -15,6 +14,7 @@ from sim2real.robots.roles import ROLES
 from sim2real.robots.servo.parameters import STRIBECK
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.types import Array, Key, PyTree
+from sim2real.worlds.composed import ComposedWorld, WorldParams
 from sim2real.worlds.worn import WornFriction
 
 __all__ = ["ServoWorld", "SimActuator", "SimSensor"]

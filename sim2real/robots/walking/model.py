@@ -8,7 +8,6 @@ from functools import cached_property
 import jax
 import jax.numpy as jnp
 
-from sim2real.composer.world import WorldParams
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.contract import RobotModel
 from sim2real.robots.control_loop.messages import EpisodeStart
@@ -18,6 +17,7 @@ from sim2real.robots.walking.scene import Ground
 from sim2real.robots.walking.terrain import Terrain
 from sim2real.robots.walking.world import ARMATURE, PAYLOAD, WalkingWorld
 from sim2real.types import PyTree, Scalar
+from sim2real.worlds.composed import WorldParams
 
 FRICTION, STRENGTH, ROUGHNESS = "foot_friction", "motor_strength", "roughness"
 

@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 
 from sim2real.composer.physics.mjx.warp import warp_fields
-from sim2real.composer.world import ComposedWorld, WorldParams
 from sim2real.graph.base import GraphState
 from sim2real.robots.roles import ROLES
 from sim2real.robots.walking.messages import BodyReading
 from sim2real.robots.walking.scene import Ground
+from sim2real.worlds.composed import ComposedWorld, WorldParams
 
 if TYPE_CHECKING:
     from sim2real.composer.physics.mjx.environment import State

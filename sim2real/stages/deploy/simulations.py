@@ -8,7 +8,6 @@ import numpy as np
 
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.timing import Timing
-from sim2real.composer.world import ComposedWorld
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import named_leaves
 from sim2real.graph.node import TICKS_PER_S
@@ -22,6 +21,7 @@ from sim2real.stages.terminal.console import note
 from sim2real.train.environment.draws import draw_robots
 from sim2real.train.environment.variation import VariationConfig
 from sim2real.types import PyTree
+from sim2real.worlds.composed import ComposedWorld
 
 _MIN_SIMULATIONS, _MIN_PER_EPISODE = 32, 8
 States = tuple[np.ndarray, dict[str, np.ndarray]]
