@@ -120,16 +120,6 @@ def test_a_dead_parameter_beside_a_group(signals):
     assert dict(zip(found.undetermined, determined(found), strict=True)) == {("K", "R"): "K/R", ("dead",): ""}
 
 
-@pytest.mark.parametrize("initial_state", ["free", "measured", "rest"])
-def test_a_shift_of_time_does_not_count_as_information(signals, initial_state):
-    """What ticks and initial states happen to say of it is none: residuals here tell both delays apart."""
-    table = ParameterTable([log("gain"), second("late", "measurement"), second("early", "command")])
-    slopes = [signals[0], 100 * signals[1], 100 * signals[2]]
-    found = checked(table, slopes, initial_state=initial_state)
-    assert determined(found) == ("late + early",)
-    assert found.condition < 100.0
-
-
 @pytest.mark.parametrize(("segment_s", "factor"), [(6.0, 1.0), (1.5, 0.5), (24.0, 2.0)])
 def test_the_error_to_expect_falls_with_the_root_of_time(signals, segment_s, factor):
     table = ParameterTable([log("a", 1e6), log("b", 1e6)])

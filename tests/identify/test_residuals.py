@@ -102,10 +102,10 @@ def test_an_unchanged_robot_is_predicted_from_noisy_readings_as_well_as_its_equi
     assert least * NOISE < noisy < most * NOISE
 
 
-def test_where_the_models_own_motion_diverges_noise_leaves_no_room(problem):
-    """Not a number as a bound would let every error pass."""
+def test_where_the_models_own_motion_diverges_its_error_is_infinite(problem):
+    """Not a number is no error: nothing can be compared with it."""
     columns = prediction.samples(problem, {"identified": TRUE}, SPLIT_S, np.ones(problem.segments, bool))
     (name,) = prediction.labels(problem)
     columns[f"{name}_identified"] = np.full_like(columns["into"], np.nan)
     noise = [Noise(name, "", NOISE, 0.0, 0.0)]
-    assert _of_noise(problem, columns, noise, TRUE, SPLIT_S, LENGTH_S - SPLIT_S) == {name: 0.0}
+    assert _of_noise(problem, columns, noise, TRUE, SPLIT_S, LENGTH_S - SPLIT_S) == {name: np.inf}

@@ -135,7 +135,7 @@ def test_another_world_has_its_own_parameters_and_the_robot_the_rest(table):
     oiled = checked(in_world(table, "oiled"), "here")
     assert isinstance(oiled, type(table))
     assert [p.name for p in oiled.model.dynamics()] == ["loop", "friction", "drag"]
-    assert oiled.identifiable(0.05).parameters.names[2:] == ("drag", "sensor_delay", "actuator_delay")
+    assert oiled.identifiable(0.05).parameters.names[2:] == ("drag", "actuator_delay")
     assert [p.name for p in table.model.dynamics()] == ["loop", "friction"]
     assert (oiled.drive, oiled.units, oiled.rate_hz) == (table.drive, table.units, table.rate_hz)
     assert oiled.identified_mjcf(VALUES) is None

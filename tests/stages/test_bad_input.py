@@ -55,7 +55,7 @@ def test_files_that_are_no_logs(fails, tmp_path, log):
         cut.write_bytes(content)
         assert word in fails(errors.ERROR, "identify", "pendulum", "--log", cut, "--runs", tmp_path)
     assert "there is no log" in fails(errors.ERROR, "identify", "pendulum", "--log", tmp_path / "none.mcap")
-    assert "there is no log" in fails(errors.ERROR, "identify", "pendulum", "--log", tmp_path, "--runs", tmp_path)
+    assert "session.mcap" in fails(errors.ERROR, "identify", "pendulum", "--log", tmp_path, "--runs", tmp_path)
     assert not (tmp_path / "pendulum").exists()
 
 

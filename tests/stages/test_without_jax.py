@@ -40,7 +40,7 @@ def test_check_prints_a_recording_as_json_and_the_reason_why_it_ends_there(tmp_p
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == errors.USAGE
     (recording,) = json.loads(done.stdout)["recordings"]
-    assert recording["sampling"]["samples"] > 1000
+    assert recording["samples"] > 1000
     assert "hint: copy it to a computer with sim2real" in done.stderr
 
 
@@ -59,14 +59,13 @@ def test_the_page_s_robot_runs_without_jax_and_trains_with_it(tmp_path):
     assert "ROBOT of pipeline 'mine'" in said
 
 
-@pytest.mark.parametrize(
-    ("words", "package"), [(["train", "pendulum"], "jax"), (["compare", "."], "scipy"), (["check", "pendulum"], "jax")]
-)
-def test_a_command_that_needs_the_rest_says_so(tmp_path, words, package):
-    code, said = call(WITHOUT_JAX, tmp_path, *words)
+@pytest.mark.parametrize("command", ["train", "check"])
+def test_a_command_that_needs_the_rest_says_so(tmp_path, command):
+    code, said = call(WITHOUT_JAX, tmp_path, command, "pendulum")
     assert code == errors.USAGE
-    assert f"needs the package {package}, which is not installed here" in said
-    assert "do it on a computer with sim2real" in said
+    assert "jax" in said.lower()
+    assert "not installed" in said
+    assert "hint: " in said
 
 
 def test_a_robot_whose_module_imports_jax_is_named(tmp_path):

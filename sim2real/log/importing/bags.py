@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ def is_ours(path: Path) -> bool:
                     return record.name == SESSION
                 if n > 2 or not isinstance(record, Header):
                     return False
-    except (OSError, McapError, ValueError):
+    except (OSError, McapError, ValueError, struct.error):  # of a file of fewer than 8 bytes
         pass
     return False
 
