@@ -45,6 +45,7 @@ MARKS = {
     "docs/guides/identify.md": [NIGHT],
     "docs/guides/interop.md": [NIGHT],
     "docs/guides/notebook.md": [NIGHT, PROCESS],
+    "docs/guides/record.md": [NIGHT],
     "docs/reference/identification.md": [NIGHT],
     "docs/reference/runs.md": [NIGHT],
     "docs/tutorial.md": [NIGHT, PROCESS],

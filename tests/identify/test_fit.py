@@ -142,6 +142,7 @@ def found(episode):
     )
 
 
+@pytest.mark.night
 def test_a_world_without_derivative_is_identified(found):
     result = found.fit
     assert not result.problem.residuals.forward
@@ -307,6 +308,7 @@ def test_what_is_padded_changes_nothing(episode, count):
     assert problem.losses(z[None], z, without)[0] == pytest.approx(0.5 * np.mean(rest**2), rel=1e-5)
 
 
+@pytest.mark.night
 def test_from_where_another_fit_ended_only_the_last_refinement_is_made(found, episode, monkeypatch):
     """A descent on windows would leave a minimum that long segments have."""
     cuts, descend = [], fitting._refine

@@ -164,6 +164,7 @@ def one():
     return SimpleNamespace(episode=episode, fit=whole, parts=parts, rows=rows)
 
 
+@pytest.mark.night
 @pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.night)])
 def test_a_part_that_is_left_out_might_as_well_not_have_been_recorded(one, count):
     for part, row in list(zip(one.parts, one.rows, strict=True))[:count]:
@@ -258,6 +259,7 @@ def test_recordings_are_left_out_whole_and_one_that_differs_stands_out(three):
     assert whole.values["bias"] > BIAS + 0.002
 
 
+@pytest.mark.night
 def test_terms_are_chosen_without_what_is_left_out(three):
     _, rows = three
     assert all("square" not in r.terms for r in rows)

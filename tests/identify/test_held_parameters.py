@@ -30,6 +30,7 @@ class Twice(Model):
         return {"world": LagParams(values["first"] * values["second"], values["tau"], start[0])}
 
 
+@pytest.mark.night
 @pytest.mark.parametrize("long_s", [0.0, 2.0])
 def test_one_factor_of_a_product_is_held_and_the_other_is_for_that_value(episode, long_s, monkeypatch):  # noqa: F811
     config = replace(CONFIG, long_s=long_s)

@@ -27,6 +27,7 @@ def test_round_trip_is_recovered(fitted):
     assert round_trip(fitted.values) == pytest.approx(round_trip(fitted.truth), abs=0.001)
 
 
+@pytest.mark.night
 def test_how_the_delay_is_shared_between_both_sides_of_the_world_changes_little(fitted):
     table = fitted.problem.table.with_fixed({"sensor_delay": 0.012})
     values = {**fitted.values, "sensor_delay": 0.012, "actuator_delay": fitted.values["actuator_delay"] - 0.012}

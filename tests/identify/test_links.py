@@ -86,6 +86,7 @@ def identify(log):
     return describe("measured", ("measured", "commands"), found, COMMAND_DELAY_S), found
 
 
+@pytest.mark.night
 @pytest.mark.parametrize(
     "kind", ["gamma", "bimodal", "usb", "held", pytest.param("bursts", marks=pytest.mark.night), "drift"]
 )

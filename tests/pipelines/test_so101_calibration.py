@@ -13,7 +13,7 @@ from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.plant import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.night]
 SO101 = load_pipeline("so101")
 GUIDE, PERSON = SO101.load("guide"), SO101.load("person")
 PLANT = f"{Path(__file__).with_name('wrong_arms.py')}:WrongArm"

@@ -65,6 +65,7 @@ def test_a_robot_that_leans_too_far_is_stopped(make_pipeline, tmp_path, capsys):
     assert read_log(folder / "episode_0.mcap").complete
 
 
+@pytest.mark.night
 def test_a_robot_that_would_fall_is_held_until_ctrl_c(tmp_path, start_cli):
     flags = ["--bundle", make_bundle("arm", tmp_path, 0.2), "--episodes", 1, "--duration-s", 1, "--runs", tmp_path]
     process = start_cli("deploy", "arm", "--hold", *flags, *PATIENT)

@@ -178,6 +178,7 @@ def test_a_joint_without_weight_is_brought_back_to_where_episodes_start(episodes
     assert np.abs(back).max() < 0.1
 
 
+@pytest.mark.night
 @pytest.mark.parametrize(
     "why", ["zero of the encoder", pytest.param("rest that does not hold", marks=pytest.mark.night)]
 )

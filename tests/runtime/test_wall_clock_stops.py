@@ -406,6 +406,7 @@ def test_a_start_can_be_stopped_at_every_line(clock, by):
     assert ("startup", "startup", "recorder.start", "stop", "stop") in states
 
 
+@pytest.mark.night
 def test_a_stop_can_be_interrupted_at_every_line(clock):
     """Ctrl-C while stop() waits: the nodes are stopped, and the next stop() ends what this one did not."""
 

@@ -82,6 +82,7 @@ assert not {{"jax", "flax", "onnx"}} & set(sys.modules)
         load_bundle(folder, "numpy")
 
 
+@pytest.mark.night
 def test_its_weights_make_the_same_policy(learnt):
     weights = learnt.best.to_weights()
     again = Policy.from_weights(weights, learnt.best.spec)

@@ -56,6 +56,7 @@ def test_what_is_resumed_ends_as_if_it_had_never_been_interrupted(whole, saved, 
     np.testing.assert_array_equal(again.best.log_std, whole.best.log_std)
 
 
+@pytest.mark.night
 def test_the_target_alone_may_be_another(saved):
     found = train(Bandit(), dataclasses.replace(CONFIG, target=1e-9), KEY, resume=saved)
     assert len(found.env_steps) in (2, 3, 4)

@@ -19,6 +19,7 @@ CONFIG = PPOConfig(
 )  # fmt: skip
 
 
+@pytest.mark.night
 def test_it_knows_what_the_policy_cannot_see():
     blind, seeing = (
         train(Coin(), dataclasses.replace(CONFIG, privileged=privileged), jax.random.key(0))

@@ -190,6 +190,7 @@ def test_differences_grow_evenly_from_update_to_update(interrupted):
     np.testing.assert_allclose(whole.history["return"], 0.7, rtol=1e-6, err_msg="evaluations have the last share")
 
 
+@pytest.mark.night
 def test_what_grows_is_resumed_bit_for_bit(interrupted):
     whole, path = interrupted
     found = train(Growing(), CONFIG, KEY, resume=path)
