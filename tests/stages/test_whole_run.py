@@ -154,7 +154,7 @@ def test_commands_about_runs_are_functions_too(run_copy, tmp_path):
     file = sim2real.export("pendulum", run.identification, tmp_path / "identified.json", "json")
     assert "friction" in json.dumps(strict_json(file))
     checked = sim2real.check("pendulum", run.recording)
-    assert {p.name for p in checked.parameters} >= {"gain", "friction", "round_trip_delay"}
+    assert {p.name for p in checked.parameters} >= {"gain", "friction", "actuator_delay"}
     assert "friction" in checked._repr_html_()
     scored = sim2real.validate("pendulum", run_copy / "identify", recorded(tmp_path / "later.mcap", 7))
     assert scored.errors[0].error > 0.0
