@@ -256,7 +256,7 @@ class Deployment(Shown):
         models = list(self.replay[0].rmse) if self.replay else []
         horizon = f"commands played again, RMSE {self.replay[0].horizon_s:g} s ahead" if self.replay else ""
         rows = [[r.name, *(r.rmse.get(m) for m in models), r.promised, r.unit] for r in self.replay]
-        return ArtifactTable((horizon, *models, "promised", "unit"), rows)
+        return ArtifactTable((horizon, *models, "expected", "unit"), rows)
 
     def save(self, folder: Path | str) -> dict[str, str]:
         """Write scores and simulation into a folder; the logs are in it already.

@@ -111,7 +111,7 @@ def _sentences(course: Course, row: Replay) -> Iterator[str]:
     if course.beside > _MAX_ERROR_RATIO * far:
         yield (
             f"{where} is {course.beside:.2g}{unit} or more beside all simulations of the policy "
-            f"for {_IGNORED_SHARE:.0%} of the time; promised were {far:.2g}{unit}"
+            f"for {_IGNORED_SHARE:.0%} of the time; expected were {far:.2g}{unit}"
         )
     for half, moved, least, most in zip(_HALVES, course.moved, course.least, course.most, strict=True):
         motion = f"{where} moves by {moved:.2g}{unit} in the {half} half"

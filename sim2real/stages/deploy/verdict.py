@@ -201,7 +201,7 @@ def _error_ratio(row: Replay, model: str) -> float:
 def _error(row: Replay, model: str) -> str:
     error, promised = row.rmse.get(model), row.promised or 0.0
     size = "it diverges" if error is None else f"off by {error:.2g} {row.unit}"
-    return f"{size} {row.horizon_s:g} s ahead, promised were {promised:.2g} {row.unit}"
+    return f"{size} {row.horizon_s:g} s ahead, expected were {promised:.2g} {row.unit}"
 
 
 def _change(c: Changed) -> str:

@@ -17,7 +17,7 @@ def tables(deployed: Deployment) -> list[Block]:
     if deployed.replay:
         caption = (
             "The recorded commands, played again on models: root mean square error of each model's prediction "
-            f"{deployed.replay[0].horizon_s:g} s ahead, and the error that the identification promised."
+            f"{deployed.replay[0].horizon_s:g} s ahead, and the expected error of the identification."
         )
         blocks.append(TableBlock.of(caption, deployed.replay_table()))
     if deployed.trained:
