@@ -49,13 +49,13 @@ _NAMES_OF_MODULE = {
     "sim2real.stages.record.stage": ("record",),
     "sim2real.stages.train.stage": ("train",),
     "sim2real.stages.validate.stage": ("validate",),
-    "sim2real.train.networks.policy": ("Policy",),
+    "sim2real.training.networks.policy": ("Policy",),
     "sim2real.view.graphs": ("plot_graph", "plot_timeline"),
 }
 _MODULE_OF_NAME = {name: module for module, names in _NAMES_OF_MODULE.items() for name in names}
 _MODULES = ("interop",)
 """Modules whose functions users call as ``sim2real.interop.vector_env(...)`` without an import of the module."""
-_CALLABLE_PACKAGES = ("identify", "train")
+_CALLABLE_PACKAGES = ("identify",)
 """Packages with the name of a public function: ``sim2real.identify`` is the function."""
 
 __all__ = sorted(_MODULE_OF_NAME)  # pyright: ignore[reportUnsupportedDunderAll] - the stub lists the names

@@ -44,7 +44,7 @@ from sim2real.stages.pipeline.pipeline import load_pipeline as load_pipeline
 from sim2real.stages.record.stage import record as record
 from sim2real.stages.train.stage import train as train
 from sim2real.stages.validate.stage import validate as validate
-from sim2real.train.networks.policy import Policy as Policy
+from sim2real.training.networks.policy import Policy as Policy
 from sim2real.view.graphs import plot_graph as plot_graph
 from sim2real.view.graphs import plot_timeline as plot_timeline
 

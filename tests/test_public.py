@@ -34,10 +34,10 @@ def test_help_and_signature_are_those_of_the_function(name):
     assert "Args:" in text
 
 
-@pytest.mark.parametrize("room", ["identify", "train"])
+@pytest.mark.parametrize("room", ["identify"])
 def test_a_room_stays_importable_beside_the_function_of_its_name(room):
     """In whatever order: importing a module of a room sets the room as the package's attribute, if nothing keeps it."""
-    module = {"identify": "parameters", "train": "sweep"}[room]
+    module = "parameters"
     code = f"""
 import sim2real
 import sim2real.{room}.{module}

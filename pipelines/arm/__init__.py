@@ -2,7 +2,7 @@
 
 from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
-from sim2real.train.config import PPOConfig
+from sim2real.training.config import PPOConfig
 
 # Goals in rad. Faster changes than the servos' profile of 5 rad/s are smoothed there, not here.
 GATE = GateLimits(limit=1.6, slew_per_s=20.0, max_speed_rad_s=12.0)

@@ -2,8 +2,8 @@
 
 from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.variation import VariationConfig
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.variation import VariationConfig
 
 VARY = VariationConfig(
     range={

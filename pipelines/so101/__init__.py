@@ -2,7 +2,7 @@
 
 from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
-from sim2real.train.config import PPOConfig
+from sim2real.training.config import PPOConfig
 
 # rad, rad/s, rad/s. Each joint's own limits are narrower; they keep the arm off the table: see robot.py.
 GATE = GateLimits(limit=1.75, slew_per_s=8.0, max_speed_rad_s=12.0)

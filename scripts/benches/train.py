@@ -16,9 +16,9 @@ from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.graph_environment import GraphEnvironment
-from sim2real.train.ppo.trainer import TrainResult, train
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.graph_environment import GraphEnvironment
+from sim2real.training.ppo.trainer import TrainResult, train
 
 SPREAD, SPREAD_S, DRAWS = 0.02, 0.002, 1024
 """Standard deviation of each parameter as a share, largest deviation of the delay [s], number of draws."""

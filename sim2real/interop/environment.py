@@ -15,8 +15,8 @@ from dm_env import specs
 from sim2real.errors import UsageError
 from sim2real.interop.pure_environment import Transition
 from sim2real.policy.contract import PolicyContract
-from sim2real.train.environment.graph_environment import EnvState, GraphEnvironment
-from sim2real.train.environment.policy_steps import PolicySteps
+from sim2real.training.environment.graph_environment import EnvState, GraphEnvironment
+from sim2real.training.environment.policy_steps import PolicySteps
 
 if TYPE_CHECKING:
     from sim2real.types import Key

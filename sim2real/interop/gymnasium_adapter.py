@@ -19,7 +19,7 @@ from sim2real.installation import with_extra
 from sim2real.interop.composed_task import PureTask
 from sim2real.interop.environment import Copy, RobotEnvironment
 from sim2real.interop.pure_environment import PureEnvironment, Transition
-from sim2real.train.environment.protocol import select
+from sim2real.training.environment.protocol import select
 
 try:
     import gymnasium

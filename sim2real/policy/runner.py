@@ -103,7 +103,7 @@ class NumpyBackend:
 
 
 def _gru_step(gru: Mapping[str, np.ndarray], carry: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the next state of a gated recurrent unit (``sim2real.train.networks.architectures.GRU``)."""
+    """Return the next state of a gated recurrent unit (``sim2real.training.networks.architectures.GRU``)."""
     of_input, of_state = np.split(x @ gru["kernel"] + gru["bias"], 3, -1), np.split(carry @ gru["recurrent"], 3, -1)
     # The logistic function by tanh, as exp overflows.
     reset, update = (0.5 * (1.0 + np.tanh(0.5 * (a + b))) for a, b in zip(of_input[:2], of_state[:2], strict=True))

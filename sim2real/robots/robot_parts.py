@@ -23,7 +23,7 @@ from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.probe import Probe
 from sim2real.robots.roles import Roles
-from sim2real.train.environment.tasks import Rewards
+from sim2real.training.environment.tasks import Rewards
 from sim2real.types import Array, Key, PyTree, Scalar
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.emulation.embedded import EmbeddedRobot
     from sim2real.hardware.safety.rig import GateConfig, Rig
     from sim2real.robots.gate_limits import GateLimits
-    from sim2real.train.environment.graph_environment import TrainingTask
+    from sim2real.training.environment.graph_environment import TrainingTask
 
 
 class Session(AbstractContextManager["Session"], Protocol):

@@ -20,12 +20,12 @@ from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.from_model.recorded import LoggedRobot
 from sim2real.robots.roles import Roles
-from sim2real.train.environment.tasks import EndingTask, Rewards
+from sim2real.training.environment.tasks import EndingTask, Rewards
 from sim2real.types import Array, Key, PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
 
 if TYPE_CHECKING:
-    from sim2real.train.environment.graph_environment import TrainingTask
+    from sim2real.training.environment.graph_environment import TrainingTask
 
 AnyRobot = TypeVar("AnyRobot", bound=RecordedRobot)
 

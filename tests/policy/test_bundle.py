@@ -40,7 +40,7 @@ def runner(request, bundle):
 def test_actions_equal_the_jax_policy(runner, weights, observations):
     import jax
 
-    from sim2real.train.networks.policy import Policy
+    from sim2real.training.networks.policy import Policy
 
     reference = np.asarray(jax.vmap(Policy.from_weights(weights).get_action)(observations))
     found = np.stack([runner.act(observation) for observation in observations])
@@ -52,7 +52,7 @@ def test_actions_equal_the_jax_policy(runner, weights, observations):
 def test_the_bundle_says_how_well_its_runner_agrees_with_jax(tmp_path, weights, contract, observations):
     import jax
 
-    from sim2real.train.networks.policy import Policy
+    from sim2real.training.networks.policy import Policy
 
     actions = np.asarray(jax.vmap(Policy.from_weights(weights).get_action)(observations))
     references = {"log": PolicyReference(observations[:200], actions[:200])}

@@ -10,7 +10,7 @@ from sim2real.policy import ActionTerm, PolicyContract
 from sim2real.policy.bundle import make_runner
 from sim2real.robots.control_loop.policy_node import PolicyNode, in_numpy
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.train.networks.policy import Policy
+from sim2real.training.networks.policy import Policy
 
 STEPS = 4
 

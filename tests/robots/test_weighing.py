@@ -20,8 +20,8 @@ from sim2real.hardware.emulation.truth import read_truth
 from sim2real.robots.walking.plain import weighing
 from sim2real.stages.estimation.fitted_logs import with_load
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.train.environment.draws import draw_robots
-from sim2real.train.environment.variation import VariationConfig
+from sim2real.training.environment.draws import draw_robots
+from sim2real.training.environment.variation import VariationConfig
 
 
 def logged(folder, seed, **options):

@@ -9,7 +9,7 @@ from sim2real.errors import UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train.show import disturbance_rows
 from sim2real.stages.train.training_setup import prepare
-from sim2real.train.environment.variation import VariationConfig
+from sim2real.training.environment.variation import VariationConfig
 
 
 @pytest.fixture(scope="module")

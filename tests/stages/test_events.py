@@ -8,7 +8,7 @@ from tensorboardX.proto.event_pb2 import Event
 
 from sim2real.errors import Sim2RealError
 from sim2real.stages.train.tensorboard import event_files
-from sim2real.train.ppo.result import Progress
+from sim2real.training.ppo.result import Progress
 
 
 def scalars(folder):

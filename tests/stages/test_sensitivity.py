@@ -17,9 +17,9 @@ from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train.sensitivity import models_of, moves_of, sensitivity, with_room
-from sim2real.train.environment.graph_environment import GraphEnvironment
-from sim2real.train.networks.architectures import MLP
-from sim2real.train.networks.policy import Policy
+from sim2real.training.environment.graph_environment import GraphEnvironment
+from sim2real.training.networks.architectures import MLP
+from sim2real.training.networks.policy import Policy
 
 VALUES = {
     "gain": 20.0, "gravity": 100.0, "damping": 20.0, "friction": 0.1, "sensor_delay": 0.02, "actuator_delay": 0.025,

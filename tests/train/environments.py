@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from sim2real.train.environment.protocol import Step
+from sim2real.training.environment.protocol import Step
 
 
 @struct.dataclass

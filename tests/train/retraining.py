@@ -15,9 +15,9 @@ from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.graph_environment import GraphEnvironment
-from sim2real.train.ppo.trainer import train
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.graph_environment import GraphEnvironment
+from sim2real.training.ppo.trainer import train
 
 
 def environment(recording: int) -> GraphEnvironment:

@@ -14,11 +14,11 @@ from flax import linen
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.policy import ActionTerm, NetworkSpec, ObservationTerm, PolicyContract, load_bundle, save_bundle
-from sim2real.train.config import PPOConfig
-from sim2real.train.networks.architectures import make_network
-from sim2real.train.networks.onnx_export import compare, export_graph
-from sim2real.train.networks.policy import Policy
-from sim2real.train.ppo.trainer import train
+from sim2real.training.config import PPOConfig
+from sim2real.training.networks.architectures import make_network
+from sim2real.training.networks.onnx_export import compare, export_graph
+from sim2real.training.networks.policy import Policy
+from sim2real.training.ppo.trainer import train
 
 CONFIG = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=8, total_steps=20_000, hidden=(8,), evaluations=1, eval_steps=20,

@@ -13,9 +13,9 @@ from sim2real.composer import mjcf
 from sim2real.composer.observation.observable import MJCFFeature
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
-from sim2real.train.environment.composed import TaskEnvironment, TaskState
-from sim2real.train.environment.graph_environment import GraphEnvironment, _require_reward
-from sim2real.train.environment.protocol import check_environment
+from sim2real.training.environment.composed import TaskEnvironment, TaskState
+from sim2real.training.environment.graph_environment import GraphEnvironment, _require_reward
+from sim2real.training.environment.protocol import check_environment
 
 CART = """
 <mujoco><worldbody><body><joint name="rail" type="slide" axis="1 0 0"/><geom size=".1" mass="0.5"/></body></worldbody>

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.train.config import PPOConfig
-from sim2real.train.scale.mesh import mesh_of
+from sim2real.training.config import PPOConfig
+from sim2real.training.scale.mesh import mesh_of
 
 SCRIPT = """
 import dataclasses, json, re
 import jax
 import numpy as np
 from environments import Bandit
-from sim2real.train.config import PPOConfig
-from sim2real.train.ppo import trainer
-from sim2real.train.sweep import Sweep
+from sim2real.training.config import PPOConfig
+from sim2real.training.ppo import trainer
+from sim2real.training.sweep import Sweep
 
 divided, shardings_of = [], trainer.shardings_of
 def seen(state, config):
@@ -40,9 +40,9 @@ for devices in (1, 8):
     found[devices] = [np.ravel(leaf).tolist() for leaf in [*leaves, *result.history.values()]]
 
 found["mesh"] = dict(divided[-1].whole.mesh.shape)
-from sim2real.train.scale.devices import place
-from sim2real.train.ppo.trainer import _train_until_evaluation
-from sim2real.train.ppo.initial_state import make_networks, make_initial_state
+from sim2real.training.scale.devices import place
+from sim2real.training.ppo.trainer import _train_until_evaluation
+from sim2real.training.ppo.initial_state import make_networks, make_initial_state
 
 config = dataclasses.replace(config, num_seeds=1, num_envs=48, rollout_steps=5, hidden=(7,), devices=2)
 networks = make_networks(Bandit(), config)

@@ -8,8 +8,8 @@ import pytest
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Quantity
 from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import UsageError
-from sim2real.train.environment.draws import COUNT, draw_robots, widen_posterior, without_default_ranges
-from sim2real.train.environment.variation import VariationConfig
+from sim2real.training.environment.draws import COUNT, draw_robots, widen_posterior, without_default_ranges
+from sim2real.training.environment.variation import VariationConfig
 
 NAMES = ("gain", "gravity", "actuator_delay", "zero")
 KINDS = ("dynamics", "dynamics", "delay", "measurement")

@@ -10,10 +10,10 @@ from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.train.environment.graph_environment import GraphEnvironment
-from sim2real.train.environment.tasks import checked_end, terms_of, total_of
-from sim2real.train.ppo.losses import gae
-from sim2real.train.ppo.rollout import Rows
+from sim2real.training.environment.graph_environment import GraphEnvironment
+from sim2real.training.environment.tasks import checked_end, terms_of, total_of
+from sim2real.training.ppo.losses import gae
+from sim2real.training.ppo.rollout import Rows
 
 FAST = 8.0
 """A pendulum that turns faster has failed [rad/s]."""

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from advantages import slow
 
-from sim2real.train.ppo.losses import gae
-from sim2real.train.ppo.rollout import Rows
+from sim2real.training.ppo.losses import gae
+from sim2real.training.ppo.rollout import Rows
 
 GAMMA, LAMBDA = 0.9, 0.8
 

@@ -11,10 +11,10 @@ from flax import linen
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle
 from sim2real.policy.network import NetworkSpec
-from sim2real.train.config import PPOConfig
-from sim2real.train.networks.architectures import GRU, make_network
-from sim2real.train.networks.sequences import unroll
-from sim2real.train.ppo.trainer import train
+from sim2real.training.config import PPOConfig
+from sim2real.training.networks.architectures import GRU, make_network
+from sim2real.training.networks.sequences import unroll
+from sim2real.training.ppo.trainer import train
 
 CONFIG = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=16, total_steps=60_000, hidden=(16,), evaluations=1, eval_steps=20,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim2real.errors import Sim2RealError
-from sim2real.train.networks.architectures import MLP, init_mlp
-from sim2real.train.networks.policy import Policy, entropy, log_prob
+from sim2real.training.networks.architectures import MLP, init_mlp
+from sim2real.training.networks.policy import Policy, entropy, log_prob
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import numpy as np
 import optax
 import pytest
 
-from sim2real.train.config import PPOConfig
-from sim2real.train.ppo.optimiser import MAX_RATE, MIN_RATE, adapt_rate, get_rate, make_optimiser, set_rate
+from sim2real.training.config import PPOConfig
+from sim2real.training.ppo.optimiser import MAX_RATE, MIN_RATE, adapt_rate, get_rate, make_optimiser, set_rate
 
 
 @pytest.mark.parametrize(

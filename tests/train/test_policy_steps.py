@@ -11,8 +11,8 @@ from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.train.environment.graph_environment import GraphEnvironment
-from sim2real.train.environment.policy_steps import PolicySteps
+from sim2real.training.environment.graph_environment import GraphEnvironment
+from sim2real.training.environment.policy_steps import PolicySteps
 
 VALUES = {"sensor_delay": 0.02, "actuator_delay": 0.025}
 

@@ -10,10 +10,10 @@ import pytest
 from environments import Bandit, Constant, Counter, Pendulum
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import check_environment
-from sim2real.train.ppo.trainer import train
-from sim2real.train.ppo.update import keys
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.protocol import check_environment
+from sim2real.training.ppo.trainer import train
+from sim2real.training.ppo.update import keys
 
 SMALL = PPOConfig(
     num_envs=64, minibatches=4, rollout_steps=16, total_steps=80_000, hidden=(32,), evaluations=4, eval_steps=20,

@@ -14,10 +14,10 @@ import pytest
 from environments import Bandit
 
 from sim2real.errors import UsageError
-from sim2real.train.config import PPOConfig
-from sim2real.train.ppo.trainer import train
-from sim2real.train.scale.hosts import HostsConfig
-from sim2real.train.scale.processes import join, leads
+from sim2real.training.config import PPOConfig
+from sim2real.training.ppo.trainer import train
+from sim2real.training.scale.hosts import HostsConfig
+from sim2real.training.scale.processes import join, leads
 
 CONFIG = PPOConfig(
     num_envs=16, minibatches=2, rollout_steps=4, total_steps=256, hidden=(8,), evaluations=2, eval_steps=2,
@@ -27,8 +27,8 @@ SCRIPT = """
 import json, os, sys
 from dataclasses import replace
 from pathlib import Path
-from sim2real.train.scale.hosts import HostsConfig
-from sim2real.train.scale.processes import join, leads, lost_process_errors
+from sim2real.training.scale.hosts import HostsConfig
+from sim2real.training.scale.processes import join, leads, lost_process_errors
 
 number, folder = int(sys.argv[1]), Path(sys.argv[3])
 join(HostsConfig(coordinator=sys.argv[2], processes=2, process=number, timeout_s=20))
@@ -37,7 +37,7 @@ import numpy as np
 from environments import Bandit
 from test_processes import CONFIG
 from sim2real.errors import Sim2RealError
-from sim2real.train.ppo.trainer import train
+from sim2real.training.ppo.trainer import train
 
 key, own = jax.random.key(3), folder / f"{number}.safetensors"
 
@@ -130,9 +130,9 @@ def test_who_loses_another_process_says_so(told):
 ALONE = """
 import os, sys, time
 from sim2real.errors import Sim2RealError
-from sim2real.train.scale import aborts
-from sim2real.train.scale.hosts import HostsConfig
-from sim2real.train.scale.processes import join, require_neighbours
+from sim2real.training.scale import aborts
+from sim2real.training.scale.hosts import HostsConfig
+from sim2real.training.scale.processes import join, require_neighbours
 
 aborts.GRACE_S = 1.0
 number = int(sys.argv[1])
@@ -196,7 +196,7 @@ def test_each_process_says_who_can_join_and_where_the_coordinator_is_not_reached
 @pytest.mark.parametrize("launcher", [pytest.param("slurm", marks=pytest.mark.night), "open_mpi"])
 def test_processes_of_a_launcher_find_each_other(launcher):
     text = "import os, signal; signal.signal(signal.SIGTERM, lambda *_: print('ended', flush=True)); "
-    text += "from sim2real.train.scale.processes import *; join(HostsConfig(found=True, timeout_s=20)); "
+    text += "from sim2real.training.scale.processes import *; join(HostsConfig(found=True, timeout_s=20)); "
     text += "os.kill(os.getpid(), signal.SIGTERM); print(jax.process_index(), jax.process_count(), leads())"
     with socket.socket() as free:  # both launchers' processes derive their port from the job's number
         free.bind(("127.0.0.1", 0))

@@ -15,12 +15,12 @@ from sim2real.graph.schedule import draw
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train.show import training_summary
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.graph_environment import GraphEnvironment
-from sim2real.train.environment.protocol import Step
-from sim2real.train.environment.pushes import Pushes
-from sim2real.train.environment.variation import VariationConfig
-from sim2real.train.ppo.trainer import Sweep, train
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.graph_environment import GraphEnvironment
+from sim2real.training.environment.protocol import Step
+from sim2real.training.environment.pushes import Pushes
+from sim2real.training.environment.variation import VariationConfig
+from sim2real.training.ppo.trainer import Sweep, train
 
 KEY = jax.random.key(4)
 CONFIG = PPOConfig(

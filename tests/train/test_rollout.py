@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from environments import Counter
 
-from sim2real.train.config import PPOConfig
-from sim2real.train.networks.architectures import MLP, init_mlp
-from sim2real.train.networks.policy import Policy
-from sim2real.train.ppo.rollout import Copies, collect, evaluate
+from sim2real.training.config import PPOConfig
+from sim2real.training.networks.architectures import MLP, init_mlp
+from sim2real.training.networks.policy import Policy
+from sim2real.training.ppo.rollout import Copies, collect, evaluate
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import pytest
 
 from sim2real.errors import Sim2RealError
 from sim2real.policy import ActionTerm, NetworkSpec, ObservationTerm, PolicyContract, load_bundle, save_bundle
-from sim2real.train.config import PPOConfig
-from sim2real.train.networks.architectures import MLP, init_mlp
-from sim2real.train.networks.policy import Policy, log_prob, log_slope
-from sim2real.train.networks.sequences import ActorCritic
-from sim2real.train.ppo.losses import Batch, loss
+from sim2real.training.config import PPOConfig
+from sim2real.training.networks.architectures import MLP, init_mlp
+from sim2real.training.networks.policy import Policy, log_prob, log_slope
+from sim2real.training.networks.sequences import ActorCritic
+from sim2real.training.ppo.losses import Batch, loss
 
 MEAN, LOG_STD = jnp.array([0.4]), jnp.array([-0.7])
 

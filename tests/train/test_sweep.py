@@ -8,10 +8,10 @@ import pytest
 from environments import Bandit
 
 from sim2real.errors import UsageError
-from sim2real.train.config import PPOConfig
-from sim2real.train.ppo.initial_state import swept_numbers
-from sim2real.train.ppo.trainer import train
-from sim2real.train.sweep import SWEPT, Sweep, format_point
+from sim2real.training.config import PPOConfig
+from sim2real.training.ppo.initial_state import swept_numbers
+from sim2real.training.ppo.trainer import train
+from sim2real.training.sweep import SWEPT, Sweep, format_point
 
 CONFIG = PPOConfig(
     num_seeds=2, num_envs=16, minibatches=2, rollout_steps=4, total_steps=512, hidden=(4,), evaluations=2, eval_steps=3,

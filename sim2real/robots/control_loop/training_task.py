@@ -13,12 +13,12 @@ from sim2real.graph.base import GraphState, StepState
 from sim2real.later import jax, jnp
 from sim2real.robots.control_loop.loop import draw_values
 from sim2real.robots.robot_parts import ConnectedParts
-from sim2real.train.environment.tasks import Rewards
+from sim2real.training.environment.tasks import Rewards
 from sim2real.types import PyTree
 
 
 class LoopTask:
-    """The training task of a robot in a loop; see ``sim2real.train.environment.graph_environment.TrainingTask``.
+    """The training task of a robot in a loop; see ``sim2real.training.environment.graph_environment.TrainingTask``.
 
     Args:
         draws: Samples of some parameters, each of shape ``(K,)``; one of the K joint samples is drawn for each episode

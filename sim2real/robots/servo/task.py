@@ -12,7 +12,7 @@ from sim2real.robots.contract import RobotTask
 from sim2real.robots.control_loop.loop import Draw
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.robots.servo.servos import Servos
-from sim2real.train.environment.tasks import Rewards
+from sim2real.training.environment.tasks import Rewards
 from sim2real.types import Array, Key, PyTree
 
 

@@ -62,7 +62,7 @@ def compare(
         simulated = [(states, states) for states in played]
     elif identification is not None and has_jax():
         from sim2real.stages.deploy.simulations import plausible_parameters, simulate  # JAX programs
-        from sim2real.train.networks.policy import Policy
+        from sim2real.training.networks.policy import Policy
 
         policy = Policy.from_weights(bundle.weights, bundle.spec)
         parameters = plausible_parameters(identification, len(recordings))

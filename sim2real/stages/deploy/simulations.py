@@ -18,8 +18,8 @@ from sim2real.robots.contract import Robot
 from sim2real.robots.score_columns import as_columns, as_sent
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.stages.terminal.console import note
-from sim2real.train.environment.draws import draw_robots
-from sim2real.train.environment.variation import VariationConfig
+from sim2real.training.environment.draws import draw_robots
+from sim2real.training.environment.variation import VariationConfig
 from sim2real.types import PyTree
 from sim2real.worlds.composed import ComposedWorld
 

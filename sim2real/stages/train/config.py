@@ -8,10 +8,10 @@ from tyro.conf import UseAppendAction
 from sim2real.errors import UsageError
 from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.variation import VariationConfig
-from sim2real.train.scale.hosts import HostsConfig
-from sim2real.train.sweep import Sweep
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.variation import VariationConfig
+from sim2real.training.scale.hosts import HostsConfig
+from sim2real.training.sweep import Sweep
 
 
 @dataclass(frozen=True)

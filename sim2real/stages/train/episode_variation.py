@@ -16,10 +16,10 @@ from sim2real.robots.control_loop.simulated_devices import SimSensor
 from sim2real.robots.control_loop.training_task import LoopTask
 from sim2real.stages.terminal.console import note
 from sim2real.stages.train.config import TrainConfig
-from sim2real.train.environment.graph_environment import TrainingTask
-from sim2real.train.environment.pushes import Pushes
-from sim2real.train.environment.timelines import TimelineDraw
-from sim2real.train.environment.variation import VariationConfig
+from sim2real.training.environment.graph_environment import TrainingTask
+from sim2real.training.environment.pushes import Pushes
+from sim2real.training.environment.timelines import TimelineDraw
+from sim2real.training.environment.variation import VariationConfig
 
 _MAX_TIMES = 5000
 """Number of times that are kept for pictures."""

@@ -10,9 +10,9 @@ from sim2real.stages.terminal.interruption import patiently
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.show import Watch, show_progress
 from sim2real.stages.train.training_setup import TrainingSetup
-from sim2real.train.ppo.trainer import Progress, TrainResult, train
-from sim2real.train.scale.processes import leads, lost_process_errors, require_neighbours
-from sim2real.train.sweep import Sweep
+from sim2real.training.ppo.trainer import Progress, TrainResult, train
+from sim2real.training.scale.processes import leads, lost_process_errors, require_neighbours
+from sim2real.training.sweep import Sweep
 
 
 def learn_policy(

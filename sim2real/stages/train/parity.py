@@ -13,7 +13,7 @@ from sim2real.policy.bundle import PolicyReference
 from sim2real.policy.runner import PolicyRunner
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.policy_node import in_numpy
-from sim2real.train.networks.policy import Policy
+from sim2real.training.networks.policy import Policy
 from sim2real.types import Array, PyTree
 
 MAX_OBSERVATIONS = 1000

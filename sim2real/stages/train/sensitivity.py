@@ -20,10 +20,10 @@ from sim2real.robots.control_loop.training_task import LoopTask
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.training_setup import prepare
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.graph_environment import GraphEnvironment, TrainingTask
-from sim2real.train.networks.policy import Policy
-from sim2real.train.ppo.rollout import evaluate
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.graph_environment import GraphEnvironment, TrainingTask
+from sim2real.training.networks.policy import Policy
+from sim2real.training.ppo.rollout import evaluate
 from sim2real.types import Array
 
 TIMELINES = 8

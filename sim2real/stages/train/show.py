@@ -6,9 +6,9 @@ from typing import Protocol
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.episodes import Episodes
 from sim2real.stages.terminal.console import artifact_table, table
-from sim2real.train.config import PPOConfig
-from sim2real.train.ppo.result import Progress, TrainResult
-from sim2real.train.sweep import Sweep
+from sim2real.training.config import PPOConfig
+from sim2real.training.ppo.result import Progress, TrainResult
+from sim2real.training.sweep import Sweep
 from sim2real.types import Json
 
 Cell = str | int | float | None

@@ -31,7 +31,7 @@ from sim2real.stages.train.show import Watch, show_history
 from sim2real.stages.train.tensorboard import watching
 from sim2real.stages.train.trained_bundle import bundle_of_training, contract_of
 from sim2real.stages.train.training_setup import prepare
-from sim2real.train.scale.processes import join, leads, lost_process_errors, wait_for_all
+from sim2real.training.scale.processes import join, leads, lost_process_errors, wait_for_all
 from sim2real.types import Json
 
 

@@ -14,8 +14,8 @@ from sim2real.installation import with_extra
 from sim2real.stages.live.viewer import live_view
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.show import Watch
-from sim2real.train.ppo.result import Progress
-from sim2real.train.sweep import Sweep
+from sim2real.training.ppo.result import Progress
+from sim2real.training.sweep import Sweep
 
 if TYPE_CHECKING:
     from tensorboardX import SummaryWriter

@@ -18,10 +18,10 @@ from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.parity import MAX_OBSERVATIONS, observations_of, reference_of
 from sim2real.stages.train.show import training_summary
 from sim2real.stages.train.training_setup import TrainingSetup
-from sim2real.train.environment.graph_environment import TrainingTask
-from sim2real.train.networks.onnx_export import export_graph
-from sim2real.train.ppo.trainer import TrainResult
-from sim2real.train.sweep import Sweep, format_point
+from sim2real.training.environment.graph_environment import TrainingTask
+from sim2real.training.networks.onnx_export import export_graph
+from sim2real.training.ppo.trainer import TrainResult
+from sim2real.training.sweep import Sweep, format_point
 
 
 def bundle_of_training(

@@ -17,10 +17,10 @@ from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.episode_variation import episodes_of, set_noise, set_start, with_disturbances
 from sim2real.stages.train.inputs import check_identification, timing_of, world_of
-from sim2real.train.environment.draws import draw_robots, without_default_ranges
-from sim2real.train.environment.graph_environment import GraphEnvironment
-from sim2real.train.environment.pushes import Pushes
-from sim2real.train.environment.timelines import RecordedTiming, draw_timelines
+from sim2real.training.environment.draws import draw_robots, without_default_ranges
+from sim2real.training.environment.graph_environment import GraphEnvironment
+from sim2real.training.environment.pushes import Pushes
+from sim2real.training.environment.timelines import RecordedTiming, draw_timelines
 
 
 @dataclass(frozen=True)

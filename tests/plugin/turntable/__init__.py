@@ -2,7 +2,7 @@
 
 from sim2real.stages.config import DeployConfig, GateLimits, IdentifyConfig, RecordConfig, TrainConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
-from sim2real.train.config import PPOConfig
+from sim2real.training.config import PPOConfig
 
 GATE = GateLimits(limit=12.0, slew_per_s=200.0, max_speed_rad_s=30.0, servo_watchdog_s=0.3)  # rad/s, rad/s^2, rad/s
 

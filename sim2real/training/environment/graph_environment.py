@@ -13,9 +13,9 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.runtime.compilation.compiled import CompiledGraph
 from sim2real.runtime.program_arguments import data_of, with_data
-from sim2real.train.environment.protocol import Step
-from sim2real.train.environment.pushes import Pushes
-from sim2real.train.environment.tasks import (
+from sim2real.training.environment.protocol import Step
+from sim2real.training.environment.pushes import Pushes
+from sim2real.training.environment.tasks import (
     REWARD,
     EndingTask,
     PrivilegedTask,
@@ -31,7 +31,7 @@ from sim2real.types import PyTree
 class TrainingTask(Protocol):
     """The training task of a pipeline: observation, action, reward and success.
 
-    ``sim2real.train.environment.tasks`` has protocols of further methods that a task may have.
+    ``sim2real.training.environment.tasks`` has protocols of further methods that a task may have.
 
     Attributes:
         supervisor: Name of the node whose steps the policy makes.

@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from sim2real.errors import UsageError
-from sim2real.train.config import PPOConfig
+from sim2real.training.config import PPOConfig
 
 SEEDS, COPIES = "seeds", "copies"
 """Names of the mesh's axes."""

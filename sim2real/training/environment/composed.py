@@ -11,8 +11,8 @@ import numpy as np
 from sim2real.composer.physics.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import UsageError
-from sim2real.train.environment.protocol import Step
-from sim2real.train.environment.tasks import REWARD
+from sim2real.training.environment.protocol import Step
+from sim2real.training.environment.tasks import REWARD
 
 if TYPE_CHECKING:
     from sim2real.composer.physics.mjx.environment import State

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import optax
 
 from sim2real.policy.network import NetworkSpec
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, widen
-from sim2real.train.networks.normaliser import Normaliser, deviations, normalise_parameters, update_normaliser
-from sim2real.train.networks.policy import Policy, log_prob
-from sim2real.train.networks.sequences import ActorCritic, unroll
-from sim2real.train.ppo.losses import Batch, gae, loss
-from sim2real.train.ppo.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
-from sim2real.train.ppo.rollout import Copies, Rows
-from sim2real.train.scale.mesh import divide_minibatches
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.protocol import TrainingEnvironment, widen
+from sim2real.training.networks.normaliser import Normaliser, deviations, normalise_parameters, update_normaliser
+from sim2real.training.networks.policy import Policy, log_prob
+from sim2real.training.networks.sequences import ActorCritic, unroll
+from sim2real.training.ppo.losses import Batch, gae, loss
+from sim2real.training.ppo.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
+from sim2real.training.ppo.rollout import Copies, Rows
+from sim2real.training.scale.mesh import divide_minibatches
 from sim2real.types import PyTree
 
 

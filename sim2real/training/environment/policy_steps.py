@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.train.environment.protocol import Step, choose
+from sim2real.training.environment.protocol import Step, choose
 
 if TYPE_CHECKING:
-    from sim2real.train.environment.graph_environment import EnvState, GraphEnvironment
+    from sim2real.training.environment.graph_environment import EnvState, GraphEnvironment
 
 
 class PolicySteps:

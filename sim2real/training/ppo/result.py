@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from sim2real.train.networks.policy import Policy
+from sim2real.training.networks.policy import Policy
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,24 +17,32 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.runtime.program_arguments import data_of, with_data
-from sim2real.train.config import PPOConfig as PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, check_environment, choose, get_width
-from sim2real.train.networks.architectures import Factory
-from sim2real.train.networks.policy import Policy
-from sim2real.train.networks.sequences import ActorCritic
-from sim2real.train.ppo.health import FINITE, check_target, check_values
-from sim2real.train.ppo.initial_state import make_initial_state, make_networks, swept_numbers
-from sim2real.train.ppo.result import Progress as Progress
-from sim2real.train.ppo.result import TrainResult as TrainResult
-from sim2real.train.ppo.result import find_best, history_of
-from sim2real.train.ppo.rollout import Copies, PolicyEvaluation, add_rows, averages, collect, evaluate, new_evaluation
-from sim2real.train.ppo.update import TrainState, keys, make_policy, update
-from sim2real.train.scale.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
-from sim2real.train.scale.compilation import compile_lowered, small_random_numbers
-from sim2real.train.scale.devices import Shardings, gather, place, replicate, shardings_of
-from sim2real.train.scale.processes import agree, leads, require_one_clock
-from sim2real.train.sweep import Sweep as Sweep
-from sim2real.train.sweep import with_numbers
+from sim2real.training.config import PPOConfig as PPOConfig
+from sim2real.training.environment.protocol import TrainingEnvironment, check_environment, choose, get_width
+from sim2real.training.networks.architectures import Factory
+from sim2real.training.networks.policy import Policy
+from sim2real.training.networks.sequences import ActorCritic
+from sim2real.training.ppo.health import FINITE, check_target, check_values
+from sim2real.training.ppo.initial_state import make_initial_state, make_networks, swept_numbers
+from sim2real.training.ppo.result import Progress as Progress
+from sim2real.training.ppo.result import TrainResult as TrainResult
+from sim2real.training.ppo.result import find_best, history_of
+from sim2real.training.ppo.rollout import (
+    Copies,
+    PolicyEvaluation,
+    add_rows,
+    averages,
+    collect,
+    evaluate,
+    new_evaluation,
+)
+from sim2real.training.ppo.update import TrainState, keys, make_policy, update
+from sim2real.training.scale.checkpoint import Checkpoint, TrainingIdentity, load_checkpoint, save_checkpoint
+from sim2real.training.scale.compilation import compile_lowered, small_random_numbers
+from sim2real.training.scale.devices import Shardings, gather, place, replicate, shardings_of
+from sim2real.training.scale.processes import agree, leads, require_one_clock
+from sim2real.training.sweep import Sweep as Sweep
+from sim2real.training.sweep import with_numbers
 from sim2real.types import Array, PyTree
 
 _Numbers = dict[str, Array]
@@ -156,7 +164,7 @@ class _Session(NamedTuple):
 def _train_until_evaluation(
     env: TrainingEnvironment, config: PPOConfig, networks: ActorCritic, state: TrainState
 ) -> tuple[TrainState, Policy, _Figures]:
-    """Train one seed until its next evaluation, and evaluate it; ``sim2real.train.ppo`` shows it as two loops.
+    """Train one seed until its next evaluation, and evaluate it; ``sim2real.training.ppo`` shows it as two loops.
 
     Training and evaluation are iterations of one scan: the environment's step, most of the program, is compiled once
     instead of twice: on a CPU the pendulum has 28 % less to compile, the arm 36 %.

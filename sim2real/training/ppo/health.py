@@ -3,8 +3,8 @@
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, metric_names
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.protocol import TrainingEnvironment, metric_names
 
 FINITE = {
     "finite_observation": ("the observation", "reset or step"),

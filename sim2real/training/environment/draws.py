@@ -8,7 +8,7 @@ import numpy as np
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.posterior import TRANSFORMS, Posterior
 from sim2real.errors import UsageError
-from sim2real.train.environment.variation import VariationConfig
+from sim2real.training.environment.variation import VariationConfig
 
 COUNT = 1024
 """Number of draws."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 from sim2real.errors import UsageError
-from sim2real.train.config import PPOConfig
+from sim2real.training.config import PPOConfig
 
 if TYPE_CHECKING:
     from sim2real.types import Array

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from sim2real.train.config import PPOConfig
-from sim2real.train.scale.mesh import COPIES, SEEDS, mesh_of
+from sim2real.training.config import PPOConfig
+from sim2real.training.scale.mesh import COPIES, SEEDS, mesh_of
 from sim2real.types import Array, PyTree
 
 if TYPE_CHECKING:
-    from sim2real.train.ppo.update import TrainState
+    from sim2real.training.ppo.update import TrainState
 
 
 T = TypeVar("T")

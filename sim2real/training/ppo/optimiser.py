@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from sim2real.train.config import PPOConfig
+from sim2real.training.config import PPOConfig
 
 ADAM_EPS = 1e-5
 MIN_RATE, MAX_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, first_reached, get_privileged
-from sim2real.train.networks.architectures import Factory, make_network, name_of
-from sim2real.train.networks.normaliser import Normaliser
-from sim2real.train.networks.sequences import ActorCritic
-from sim2real.train.ppo.optimiser import make_optimiser, set_rate
-from sim2real.train.ppo.rollout import Copies
-from sim2real.train.ppo.update import TrainState
-from sim2real.train.sweep import Sweep
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.protocol import TrainingEnvironment, first_reached, get_privileged
+from sim2real.training.networks.architectures import Factory, make_network, name_of
+from sim2real.training.networks.normaliser import Normaliser
+from sim2real.training.networks.sequences import ActorCritic
+from sim2real.training.ppo.optimiser import make_optimiser, set_rate
+from sim2real.training.ppo.rollout import Copies
+from sim2real.training.ppo.update import TrainState
+from sim2real.training.sweep import Sweep
 from sim2real.types import Array, PyTree
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import jax
 
-from sim2real.train.environment.protocol import select
-from sim2real.train.networks.architectures import Network, is_recurrent
-from sim2real.train.ppo.rollout import repeat
+from sim2real.training.environment.protocol import select
+from sim2real.training.networks.architectures import Network, is_recurrent
+from sim2real.training.ppo.rollout import repeat
 from sim2real.types import PyTree
 
 

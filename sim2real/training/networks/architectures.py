@@ -221,7 +221,7 @@ def make_network(
     if not isinstance(network, Network):
         raise UsageError(
             f"network {name_of(kind)} makes a {type(module).__name__}, neither a flax.linen.Module nor a Network",
-            hint="a Network has init, initial_carry and apply: sim2real.train.networks.architectures.Network",
+            hint="a Network has init, initial_carry and apply: sim2real.training.networks.architectures.Network",
         )
     _check_network(network, name_of(kind), inputs, outputs)
     if exported:
@@ -283,7 +283,7 @@ def _check_network(network: Network, name: str, inputs: int, outputs: int) -> No
 
 def _check_export(network: Network, name: str, inputs: int) -> None:
     """Raise unless a network can be translated to ONNX."""
-    from sim2real.train.networks.jaxpr_onnx import Translation, trace  # onnx takes 0.2 s to import
+    from sim2real.training.networks.jaxpr_onnx import Translation, trace  # onnx takes 0.2 s to import
 
     params = network.init(np.random.default_rng(0), inputs, 1.0)
     leaves, tree = jax.tree.flatten((network.initial_carry(), np.zeros(inputs, np.float32)))

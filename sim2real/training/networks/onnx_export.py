@@ -9,8 +9,8 @@ import numpy as np
 from sim2real.policy.bundle import check_parity, draw_samples
 from sim2real.policy.onnx_graph import make_model
 from sim2real.policy.runner import OnnxBackend
-from sim2real.train.networks.jaxpr_onnx import Translation, trace
-from sim2real.train.networks.policy import Policy
+from sim2real.training.networks.jaxpr_onnx import Translation, trace
+from sim2real.training.networks.policy import Policy
 
 PARITY = 1e-4
 """Largest accepted difference between ONNX and JAX, as a fraction of the actions' range. A layer's norm amplifies

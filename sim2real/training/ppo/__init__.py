@@ -45,8 +45,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sim2real.train.ppo.result import TrainResult
-    from sim2real.train.ppo.trainer import train as train
+    from sim2real.training.ppo.result import TrainResult
+    from sim2real.training.ppo.trainer import train as train
 
 __all__ = ["train"]
 
@@ -54,7 +54,7 @@ __all__ = ["train"]
 def __getattr__(name: str) -> Callable[..., TrainResult]:
     """Import ``train`` on first use: it imports JAX."""
     if name in __all__:
-        from sim2real.train.ppo import trainer
+        from sim2real.training.ppo import trainer
 
         return getattr(trainer, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

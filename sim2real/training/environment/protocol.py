@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.train.config import PPOConfig
+from sim2real.training.config import PPOConfig
 from sim2real.types import PyTree
 
 T = TypeVar("T")

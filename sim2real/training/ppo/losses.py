@@ -5,11 +5,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sim2real.train.config import PPOConfig
-from sim2real.train.networks.architectures import Network, is_recurrent
-from sim2real.train.networks.policy import entropy, log_prob, log_slope
-from sim2real.train.networks.sequences import ActorCritic, unroll
-from sim2real.train.ppo.rollout import Rows
+from sim2real.training.config import PPOConfig
+from sim2real.training.networks.architectures import Network, is_recurrent
+from sim2real.training.networks.policy import entropy, log_prob, log_slope
+from sim2real.training.networks.sequences import ActorCritic, unroll
+from sim2real.training.ppo.rollout import Rows
 from sim2real.types import PyTree
 
 

@@ -6,9 +6,9 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
-from sim2real.train.config import PPOConfig
-from sim2real.train.environment.protocol import TrainingEnvironment, get_privileged, get_reset, metric_names, select
-from sim2real.train.networks.policy import Policy
+from sim2real.training.config import PPOConfig
+from sim2real.training.environment.protocol import TrainingEnvironment, get_privileged, get_reset, metric_names, select
+from sim2real.training.networks.policy import Policy
 from sim2real.types import PyTree
 
 T = TypeVar("T")

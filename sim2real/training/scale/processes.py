@@ -11,9 +11,9 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.train.config import PPOConfig
-from sim2real.train.scale.aborts import aborted, catch_aborts
-from sim2real.train.scale.hosts import HostsConfig
+from sim2real.training.config import PPOConfig
+from sim2real.training.scale.aborts import aborted, catch_aborts
+from sim2real.training.scale.hosts import HostsConfig
 from sim2real.types import Json
 
 _SHUTDOWN_S = 7 * 86400

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
-from sim2real.train.environment.variation import VariationConfig
+from sim2real.training.environment.variation import VariationConfig
 from sim2real.types import PyTree
 
 

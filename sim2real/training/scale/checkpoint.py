@@ -21,11 +21,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.train.config import PPOConfig
-from sim2real.train.networks.policy import Policy
-from sim2real.train.ppo.result import Progress
-from sim2real.train.ppo.update import TrainState
-from sim2real.train.sweep import Sweep
+from sim2real.training.config import PPOConfig
+from sim2real.training.networks.policy import Policy
+from sim2real.training.ppo.result import Progress
+from sim2real.training.ppo.update import TrainState
+from sim2real.training.sweep import Sweep
 from sim2real.types import Array, Json, PyTree
 
 _METADATA = "training"
