@@ -35,7 +35,6 @@ BENCHES = {
     "drift": ("drift", "how often the drift test detects and names a change of a hidden SO-101"),
     "faults": ("faults", "faults while a policy runs: time until the motor is safe, the log, exit code and message"),
     "graph": ("graph", "the compiled graph against a robot written by hand"),
-    "identify": ("recorded.identify", "recordings of real motors, fitted on one part and judged on another"),
     "latency-league": ("latency", "six emulated links, whose delays four methods estimate"),
     "league": ("recorded.league", "every recording, held out in parts, against mujoco.sysid, PACE and BAM"),
     "legs-identify": ("legs_identify", "hidden Go2s: the errors of identified parameters and delays"),

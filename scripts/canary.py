@@ -34,21 +34,7 @@ CASES: tuple[tuple[str, str, Tolerances], ...] = (
         "arm_cpu",
         {**RUN, "*/held_out_mae_mrad": ("times", 1.5), "*/reached/identified": ("less by", 2.0)},
     ),
-    (
-        "identify --case disk",
-        "identify_disk",
-        {"*/disk/free_run_rmse_rad": ("times", 1.15), "*/fit_s": ("times", 2.0)},
-    ),
-    (
-        "identify --case xl330 --seeds 0",
-        "identify_xl330",
-        {"*/xl330/test_mae_mrad": ("times", 1.15)},
-    ),
-    (
-        "identify --case so101_log",
-        "identify_so101",
-        {"*_sysid_*": ("times", 1.5), "*_rmse_mrad": ("times", 1.3), "*/fit_s": ("times", 2.0)},
-    ),
+    ("league --entrants ours --folds 1 --sets disk xl330 so101", "league", {"*/worst": ("times", 1.15)}),
     ("faults --runs 1 --jobs 1", "faults", {}),
     ("async --seconds 10", "", {}),
 )
@@ -78,12 +64,12 @@ def why_red(row: Mapping[str, Any], committed: Mapping[str, Any] | None, toleran
 def main() -> int:
     """Run the benches; print red rows."""
     parser = argparse.ArgumentParser("canary.py", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--data", type=Path, help="folder of the public recordings; without it, no identify")
+    parser.add_argument("--data", type=Path, help="folder of the public recordings; without it, no league")
     options, red = parser.parse_args(), []
     with tempfile.TemporaryDirectory() as folder:
         for command, name, tolerances in CASES:
             words, new = command.split(), Path(folder) / "report.json"
-            if words[0] == "identify":
+            if words[0] == "league":
                 if options.data is None:
                     continue
                 words += ["--data", str(options.data)]

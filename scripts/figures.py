@@ -23,7 +23,6 @@ TABLES = {
     "arm": ("runs.arm.table", "arm_cpu"),
     "so101": ("runs.arm.table", "so101_cpu"),
     "so101_time": ("runs.arm.sentence", "so101_cpu"),
-    "real": ("recorded.identify.table", "identify_disk", "identify_xl330", "identify_so101"),
     "league": ("recorded.league.table", "league"),
     "worst_joint": ("recorded.league.worst_joint", "league"),
     "carried": ("carried.table", "carried"),

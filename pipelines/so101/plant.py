@@ -4,7 +4,7 @@ Run by the emulator's process; imports neither JAX nor the pipeline's model, so 
 geometry is therefore written down a second time (source: see parts.py).
 
 The parameters are those that were identified on recordings of a real SO-101, isaac-sim2real/sage @ 4ffd2627
-(Apache-2.0), by `python scripts/bench.py identify --case so101_log` (reports/identify_so101.json). There they are
+(Apache-2.0), by `sim2real identify so101_log`. There they are
 divided by a joint's inertia, or by its servo's stiffness. In units of torque:
 
 - Gain. Rotation's servo pushes no harder beyond 0.45 rad; taken for the 2.94 N m of its data sheet, the gain is 6.53

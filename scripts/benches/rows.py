@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.stats import binomtest
 
 from sim2real.types import PyTree
@@ -87,16 +86,6 @@ def share(successes: int, trials: int) -> tuple[float, float, float]:
     """Return a share and its exact 95 % interval (Clopper and Pearson): value, lower end, upper end."""
     ends = binomtest(successes, trials).proportion_ci(method="exact")
     return successes / trials, ends.low, ends.high
-
-
-def mean_absolute(errors: np.ndarray) -> float:
-    """Return the mean absolute error."""
-    return float(np.abs(errors).mean())
-
-
-def rmse(errors: np.ndarray) -> float:
-    """Return the root mean square error."""
-    return float(np.sqrt(np.mean(errors**2)))
 
 
 def medians(

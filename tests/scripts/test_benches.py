@@ -20,11 +20,10 @@ PROCESSES = ("arm", "async", "demo", "faults", "light", "runner", "so101")
 """Benches that start robots or keep deadlines on the wall clock."""
 ON_A_GPU = ("walk-rival", "walk-train")
 FLAGS = {"compose": ["--parts", "step"], "graph": ["--mjx", "0"], "randomise": ["--ways", "all", "--record-s", "12"]}
-RECORDED = ("identify", "league")
 ON_A_CPU = [
     pytest.param(name, marks=[pytest.mark.process] if name in PROCESSES else [])
     for name in bench.BENCHES
-    if name not in (*ON_A_GPU, *RECORDED)
+    if name not in (*ON_A_GPU, "league")
 ]
 
 
@@ -42,20 +41,6 @@ def test_quick_run_writes_a_report(name, tmp_path):
     assert report["quick"]
     assert report["rows"]
     assert all(set(line) == {"name", "value", "unit", "yardstick", "goal"} for line in report["rows"])
-
-
-@pytest.mark.night
-def test_identify_beside_mujoco_sysid(tmp_path):
-    pytest.importorskip("mujoco.sysid")
-    voltage = np.repeat(np.random.default_rng(0).uniform(-2, 2, 50), 10)
-    state, angles = np.zeros(2), []
-    for u in voltage:
-        for _ in range(5):
-            state = state + 0.005 * np.array([state[1], 50.0 * u - 100.0 * np.sin(state[0]) - 5.0 * state[1]])
-        angles.append(state[0])
-    np.savez(tmp_path / "disk.npz", u=voltage, th=np.array(angles))
-    names = {line["name"] for line in run(tmp_path, "identify", "--data", tmp_path / "disk.npz")["rows"]}
-    assert {"identify/disk/fit_s", "identify/disk/free_run_over_sysid"} <= names
 
 
 @pytest.mark.night

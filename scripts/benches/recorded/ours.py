@@ -112,12 +112,6 @@ def predict_whole(case: Case, models: Mapping[str, Any], test: Mapping[str, Epis
     return columns | {"ahead": columns["into"] - settle}
 
 
-def errors_of(case: Case, columns: Columns, recording: int, model: str) -> np.ndarray:
-    """Return a model's errors over one recording, ``(N, joints)`` [rad]."""
-    pick = (columns["recording"] == recording) & (columns["ahead"] > 0)
-    return np.stack([columns[f"{f}_{model}"][pick] - columns[f"{f}_measured"][pick] for f in case.fields], axis=1)
-
-
 def fit(name: str, fold: Fold, data: Path, seed: int) -> Fit:
     """Identify with our own settings, without a limit of time.
 

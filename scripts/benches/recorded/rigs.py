@@ -15,7 +15,6 @@ damping, friction and encoder bias, and one delay in whole steps, by CMA-ES from
   MuJoCo's Euler step responds half a step early, so the delay that it reports is about half a physics step
   (``PHYSICS_S``) shorter than the loop's. Neither is corrected here.
 - Residuals are plain position errors [rad], not divided by the norm of each recording.
-- Intervals are ``calculate_intervals`` at the last Jacobian of the optimiser, 95 %, linearised.
 - An actuator cannot be switched off during a roll-out: a recording whose torque is disabled on the way is fitted in two
   parts. The second has no drive and no back-EMF, and starts at the position and velocity measured there.
 """
@@ -96,19 +95,12 @@ class Rig:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted rig.
-
-    Attributes:
-        interval95: Of each parameter, if the optimiser ended within its iterations.
-        seconds: Wall-clock time.
-    """
+    """A fitted rig."""
 
     rig: Rig
     parameters: sysid.ParameterDict
     evaluations: int
     starts: int = 1
-    interval95: dict[str, tuple[float, float]] | None = None
-    seconds: float = 0.0
 
     def value(self, name: str) -> float:
         """Return a parameter."""
@@ -149,21 +141,6 @@ class _Residual:
         if np.min(self.losses) < self.lowest:
             self.lowest, self.best = float(np.min(self.losses)), columns[:, int(np.argmin(self.losses))].copy()
         return residuals
-
-
-def fit_once(rig: Rig, fitted: Sequence[Recording], delay: bool, iterations: int) -> Fit:
-    """Fit all terms with the toolbox's optimiser from the guess, without a limit of time."""
-    parameters, transform = _parameters({**rig.plain, **rig.more}, delay)
-    residual = _Residual([run for r in fitted for run in rig.runs(r)], transform, np.inf)
-    begin = time.perf_counter()
-    with contextlib.redirect_stdout(io.StringIO()):
-        best, optimum = sysid.optimize(parameters, residual, verbose=False, max_iters=iterations, x_scale="jac")
-    seconds, evaluations = time.perf_counter() - begin, residual.evaluations
-    _, half = sysid.calculate_intervals(residual(optimum.x, best)[0], optimum.jac)
-    names = list(best.keys())
-    values = {name: float(best[name].value[0]) for name in names}
-    interval = {name: (values[name] - float(h), values[name] + float(h)) for name, h in zip(names, half, strict=True)}
-    return Fit(rig, best, evaluations, 1, interval, seconds)
 
 
 def fit_sysid(rig: Rig, fitted: Sequence[Recording], ours: bool, budget_s: float, seed: int) -> Fit:
@@ -473,9 +450,3 @@ def described(recording: Recording) -> Rig | None:
         drive = {"kp": (GO2_KP, 1.0, 500.0, _of_drives(lambda a, v: _set_drive(a, v, None)))}
         drive["kd"] = (GO2_KD, 0.0, 20.0, _of_drives(lambda a, v: _set_drive(a, None, v)))
     return Rig(lambda r: [Run(r, spec)], {**drive, **rows}, more, {**drive, **rows}, biased=not force)
-
-
-def predict_joints(fits: Sequence[Fit], recordings: Sequence[Recording]) -> list[np.ndarray]:
-    """Return the predictions of fits of single joints, side by side."""
-    columns = [fit.predict([r.joint(j) for r in recordings]) for j, fit in enumerate(fits)]
-    return [np.hstack(joints) for joints in zip(*columns, strict=True)]

@@ -44,12 +44,6 @@ EMPS = {"mjcf": "emps.xml", "fit": ["fit.npz[0:0.6]"], "test": ["fit.npz[0.6:1]"
 """The axis's validation file is not read: the end of the estimation file is held out."""
 DESCRIPTION = "league.toml"
 FOLDERS = {"disk": "unbalanced_disk", "xl330": "bam_xl330", "so101_log": "so101"}
-SPECS = {
-    "disk": ":25000", "disk_test": "25000:30000",
-    "xl330": "kp=100,800", "xl330_test": "kp=200",
-    "so101_log": "chirp_sweep[0:0.9] multisine prbs_excitation single_joint_*[0:0.5]",
-    "so101_log_test": "step_response single_joint_*[0.5:1]",
-}  # fmt: skip
 BEFORE = 20
 """Number of samples before a test part of the disk from which its initial state is estimated."""
 
