@@ -29,7 +29,6 @@ from benches.rows import ROOT, missed, text_of
 BENCHES = {
     "arm": ("runs.arm", "the arm's whole run"),
     "async": ("asynchronous", "the simulated clock's speed, and the wall clock's lateness"),
-    "carried": ("carried", "an arm whose controller carries its weight, from two logs to a verdict"),
     "compose": ("compose", "control steps against dm_control, tasks on Warp against bare steps"),
     "demo": ("runs.demo", "the pendulum's whole run for several seeds"),
     "drift": ("drift", "how often the drift test detects and names a change of a hidden SO-101"),
@@ -40,7 +39,7 @@ BENCHES = {
     "legs-identify": ("legs_identify", "hidden Go2s: the errors of identified parameters and delays"),
     "light": ("light", "sim2real-robot in a new environment: its size, and record's processor time"),
     "randomise": ("hidden.randomise", "success on hidden robots by what the training was given"),
-    "runner": ("runner", "a step of a policy in numpy, and the loop of twelve joints at 500 Hz"),
+    "runner": ("runner", "a step of a policy in numpy, and the loop of an emulated Go2 at 500 Hz"),
     "scaling": ("train", "training on all devices of a host against one"),
     "so101": ("runs.arm", "the SO-101's whole run"),
     "train": ("train", "PPO on the pendulum with its delays"),

@@ -12,6 +12,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+
 sys.path.insert(0, str(Path(__file__).parent))
 
 from benches.rows import ROOT, Report, markdown, missed
@@ -25,7 +27,6 @@ TABLES = {
     "so101_time": ("runs.arm.sentence", "so101_cpu"),
     "league": ("recorded.league.table", "league"),
     "worst_joint": ("recorded.league.worst_joint", "league"),
-    "carried": ("carried.table", "carried"),
     "latency": ("latency.table", "latency_league"),
     "randomise": ("hidden.randomise.table", "randomise", "randomise_worn"),
     "wall": ("hidden.randomise.sentence", "randomise_wall"),
@@ -50,7 +51,7 @@ IMAGES = {
 }
 
 
-def written(function: str, *reports: Report) -> str:
+def made(function: str, *reports: Report) -> Any:
     """Return what a bench's function makes of reports."""
     module, _, name = function.rpartition(".")
     return getattr(importlib.import_module(f"benches.{module}"), name)(*reports)
@@ -84,7 +85,7 @@ def main() -> int:
     tables = {"missed": missed_goals(reports)}
     for table, (function, *names) in TABLES.items():
         about = "; ".join(origin(name, reports[name]) for name in names)
-        tables[table] = f"{written(function, *(reports[name] for name in names))}\nMeasured: {about}.\n"
+        tables[table] = f"{made(function, *(reports[name] for name in names))}\nMeasured: {about}.\n"
     for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         text = old = page.read_text()
         for name, table in tables.items():
@@ -94,8 +95,10 @@ def main() -> int:
                 text = head + begin + table + end + rest.partition(end)[2]
         if text != old:
             page.write_text(text)
+    # A figure is the same file again as long as its report is the same.
+    matplotlib.rcParams.update({"svg.hashsalt": "sim2real", "svg.fonttype": "none", "font.family": "sans-serif"})
     for path, (function, *names) in IMAGES.items():
-        (ROOT / path).write_text(written(function, *(reports[name] for name in names)))
+        made(function, *(reports[name] for name in names)).savefig(ROOT / path, metadata={"Date": None})
     return 0
 
 

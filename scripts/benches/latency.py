@@ -141,8 +141,8 @@ STEP_S, LONGEST_S = 0.001, 0.08
 GUESS = {"kp": 14.0, "damping": 0.6, "friction": 0.05, "armature": 0.03}
 """Assumed values of the servo before it is fitted, by every method."""
 _DIFFERENCE, _EVERY = 0.01, 2
-PACE_STEP_S, PACE_S = 0.0025, 8.0
-"""PACE's time step, whose multiples its delays are, and the processor time of its search, restarts included [s]."""
+PACE_STEP_S, SEARCH_S = 0.0025, 8.0
+"""PACE's time step, whose multiples its delays are; processor time of its and mujoco.sysid's search [s]."""
 Ends = tuple[float, float] | None
 
 
@@ -206,19 +206,16 @@ def _problem(log: Log, step_s: float) -> tuple[rigs.Rig, Recording]:
 
 
 def sysid(log: Log, seed: int) -> Estimate:
-    """Fit the servo and mujoco.sysid's delay of the sensor, with its simulated linearised interval."""
-    del seed
+    """Fit the servo and mujoco.sysid's delay of the sensor within PACE's time; no interval."""
     rig, recording = _problem(log, STEP_S)
-    fit = rigs.fit_once(rig, [recording], delay=True, iterations=25)
     # The toolbox stamps a reading at the end of the step at whose begin it was taken.
-    low, high = fit.interval95["delay"]
-    return _constant(fit.value("delay") + 0.5 * STEP_S, (low + 0.5 * STEP_S, high + 0.5 * STEP_S))
+    return _constant(rigs.fit_sysid(rig, [recording], True, SEARCH_S, seed).value("delay") + 0.5 * STEP_S)
 
 
 def pace(log: Log, seed: int) -> Estimate:
     """Fit the servo, an encoder's bias and a delay in whole steps by CMA-ES, as PACE does; it gives no interval."""
     rig, recording = _problem(log, PACE_STEP_S)
-    return _constant(rigs.fit_pace(rig, [recording], PACE_S, seed).value("delay") + 0.5 * PACE_STEP_S)
+    return _constant(rigs.fit_pace(rig, [recording], SEARCH_S, seed).value("delay") + 0.5 * PACE_STEP_S)
 
 
 def correlation(log: Log, seed: int) -> Estimate:
@@ -229,9 +226,9 @@ def correlation(log: Log, seed: int) -> Estimate:
     return _constant(float(lags[int(np.argmax([np.corrcoef(g, log.position)[0, 1] for g in held]))]))
 
 
-def _constant(delay_s: float, ends: Ends = None) -> Estimate:
+def _constant(delay_s: float) -> Estimate:
     """Return a delay that is the same for all messages."""
-    return Estimate(delay_s, delay_s, 0.0, ends, ends)
+    return Estimate(delay_s, delay_s)
 
 
 METHODS: dict[str, Callable[[Log, int], Estimate]] = {

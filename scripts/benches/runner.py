@@ -1,14 +1,12 @@
-"""A policy on the robot: a single step of it, and the loop of twelve joints, on an emulated bus and an emulated Go2."""
+"""A policy on the robot: a single step of it, and the loop of twelve joints of an emulated Go2 over DDS."""
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,13 +14,8 @@ import numpy as np
 
 from benches.rows import Report, Row, markdown, missed, row
 from pipelines.go2.plant import LYING
-from sim2real.graph.base import Base
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.device import Device
-from sim2real.hardware.dynamixel.bus import BusConfig
-from sim2real.hardware.dynamixel.device import DynamixelServos
-from sim2real.hardware.dynamixel.drive import VoltageDrive
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
@@ -38,9 +31,7 @@ from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import realtime
 
 QUICK = {"steps": 200, "seconds": 0.5, "rate": 50.0}
-JOINTS, SUPPLY_V, LIMIT_V = 12, 5.0, 2.0
-BAUD = 4_000_000
-"""Twelve servos' states are 280 bytes: 2.8 ms at 1 Mbaud, more than the period at 500 Hz; 0.7 ms at this rate."""
+JOINTS, LIMIT_V = 12, 2.0
 
 
 def policy(observations: int, actions: int, rate_hz: float, hidden: tuple[int, ...] = (64, 64)) -> PolicyRunner:
@@ -86,8 +77,8 @@ def _damped(torque: Any) -> LegCommand:
     return LegCommand(np.array(LYING), rest, rest, np.full(JOINTS, 3.0), torque)
 
 
-def nodes_of(rig: Rig, rate_hz: float, message: Callable[[Any], Base] = Goals) -> dict[str, BaseNode]:
-    """Return sensor, policy and actuator of twelve joints; ``message`` makes a command of the policy's action."""
+def nodes_of(rig: Rig, rate_hz: float) -> dict[str, BaseNode]:
+    """Return sensor, policy and actuator of twelve joints."""
     rest = JointReading(np.zeros(JOINTS), np.zeros(JOINTS))
     agent = DirectAgent("agent", rate_hz, _see, (2 * JOINTS, JOINTS), 1, Goals, delay=0.0005)
     return control_nodes(
@@ -95,23 +86,8 @@ def nodes_of(rig: Rig, rate_hz: float, message: Callable[[Any], Base] = Goals) -
             "sensor", rate_hz, rig, lambda r: JointReading(r.position_rad, r.velocity_rad_s), rest, delay=0.001
         ),
         PolicyNode(agent, policy(5 * JOINTS, JOINTS, rate_hz)),
-        ServoActuator("actuator", rate_hz, rig, "goal", message, delay=0.0005),
+        ServoActuator("actuator", rate_hz, rig, "goal", _damped, delay=0.0005),
     )
-
-
-@contextmanager
-def servos() -> Iterator[Rig]:
-    """Yield a rig of twelve servos on an emulated bus."""
-    plant = f"{Path(__file__).with_name('twelve_joints.py')}:TwelveJoints"
-    config = EmulatorConfig(baud_rate=BAUD, return_delay_us=0, plant_step_s=0.001)
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        EmbeddedRobot(plant, config, None, Path(folder) / "truth.bin") as robot,
-    ):
-        bus = BusConfig(robot.port, baud_rate=BAUD, silence_s=1.0, max_silence_s=1.0)
-        device = DynamixelServos(bus, list(range(1, JOINTS + 1)), VoltageDrive(SUPPLY_V))
-        with Rig(device, GateConfig(LIMIT_V)) as rig:
-            yield rig
 
 
 @contextmanager
@@ -176,11 +152,9 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> Report:
     """Measure single steps of the policy, and the loops."""
     flags, rows = (options.rate, options.seconds, options.spin_s), a_step(options.steps)
-    with servos() as rig:
-        rows += loop(f"runner/{JOINTS}_joints_{options.rate:g}_hz", rig, nodes_of(rig, options.rate), *flags)
     with legs() as rig:
         rows.append(a_cycle(rig.device, options.steps // 10))
-        rows += loop(f"runner/go2_{options.rate:g}_hz", rig, nodes_of(rig, options.rate, _damped), *flags)
+        rows += loop(f"runner/go2_{options.rate:g}_hz", rig, nodes_of(rig, options.rate), *flags)
     return {"rows": rows}
 
 
@@ -190,10 +164,9 @@ def table(report: Report) -> str:
     rate = report["flags"]["rate"]
     lines = [("a step of the policy in numpy, median", "numpy/32-64-64-8/p50_us", "us")]
     lines += [("the Go2's `measure` and `command`, processor time", "go2/measure_and_command_us", "us")]
-    for base, what in ((f"{JOINTS}_joints_{rate:g}_hz", "twelve servos"), (f"go2_{rate:g}_hz", "the Go2")):
-        nodes = ("sensor", "agent", "actuator")
-        lines += [(f"{what} at {rate:g} Hz: lateness of {n}, p99", f"{base}/{n}/lateness_ms", "ms") for n in nodes]
-        lines.append((f"{what} at {rate:g} Hz: wait for a reading, p99", f"{base}/reading_ms", "ms"))
+    base, what, nodes = f"go2_{rate:g}_hz", f"the Go2 at {rate:g} Hz", ("sensor", "agent", "actuator")
+    lines += [(f"{what}: lateness of {n}, p99", f"{base}/{n}/lateness_ms", "ms") for n in nodes]
+    lines.append((f"{what}: wait for a reading, p99", f"{base}/reading_ms", "ms"))
     cells = []
     for about, name, unit in lines:
         value = of[name]["value"][1] if isinstance(of[name]["value"], list) else of[name]["value"]

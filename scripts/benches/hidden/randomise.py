@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from benches.hidden import robots as hidden
 from benches.jobs import robots
@@ -293,24 +294,19 @@ def sentence(report: Report) -> str:
     )
 
 
-def figure(ideal: Report, worn: Report) -> str:
-    """Return README's figure as SVG: success on hidden robots by what the training was given."""
-    row_px, left_px, scale_px = 44, 390, 3.6
-    height_px = 60 + row_px * len(TRAINED_ON)
-    body = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 820 {height_px}" font-family="sans-serif">',
-        "<title>Success on hidden robots by what the training was given</title>",
-        f'<rect width="820" height="{height_px}" fill="#ffffff"/>',
-        '<rect x="390" y="14" width="14" height="12" fill="#0b62b0"/><text x="410" y="25">nearly ideal robots</text>',
-        '<rect x="570" y="14" width="14" height="12" fill="#b8540c"/><text x="590" y="25">worn robots</text>',
-    ]
-    for i, (way, label) in enumerate(TRAINED_ON.items()):
-        top_px = 44 + i * row_px
-        body.append(f'<text x="{left_px - 12}" y="{top_px + 20}" text-anchor="end">{label}</text>')
-        for j, (report, colour) in enumerate(((ideal, "#0b62b0"), (worn, "#b8540c"))):
-            percent, y_px = 100 * values(report)[f"randomise/{way}/success"], top_px + 16 * j
-            body.append(
-                f'<rect x="{left_px}" y="{y_px}" width="{scale_px * percent:.0f}" height="13" fill="{colour}"/>'
-                f'<text x="{left_px + scale_px * percent + 6:.0f}" y="{y_px + 11}">{percent:.0f} %</text>'
-            )
-    return "\n".join([*body, "</svg>", ""])
+def figure(ideal: Report, worn: Report) -> Figure:
+    """Return README's figure: success on hidden robots by what the training was given."""
+    drawn = Figure((8.2, 2.9), layout="constrained")
+    axes = drawn.subplots()
+    places = np.arange(len(TRAINED_ON))
+    for offset, (report, label) in zip(
+        (-0.18, 0.18), ((ideal, "nearly ideal robots"), (worn, "worn robots")), strict=True
+    ):
+        shares = [100 * values(report)[f"randomise/{way}/success"] for way in TRAINED_ON]
+        axes.bar_label(axes.barh(places + offset, shares, 0.34, label=label), fmt="%.0f %%", padding=3)
+    axes.set_yticks(places, list(TRAINED_ON.values()))
+    axes.set(xlim=(0, 110), xticks=[], xlabel="deployments that swing up and balance")
+    axes.invert_yaxis()
+    axes.spines[["top", "right", "bottom"]].set_visible(False)
+    drawn.legend(loc="outside upper center", ncols=2)
+    return drawn

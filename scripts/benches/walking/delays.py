@@ -19,6 +19,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from benches.jobs import each
 from benches.rows import Report, markdown, share
 from benches.walk import Trial, judged
@@ -130,9 +132,6 @@ def trained(
     (work / name / "training.json").write_text(json.dumps(about, indent=1))
 
 
-COLOURS = ("#b8540c", "#0b62b0", "#2c8a4b")
-LEFT, WIDTH, TOP, HEIGHT, APART = 62, 310, 62, 210, 410
-"""Place and size of a panel, and the distance of the two [px]."""
 _FALLS, _ERROR = "falls", "error_m_s"
 LABELS = {
     "nominal": "nominal: no delay, one robot",
@@ -157,57 +156,24 @@ def table(report: Mapping[str, Any]) -> str:
     return markdown(head, lines, "r" * len(head))
 
 
-def figure(report: Mapping[str, Any]) -> str:
-    """Return the figure as SVG: falls with exact 95 % intervals, and the error of the velocity, over the true delay."""
+def figure(report: Mapping[str, Any]) -> Figure:
+    """Return the figure: falls with exact 95 % intervals, and the error of the velocity, over the true delay."""
     delays, v = _of(report)
-    twins, most = report["flags"]["twins"], max(v[name, ms, _ERROR] for name in LABELS for ms in delays)
-    top_error = 0.1 * (int(10 * most) + 1)
-    body = [
-        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 820 330" font-family="sans-serif" font-size="13">',
-        "<title>Falls and velocity error of three policies over the true delay</title>",
-        '<rect width="820" height="330" fill="#ffffff"/>',
-        *_axes(0, f"falls of {twins} twins, 95 % interval", twins, delays, "{:.0f}"),
-        *_axes(1, "error of the velocity [m/s]", top_error, delays, "{:.2g}"),
-    ]
+    twins = report["flags"]["twins"]
+    drawn = Figure((8.2, 3.3), layout="constrained")
+    falls, errors = drawn.subplots(1, 2, sharex=True)
     for i, (name, label) in enumerate(LABELS.items()):
-        colour, left = COLOURS[i], LEFT + 250 * i
-        body.append(f'<rect x="{left}" y="10" width="14" height="12" fill="{colour}"/>')
-        body.append(f'<text x="{left + 20}" y="21">{label}</text>')
-        for panel, what, most in ((0, _FALLS, twins), (1, _ERROR, top_error)):
-            # The curves stand beside one another, so that their intervals can stay apart.
-            places = [(x(panel, ms, delays) + 5 * (i - 1), y(v[name, ms, what], most)) for ms in delays]
-            path = " ".join(f"{a:.1f},{b:.1f}" for a, b in places)
-            body.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2"/>')
-            for ms, (a, b) in zip(delays, places, strict=True):
-                body.append(f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.5" fill="{colour}"/>')
-                if what == _FALLS:
-                    _, low, high = share(int(v[name, ms, what]), twins)
-                    ends = f'y1="{y(twins * low, twins):.1f}" y2="{y(twins * high, twins):.1f}"'
-                    body.append(f'<line x1="{a:.1f}" x2="{a:.1f}" {ends} stroke="{colour}"/>')
-    return "\n".join([*body, "</svg>", ""])
-
-
-def x(panel: int, ms: float, delays: list[float]) -> float:
-    """Return the place of a delay in a panel [px]."""
-    return LEFT + APART * panel + 12 + (WIDTH - 24) * ms / max(*delays, 1.0)
-
-
-def y(value: float, most: float) -> float:
-    """Return the place of a value on an axis from 0 to ``most`` [px]."""
-    return TOP + HEIGHT * (1.0 - value / most)
-
-
-def _axes(panel: int, title: str, most: float, delays: list[float], form: str) -> list[str]:
-    left, bottom = LEFT + APART * panel, TOP + HEIGHT
-    lines = [f'<text x="{left}" y="{TOP - 14}">{title}</text>']
-    for i in range(6):
-        value, at = most * i / 5, y(most * i / 5, most)
-        lines.append(f'<line x1="{left}" x2="{left + WIDTH}" y1="{at:.1f}" y2="{at:.1f}" stroke="#dddddd"/>')
-        lines.append(f'<text x="{left - 8}" y="{at + 4:.1f}" text-anchor="end">{form.format(value)}</text>')
-    lines += [
-        f'<text x="{x(panel, ms, delays):.1f}" y="{bottom + 20}" text-anchor="middle">{ms:g}</text>' for ms in delays
-    ]
-    return [*lines, f'<text x="{left + WIDTH / 2}" y="{bottom + 42}" text-anchor="middle">true delay [ms]</text>']
+        # The curves stand beside one another, so that their intervals can stay apart.
+        beside = [ms + 0.5 * (i - 1) for ms in delays]
+        counts = [v[name, ms, _FALLS] for ms in delays]
+        ends = [[twins * end for end in share(int(count), twins)[1:]] for count in counts]
+        below, above = zip(*((n - low, high - n) for n, (low, high) in zip(counts, ends, strict=True)), strict=True)
+        falls.errorbar(beside, counts, (below, above), fmt="o-", label=label)
+        errors.plot(beside, [v[name, ms, _ERROR] for ms in delays], "o-")
+    falls.set(title=f"falls of {twins} twins, 95 % interval", xlabel="true delay [ms]", ylim=(0, twins))
+    errors.set(title="error of the velocity [m/s]", xlabel="true delay [ms]", ylim=(0, None))
+    drawn.legend(loc="outside upper center", ncols=len(LABELS))
+    return drawn
 
 
 def _of(report: Mapping[str, Any]) -> tuple[list[float], dict[tuple[str, float, str], float]]:
