@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.plant import OperatingMode
+from sim2real.emulation.truth import Kind
+from sim2real.hardware.device import OperatingMode
 
 TINY = [
     *("--identify.generations=10", "--identify.population=8", "--identify.folds=0"),

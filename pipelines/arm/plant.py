@@ -11,8 +11,8 @@ from typing import Any, Final
 
 from mujoco import MjData, MjModel, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel.registers import PWM_FULL_SCALE, RAD_PER_COUNT
-from sim2real.hardware.plant import OperatingMode
 
 CENTRE_RAD: Final = 2048 * RAD_PER_COUNT
 """Reading of the encoder while the joint is at 0 and the arm hangs [rad]."""

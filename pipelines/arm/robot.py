@@ -32,7 +32,7 @@ HAND = Hand("elbow", (0.0, 0.0, -LINK_M), most_kg=0.3, least_kg=-0.044)  # the t
 
 def embedded() -> Embedded:
     """Return the emulated arm, with latencies that no stage reads."""
-    from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+    from sim2real.emulation.dynamixel import EmulatorConfig
 
     emulator = EmulatorConfig(
         sensing_latency_s=0.006,

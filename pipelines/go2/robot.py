@@ -27,7 +27,7 @@ def _pose(now: Moment) -> jnp.ndarray:
 
 def embedded(place: Place) -> Embedded:
     """Return the emulated Go2, lying on the floor or in a stand, with parameters and latencies that no stage reads."""
-    from sim2real.hardware.unitree.emulation import UnitreeEmulation
+    from sim2real.emulation.legs import UnitreeEmulation
 
     seed, file = 37, Path(__file__).with_name("plant.py")
     return Embedded(f"{file}:Go2Body", UnitreeEmulation(*latencies(seed)), {"place": place, "seed": seed})

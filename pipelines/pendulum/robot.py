@@ -75,7 +75,7 @@ class HingeDrive(RobotDrive):
     @cached_property
     def embedded(self) -> Embedded:
         """The emulated pendulum. The stages never read its latencies; ``--reveal`` compares with them."""
-        from sim2real.hardware.dynamixel.emulation import EmulatorConfig
+        from sim2real.emulation.dynamixel import EmulatorConfig
 
         emulator = EmulatorConfig(
             sensing_latency_s=0.020,

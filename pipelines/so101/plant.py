@@ -25,8 +25,8 @@ from typing import Any, Final
 import numpy as np
 from mujoco import MjData, MjModel, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.feetech.registers import RAD_PER_COUNT
-from sim2real.hardware.plant import OperatingMode
 
 ZERO_COUNTS: Final = (2133, 2118, 2154, 2127, 2133, 2098)
 """Counts of the encoders while the joints are at 0, before the servos' homing offset."""

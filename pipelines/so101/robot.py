@@ -87,7 +87,7 @@ class SO101Robot(Robot):
 
 def embedded() -> Embedded:
     """Return the emulated arm, with latencies that no stage reads."""
-    from sim2real.hardware.feetech.emulation import StsEmulation
+    from sim2real.emulation.feetech import StsEmulation
 
     draw = random.Random("an SO-101 of its own")
     emulator = StsEmulation(

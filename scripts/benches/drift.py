@@ -23,9 +23,10 @@ import numpy as np
 from benches import jobs
 from benches.hidden import robots as hidden
 from benches.rows import Report, Row, markdown, row, share
+from sim2real.emulation.plant import PlantClock, load_plant
+from sim2real.emulation.truth import TruthLog
 from sim2real.errors import Sim2RealError
-from sim2real.hardware.emulation.truth import TruthLog
-from sim2real.hardware.plant import OperatingMode, PlantClock, load_plant
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.safety.gate import SafetyGate
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.pipeline.pipeline import load_pipeline

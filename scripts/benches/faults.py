@@ -31,10 +31,10 @@ import numpy as np
 
 from benches.rows import Report, row, values
 from sim2real import cli
+from sim2real.emulation import process as emulator
+from sim2real.emulation.truth import Kind, Truth, read_truth
 from sim2real.errors import ERROR, HARDWARE_LOST, SAFETY_STOP, Sim2RealError
-from sim2real.hardware.emulation import emulator
-from sim2real.hardware.emulation.truth import Kind, Truth, read_truth
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -124,7 +124,7 @@ def swinging_bundle(folder: Path) -> Path:
 def _server() -> Any:
     """Return the server that forks the processes; it has imported the slow modules, and computed nothing."""
     server = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload(["sim2real.stages.deploy.stage", "sim2real.hardware.dynamixel.emulation", "mujoco"])
+    server.set_forkserver_preload(["sim2real.stages.deploy.stage", "sim2real.emulation.dynamixel", "mujoco"])
     return server
 
 

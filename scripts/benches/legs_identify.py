@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> Report:
 def one(seed: int, options: argparse.Namespace) -> dict[str, Any]:
     """Record a twin, identify it, and compare with its true parameters."""
     from sim2real.artifacts.identification import ROUND_TRIP
-    from sim2real.hardware.emulation.truth import read_truth
+    from sim2real.emulation.truth import read_truth
     from sim2real.stages.identify.stage import identify
 
     with tempfile.TemporaryDirectory() as folder:

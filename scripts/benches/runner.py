@@ -14,9 +14,9 @@ import numpy as np
 
 from benches.rows import Report, Row, markdown, missed, row
 from pipelines.go2.plant import LYING
+from sim2real.emulation.process import EmbeddedRobot
 from sim2real.graph.node import BaseNode
 from sim2real.hardware.device import Device
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, PolicyRunner
@@ -93,8 +93,8 @@ def nodes_of(rig: Rig, rate_hz: float) -> dict[str, BaseNode]:
 @contextmanager
 def legs() -> Iterator[Rig]:
     """Yield a rig of an emulated Go2 that lies, over DDS."""
+    from sim2real.emulation.legs import UnitreeEmulation
     from sim2real.hardware.unitree.device import UnitreeLegs
-    from sim2real.hardware.unitree.emulation import UnitreeEmulation
 
     with EmbeddedRobot("pipelines.go2.plant:Go2Body", UnitreeEmulation()) as robot:
         device = UnitreeLegs(robot.port, silence_s=1.0, max_silence_s=1.0)

@@ -20,7 +20,7 @@ from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.types import Json
 
 if TYPE_CHECKING:
-    from sim2real.hardware.emulation.truth import Truth
+    from sim2real.emulation.truth import Truth
 
 LOG, TRUTH = "session.mcap", "truth.bin"
 
@@ -113,7 +113,7 @@ class Recording(Shown):
         Raises:
             Sim2RealError: When its file is damaged.
         """
-        from sim2real.hardware.emulation.truth import read_truth  # training reads recordings without hardware
+        from sim2real.emulation.truth import read_truth  # training reads recordings without hardware
 
         return None if self.truth_path is None else read_truth(self.truth_path)
 

@@ -1,6 +1,7 @@
 """The contract of a device: motors that can be measured and commanded, over any connection.
 
-`sim2real.hardware.safety.rig.Rig` puts the safety gate in front of any device; `sim2real.hardware.testing` tests one.
+`sim2real.hardware.safety.rig.Rig` puts the safety gate in front of any device; `sim2real.emulation.conformance` tests
+one.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, IntEnum
 from typing import Final, Literal, Self, TypeAlias
 
 import numpy as np
@@ -139,6 +140,16 @@ class CommandKind:
 VOLTAGE: Final = CommandKind("volts", "V", "zero")
 DUTY: Final = CommandKind("duties", "1", "zero")
 POSITION: Final = CommandKind("positions", "rad", "hold")
+
+
+class OperatingMode(IntEnum):
+    """Mode of a motor; the numbers are those of DYNAMIXEL's register, with OFF for torque off."""
+
+    OFF = 0
+    VELOCITY = 1
+    POSITION = 3
+    EXTENDED_POSITION = 4
+    PWM = 16
 
 
 class Alone(Enum):

@@ -1,12 +1,16 @@
 """Devices by name: those of sim2real, and those of installed packages."""
 
+import importlib
+import importlib.util
+import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol, cast
 
 from sim2real.errors import UsageError
 from sim2real.hardware.device import Device
 from sim2real.hardware.entries import DEVICES, available
-from sim2real.hardware.plant import load_named
 
 
 class DeviceFactory(Protocol):
@@ -60,3 +64,42 @@ def load_entry(what: str, name: str, group: str, contract: str) -> Callable[...,
             hint=f"see sim2real.{contract}",
         )
     return factory
+
+
+def load_named(spec: str, what: str) -> Callable[..., Any]:
+    """Return the callable that a command line names as `package.module:Name` or `path/to/file.py:Name`.
+
+    Args:
+        what: The noun for it in errors, e.g. ``plant``.
+
+    Raises:
+        UsageError: The module, the file or the name does not exist, or it cannot be called.
+    """
+    place, _, name = spec.rpartition(":")
+    if not place or not name:
+        hint = f"e.g. my_robot/{what}.py:{what.title()}"
+        raise UsageError(f"{what} {spec!r} is not of the form MODULE_OR_FILE:NAME", hint=hint)
+    module = _load_module(place, what)
+    target: Callable[..., Any] | None = getattr(module, name, None)
+    if not callable(target):
+        available = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+        raise UsageError(f"{place} has no callable {name!r}. Available: {available}")
+    return target
+
+
+def _load_module(place: str, what: str) -> ModuleType:
+    path = Path(place)
+    if path.suffix == ".py":
+        module_spec = importlib.util.spec_from_file_location(f"_sim2real_{what}_{path.stem}", path)
+        if not path.is_file() or module_spec is None or module_spec.loader is None:
+            raise UsageError(f"there is no {what} file {path}")
+        module = importlib.util.module_from_spec(module_spec)
+        sys.modules[module.__name__] = module  # dataclasses look up their module there
+        module_spec.loader.exec_module(module)
+        return module
+    try:
+        return importlib.import_module(place)
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"{what} module {place!r} cannot be imported: {error}", hint="a file's path must end in .py"
+        ) from error

@@ -29,8 +29,8 @@ from sim2real.types import Array, Key, PyTree, Scalar
 if TYPE_CHECKING:
     import jax
 
+    from sim2real.emulation.process import EmbeddedRobot
     from sim2real.hardware.device import Reading
-    from sim2real.hardware.emulation.embedded import EmbeddedRobot
     from sim2real.hardware.safety.rig import GateConfig, Rig
     from sim2real.robots.gate_limits import GateLimits
     from sim2real.training.environment.graph_environment import TrainingTask

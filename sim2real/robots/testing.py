@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2real.emulation.truth import Kind, read_truth
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import named_leaves
 from sim2real.graph.schedule import draw
-from sim2real.hardware.emulation.truth import Kind, read_truth
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 from sim2real.identify.model import IdentifiableModel
 from sim2real.robots import score_columns
 from sim2real.robots.contract import RecordedRobot, Robot

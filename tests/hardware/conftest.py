@@ -1,9 +1,9 @@
 import pytest
 from virtual_bus import PLANTS, VirtualBus
 
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.emulation.virtual import VirtualRobot
 
 
 @pytest.fixture

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.emulation.bus import BusEmulation
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.feetech import StsEmulation
+from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware.device import Device
 from sim2real.hardware.dynamixel import registers as dynamixel
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.emulation.emulated_bus import BusEmulation
-from sim2real.hardware.emulation.virtual import VirtualRobot
 from sim2real.hardware.feetech import registers as feetech
 from sim2real.hardware.feetech.calibration import CalibratedJoint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
-from sim2real.hardware.feetech.emulation import StsEmulation
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 

@@ -146,7 +146,7 @@ def mean_latencies(truth) -> dict[str, float]:
     bytes to its effect. `sample_before_request_s`: time from the sample to the arrival of the read's bytes;
     negative if sampled later.
     """
-    from sim2real.hardware.emulation.truth import Kind  # not in a robot's process
+    from sim2real.emulation.truth import Kind  # not in a robot's process
 
     samples = truth.of(Kind.SAMPLE)
     effects = truth.of(Kind.EFFECT)
@@ -164,6 +164,6 @@ def _mean_s(durations_ns):
 
 def lateness_s(truth):
     """Return the lateness of each answer against the plan, shape (N,) [s]: the emulator's real-time error."""
-    from sim2real.hardware.emulation.truth import Kind
+    from sim2real.emulation.truth import Kind
 
     return 1e-9 * truth.rows["late_ns"][[kind in (Kind.SAMPLE, Kind.REPLY) for kind in truth.rows["kind"]]]

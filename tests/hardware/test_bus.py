@@ -2,12 +2,12 @@
 
 import pytest
 
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.plant import OperatingMode
 
 PWM = OperatingMode.PWM
 

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from sim2real.emulation.conformance import DeviceConformance
+from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.testing import DeviceConformance
 
 PLANTS = Path(__file__).parent / "plants.py"
 

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
+from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.hardware.bus import models
 from sim2real.hardware.device import Alone
 from sim2real.hardware.dynamixel import models as dynamixel
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.feetech import device as feetech
 
 GUIDE = Path(__file__).parents[2] / "docs" / "guides" / "safety.md"

@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from virtual_bus import IdleDevice
 
+from sim2real.emulation.plant import MountedPlant
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.device import DUTY, POSITION, VOLTAGE, CommandKind, Counters, Reading, Transaction
-from sim2real.hardware.emulation.mounted_plant import MountedPlant
+from sim2real.hardware.device import DUTY, POSITION, VOLTAGE, CommandKind, Counters, OperatingMode, Reading, Transaction
 from sim2real.hardware.joint import Joint, Mounting
-from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 

@@ -8,9 +8,9 @@ import pytest
 from families import FAMILIES, IDS, STS
 from virtual_bus import IdleDevice
 
+from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError
 from sim2real.hardware.device import VOLTAGE, Counters, Transaction
-from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.plausibility import Plausibility
 from sim2real.hardware.safety.rig import Rig

@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
+from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.bus.packets import Instruction
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, BusLink, ServoBus
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
 from sim2real.hardware.dynamixel.protocol import PROTOCOL
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 

@@ -2,10 +2,10 @@ import math
 
 import pytest
 
+from sim2real.emulation.dynamixel import EmulatedServo
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.protocol import StatusError
-from sim2real.hardware.dynamixel.servo import EmulatedServo
-from sim2real.hardware.plant import OperatingMode
 
 
 def write(servo, register, value):

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from sim2real.emulation.servo_plant import TwinPlant
 from sim2real.errors import UsageError
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
-from sim2real.hardware.emulation.twin import TwinPlant
-from sim2real.hardware.plant import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 CENTRE_RAD = 2048 * RAD_PER_COUNT

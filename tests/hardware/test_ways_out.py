@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from families import FAMILIES, STS, VOLTS
 
+from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.bus.packets import Instruction
-from sim2real.hardware.emulation.truth import Kind
 from sim2real.hardware.safety import guardian_process
 
 PERIOD_S = 0.02

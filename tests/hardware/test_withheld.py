@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from sim2real.emulation.truth import Kind
 from sim2real.errors import SafetyStop
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
 from sim2real.hardware.dynamixel.drive import PositionDrive, VoltageDrive
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 

@@ -1,11 +1,11 @@
 from functools import cached_property
 from pathlib import Path
 
+from sim2real.emulation.bus import truth_header
+from sim2real.emulation.plant import load_plant
+from sim2real.emulation.truth import TruthLog, read_truth
+from sim2real.emulation.virtual import VirtualTime
 from sim2real.hardware.device import Device
-from sim2real.hardware.emulation.emulated_bus import truth_header
-from sim2real.hardware.emulation.truth import TruthLog, read_truth
-from sim2real.hardware.emulation.virtual import VirtualTime
-from sim2real.hardware.plant import load_plant
 
 PLANTS = Path(__file__).parent / "plants.py"
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.hardware.plant import OperatingMode, load_plant
+from sim2real.emulation.plant import load_plant
+from sim2real.hardware.device import OperatingMode
 
 FILE = Path(__file__).resolve().parents[2] / "pipelines" / "arm" / "plant.py"
 ArmPlant = functools.partial(load_plant, f"{FILE}:ArmPlant")  # as the emulator gets it

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("pendulum")

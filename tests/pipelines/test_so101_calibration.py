@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from sim2real.commands.new_like import calibrate
+from sim2real.emulation.feetech import StsEmulation
+from sim2real.emulation.process import EmbeddedRobot
+from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, Sim2RealError
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.feetech.emulation import StsEmulation
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pytestmark = [pytest.mark.process, pytest.mark.night]

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.hardware.plant import OperatingMode, load_plant
+from sim2real.emulation.plant import load_plant
+from sim2real.hardware.device import OperatingMode
 
 FILE = Path(__file__).resolve().parents[2] / "pipelines" / "so101" / "plant.py"
 SO101Plant = functools.partial(load_plant, f"{FILE}:SO101Plant")  # as the emulator gets it
@@ -127,7 +128,7 @@ def test_half_the_p_gain_pushes_half_as_hard():
 def test_it_imports_no_jax():
     code = f"""
 import sys
-from sim2real.hardware.plant import load_plant
+from sim2real.emulation.plant import load_plant
 load_plant({str(FILE) + ":SO101Plant"!r})
 sys.exit("jax" in sys.modules)
 """

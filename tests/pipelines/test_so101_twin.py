@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.plant import OperatingMode
+from sim2real.emulation.process import EmbeddedRobot
+from sim2real.emulation.truth import Kind
+from sim2real.hardware.device import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SO101 = load_pipeline("so101")

@@ -3,7 +3,7 @@
 from turntable.odrive import ODrive, SpeedLoop
 from turntable.odrive_emulation import ODriveEmulation
 
-from sim2real.hardware.testing import DeviceConformance
+from sim2real.emulation.conformance import DeviceConformance
 
 
 class TestODrive(DeviceConformance):

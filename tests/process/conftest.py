@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.process import EmbeddedRobot
+from sim2real.emulation.truth import read_truth
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
-from sim2real.hardware.emulation.truth import read_truth
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PLANTS = Path(__file__).parents[1] / "hardware" / "plants.py"
@@ -82,8 +82,8 @@ def lone_robot(tmp_path):
     """Start an emulated pendulum that does not end with its host; returns its port, its truth file, how to stop it."""
     embedded = load_pipeline("pendulum").load().drive.embedded
     path = tmp_path / "truth.bin"
-    command = [sys.executable, "-m", "sim2real.hardware.emulation.emulator", "--plant", embedded.plant]
-    command += ["--emulation", "sim2real.hardware.dynamixel.emulation:EmulatorConfig", "--truth", str(path)]
+    command = [sys.executable, "-m", "sim2real.emulation.process", "--plant", embedded.plant]
+    command += ["--emulation", "sim2real.emulation.dynamixel:EmulatorConfig", "--truth", str(path)]
     command += [f"--{n.replace('_', '-')}={v!r}" for n, v in asdict(embedded.emulator).items() if v is not None]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

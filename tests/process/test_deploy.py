@@ -9,8 +9,8 @@ import pytest
 from live_robots import PATIENT, assert_torque_ends_off, manifest_of, wait_until_running
 
 from sim2real import cli, errors
-from sim2real.hardware.emulation.truth import Kind, read_truth
-from sim2real.hardware.plant import OperatingMode
+from sim2real.emulation.truth import Kind, read_truth
+from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.stages.pipeline.pipeline import load_pipeline

@@ -14,15 +14,15 @@ import pytest
 from dynamixel_sdk import GroupBulkRead, GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 from plants import mean_latencies
 
+from sim2real.emulation import process as emulator
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.plant import load_plant
+from sim2real.emulation.process import EmbeddedRobot
+from sim2real.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
 from sim2real.hardware.bus.packets import Instruction, Parser
 from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.dynamixel.protocol import PROTOCOL, StatusError
-from sim2real.hardware.emulation import emulator
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
-from sim2real.hardware.emulation.truth import Kind, TruthLog, read_truth
-from sim2real.hardware.plant import load_plant
 
 pytestmark = pytest.mark.process
 
@@ -249,8 +249,8 @@ def test_truth_file_can_be_read_at_any_time_and_cut_anywhere(start_robot, tmp_pa
 
 
 def test_first_line_is_the_port_and_sigterm_ends_cleanly(tmp_path):
-    command = [sys.executable, "-m", "sim2real.hardware.emulation.emulator", "--plant", f"{PLANTS}:Ramp"]
-    command += ["--emulation", "sim2real.hardware.dynamixel.emulation:EmulatorConfig"]
+    command = [sys.executable, "-m", "sim2real.emulation.process", "--plant", f"{PLANTS}:Ramp"]
+    command += ["--emulation", "sim2real.emulation.dynamixel:EmulatorConfig"]
     began_s = time.monotonic()
     process = subprocess.Popen(
         [*command, "--truth", tmp_path / "t.bin", "--plant-args", '{"ids": [4]}'], stdout=subprocess.PIPE
@@ -268,8 +268,8 @@ def test_first_line_is_the_port_and_sigterm_ends_cleanly(tmp_path):
 
 def test_robot_goes_when_its_parent_is_killed(tmp_path):
     code = (
-        "import time; from sim2real.hardware.emulation.embedded import EmbeddedRobot;"
-        "from sim2real.hardware.dynamixel.emulation import EmulatorConfig;"
+        "import time; from sim2real.emulation.process import EmbeddedRobot;"
+        "from sim2real.emulation.dynamixel import EmulatorConfig;"
         f"print(EmbeddedRobot({f'{PLANTS}:Ramp'!r}, EmulatorConfig()).pid, flush=True); time.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=_env(tmp_path))
@@ -288,7 +288,7 @@ def _env(tmp_path):
 
 def test_import_is_light():
     code = (
-        "import sys, sim2real.hardware.emulation.emulator, sim2real.hardware.emulation.embedded;"
+        "import sys, sim2real.emulation.process, sim2real.emulation.process;"
         "import sim2real.hardware.safety.gate;"
         "print([m for m in ('jax', 'mujoco', 'serial', 'sim2real.graph', 'sim2real.log') if m in sys.modules])"
     )
@@ -304,7 +304,7 @@ def test_a_plant_that_does_not_start_says_why():
     ("name", "message"), [("EmulatorConfigg", "has no callable"), ("Plant", "no class of settings")]
 )
 def test_an_emulation_that_is_none_says_so(capsys, name, message):
-    module = "sim2real.hardware.plant" if name == "Plant" else "sim2real.hardware.dynamixel.emulation"
+    module = "sim2real.emulation.plant" if name == "Plant" else "sim2real.emulation.dynamixel"
     assert emulator.main(["--emulation", f"{module}:{name}", "--plant", f"{PLANTS}:Ramp", "--truth", "t.bin"]) == 2
     assert message in capsys.readouterr().err
 

@@ -10,12 +10,12 @@ import time
 import numpy as np
 import pytest
 
+from sim2real.emulation import process as emulator
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.truth import Kind
 from sim2real.errors import SAFETY_STOP, SafetyStop
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import registers as reg
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.emulation import emulator
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.safety import guardian_process
 from sim2real.runtime import clock
 
@@ -27,7 +27,7 @@ HOST = """
 import os, signal, sys, time
 from sim2real.errors import Sim2RealError
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 
 bus = ServoBus(BusConfig({port!r}, silence_s={silence_s}, max_silence_s=1.0, guardian={guardian}))
 bus.open()

@@ -12,8 +12,8 @@ import pytest
 
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.plant import OperatingMode
+from sim2real.emulation.truth import Kind
+from sim2real.hardware.device import OperatingMode
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]  # a busy machine compiles for minutes
 

@@ -13,8 +13,8 @@ from wiretap import Wiretap
 
 from sim2real import cli, errors
 from sim2real.artifacts.run.manifest import read_manifest
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
-from sim2real.hardware.emulation.truth import Kind, read_truth
+from sim2real.emulation.process import EmbeddedRobot
+from sim2real.emulation.truth import Kind, read_truth
 from sim2real.log.reader import TruncatedLogWarning, read_log
 from sim2real.stages.pipeline.pipeline import load_pipeline
 

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
-from sim2real.hardware.emulation.truth import Kind
+from sim2real.emulation.process import EmbeddedRobot
+from sim2real.emulation.truth import Kind
 
 pytest.importorskip("cyclonedds")
+from sim2real.emulation.legs import UnitreeEmulation
 from sim2real.errors import HardwareLost
 from sim2real.hardware.unitree import guarded
 from sim2real.hardware.unitree.dds import Address, DdsLink
 from sim2real.hardware.unitree.device import UnitreeLegs
-from sim2real.hardware.unitree.emulation import UnitreeEmulation
 
 pytestmark = pytest.mark.process
 

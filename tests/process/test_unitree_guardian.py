@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("cyclonedds")
 from unitree_bench import CONTROLS, DAMPS, OFF, emulated, ways
 
-from sim2real.hardware.emulation.truth import Kind
+from sim2real.emulation.truth import Kind
 from sim2real.hardware.safety.guardian_process import BEAT, REST, Guard
 from sim2real.log.reader import read_log
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.timing import Timing
+from sim2real.emulation.truth import Kind, read_truth
 from sim2real.errors import SafetyStop, UsageError
-from sim2real.hardware.emulation.truth import Kind, read_truth
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
 from sim2real.robots.control_loop.hardware import Excitation
 from sim2real.robots.control_loop.messages import Goals

@@ -8,12 +8,12 @@ import pytest
 from mujoco import MjModel
 from small_robot import SERVOS, PairRobot, PairTask
 
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.servo_plant import TwinPlant
+from sim2real.emulation.truth import Kind, read_truth
 from sim2real.errors import UsageError
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
-from sim2real.hardware.emulation.truth import Kind, read_truth
-from sim2real.hardware.emulation.twin import TwinPlant
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.joint import Joint
-from sim2real.hardware.plant import OperatingMode
 from sim2real.identify.fit import fit
 from sim2real.identify.problem.segments import Span
 from sim2real.log.reader import read_log

@@ -6,7 +6,7 @@ import mujoco as mj
 import numpy as np
 import pytest
 
-from sim2real.hardware.plant import load_plant
+from sim2real.emulation.plant import load_plant
 from sim2real.robots.control_loop.messages import EpisodeStart
 from sim2real.stages.estimation.held_out_parts import widest
 from sim2real.stages.pipeline.pipeline import load_pipeline

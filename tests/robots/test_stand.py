@@ -13,8 +13,8 @@ from benches.hidden import legs
 
 from pipelines.go2.robot import ROBOT
 from sim2real.artifacts.recording import Recording
+from sim2real.emulation.truth import read_truth
 from sim2real.errors import OtherMotion
-from sim2real.hardware.emulation.truth import read_truth
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span

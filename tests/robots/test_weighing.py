@@ -15,8 +15,8 @@ from pipelines.go2.robot import ROBOT
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.posterior import Alternative, Posterior
 from sim2real.artifacts.recording import Recording
+from sim2real.emulation.truth import read_truth
 from sim2real.errors import OtherMotion, UsageError
-from sim2real.hardware.emulation.truth import read_truth
 from sim2real.robots.walking.plain import weighing
 from sim2real.stages.estimation.fitted_logs import with_load
 from sim2real.stages.pipeline.pipeline import load_pipeline

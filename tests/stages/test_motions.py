@@ -10,9 +10,9 @@ from live_robots import PATIENT, manifest_of
 import sim2real
 from sim2real import cli
 from sim2real.artifacts.run.run_folder import newest
+from sim2real.emulation.truth import Kind, read_truth
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.hardware.emulation.truth import Kind, read_truth
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
 from sim2real.robots.servo.drive import ServoDrive
 from sim2real.stages.excitation.played import played

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from sim2real.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.graph.episode import Steps
-from sim2real.hardware.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.stages.identify.true_values import sensing_delay_s
 
 MS = 1_000_000

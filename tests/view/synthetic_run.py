@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.graph.episode import MessageRecord, StepRecord
-from sim2real.hardware.emulation.truth import Kind, TruthLog
 from sim2real.log.writer import McapRecorder
 
 EVIL = "<b>gain</b> & $x_1$"

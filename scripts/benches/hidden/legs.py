@@ -32,9 +32,9 @@ def record(
     """
     from dataclasses import replace
 
-    from sim2real.hardware.emulation.truth import TruthLog
-    from sim2real.hardware.plant import load_named
-    from sim2real.hardware.unitree.emulation import EmulatedLegs, UnitreeEmulation, truth_header
+    from sim2real.emulation.legs import EmulatedLegs, UnitreeEmulation, truth_header
+    from sim2real.emulation.truth import TruthLog
+    from sim2real.hardware.registry import load_named
     from sim2real.robots.servo.drive import approached
     from sim2real.stages.excitation.signals import excitation
     from sim2real.stages.pipeline.pipeline import load_pipeline

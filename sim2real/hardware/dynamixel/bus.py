@@ -13,11 +13,10 @@ from sim2real.hardware.bus.packets import BROADCAST_ID, Answer, Instruction
 from sim2real.hardware.bus.port import LinkConfig
 from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.bus.servos import GuardedServos
-from sim2real.hardware.device import Reading, Transaction
+from sim2real.hardware.device import OperatingMode, Reading, Transaction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.models import model
 from sim2real.hardware.dynamixel.protocol import ALERT_BIT, PROTOCOL, StatusError
-from sim2real.hardware.plant import OperatingMode
 
 _STATE: Final = (reg.PRESENT_LOAD, reg.PRESENT_VELOCITY, reg.PRESENT_POSITION)
 _REASONS: Final[dict[int, str]] = {

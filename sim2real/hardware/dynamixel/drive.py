@@ -9,10 +9,9 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.hardware.bus.registers import Register
-from sim2real.hardware.device import POSITION, VOLTAGE, CommandKind, Reading, Transaction
+from sim2real.hardware.device import POSITION, VOLTAGE, CommandKind, OperatingMode, Reading, Transaction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import ServoBus
-from sim2real.hardware.plant import OperatingMode
 
 
 class Drive(ABC):

@@ -18,8 +18,8 @@ from sim2real.robots.roles import ROLES
 from sim2real.types import Key, PyTree
 
 if TYPE_CHECKING:
+    from sim2real.emulation.process import EmbeddedRobot, Emulated
     from sim2real.hardware.device import Device, Reading
-    from sim2real.hardware.emulation.embedded import EmbeddedRobot, Emulated
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig
     from sim2real.hardware.safety.rig import Rig
@@ -50,7 +50,7 @@ class Embedded:
             return self
         inside = {"plant": self.plant, "plant_args": dict(self.plant_args)}
         rows = {"joints": [asdict(joint) for joint in joints], "zero_rad": zero_rad}
-        return replace(self, plant="sim2real.hardware.emulation.mounted_plant:MountedPlant", plant_args=inside | rows)
+        return replace(self, plant="sim2real.emulation.plant:MountedPlant", plant_args=inside | rows)
 
 
 class ServoSession:
@@ -79,7 +79,7 @@ class ServoSession:
         joints: Sequence[Joint] = (),
     ) -> None:
         # Imported here: training also makes robots, and must not import their drivers.
-        from sim2real.hardware.emulation.embedded import EmbeddedRobot
+        from sim2real.emulation.process import EmbeddedRobot
         from sim2real.hardware.safety.rig import Rig
 
         self._stack = ExitStack()

@@ -27,7 +27,7 @@ from sim2real.robots.servo.task import NO_AIM, Aim
 from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
-    from sim2real.hardware.emulation.emulated_bus import BusEmulation
+    from sim2real.emulation.bus import BusEmulation
     from sim2real.worlds.rollouts import WorldParams
 
 mj: Any = mujoco
@@ -179,7 +179,7 @@ class ComposedModel(RobotModel):
             "factors": factors,
         }
         emulator = replace(emulator, model_number=s.sheet.model_number)
-        return Embedded("sim2real.hardware.emulation.twin:TwinPlant", emulator, arguments)
+        return Embedded("sim2real.emulation.servo_plant:TwinPlant", emulator, arguments)
 
     @property
     def _mjcf(self) -> str:

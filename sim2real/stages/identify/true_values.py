@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from sim2real.artifacts.recording import Recording
+from sim2real.emulation.truth import Kind, Truth
 from sim2real.graph.episode import Steps
-from sim2real.hardware.emulation.truth import Kind, Truth
 from sim2real.robots.roles import Roles
 from sim2real.stages.terminal.console import note
 

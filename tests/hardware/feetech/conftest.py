@@ -1,9 +1,9 @@
 import pytest
 from families import IDS
 
+from sim2real.emulation.feetech import StsEmulation
 from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
-from sim2real.hardware.feetech.emulation import StsEmulation
 
 STS = StsEmulation(return_delay_us=0)
 

@@ -3,12 +3,12 @@
 import pytest
 from families import STS, VOLTS
 
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.feetech import StsEmulation
 from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
-from sim2real.hardware.dynamixel.emulation import EmulatorConfig
 from sim2real.hardware.feetech import registers as sts
-from sim2real.hardware.feetech.emulation import StsEmulation
 
 
 def answer_twice(robot, servo_id, place, join):

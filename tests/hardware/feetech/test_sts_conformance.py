@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from sim2real.emulation.conformance import DeviceConformance
+from sim2real.emulation.feetech import StsEmulation
 from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
-from sim2real.hardware.feetech.emulation import StsEmulation
-from sim2real.hardware.testing import DeviceConformance
 
 PLANTS = Path(__file__).parents[1] / "plants.py"
 

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from families import IDS
 
+from sim2real.emulation.feetech import StsEmulation
+from sim2real.emulation.truth import Kind
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
-from sim2real.hardware.device import Alone
-from sim2real.hardware.emulation.truth import Kind
+from sim2real.hardware.device import Alone, OperatingMode
 from sim2real.hardware.feetech import registers as reg
 from sim2real.hardware.feetech.calibration import CalibratedJoint as Joint
 from sim2real.hardware.feetech.device import StsConfig, StsServos
 from sim2real.hardware.feetech.drive import StsDrive
-from sim2real.hardware.feetech.emulation import StsEmulation
-from sim2real.hardware.plant import OperatingMode
 from sim2real.hardware.registry import load_device
 
 

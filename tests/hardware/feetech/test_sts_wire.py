@@ -5,14 +5,13 @@ import math
 import numpy as np
 import pytest
 
+from sim2real.emulation.feetech import ProfiledPlant, StsEmulation
+from sim2real.emulation.truth import Kind
 from sim2real.errors import UsageError
 from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction
-from sim2real.hardware.emulation.truth import Kind
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.feetech import registers as reg
-from sim2real.hardware.feetech.emulation import StsEmulation
-from sim2real.hardware.feetech.profile import ProfiledPlant
 from sim2real.hardware.feetech.protocol import PROTOCOL
-from sim2real.hardware.plant import OperatingMode
 
 MS = 1_000_000
 build = PROTOCOL.build

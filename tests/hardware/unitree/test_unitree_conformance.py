@@ -4,11 +4,11 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 from pipelines.go2.plant import Go2Body
-from sim2real.hardware.testing import DeviceConformance
+from sim2real.emulation.conformance import DeviceConformance
+from sim2real.emulation.legs import UnitreeEmulation
+from sim2real.emulation.virtual_legs import VirtualLegs
 from sim2real.hardware.unitree.device import UnitreeLegs
-from sim2real.hardware.unitree.emulation import UnitreeEmulation
 from sim2real.hardware.unitree.legs import LegDrive
-from sim2real.hardware.unitree.virtual import VirtualLegs
 
 
 class TestUnitreeLegs(DeviceConformance):

@@ -11,15 +11,15 @@ pytest.importorskip("cyclonedds")
 from unitree_bench import CONTROLS, DAMPS, OFF, ways
 
 from pipelines.go2.plant import LYING, Go2Body
+from sim2real.emulation.legs import UnitreeEmulation
+from sim2real.emulation.virtual_legs import VirtualLegs
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.device import Alone
 from sim2real.hardware.registry import load_device
 from sim2real.hardware.unitree import guarded, legs
 from sim2real.hardware.unitree.dds import Address, connect
 from sim2real.hardware.unitree.device import UnitreeLegs
-from sim2real.hardware.unitree.emulation import UnitreeEmulation
 from sim2real.hardware.unitree.legs import LegDrive
-from sim2real.hardware.unitree.virtual import VirtualLegs
 
 MIXED = (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8)
 

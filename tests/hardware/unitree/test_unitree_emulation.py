@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from pipelines.go2.plant import LYING, Go2Body
+from sim2real.emulation.truth import Kind, TruthLog, read_truth
 from sim2real.errors import UsageError
-from sim2real.hardware.emulation.truth import Kind, TruthLog, read_truth
 
 pytest.importorskip("cyclonedds")
-from sim2real.hardware.unitree.emulation import EmulatedLegs, UnitreeEmulation, truth_header
+from sim2real.emulation.legs import EmulatedLegs, UnitreeEmulation, truth_header
 from sim2real.hardware.unitree.messages import HEAD, LOW_LEVEL, NO_POSITION, NO_VELOCITY, LowCmd
 
 MS = 1_000_000

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from sim2real.hardware.emulation.embedded import EmbeddedRobot
-from sim2real.hardware.emulation.truth import Kind
-from sim2real.hardware.unitree.emulation import UnitreeEmulation
+from sim2real.emulation.legs import UnitreeEmulation
+from sim2real.emulation.process import EmbeddedRobot
+from sim2real.emulation.truth import Kind
 
 OFF, CONTROLS, DAMPS = "off", "controls", "damps"
 

@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sim2real.hardware.emulation.emulated_bus import BusEmulation, PlannedBus, Request
-from sim2real.hardware.emulation.truth import TruthLog
-from sim2real.hardware.plant import OperatingMode, Plant
+from sim2real.emulation.bus import BusEmulation, PlannedBus, Request
+from sim2real.emulation.plant import Plant
+from sim2real.emulation.truth import TruthLog
+from sim2real.hardware.device import OperatingMode
 
 from .odrive import CLOSED_LOOP, IDLE, STATE, TURN, WATCHDOG, SpeedLoop, framed, unframed
 

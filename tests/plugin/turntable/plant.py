@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 
 _COUNTS = 8192  # of the encoder, per turn
 
 
 class Turntable:
-    """A turntable; see `sim2real.hardware.plant.Plant`.
+    """A turntable; see `sim2real.emulation.plant.Plant`.
 
     Args:
         loop: What the speed loop does about an error of speed [1/s].

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from sim2real.hardware.unitree.body import measured_dtype
+from sim2real.emulation.body import measured_dtype
 from sim2real.robots.walking.plain.hidden import HiddenTwin, hidden_spec, hide
 
 _mj: Any = mujoco
@@ -21,7 +21,7 @@ _TOUCH_M = 0.03
 
 
 class LeggedBody:
-    """A robot of an MJCF file with hidden parameters; see ``sim2real.hardware.unitree.body.Body``.
+    """A robot of an MJCF file with hidden parameters; see ``sim2real.emulation.body.Body``.
 
     The torque of a motor is its law's, limited to the actuator's range, times the motor's strength. The motor reports
     the torque of its law, as it does not know its strength. Its encoder has a bias, for the law too.

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import deque
 from pathlib import Path
 
+from sim2real.emulation.body import Body
+from sim2real.emulation.legs import STATE_HZ, EmulatedLegs, Sender, UnitreeEmulation, truth_header
+from sim2real.emulation.truth import TruthLog
+from sim2real.emulation.virtual import NUMBERS, VirtualChannel, VirtualTime
 from sim2real.errors import HardwareLost
-from sim2real.hardware.emulation.truth import TruthLog
-from sim2real.hardware.emulation.virtual import NUMBERS, VirtualChannel, VirtualTime
 from sim2real.hardware.safety.guardian import Guardian
-from sim2real.hardware.unitree.body import Body
 from sim2real.hardware.unitree.dds import EMULATED, QUEUE, Address, DdsLink
-from sim2real.hardware.unitree.emulation import STATE_HZ, EmulatedLegs, UnitreeEmulation, truth_header
-from sim2real.hardware.unitree.emulator import Sender
 from sim2real.hardware.unitree.guardian_process import LegGuard
 from sim2real.hardware.unitree.legs import LegDrive
 from sim2real.hardware.unitree.messages import LowCmd, LowState

@@ -1,6 +1,6 @@
-"""The emulator process: servos behind a pseudo-terminal, in real time.
+"""An emulated robot in a process of its own, in real time: the host's side starts and stops it, the other side runs it.
 
-    python -m sim2real.hardware.emulation.emulator --emulation sim2real.hardware.dynamixel.emulation:EmulatorConfig \
+    python -m sim2real.emulation.process --emulation sim2real.emulation.dynamixel:EmulatorConfig \
         --plant my_robot/plant.py:Plant --truth truth.bin --sensing-latency-s 0.004
 
 prints one line of JSON with the port when it is ready, and runs until SIGTERM.
@@ -13,26 +13,33 @@ import contextlib
 import ctypes
 import gc
 import json
+import logging
 import os
 import select
 import signal
+import subprocess
 import sys
+import tempfile
 import termios
 import time
 import tty
-from collections.abc import Callable, Sequence
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
+from dataclasses import Field, asdict, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, Protocol, Self, cast
 
-from sim2real.errors import Sim2RealError, UsageError
-from sim2real.hardware.emulation.emulated_bus import BusEmulation, PlannedBus, truth_header
-from sim2real.hardware.emulation.truth import TruthLog
-from sim2real.hardware.plant import load_named, load_plant
+from sim2real.emulation.bus import BusEmulation, PlannedBus, truth_header
+from sim2real.emulation.plant import load_plant
+from sim2real.emulation.truth import Truth, TruthLog, read_truth
+from sim2real.errors import HardwareLost, Sim2RealError, UsageError
+from sim2real.hardware.registry import load_named
 
 if TYPE_CHECKING:
     from types import FrameType
 
+_LOGGER = logging.getLogger(__name__)
+_START_TIMEOUT_S: Final = 20.0
+_STOP_TIMEOUT_S: Final = 3.0
 _IDLE_NS: Final = 2_000_000  # longest time without stepping the plant: catching up with more would delay answers
 _PR_SET_TIMERSLACK: Final = 29
 _TIMER_SLACK_NS: Final = 1_000
@@ -40,6 +47,125 @@ _REAL_TIME_PRIORITY: Final = 2  # above the threads of the controlling process, 
 _NOT_SET: Final = termios.B50  # until a host sets a rate; no servo has this one
 _SPEEDS: Final = {r: getattr(termios, f"B{r}", -1) for r in (38_400, 57_600, 115_200, 500_000, 1_000_000, 2_000_000)}
 _TYPES: Final = {"int": int, "float": float, "bool": {"True": True, "False": False}.__getitem__}
+
+
+class Emulated(Protocol):
+    """Settings of an emulated robot: a dataclass whose fields become flags of its process.
+
+    Attributes:
+        serve: ``module:function`` that emulates the robot: called with the options of the command line, these settings
+            and a `StopFlag`, it returns when the flag is set.
+        actuation_latency_s: Time from a command to its effect [s].
+        actuation_jitter_s: Half-width of the variation of that time [s].
+    """
+
+    __dataclass_fields__: ClassVar[dict[str, Field]]
+    serve: ClassVar[str]
+    if TYPE_CHECKING:
+
+        @property
+        def seed(self) -> int: ...
+        @property
+        def actuation_latency_s(self) -> float: ...
+        @property
+        def actuation_jitter_s(self) -> float: ...
+
+
+class EmbeddedRobot:
+    """Emulated servos on `port`, from construction until `stop` or any end of this process.
+
+    The stages get only the port. The emulator logs true states and latencies to the truth file; `truth` and `reveal`
+    read it.
+
+    Args:
+        plant: `package.module:Name` or `path/to/file.py:Name`; see `load_plant`.
+        plant_args: Keyword arguments for the plant: JSON-able.
+        truth_path: The truth file; None: a temporary file, deleted by `stop`.
+
+    Raises:
+        HardwareLost: The emulator did not start; its own message is included.
+    """
+
+    def __init__(
+        self,
+        plant: str,
+        config: Emulated,
+        plant_args: Mapping[str, Any] | None = None,
+        truth_path: Path | str | None = None,
+    ) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="sim2real-robot-")
+        folder = Path(self._folder.name)
+        self.truth_path = Path(truth_path) if truth_path is not None else folder / "truth.bin"
+        self.truth_path.parent.mkdir(parents=True, exist_ok=True)
+        self._messages_path = folder / "messages.txt"
+        # The settings become flags. -P: files in the user's working directory must not be imported as modules.
+        command = [sys.executable, "-P", "-m", "sim2real.emulation.process", "--until-stdin-closes", "--plant", plant]
+        command += ["--emulation", f"{type(config).__module__}:{type(config).__qualname__}"]
+        command += ["--truth", str(self.truth_path), "--plant-args", json.dumps(dict(plant_args or {}))]
+        for name, value in asdict(config).items():
+            if value is not None:
+                command.append(f"--{name.replace('_', '-')}={value!r}")
+        with self._messages_path.open("wb") as messages:
+            # In a new session, so that Ctrl-C in a terminal reaches only the host, which then stops the robot.
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=messages, start_new_session=True
+            )
+        # The emulator prints the port when it is ready.
+        ready = self._wait_until_ready()
+        self.port: str = ready["port"]
+        self.pid: int = ready["pid"]
+
+    def __enter__(self) -> Self:
+        """Return the running robot."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Stop it."""
+        self.stop()
+
+    @property
+    def running(self) -> bool:
+        """Whether the emulator's process is alive."""
+        return self._process.poll() is None
+
+    def stop(self) -> None:
+        """End the process, after which the truth file is complete. May be called twice."""
+        if not self.running and self._process.returncode != 0 and self._messages_path.exists():
+            # To the host, a plant that raised an exception looks like a lost bus; the reason is in its messages.
+            _LOGGER.error("the emulated robot had died (%d): %s", self._process.returncode, self._messages())
+        elif self.running:
+            self._process.terminate()
+            try:
+                self._process.wait(_STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+        self._folder.cleanup()
+
+    def truth(self) -> Truth:
+        """Read the truth file; while the robot runs, the last 0.25 s may be missing."""
+        return read_truth(self.truth_path)
+
+    def reveal(self) -> dict[str, Any]:
+        """Return the plant's true parameters."""
+        return self.truth().parameters
+
+    def _wait_until_ready(self) -> dict[str, Any]:
+        stdout = cast(IO[bytes], self._process.stdout)
+        line = stdout.readline() if select.select([stdout], [], [], _START_TIMEOUT_S)[0] else b""
+        if line:
+            return json.loads(line)
+        message = f"the emulated robot did not start: {self._messages()}"
+        self.stop()
+        raise HardwareLost(message)
+
+    def _messages(self) -> str:
+        """Return the process's messages on stderr."""
+        return self._messages_path.read_text(errors="replace").strip() or "without a message"
 
 
 class _Pty:
@@ -146,9 +272,9 @@ def keep_time() -> None:
     gc.disable()
 
 
-def _parser(arguments: Sequence[str] | None, program: str, about: str | None, kind: type) -> argparse.ArgumentParser:
+def _parser(arguments: Sequence[str] | None) -> argparse.ArgumentParser:
     """Return the parser of the command line, with a flag for each setting of the named emulation."""
-    parser = argparse.ArgumentParser(prog=f"python -m {program}", description=about, add_help=False)
+    parser = argparse.ArgumentParser(prog="python -m sim2real.emulation.process", description=__doc__, add_help=False)
     place = "MODULE_OR_FILE:NAME"
     parser.add_argument(
         "--emulation", required=True, metavar=place, help="the class of the settings, which makes the bus"
@@ -156,8 +282,8 @@ def _parser(arguments: Sequence[str] | None, program: str, about: str | None, ki
     # The class of the settings decides the other flags.
     named = parser.parse_known_args(arguments)[0]
     settings = load_named(named.emulation, "emulation")
-    if not (isinstance(settings, type) and issubclass(settings, kind)):
-        raise UsageError(f"emulation {named.emulation!r} is no class of settings of this emulator, no {kind.__name__}")
+    if not (isinstance(settings, type) and is_dataclass(settings) and hasattr(settings, "serve")):
+        raise UsageError(f"emulation {named.emulation!r} is not a class of settings of an emulated robot")
     parser.set_defaults(settings=settings)
     parser.add_argument("-h", "--help", action="help")
     parser.add_argument("--plant", required=True, metavar=place, help="the callable that returns the plant")
@@ -186,8 +312,8 @@ def plant_arguments(text: str) -> dict[str, Any]:
     return arguments
 
 
-def _run(options: argparse.Namespace, config: BusEmulation, stop: StopFlag) -> None:
-    # Make plant and port.
+def serve_bus(options: argparse.Namespace, config: BusEmulation, stop: StopFlag) -> None:
+    """Emulate servos behind a pseudo-terminal until the flag is set."""
     plant = load_plant(options.plant, plant_arguments(options.plant_args))
     pty = _Pty()
     keep_time()
@@ -203,31 +329,16 @@ def _run(options: argparse.Namespace, config: BusEmulation, stop: StopFlag) -> N
         truth.close()
 
 
-def emulate(
-    arguments: Sequence[str] | None,
-    program: str,
-    about: str | None,
-    kind: type,
-    run: Callable[[argparse.Namespace, Any, StopFlag], None],
-) -> int:
-    """Run the command line of an emulator; return its exit code.
-
-    Args:
-        run: Emulates with options and settings until the flag is set.
-    """
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line of an emulated robot; return its exit code."""
     try:
-        options = _parser(arguments, program, about, kind).parse_args(arguments)
+        options = _parser(arguments).parse_args(arguments)
         config = options.settings(**{field.name: getattr(options, field.name) for field in fields(options.settings)})
-        run(options, config, StopFlag())
+        load_named(config.serve, "emulation")(options, config, StopFlag())
     except Sim2RealError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     return 0
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line of an emulated bus; return its exit code."""
-    return emulate(arguments, BusEmulation.program, __doc__, BusEmulation, _run)
 
 
 if __name__ == "__main__":

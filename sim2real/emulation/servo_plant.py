@@ -11,7 +11,7 @@ from typing import Any
 from mujoco import MjData, MjModel, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
 from sim2real.errors import UsageError
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import OperatingMode
 
 _RAD_PER_COUNT = 2.0 * math.pi / 4096  # of the encoders of DYNAMIXEL X and Feetech STS servos
 _CENTRE_RAD = 2048 * _RAD_PER_COUNT
@@ -19,7 +19,7 @@ _FACTORS = ("gain", "damping", "armature", "friction")
 
 
 class TwinPlant:
-    """Position-controlled servos on a model's position actuators; see ``sim2real.hardware.plant.Plant``.
+    """Position-controlled servos on a model's position actuators; see ``sim2real.emulation.plant.Plant``.
 
     A joint is at 0 where its encoder reads the centre of its range; ``MountedPlant`` puts other mountings in between.
     With torque off the motor applies no torque, but the model's damping still acts. Position errors are computed in

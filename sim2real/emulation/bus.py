@@ -1,4 +1,4 @@
-"""The core of emulated half-duplex buses, computed in planned time, independent of the protocol.
+"""Servos on an emulated half-duplex bus, computed in planned time: settings and faults, the wire, and the instructions.
 
 The times of all events are computed from the times at which the host's bytes arrive, and do not depend on how late the
 emulator's process runs: an instruction of n bytes that arrives at t is complete at max(t, wire free) + n * 10 / baud;
@@ -6,16 +6,93 @@ the values that it reads are those of one sensing latency earlier, and its comma
 later.
 """
 
+from __future__ import annotations
+
 import heapq
 import random
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
-from sim2real.hardware.emulation.settings import Emulation
-from sim2real.hardware.emulation.truth import Kind, TruthLog
-from sim2real.hardware.plant import OperatingMode, Plant, PlantClock
+from sim2real.emulation.firmware import Firmware, ServoFirmware
+from sim2real.emulation.plant import Plant, PlantClock
+from sim2real.emulation.truth import Kind, TruthLog
+from sim2real.errors import UsageError
+from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, PacketFormat, Parser
+from sim2real.hardware.bus.registers import Register
+from sim2real.hardware.device import OperatingMode
+
+
+@dataclass(frozen=True)
+class Emulation:
+    """Settings of the emulated bus and servos; times of faults count from the emulator's start, or a signal.
+
+    Args:
+        baud_rate: Bits per second; a byte takes 10 bits.
+        sensing_latency_s: Age of a measurement when the instruction that reads it is complete [s].
+        sensing_jitter_s: Half-width of the uniform variation of that age [s]; at most the latency.
+        actuation_latency_s: Time from a complete goal instruction to its effect on the motor [s].
+        actuation_jitter_s: Half-width of the uniform variation of that time [s]; at most the latency. Commands take
+            effect in the order in which they were sent.
+        return_delay_us: The servos' Return Delay Time at power-up [us].
+        reply_loss: Probability that an answer is lost.
+        corrupt: Probability that an answer has a corrupted byte.
+        encoder_counts: Resolution of the encoder [counts per revolution].
+        plant_step_s: Period of the grid on which the plant is stepped and commands take effect [s]; at most 1 ms.
+        seed: Seed of jitter, loss and corruption.
+        silent_after_s: Time from which no byte is received or answered, as with an unplugged cable [s]; None: never.
+        overload_after_s: Time at which the servos report an overload and switch their torque off [s]; None: never.
+        late: Probability that an answer is delayed, as by a USB adapter; later answers wait for it.
+        late_s: That delay [s].
+        wild: Probability that a read returns a position out of the motors' reach, with a correct checksum.
+        frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
+        unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
+        ill_after_s: Time from which answers are late or wild [s].
+        on_signal: Whether these times, except the overload's, count from SIGUSR1 to the process.
+    """
+
+    baud_rate: int = 1_000_000
+    sensing_latency_s: float = 0.0
+    sensing_jitter_s: float = 0.0
+    actuation_latency_s: float = 0.0
+    actuation_jitter_s: float = 0.0
+    return_delay_us: int = 500
+    reply_loss: float = 0.0
+    corrupt: float = 0.0
+    encoder_counts: int = 4096
+    plant_step_s: float = 0.0005
+    seed: int = 0
+    silent_after_s: float | None = None
+    overload_after_s: float | None = None
+    late: float = 0.0
+    late_s: float = 0.009
+    wild: float = 0.0
+    frozen_after_s: float | None = None
+    unplugged_after_s: float | None = None
+    ill_after_s: float = 0.0
+    on_signal: bool = False
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "baud_rate": (1, 10_000_000),
+            "sensing_jitter_s": (0.0, self.sensing_latency_s),
+            "actuation_jitter_s": (0.0, self.actuation_latency_s),
+            "return_delay_us": (0, 508),
+            "reply_loss": (0.0, 1.0),
+            "corrupt": (0.0, 1.0),
+            "late": (0.0, 1.0),
+            "late_s": (0.0, 1.0),
+            "wild": (0.0, 1.0),
+            "plant_step_s": (1e-5, 1e-3),
+            "encoder_counts": (2, 1 << 24),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise UsageError(f"emulator: {name} = {value} is outside [{low}, {high}]")
+
 
 _STALE_PACKET_NS: Final = 5_000_000  # after a longer pause, an incomplete packet is dropped
 
@@ -48,50 +125,6 @@ class PacketParser(Protocol):
 
     def feed(self, chunk: bytes) -> list[tuple[Any, int]]:
         """Return the packets that a chunk completes, each with the number of bytes of it up to the packet's end."""
-        ...
-
-
-class Firmware(Protocol):
-    """Registers and firmware of one servo, without time, bus and physics.
-
-    Attributes:
-        heard_ns: Time of the last instruction that it received.
-        watchdog_stops: Whether a tripped watchdog stops the motor.
-    """
-
-    servo_id: int
-    heard_ns: int
-    watchdog_stops: bool
-
-    def command(self) -> tuple[int, float]:
-        """Return mode and goal of the motor, as ``Plant.command`` takes them, according to the registers."""
-        ...
-
-    def controller(self) -> tuple[int, int, float]:
-        """Return the position controller's settings, as ``ConfigurablePlant.configure`` takes them."""
-        ...
-
-    def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int) -> None:
-        """Set the registers of present values.
-
-        Args:
-            position_rad: Angle from the encoder's zero [rad].
-            velocity_rad_s: Speed [rad/s].
-            load: Fraction of the largest load, in [-1, 1].
-            tick_ms: Time since power-up [ms].
-        """
-        ...
-
-    def watchdog_deadline_ns(self) -> int | None:
-        """Return the time at which its watchdog trips without an instruction; None if it has none, or it is off."""
-        ...
-
-    def trip_watchdog(self) -> None:
-        """Trip the watchdog."""
-        ...
-
-    def overload(self) -> None:
-        """Shut down as after an overload: torque off, and an error reported from now on."""
         ...
 
 
@@ -305,8 +338,7 @@ class PlannedBus(ABC):
 class BusEmulation(Emulation):
     """Settings of a certain bus; see `Emulation` for their meaning."""
 
-    program: ClassVar[str] = "sim2real.hardware.emulation.emulator"
-    """Module of the process that emulates the bus."""
+    serve: ClassVar[str] = "sim2real.emulation.process:serve_bus"
     bus_type: ClassVar[Callable[..., PlannedBus]]
     """Makes the bus from plant, settings, truth, ``send`` and ``start_ns``."""
 
@@ -324,3 +356,162 @@ def truth_header(plant: Plant, config: Emulation, start_ns: int) -> dict[str, An
         "state_names": list(plant.state()),
         "truth": plant.truth(),
     }
+
+
+S = TypeVar("S", bound=ServoFirmware)
+E = TypeVar("E", bound=BusEmulation)
+
+
+class InstructedBus(PlannedBus, Generic[S, E]):
+    """Emulated servos of one family on a bus, driving a plant; see `PlannedBus`.
+
+    Args:
+        send: Delivers the bytes of an answer to the host; returns False if the host cannot take them.
+        start_ns: Time 0 of the plant.
+
+    Attributes:
+        present: The first and the last register of present values.
+        wild_counts: Range of positions out of the motors' reach.
+    """
+
+    form: ClassVar[PacketFormat]
+    present: ClassVar[tuple[Register, Register]]
+    wild_counts: ClassVar[tuple[int, int]]
+
+    def __init__(
+        self,
+        plant: Plant,
+        config: E,
+        truth: TruthLog,
+        send: Callable[[bytes], bool],
+        start_ns: int,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self.config = config
+        self.servos = {i: self.make_servo(i) for i in sorted(plant.servo_ids)}
+        self._handlers: dict[int, Callable[[Request, list[S]], None]] = {
+            Instruction.PING: self._ping,
+            Instruction.READ: self._read,
+            Instruction.WRITE: self._write,
+            Instruction.REG_WRITE: self._reg_write,
+            Instruction.ACTION: self._action,
+            Instruction.REBOOT: self._reboot,
+            Instruction.SYNC_READ: self._sync_read,
+            Instruction.SYNC_WRITE: self._sync_write,
+        }
+        super().__init__(plant, config, truth, send, start_ns, now_ns, Parser(self.form), self.servos)
+
+    @abstractmethod
+    def make_servo(self, servo_id: int) -> S:
+        """Return a servo with this bus's settings."""
+
+    def execute(self, request: Request) -> None:
+        """Carry out an instruction that is complete on the wire, and reply to it."""
+        packet = request.packet
+        # Every servo that receives the instruction resets its watchdog.
+        broadcast = packet.servo_id == BROADCAST_ID
+        targets = [s for i, s in self.servos.items() if broadcast or i == packet.servo_id]
+        if packet.intact:
+            for servo in targets:
+                servo.heard_ns = request.t_ns
+        handler = self._handlers.get(packet.code)
+        if targets and packet.intact and handler is not None:
+            handler(request, targets)
+        elif targets and not broadcast:
+            self._misunderstand(targets[0], request)
+
+    def _misunderstand(self, servo: S, request: Request) -> None:
+        """React to an instruction with a wrong checksum, or an unknown one: here without an answer."""
+
+    def _misread(self, servo: S, request: Request) -> None:
+        """React to a READ of a wrong length: here without an answer."""
+
+    def _ping(self, request: Request, targets: list[S]) -> None:
+        """Answer a ping."""
+        for servo in targets:
+            self._answer(servo, request, 0, servo.identity)
+
+    def _answer(self, servo: S, request: Request, error: int, data: bytes = b"", sample: Sample | None = None) -> None:
+        """Let a servo answer, with its measurement if the answer has present values."""
+        status = self._status(servo, error | servo.alert, data)
+        self.reply(servo.servo_id, request, status, servo.return_delay_s, sample)
+
+    def _status(self, servo: S, error: int, data: bytes) -> bytes:
+        """Return the bytes of an answer."""
+        return self.form.build_status(servo.servo_id, error, data)
+
+    def _confirm(self, servo: S, request: Request, error: int) -> None:
+        """Let a servo answer an instruction that writes."""
+        if request.packet.servo_id != BROADCAST_ID and servo.confirms:
+            self._answer(servo, request, error)
+
+    def _answer_read(self, servo: S, request: Request, position: int) -> None:
+        """Let a servo answer a read whose address and length begin at a position in the parameters."""
+        address = self.form.word(request.packet.parameters, position)
+        length = self.form.word(request.packet.parameters, position + self.form.address_bytes)
+        sample = self.measure(servo, request.t_ns)
+        if self.ill(self._config.wild, request.t_ns):
+            servo.put(servo.table.position, self.random.randrange(*self.wild_counts))
+        error, data = servo.read(address, length)
+        if servo.answers_reads:
+            first, last = self.present
+            measured = address < last.end and address + length > first.address
+            self._answer(servo, request, error, data, sample if measured else None)
+
+    def _read(self, request: Request, targets: list[S]) -> None:
+        if request.packet.servo_id == BROADCAST_ID:
+            return
+        if len(request.packet.parameters) != 2 * self.form.address_bytes:
+            self._misread(targets[0], request)
+            return
+        self._answer_read(targets[0], request, 0)
+
+    def _sync_read(self, request: Request, targets: list[S]) -> None:
+        del targets
+        for servo_id in request.packet.parameters[2 * self.form.address_bytes :]:
+            if servo_id in self.servos:
+                self._answer_read(self.servos[servo_id], request, 0)
+
+    def _write(self, request: Request, targets: list[S]) -> None:
+        address, data = self._place(request)
+        for servo in targets:
+            self._confirm(servo, request, self._carry_out(servo, request, lambda s: s.write(address, data)))
+
+    def _sync_write(self, request: Request, targets: list[S]) -> None:
+        del targets
+        parameters, begin = request.packet.parameters, 2 * self.form.address_bytes
+        address, length = self.form.word(parameters, 0), self.form.word(parameters, self.form.address_bytes)
+        for i in range(begin, len(parameters) - length, length + 1):
+            if parameters[i] in self.servos:
+                data = parameters[i + 1 : i + 1 + length]
+                self._carry_out(self.servos[parameters[i]], request, lambda s, data=data: s.write(address, data))
+
+    def _reg_write(self, request: Request, targets: list[S]) -> None:
+        for servo in targets:
+            servo.register_write(*self._place(request))
+            self._confirm(servo, request, 0)
+
+    def _action(self, request: Request, targets: list[S]) -> None:
+        for servo in targets:
+            self._confirm(servo, request, self._carry_out(servo, request, lambda s: s.action()))
+
+    def _reboot(self, request: Request, targets: list[S]) -> None:
+        for servo in targets:
+            self._confirm(servo, request, 0)
+            servo.reboot()
+            self.configure(servo)
+            self.actuate(servo, request)
+
+    def _carry_out(self, servo: S, request: Request, change: Callable[[S], tuple[int, bool]]) -> int:
+        """Let a servo change its registers, and the motor follow; return the error."""
+        self.measure(servo, request.t_ns)
+        error, moves = change(servo)
+        self.configure(servo)
+        if moves:
+            self.actuate(servo, request)
+        return error
+
+    def _place(self, request: Request) -> tuple[int, bytes]:
+        """Return the address and the data of an instruction that writes."""
+        parameters = request.packet.parameters
+        return self.form.word(parameters, 0), parameters[self.form.address_bytes :]

@@ -2,7 +2,7 @@
 
 Fill in `make_device` in a test module of your own; pytest runs the rest:
 
-    from sim2real.hardware.testing import DeviceConformance
+    from sim2real.emulation.conformance import DeviceConformance
 
     class TestMyServos(DeviceConformance):
         emulation = MyEmulation
@@ -25,13 +25,12 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import pytest
 
+from sim2real.emulation.bus import BusEmulation
+from sim2real.emulation.truth import Kind, Truth
+from sim2real.emulation.virtual import VirtualRobot
 from sim2real.errors import HardwareLost, SafetyStop, UsageError
 from sim2real.hardware.clock import Clock
-from sim2real.hardware.device import Device, Reading
-from sim2real.hardware.emulation.emulated_bus import BusEmulation
-from sim2real.hardware.emulation.truth import Kind, Truth
-from sim2real.hardware.emulation.virtual import VirtualRobot
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.device import Device, OperatingMode, Reading
 from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.plausibility import require_parts
 from sim2real.hardware.safety.rig import Rig

@@ -17,12 +17,12 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
+from sim2real.emulation.bus import BusEmulation, truth_header
+from sim2real.emulation.plant import Plant, load_plant
+from sim2real.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.errors import HardwareLost
 from sim2real.hardware.bus.port import EMULATED, Port
 from sim2real.hardware.clock import Clock
-from sim2real.hardware.emulation.emulated_bus import BusEmulation, truth_header
-from sim2real.hardware.emulation.truth import Truth, TruthLog, read_truth
-from sim2real.hardware.plant import Plant, load_plant
 from sim2real.hardware.safety.guardian import Guardian
 from sim2real.hardware.safety.guardian_process import BusGuard, FdPort, Guard
 

@@ -1,10 +1,53 @@
 """The firmware of one emulated servo, as far as all families share it."""
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 from sim2real.hardware.bus.registers import RETURN_DELAY_UNIT_S, MemoryTable, Register
-from sim2real.hardware.emulation.emulated_bus import Firmware
+
+
+class Firmware(Protocol):
+    """Registers and firmware of one servo, without time, bus and physics.
+
+    Attributes:
+        heard_ns: Time of the last instruction that it received.
+        watchdog_stops: Whether a tripped watchdog stops the motor.
+    """
+
+    servo_id: int
+    heard_ns: int
+    watchdog_stops: bool
+
+    def command(self) -> tuple[int, float]:
+        """Return mode and goal of the motor, as ``Plant.command`` takes them, according to the registers."""
+        ...
+
+    def controller(self) -> tuple[int, int, float]:
+        """Return the position controller's settings, as ``ConfigurablePlant.configure`` takes them."""
+        ...
+
+    def refresh(self, position_rad: float, velocity_rad_s: float, load: float, tick_ms: int) -> None:
+        """Set the registers of present values.
+
+        Args:
+            position_rad: Angle from the encoder's zero [rad].
+            velocity_rad_s: Speed [rad/s].
+            load: Fraction of the largest load, in [-1, 1].
+            tick_ms: Time since power-up [ms].
+        """
+        ...
+
+    def watchdog_deadline_ns(self) -> int | None:
+        """Return the time at which its watchdog trips without an instruction; None if it has none, or it is off."""
+        ...
+
+    def trip_watchdog(self) -> None:
+        """Trip the watchdog."""
+        ...
+
+    def overload(self) -> None:
+        """Shut down as after an overload: torque off, and an error reported from now on."""
+        ...
 
 
 class ServoFirmware(Firmware, ABC):

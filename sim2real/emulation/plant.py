@@ -1,30 +1,17 @@
-"""The physics of emulated servos: the protocol of a plant, and the clock that steps it."""
+"""The physics of emulated servos: a plant's protocol, the clock that steps it, and mountings of its joints."""
 
 import heapq
-import importlib
-import importlib.util
 import math
-import sys
-from collections.abc import Callable, Mapping
-from enum import IntEnum
-from pathlib import Path
-from types import ModuleType
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, Protocol, runtime_checkable
 
+from sim2real.emulation.truth import Kind, TruthLog
 from sim2real.errors import UsageError
-from sim2real.hardware.emulation.truth import Kind, TruthLog
+from sim2real.hardware.device import OperatingMode
+from sim2real.hardware.joint import Joint
+from sim2real.hardware.registry import load_named
 
 STATE_PERIOD_S: Final = 0.005
-
-
-class OperatingMode(IntEnum):
-    """Mode of a motor; the numbers are those of DYNAMIXEL's register, with OFF for torque off."""
-
-    OFF = 0
-    VELOCITY = 1
-    POSITION = 3
-    EXTENDED_POSITION = 4
-    PWM = 16
 
 
 class Plant(Protocol):
@@ -188,40 +175,61 @@ def load_plant(spec: str, arguments: Mapping[str, Any] | None = None) -> Plant:
     return load_named(spec, "plant")(**(arguments or {}))
 
 
-def load_named(spec: str, what: str) -> Callable[..., Any]:
-    """Return the callable that a command line names as `package.module:Name` or `path/to/file.py:Name`.
+class MountedPlant:
+    """A plant whose servos drive its joints through their mountings; see `sim2real.emulation.plant.Plant`.
+
+    The plant inside works on the joints' side: it gets their angles, speeds and voltages, and has their true states.
 
     Args:
-        what: The noun for it in errors, e.g. ``plant``.
+        joints: Fields of `Joint`, one row per servo, in the order of the plant's `servo_ids`.
+        zero_rad: The encoder's angle from count 0 where the device reports 0 [rad]; in the plant inside, that of a
+            joint at 0.
 
     Raises:
-        UsageError: The module, the file or the name does not exist, or it cannot be called.
+        UsageError: There is another number of joints than of servos.
     """
-    place, _, name = spec.rpartition(":")
-    if not place or not name:
-        hint = f"e.g. my_robot/{what}.py:{what.title()}"
-        raise UsageError(f"{what} {spec!r} is not of the form MODULE_OR_FILE:NAME", hint=hint)
-    module = _load_module(place, what)
-    target: Callable[..., Any] | None = getattr(module, name, None)
-    if not callable(target):
-        available = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-        raise UsageError(f"{place} has no callable {name!r}. Available: {available}")
-    return target
 
+    def __init__(
+        self, plant: str, plant_args: Mapping[str, Any], joints: Sequence[Mapping[str, Any]], zero_rad: float
+    ) -> None:
+        self._plant, self._zero_rad = load_plant(plant, plant_args), zero_rad
+        self.servo_ids = tuple(self._plant.servo_ids)
+        if len(joints) != len(self.servo_ids):
+            raise UsageError(f"{len(joints)} joints are mounted on {len(self.servo_ids)} servos")
+        self._joints = {i: Joint(**fields) for i, fields in zip(self.servo_ids, joints, strict=True)}
 
-def _load_module(place: str, what: str) -> ModuleType:
-    path = Path(place)
-    if path.suffix == ".py":
-        module_spec = importlib.util.spec_from_file_location(f"_sim2real_{what}_{path.stem}", path)
-        if not path.is_file() or module_spec is None or module_spec.loader is None:
-            raise UsageError(f"there is no {what} file {path}")
-        module = importlib.util.module_from_spec(module_spec)
-        sys.modules[module.__name__] = module  # dataclasses look up their module there
-        module_spec.loader.exec_module(module)
-        return module
-    try:
-        return importlib.import_module(place)
-    except ModuleNotFoundError as error:
-        raise UsageError(
-            f"{what} module {place!r} cannot be imported: {error}", hint="a file's path must end in .py"
-        ) from error
+    def advance(self, t_s: float) -> None:
+        """Integrate up to ``t_s`` [s]."""
+        self._plant.advance(t_s)
+
+    def command(self, servo_id: int, mode: int, goal: float) -> None:
+        """Command a servo; see `Plant.command`. The goal is the servo's, not its joint's."""
+        joint = self._joints[servo_id]
+        if mode in (OperatingMode.POSITION, OperatingMode.EXTENDED_POSITION):
+            goal = joint.angle(goal - self._zero_rad) + self._zero_rad
+        elif mode == OperatingMode.VELOCITY:
+            goal = joint.speed(goal)
+        else:
+            goal = joint.direction * goal
+        self._plant.command(servo_id, mode, goal)
+
+    def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
+        """Set a servo's position controller if the plant inside has one; see `ConfigurablePlant`."""
+        if isinstance(self._plant, ConfigurablePlant):
+            speed = profile_velocity_rad_s / self._joints[servo_id].gear
+            self._plant.configure(servo_id, p_gain, d_gain, speed)
+
+    def measure(self, servo_id: int) -> tuple[float, float, float]:
+        """Return the encoder's angle from count 0 [rad], its speed [rad/s], and the servo's load."""
+        joint = self._joints[servo_id]
+        angle, speed, load = self._plant.measure(servo_id)
+        encoder = joint.encoder(angle - self._zero_rad) + self._zero_rad
+        return encoder, joint.direction * joint.gear * speed, joint.direction * load
+
+    def state(self) -> dict[str, float]:
+        """Return the true state of the plant inside."""
+        return self._plant.state()
+
+    def truth(self) -> dict[str, Any]:
+        """Return the true parameters of the plant inside."""
+        return self._plant.truth()

@@ -1,14 +1,19 @@
-"""One emulated servo: its registers, and the rules of its firmware."""
+"""Emulated DYNAMIXEL X servos: their registers and firmware, and their bus."""
+
+from __future__ import annotations
 
 import math
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 
+from sim2real.emulation.bus import BusEmulation, InstructedBus, Request
+from sim2real.emulation.firmware import ServoFirmware
+from sim2real.hardware.bus.packets import Instruction
 from sim2real.hardware.bus.registers import Register
+from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.models import model
-from sim2real.hardware.dynamixel.protocol import ALERT_BIT, StatusError
-from sim2real.hardware.emulation.firmware import ServoFirmware
-from sim2real.hardware.plant import OperatingMode
+from sim2real.hardware.dynamixel.protocol import ALERT_BIT, PROTOCOL, StatusError
 
 _MOVING_THRESHOLD_COUNT: Final = 10
 _OVERLOAD_BIT: Final = 5
@@ -191,3 +196,55 @@ class EmulatedServo(ServoFirmware):
         if register == reg.GOAL_POSITION and self.get(reg.OPERATING_MODE) == OperatingMode.POSITION:
             return not self.get(reg.MIN_POSITION_LIMIT) <= value <= self.get(reg.MAX_POSITION_LIMIT)
         return False
+
+
+class EmulatedBus(InstructedBus[EmulatedServo, "EmulatorConfig"]):
+    """Emulated DYNAMIXEL servos on a bus, driving a plant; see `InstructedBus`."""
+
+    form = PROTOCOL
+    present = (reg.PRESENT_PWM, reg.PRESENT_POSITION)
+    wild_counts = (1 << 24, 1 << 31)
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._handlers[Instruction.BULK_READ] = self._bulk_read
+
+    def make_servo(self, servo_id: int) -> EmulatedServo:
+        """Return a servo with this bus's settings."""
+        c = self.config
+        return EmulatedServo(servo_id, c.model_number, c.return_delay_us, c.encoder_counts, c.watchdog_stops)
+
+    def execute(self, request: Request) -> None:
+        """Carry out an instruction that is complete on the wire, and reply to it."""
+        if request.packet.code != Instruction.STATUS:
+            super().execute(request)
+
+    def _misunderstand(self, servo: EmulatedServo, request: Request) -> None:
+        """Answer an instruction with its error."""
+        self._answer(servo, request, StatusError.INSTRUCTION if request.packet.intact else StatusError.CRC)
+
+    def _misread(self, servo: EmulatedServo, request: Request) -> None:
+        """Answer a READ of a wrong length with an error."""
+        self._confirm(servo, request, StatusError.DATA_LENGTH)
+
+    def _bulk_read(self, request: Request, targets: list[EmulatedServo]) -> None:
+        del targets
+        parameters = request.packet.parameters
+        for i in range(0, len(parameters) - 4, 5):
+            if parameters[i] in self.servos:
+                self._answer_read(self.servos[parameters[i]], request, i + 1)
+
+
+@dataclass(frozen=True)
+class EmulatorConfig(BusEmulation):
+    """Settings of emulated DYNAMIXEL servos on their bus; see `Emulation` for the others.
+
+    Args:
+        model_number: The servos' model number; their firmware behaves as that of the model.
+        watchdog_stops: Whether a tripped bus watchdog stops the motor; None: as in the model's firmware.
+    """
+
+    bus_type = EmulatedBus
+
+    model_number: int = 1060
+    watchdog_stops: bool | None = None

@@ -1,1 +1,0 @@
-"""Emulated servos on an emulated bus, in a process of their own."""
