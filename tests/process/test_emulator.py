@@ -300,9 +300,7 @@ def test_a_plant_that_does_not_start_says_why():
         EmbeddedRobot(f"{PLANTS}:Rampp", EmulatorConfig())
 
 
-@pytest.mark.parametrize(
-    ("name", "message"), [("EmulatorConfigg", "has no callable"), ("Plant", "class of settings")]
-)
+@pytest.mark.parametrize(("name", "message"), [("EmulatorConfigg", "has no callable"), ("Plant", "class of settings")])
 def test_an_emulation_that_is_none_says_so(capsys, name, message):
     module = "sim2real.emulation.plant" if name == "Plant" else "sim2real.emulation.dynamixel"
     assert emulator.main(["--emulation", f"{module}:{name}", "--plant", f"{PLANTS}:Ramp", "--truth", "t.bin"]) == 2
