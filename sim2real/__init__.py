@@ -39,7 +39,7 @@ _NAMES_OF_MODULE = {
     "sim2real.graph.schedule": ("draw",),
     "sim2real.runtime.asynchronous": ("AsyncGraph",),
     "sim2real.runtime.clock": ("Clock",),
-    "sim2real.runtime.compilation.compiled": ("CompiledGraph",),
+    "sim2real.runtime.compiled.graph": ("CompiledGraph",),
     "sim2real.stages.check.stage": ("check",),
     "sim2real.stages.deploy.stage": ("deploy",),
     "sim2real.commands.export.identified": ("export",),

@@ -35,7 +35,7 @@ from sim2real.graph.rebuilding import rebuild as rebuild
 from sim2real.graph.schedule import draw as draw
 from sim2real.runtime.asynchronous import AsyncGraph as AsyncGraph
 from sim2real.runtime.clock import Clock as Clock
-from sim2real.runtime.compilation.compiled import CompiledGraph as CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph as CompiledGraph
 from sim2real.stages.check.stage import check as check
 from sim2real.stages.deploy.stage import deploy as deploy
 from sim2real.stages.identify.stage import identify as identify

@@ -245,7 +245,7 @@ def make_graph(task: Any, options: dict[str, Any], seconds: float) -> Any:
     from sim2real import composer
     from sim2real.graph import Base, BaseNode
     from sim2real.graph.schedule import draw
-    from sim2real.runtime.compilation.compiled import CompiledGraph
+    from sim2real.runtime.compiled.graph import CompiledGraph
 
     @struct.dataclass
     class Angles(Base):

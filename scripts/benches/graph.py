@@ -22,8 +22,8 @@ from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
-from sim2real.runtime.compilation.compiled import CompiledGraph
-from sim2real.runtime.compilation.wiring import wire
+from sim2real.runtime.compiled.graph import CompiledGraph
+from sim2real.runtime.compiled.wiring import wire
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.types import Array, Key, PyTree
 from sim2real.worlds.ode import OdeWorld
@@ -229,25 +229,25 @@ def case(device: str, kind: str, copies: int, repeats: int) -> list[Row]:
     graph_nodes = nodes(*rates)
     graph = CompiledGraph(graph_nodes, "agent", timelines(graph_nodes, kind == "hiccups"))
     world = graph_nodes["world"]
-    total = (graph.repetition or graph).wiring.total
-    pattern_rows = total // sum(ticks)
+    total = graph.rows * graph.wiring.ticks
+    loops = total // sum(ticks)
     rows_per_pass = 1 if jax.default_backend() == "cpu" else 2  # as in the graph's loop
     programs = {
-        "bare": bare_program(pattern_rows, ticks, world),
-        "hand": hand_program(pattern_rows, ticks, world),
-        # A pattern of several policy steps is unrolled as it is; twice of it took XLA 8 times as long on an H200.
-        "unrolled": hand_program(pattern_rows, ticks, world, rows_per_pass if len(ticks) == 1 else 1),
+        "bare": bare_program(loops, ticks, world),
+        "hand": hand_program(loops, ticks, world),
+        # Several policy steps in a row are unrolled as they are; twice of it took XLA 8 times as long on an H200.
+        "unrolled": hand_program(loops, ticks, world, rows_per_pass if len(ticks) == 1 else 1),
         "graph": graph_program(graph),
     }
     seconds, compile_s = compare(programs, jax.random.split(jax.random.key(0), copies), repeats)
     # The programs may differ by a tick or two in length: compared per tick.
-    per_tick = {n: s / (total if n == "graph" else pattern_rows * sum(ticks)) for n, s in seconds.items()}
+    per_tick = {n: s / (total if n == "graph" else loops * sum(ticks)) for n, s in seconds.items()}
     policy_steps = float(graph.timeline.vertices["agent"].count.mean())
     report = graph.report()
     print(kind, copies, {n: f"{1e3 * s:.2f} ms" for n, s in seconds.items()}, report, file=sys.stderr)
     over = {b: per_tick["graph"] / per_tick[b] for b in ("hand", "unrolled", "bare")}
     rate = copies * policy_steps / seconds["graph"]
-    hand_rate = copies * pattern_rows * len(ticks) / seconds["hand"]
+    hand_rate = copies * loops * len(ticks) / seconds["hand"]
     label = f"{device}/{copies}" if kind == "plain" else f"{device}/{kind}/{copies}"
     goal = "<= 1.2" if kind == "plain" else "<= 1.15 times the plain timelines"
     return [

@@ -14,7 +14,7 @@ import numpy as np
 from benches.rows import Report, Row, row, values
 from sim2real.graph.delays import EmpiricalDist
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.graph_environment import GraphEnvironment

@@ -10,6 +10,8 @@ from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection, to_ticks
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import NEVER, Edge, Vertex, search_rows
 
+EMPTY_AGE_S = 1e6
+"""Age of an empty slot in a window [s]: older than any message."""
 _ROUNDING = 2
 """Each slot is rounded to whole ticks, so the distance of two can be smaller than the period by this [ticks]."""
 

@@ -25,7 +25,7 @@ from sim2real.robots import score_columns
 from sim2real.robots.contract import RecordedRobot, Robot
 from sim2real.robots.gate_limits import GateLimits
 from sim2real.robots.loading import checked
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.training.environment.graph_environment import TrainingTask
 from sim2real.training.environment.tasks import EndingTask, PrivilegedTask, terms_of
 from sim2real.types import PyTree

@@ -57,7 +57,7 @@ A graph of a world and an agent, as every way takes it::
 
 **Compiled**: the same timeline as data of one program, for ``jit``, ``vmap`` and ``grad``::
 
-    from sim2real.runtime.compilation.compiled import CompiledGraph
+    from sim2real.runtime.compiled.graph import CompiledGraph
 
     compiled = CompiledGraph([world, agent], "agent", timeline)
 

@@ -11,7 +11,7 @@ from sim2real import pytree
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import TICKS_PER_S, BaseNode, Connection
-from sim2real.runtime.compilation.wiring import EMPTY_AGE_S
+from sim2real.graph.windows import EMPTY_AGE_S
 from sim2real.runtime.init import default_output
 from sim2real.types import PyTree
 

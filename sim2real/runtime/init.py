@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,14 +16,55 @@ from sim2real.graph.node import BaseNode, by_name, check_senders, phase_ticks
 from sim2real.graph.rules import waits_for_schedule
 from sim2real.installation import has_jax
 from sim2real.later import jax, jnp
-from sim2real.runtime.compilation.bounds import DelayBounds, bounds_of
 from sim2real.types import Array, PyTree
 
 if TYPE_CHECKING:
     from jax.typing import ArrayLike
 
+    from sim2real.graph.base import Number
+
 OUTPUTS = "outputs"
 """Key in ``GraphState.aux`` of the default outputs by node name; each is drawn once and shared by all readers."""
+
+
+class Bounds(NamedTuple):
+    """The numbers of a ``TrainableDist``, each of shape ``()``.
+
+    Attributes:
+        low: Its smallest delay [s].
+        span: Its largest delay minus the smallest [s].
+        alpha: Its position between the bounds, in [0, 1].
+    """
+
+    low: Number
+    span: Number
+    alpha: Number
+
+    def at(self, dist: TrainableDist, delay: Number | None) -> TrainableDist:
+        """Return a distribution at a delay [s], clipped to these bounds; None: at ``alpha``."""
+        if delay is None:
+            return dist.replace(alpha=jnp.asarray(self.alpha))
+        alpha = (jnp.asarray(delay, jnp.float32) - self.low) / self.span
+        return dist.replace(alpha=jnp.clip(alpha, 0.0, 1.0))
+
+    def opened(self, dist: TrainableDist) -> TrainableDist:
+        """Return a distribution with the same delay and the bounds 0 and 1 s, which are the same in each program."""
+        return dist.replace(alpha=self.low + dist.alpha * self.span, min=0.0, max=1.0)
+
+
+DelayBounds = Mapping[str, Mapping[str, Bounds]]
+"""Node -> input -> the bounds of its trainable delay."""
+
+
+def bounds_of(nodes: Mapping[str, BaseNode]) -> dict[str, dict[str, Bounds]]:
+    """Return the bounds of all trainable delays."""
+    bounds: dict[str, dict[str, Bounds]] = {}
+    for name, node in nodes.items():
+        for input_name, connection in node.inputs.items():
+            if isinstance(dist := connection.delay_dist, TrainableDist):
+                numbers = (np.float32(dist.min), np.float32(dist.max - dist.min), dist.alpha)
+                bounds.setdefault(name, {})[input_name] = Bounds(*numbers)
+    return bounds
 
 
 def collect(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], supervisor: BaseNode) -> dict[str, BaseNode]:

@@ -15,7 +15,7 @@ from sim2real.composer.variation import PhysicsVariator, distributions, noises
 from sim2real.errors import UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 
 pytestmark = pytest.mark.night  # compiles kernels; starting without them is tested in test_warp_start.py
 STEPS, SUBSTEPS = 50, 2

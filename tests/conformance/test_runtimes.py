@@ -9,8 +9,8 @@ from oracles.table_interpreter import interpret_hashes
 from sim2real.graph.episode import MemoryRecorder
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.runtime.compilation.compiled import CompiledGraph
-from sim2real.runtime.compilation.wiring import wire
+from sim2real.runtime.compiled.graph import CompiledGraph
+from sim2real.runtime.compiled.wiring import wire
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 
 KEY = jax.random.key(0)

@@ -23,7 +23,7 @@ from sim2real.graph.episode import MemoryRecorder
 from sim2real.graph.schedule import draw
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.training.networks.architectures import MLP, init_mlp
 
 SEEDS = Path(os.environ.get("SIM2REAL_SEEDS", Path(__file__).parents[3] / "shared" / "seeds"))

@@ -8,7 +8,7 @@ import numpy as np
 from oracles.hash_nodes import hash_step
 
 from sim2real.graph.node import BaseNode
-from sim2real.runtime.compilation.wiring import InputTable, SlotTable, Wiring
+from sim2real.runtime.compiled.wiring import InputTable, SlotTable, Wiring
 
 Windows = dict[str, tuple[list[int], list[int]]]
 """Input name -> (seq of each message in the window, value of each), oldest first."""
@@ -36,18 +36,11 @@ def interpret(
     """
     player = _Player(nodes, wiring, step, defaults, recorded or {})
     for row in range(wiring.rows):
-        last = wiring.last if row == wiring.rows - 1 else wiring.ticks
-        done = 0
-        # Before each slot, the world makes the ticks up to the slot's offset; after the last slot, the rest of the row.
-        for name, table, offset in zip(
-            (*wiring.slots, ""), (*wiring.tables, None), (*wiring.offsets, wiring.ticks), strict=True
-        ):
-            if wiring.world is not None and wiring.world_table is not None:
-                for tick in range(done, min(offset, last)):
-                    player.play(wiring.world, wiring.world_table, (episode, row, tick))
-            done = max(done, min(offset, last))
-            if table is not None:
-                player.play(name, table, (episode, row))
+        for name, table in zip(wiring.slots, wiring.tables, strict=True):
+            player.play(name, table, (episode, row))
+        if wiring.world is not None and wiring.world_table is not None:
+            for tick in range(wiring.ticks):
+                player.play(wiring.world, wiring.world_table, (episode, row, tick))
     return player.outputs
 
 

@@ -1,7 +1,6 @@
 """A dozen small graphs, one for each thing that a compiled graph must get right."""
 
-import numpy as np
-from oracles.hash_nodes import hash_node, random_graph
+from oracles.hash_nodes import random_graph
 
 from sim2real.graph import BaseNode, EmpiricalDist, Jitter, Scheduling
 
@@ -43,7 +42,7 @@ def unequal_rates(make):
 
 
 def three_in_ten(make):
-    """The policy makes 3 steps in 10 ticks, with some jitter: rows of a pattern."""
+    """The policy makes 3 steps in 10 ticks, with some jitter."""
     return robot(make, world_hz=100, policy_hz=30, delay_dist=hiccups(0.001, 0.003), delay=0.002)
 
 
@@ -154,17 +153,6 @@ def inner_loop(make, policy_hz=10):
 def random_one(make):
     """A random graph with two worlds."""
     return random_graph(13, size=3, worlds=2, make=make), "n0"
-
-
-def random_pattern(seed, make=hash_node):
-    """A random graph under a world of 100 Hz, with rates that do not divide; its jitter often leaves a pattern."""
-    nodes, rng = random_graph(seed, worlds=1, make=make), np.random.default_rng(seed)
-    for node in nodes.values():
-        node.rate = 100.0 if node.name == "world0" else float(rng.choice([30, 40, 60, 70, 150]))
-        node.delay_dist = EmpiricalDist([round(1e-4 + 0.1 * float(rng.random()) / node.rate, 4)])
-        for connection in node.inputs.values():
-            connection.delay_dist, connection.delay = EmpiricalDist(rng.choice([0.0, 0.001, 0.003], 20)), 0.003
-    return nodes, "n0"
 
 
 ALL = [

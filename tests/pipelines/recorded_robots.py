@@ -16,7 +16,7 @@ from sim2real.identify.parameter_paths import get_leaf
 from sim2real.identify.validation.prediction import samples
 from sim2real.log.importing.importer import import_file
 from sim2real.log.importing.mapping import load_mapping
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
 DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))

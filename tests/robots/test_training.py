@@ -10,7 +10,7 @@ from small_robot import VALUES
 
 from sim2real.graph.schedule import draw
 from sim2real.robots.control_loop.messages import EpisodeStart
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.training.environment.graph_environment import GraphEnvironment
 
 DELAYED = {**VALUES, "sensor_delay": 0.015, "actuator_delay": 0.012}

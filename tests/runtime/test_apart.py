@@ -13,8 +13,8 @@ from sim2real.graph.base import Base
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
-from sim2real.runtime.compilation.open_loop import OpenLoopGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
+from sim2real.runtime.compiled.open_loop import OpenLoopGraph
 
 
 @struct.dataclass

@@ -17,12 +17,10 @@ from sim2real.graph.times import Vertex
 from sim2real.graph.windows import bursty_episodes
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 
 KEY = jax.random.key(0)
 DURATION_S = 0.45
-PATTERNS = (34, 37, 57)
-"""Seeds of random graphs whose timelines repeat a pattern."""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +43,7 @@ def others_in_full(topologies_, *few):
 
 
 DEAR = (topologies.open_loop, topologies.random_one, topologies.two_in_five, topologies.slow_world)
-"""Their programs take longest to compile; the others have loops, patterns, bursts and several steps in a row, too."""
+"""Their programs take longest to compile; the others have loops, bursts and several steps in a row, too."""
 
 
 def rolled(graph, eps, record=None, params=None):
@@ -86,61 +84,6 @@ def test_floats_that_contract_agree_to_1e_6(topology):
     for name in nodes:
         got = by_seq(records[name]).x
         np.testing.assert_allclose(got, episode.outputs[name]["x"][: len(got)], rtol=1e-6, atol=1e-6)
-
-
-# Patterns of ticks and steps
-
-
-def without_pattern(graph):
-    rows = CompiledGraph(graph.nodes, graph.supervisor, graph.timeline)
-    rows.repetition = None
-    return rows
-
-
-@pytest.mark.parametrize(
-    "topology", others_in_full([topologies.three_in_ten, topologies.two_in_five], topologies.three_in_ten)
-)
-def test_a_pattern_of_ticks_and_steps_equals_rows(topology, compiled):
-    graph = compiled(topology)
-    check_pattern(graph)
-
-
-@pytest.mark.night  # `make test` takes the pattern of a topology, above
-@pytest.mark.parametrize("seed", PATTERNS)
-def test_a_random_pattern_equals_rows(seed):
-    nodes, supervisor = topologies.random_pattern(seed, jax_hash_node)
-    check_pattern(CompiledGraph(nodes, supervisor, draw(nodes, 0.7, 2, seed)))
-
-
-def check_pattern(graph):
-    assert graph.repetition is not None
-    by_pattern, by_row = (
-        jax.jit(jax.vmap(lambda e, g=g: rolled(g, e)))(np.arange(2)) for g in (graph, without_pattern(graph))
-    )
-    for name in graph.nodes:
-        for eps in range(2):
-            a, b = (by_seq(jax.tree.map(lambda x, eps=eps: x[eps], r[1][name])).x for r in (by_pattern, by_row))
-            np.testing.assert_array_equal(a[: len(b)], b[: len(a)], err_msg=name)
-            assert abs(len(a) - len(b)) <= graph.repetition.wiring.ticks
-    assert jax.tree.structure(by_pattern[0]) == jax.tree.structure(by_row[0])
-    world = graph.wiring.world
-    assert len(a) > 0
-    assert int(by_pattern[1][world].seq.max()) + 1 == graph.repetition.wiring.total
-    for name, made in by_pattern[1].items():  # the newest output stays in the buffer
-        if name in by_pattern[0].buffer:
-            last = np.asarray(made.output.x)[0][np.asarray(made.seq)[0].argmax()]
-            assert by_pattern[0].buffer[name][-1].x[0] == last
-
-
-def test_a_timeline_that_departs_from_the_pattern_takes_rows():
-    nodes, supervisor = topologies.three_in_ten(jax_hash_node)
-    nodes["sensor"].delay_dist = topologies.hiccups(0.001, 0.15)
-    graph = CompiledGraph(nodes, supervisor, draw(nodes, 0.9, 2, 7))
-    assert graph.repetition is None
-    steady, _ = topologies.three_in_ten(jax_hash_node)
-    mixed = Timeline.stack([draw(steady, 0.9, 2, 7), graph.timeline])
-    assert CompiledGraph(steady, supervisor, mixed[:2]).repetition is not None
-    assert CompiledGraph(steady, supervisor, mixed).repetition is None
 
 
 # reset and step
@@ -203,7 +146,7 @@ def test_a_step_is_as_large_a_program_as_a_row():
     graph = CompiledGraph(nodes, supervisor, draw(nodes, 0.5))
     assert graph.report()["longest_gap"] >= 10
     gs = graph.init(KEY)
-    row = equations(lambda s: graph.run_row(s)[0], gs)
+    row = equations(lambda s: graph.rollout(s, rows=1)[0], gs)
     assert equations(graph.step, jax.eval_shape(graph.reset, gs)[0]) < 1.5 * row
 
 
@@ -240,11 +183,6 @@ def rolls_in_parts(graph, gs):
     return graph.rollout(graph.rollout(gs, rows=2)[0], tuple(graph.nodes), rows=2)
 
 
-def runs_a_row(graph, gs):
-    gs, made = graph.run_row(gs)
-    return gs, {n: steps[0] for n, steps in made.items()}
-
-
 def steps(graph, gs):
     gs, first = graph.reset(gs)
     gs, second = graph.step(gs, first, Value(x=jnp.uint32(3)))
@@ -258,8 +196,7 @@ def observes(graph, gs):
 
 @pytest.mark.parametrize(
     ("way", "topology"),
-    [(w, topologies.robot) for w in (rolls, rolls_in_parts, runs_a_row, steps, observes)]
-    + [pytest.param(rolls, topologies.three_in_ten, marks=pytest.mark.night)],
+    [(w, topologies.robot) for w in (rolls, rolls_in_parts, steps, observes)],
     ids=lambda x: x.__name__,
 )
 def test_an_episode_that_does_not_exist_has_no_steps(way, topology, compiled):
@@ -329,7 +266,7 @@ def test_errors_instead_of_silence(compiled):
         with pytest.raises(UsageError, match=r"step of the supervisor 'policy' awaits"):
             call(gs)
     awaiting, ss = graph.reset(gs)
-    for call in (graph.reset, graph.rollout, graph.observe, graph.run_row):
+    for call in (graph.reset, graph.rollout, graph.observe):
         with pytest.raises(UsageError, match="was called while a step"):
             call(awaiting)
     with pytest.raises(UsageError, match="row 3 of"):

@@ -11,7 +11,7 @@ from sim2real.graph import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.runtime.data import Format
 from sim2real.runtime.match import matched
 

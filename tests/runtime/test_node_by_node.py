@@ -17,8 +17,8 @@ from sim2real.graph import BaseWorld, Timeline, TrainableDist
 from sim2real.graph.node import TICKS_PER_S, Jitter, Scheduling
 from sim2real.graph.schedule import draw
 from sim2real.graph.windows import make_room
-from sim2real.runtime.compilation.compiled import CompiledGraph
-from sim2real.runtime.compilation.open_loop import OpenLoopGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
+from sim2real.runtime.compiled.open_loop import OpenLoopGraph
 
 KEY = jax.random.key(0)
 DURATION_S, EPISODES = 0.4, 2

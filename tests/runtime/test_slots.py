@@ -9,8 +9,8 @@ from oracles.hash_nodes import hash_node, jax_hash_node, random_graph
 
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
-from sim2real.runtime.compilation.wiring import wire
+from sim2real.runtime.compiled.graph import CompiledGraph
+from sim2real.runtime.compiled.wiring import wire
 
 RATES = [(100, 100, 50, 50), (200, 200, 50, 50), (500, 100, 50, 50), (200, 100, 50, 50), (500, 500, 100, 100)]
 """Of world, sensor, agent and actuator [Hz]."""

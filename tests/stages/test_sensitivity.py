@@ -14,7 +14,7 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.errors import Sim2RealError
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train.sensitivity import models_of, moves_of, sensitivity, with_room
 from sim2real.training.environment.graph_environment import GraphEnvironment

@@ -9,7 +9,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.training.environment.graph_environment import GraphEnvironment
 from sim2real.training.environment.policy_steps import PolicySteps

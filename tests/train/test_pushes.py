@@ -12,7 +12,7 @@ from sim2real.artifacts.episodes import Episodes
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train.show import training_summary
 from sim2real.training.config import PPOConfig

@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 GRAVITY, DAMPING, DRY = 30.0, 0.7, 2.5

@@ -8,7 +8,7 @@ from flax import struct
 from sim2real.errors import UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.worlds.mjx import MjxState, MjxWorld
 
 ARM = """

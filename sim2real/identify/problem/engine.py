@@ -14,7 +14,7 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode, BaseWorld
 from sim2real.installation import has_jax
 from sim2real.later import jax, jnp
-from sim2real.runtime.compilation.open_loop import OpenLoopGraph, Tables
+from sim2real.runtime.compiled.open_loop import OpenLoopGraph, Tables
 from sim2real.types import Array, MjModel, PyTree
 from sim2real.worlds.rollouts import OpenLoop, Rollouts, Start, StepLaw
 

@@ -25,7 +25,7 @@ from sim2real.identify.problem.robust import tamed
 from sim2real.identify.problem.segments import Data
 from sim2real.installation import has_jax
 from sim2real.later import jax, jnp
-from sim2real.runtime.compilation.open_loop import OpenLoopGraph
+from sim2real.runtime.compiled.open_loop import OpenLoopGraph
 from sim2real.types import Array, PyTree, Scalar
 
 _STATE_STEPS = 2

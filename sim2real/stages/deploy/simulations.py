@@ -16,7 +16,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import make_room
 from sim2real.robots.contract import Robot
 from sim2real.robots.score_columns import as_columns, as_sent
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.terminal.console import note
 from sim2real.training.environment.draws import draw_robots
 from sim2real.training.environment.variation import VariationConfig

@@ -15,7 +15,7 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.engine import CRollouts, choose
 from sim2real.robots.contract import Robot
-from sim2real.runtime.compilation.open_loop import OpenLoopGraph
+from sim2real.runtime.compiled.open_loop import OpenLoopGraph
 
 
 def simulate(

@@ -11,7 +11,7 @@ from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.robots.contract import Robot
 from sim2real.robots.control_loop.loop import DELAYS
-from sim2real.runtime.compilation.compiled import CompiledGraph
+from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.train.config import TrainConfig

@@ -14,7 +14,7 @@ from sim2real.graph.node import TICKS_PER_S, BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import bursty_episodes
-from sim2real.runtime.compilation.placement import Placement, Placer
+from sim2real.runtime.compiled.placement import Placement, Placer
 
 STRETCH_S = 1.0
 """Length of a stretch of a recording [s]: hiccups of a computer last tens of milliseconds."""

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -20,21 +19,14 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.graph.timeline import Timeline
-from sim2real.runtime.compilation.fit import check_fit, nodes_of, supervisor_of
-from sim2real.runtime.compilation.program import Rollout, RowProgram, has_mjx_data, scan_rows, select
-from sim2real.runtime.compilation.repetition import Repetition
-from sim2real.runtime.compilation.report import report_of
-from sim2real.runtime.compilation.walk import Walk
-from sim2real.runtime.compilation.wiring import Wiring, wire, wire_pattern
+from sim2real.runtime.compiled.rows import Rollout, RowProgram, scan_rows, select
+from sim2real.runtime.compiled.wiring import Wiring, check_fit, nodes_of, supervisor_of, wire
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.program_arguments import data_of, with_data
 from sim2real.types import Json, PyTree
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Number
-
-
-T = TypeVar("T")
 
 
 class CompiledGraph:
@@ -59,10 +51,6 @@ class CompiledGraph:
         given: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
         reusable: Whether other timelines of the robot, given as ``data``, shall have the same program.
 
-    Attributes:
-        rows_per_pass: Unroll factor of ``rollout``'s loop over rows.
-        walk: The steps of the supervisor in the rows.
-
     Raises:
         UsageError: Nodes, connections and timeline do not fit each other.
     """
@@ -82,19 +70,19 @@ class CompiledGraph:
         check_fit(self.nodes, timeline, given or {})
         self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.replayed), reusable)
         self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes, reusable=reusable)
-        self.walk = Walk(self.program, self.supervisor)
+        # The supervisor may have several slots in a row; the i-th is its turn i. Where each of its steps is, `(E, K)`:
+        # row * turns + turn; behind the last row if the program does not compute it.
+        self._turns = [i for i, n in enumerate(self.wiring.slots) if n == self.supervisor]
+        self._behind = self.rows * len(self._turns)
+        self._places = np.zeros((self.episodes, 0), np.int64)
+        if self._turns:
+            seq = np.stack([self.wiring.tables[i].seq for i in self._turns], axis=-1).reshape(self.episodes, -1)
+            self._places = np.full((self.episodes, int(seq.max()) + 1), self._behind)
+            e, at = np.nonzero(seq >= 0)
+            self._places[e, seq[e, at]] = at
         # Unrolling halves a GPU's copies of the carried state: 100,000 pendulums on an H200 take 0.63 of the time. On a
         # CPU it costs time to compile.
-        self.rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
-
-    @cached_property
-    def repetition(self) -> Repetition | None:
-        """The program of whole episodes in a pattern that all repeat; None without a pattern, or with ``given``."""
-        pattern = None if self.replayed else wire_pattern(self.nodes, self.supervisor, self.timeline)
-        if pattern is not None and np.diff(pattern.full) < 2:
-            return None
-        with jax.ensure_compile_time_eval():  # the first rollout may be traced
-            return pattern and Repetition(self.nodes, pattern, self.episodes)
+        self._rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
 
     @property
     def data(self) -> PyTree:
@@ -102,11 +90,10 @@ class CompiledGraph:
         return self.program.data, {n: data_of(node) for n, node in self.nodes.items()}
 
     def with_data(self, data: PyTree) -> CompiledGraph:
-        """Return a copy with other data, which may be traced; its rollouts run in rows."""
+        """Return a copy with other data, which may be traced; for ``rollout``, ``observe`` and ``advance``."""
         graph, (numbers, of_nodes) = copy.copy(self), data
         graph.nodes = {n: with_data(node, of_nodes[n]) for n, node in self.nodes.items()}
         graph.program = self.program.with_data(graph.nodes, numbers)
-        graph.walk, graph.repetition = Walk(graph.program, self.supervisor), None
         return graph
 
     @property
@@ -122,16 +109,17 @@ class CompiledGraph:
     @property
     def steps(self) -> int:
         """Number of the supervisor's steps in the shortest episode; ``reset`` returns the first."""
-        return int(self.walk.counts.min())
+        return int(self._counts().min())
 
     def last_row(self, steps: np.ndarray) -> np.ndarray:
         """Return the row of the last of the supervisor's first ``steps (E,)`` steps in each episode, ``(E,)``."""
-        return self.walk.last_row(steps)
+        computed = (np.arange(self._places.shape[1]) < steps[:, None]) & (self._places < self._behind)
+        return np.where(computed, self._places, 0).max(axis=1, initial=0) // max(1, len(self._turns))
 
     @property
     def turns(self) -> np.ndarray:
         """Mask of the rows with a step of the supervisor, bool of shape ``(episodes, rows)``."""
-        return np.any([self.wiring.tables[turn].seq >= 0 for turn in self.walk.turns], axis=0)
+        return np.any([self.wiring.tables[turn].seq >= 0 for turn in self._turns], axis=0)
 
     def init(
         self, rng: jax.Array, params: Mapping[str, PyTree] | None = None, order: Sequence[str] = (), eps: Number = 0
@@ -163,7 +151,9 @@ class CompiledGraph:
             The graph's state, whose ``seq`` has the number of the supervisor's next step; and its step state.
         """
         self._check_row_start(gs, "reset")
-        return self.walk.to_first(gs)
+        gs = self.program.run_slots(gs, 0, self._first_turn(), {})
+        arrived = self.program.seq(gs, self._turns[0]) >= 0
+        return self._at_step(*self._play_on(gs, jnp.int32(0), arrived, int(self._places[:, 0].max())))
 
     def step(
         self, gs: GraphState, step_state: StepState | None = None, output: PyTree = None
@@ -180,21 +170,21 @@ class CompiledGraph:
         Raises:
             UsageError: ``reset`` was not called, or the episode has no further step.
         """
-        self.walk.first_turn()
+        self._first_turn()
         k = self._awaited(gs, "step")
         if not (_traced(k) or _traced(gs.eps)):
-            last = int(self.walk.counts[int(gs.eps)]) - 1
+            last = int(self._counts()[int(gs.eps)]) - 1
             if not 0 <= int(k) < last:
                 raise UsageError(
                     f"the timeline ends after step {last} of the supervisor {self.supervisor!r}",
                     hint="start again with init() and reset(), or draw longer timelines",
                 )
         # Make the supervisor's step, then all steps until its next one.
-        turn = self.walk.turn_of(gs, k)
-        before = self.walk.step_state(gs, turn) if step_state is None else step_state
+        turn = jnp.asarray(self._places)[gs.eps, jnp.maximum(k, 0)] % len(self._turns)
+        before = self._step_state(gs, turn) if step_state is None else step_state
         after, output = self.program.call(self.supervisor, before) if output is None else (before, output)
         gs = self.program.commit(gs, self.supervisor, after, output, k >= 0)
-        return self.walk.to_next(gs, turn, k < 0)
+        return self._at_step(*self._play_on(gs, turn, k < 0, int(np.diff(self._places, axis=1).max(initial=1))))
 
     def run(self, gs: GraphState) -> GraphState:
         """Make the supervisor's next step by its own ``step``, and run to the step after it.
@@ -204,24 +194,13 @@ class CompiledGraph:
         """
         return self.step(gs if gs.seq else self.reset(gs)[0])[0]
 
-    def run_row(self, gs: GraphState) -> tuple[GraphState, dict[str, list[Rollout]]]:
-        """Run one row: the due steps of the nodes, then the world's ticks.
-
-        Returns:
-            The graph's state, and each node's steps of the row.
-        """
-        self._check_row_start(gs, "run_row")
-        return self._run_row(gs, _is_checked(gs))
-
     def rollout(
         self, gs: GraphState, record: Sequence[str] = (), rows: int | None = None
     ) -> tuple[GraphState, dict[str, Rollout]]:
         """Run the rows of an episode, the supervisor making its own steps.
 
         Args:
-            rows: Number of rows; default: all remaining rows, or the whole episode if ``gs.step`` is traced. A whole
-                episode runs in a pattern if there is one, see ``repetition``: to the world's last tick, in another
-                order of the records' places.
+            rows: Number of rows; default: all remaining rows, or the whole episode if ``gs.step`` is traced.
 
         Returns:
             The last state, and the records by node.
@@ -230,36 +209,27 @@ class CompiledGraph:
             UsageError: Fewer than ``rows`` rows remain, or a node in ``record`` does not run.
         """
         self._check_row_start(gs, "rollout")
-        fresh = rows is None and not _traced(gs.step) and not int(gs.step)
-        # XLA compiles each tick of MJX for seconds, and masks do not slow it down: rows have fewer ticks.
-        if fresh and not has_mjx_data(gs.state) and self.repetition is not None:
-            self._check_record(record)
-            end, records = self.repetition.rollout(gs, record)
-            return self._of_existing(gs, end.replace(step=np.int32(self.rows)), records)
         left = self.rows if _traced(gs.step) else self.rows - int(gs.step)
         rows = left if rows is None else rows
         if not 1 <= rows <= left:
             raise UsageError(f"{left} of this graph's {self.rows} rows are left, rows={rows}")
-        self._check_record(record)
+        running = [n for n in self.nodes if n not in self.replayed]
+        if unknown := [n for n in record if n not in running]:
+            raise UsageError(f"no node {unknown[0]!r} runs that could be recorded. Nodes: {', '.join(running)}")
+
+        def run_row(state: GraphState) -> tuple[GraphState, dict[str, list[Rollout]]]:
+            outputs: dict[str, list[Rollout]] = {}
+            state = self.program.run_slots(state, 0, len(self.wiring.slots), outputs, inside)
+            return self.program.run_world(state, outputs, inside), outputs
+
         inside = not _traced(gs.step)
-        end, records = scan_rows(lambda state: self._run_row(state, inside), gs, record, rows, self.rows_per_pass)
-        return self._of_existing(gs, end, records) if inside else (end, records)
-
-    def _of_existing(
-        self, begin: GraphState, end: GraphState, records: dict[str, Rollout]
-    ) -> tuple[GraphState, dict[str, Rollout]]:
-        """Return the results of rows whose updates are not masked: none where a traced ``eps`` is no episode."""
-        if not _traced(begin.eps):
+        end, records = scan_rows(run_row, gs, record, rows, self._rows_per_pass)
+        if not (inside and _traced(gs.eps)):
             return end, records
-        exists = self.program.within(begin)
+        # The rows' updates are not masked: there is no result where a traced ``eps`` is no episode.
+        exists = self.program.within(gs)
         records = {n: r._replace(seq=jnp.where(exists, r.seq, -1)) for n, r in records.items()}
-        return select(exists, end, begin.replace(step=end.step)), records
-
-    def _check_record(self, record: Sequence[str]) -> None:
-        for name in record:
-            if name not in self.nodes or name in self.replayed:
-                running = [n for n in self.nodes if n not in self.replayed]
-                raise UsageError(f"no node {name!r} runs that could be recorded. Nodes: {', '.join(running)}")
+        return select(exists, end, gs.replace(step=end.step)), records
 
     def observe(self, gs: GraphState, inside: bool = False) -> tuple[GraphState, StepState, Number]:
         """Run a row up to the supervisor's step.
@@ -275,7 +245,7 @@ class CompiledGraph:
             UsageError: The supervisor makes several steps in one row.
         """
         self._check_row_start(gs, "observe")
-        turn = self.walk.only_turn()
+        turn = self._only_turn()
         inside = inside or _is_checked(gs)
         gs = self.program.run_slots(gs, 0, turn, {}, inside)
         step_state = self.program.step_state(gs, turn, inside)
@@ -290,7 +260,7 @@ class CompiledGraph:
         Returns:
             The state at the start of the next row.
         """
-        turn, k = self.walk.only_turn(), self._awaited(gs, "advance")
+        turn, k = self._only_turn(), self._awaited(gs, "advance")
         inside = inside or _is_checked(gs)
         ran = None if inside and self.program.always(turn) else k >= 0
         gs = self.program.commit(gs.replace(seq={}), self.supervisor, step_state, output, ran)
@@ -307,12 +277,92 @@ class CompiledGraph:
             by node), ``bursts`` (``node/input`` -> the most messages that one step after the first consumes, and the
             length of its window), ``bytes_per_copy`` (size of the carried state).
         """
-        return report_of(self.walk, jax.eval_shape(self.init, jax.random.key(0)))
+        w, state = self.wiring, jax.eval_shape(self.init, jax.random.key(0))
+        windows = {(n, i): self.nodes[n].inputs[i].total_window for n, i in w.bursts}
+        rows = self._places // max(1, len(self._turns))
+        return {
+            "episodes": self.episodes,
+            "rows": w.rows,
+            "ticks_per_row": w.ticks,
+            "slots": list(w.slots),
+            "supervisor_slots": len(self._turns),
+            "supervisor_steps": self.steps if self._turns else 0,
+            "longest_gap": int(np.diff(rows, axis=1).max(initial=1)),
+            "discarded": w.discarded,
+            "rings": dict(w.rings),
+            "bursts": {f"{n}/{i}": {"burst": b, "window": windows[n, i]} for (n, i), b in w.bursts.items()},
+            "bytes_per_copy": sum(x.size * x.dtype.itemsize for x in jax.tree_util.tree_leaves(state)),
+        }
 
-    def _run_row(self, gs: GraphState, inside: bool) -> tuple[GraphState, dict[str, list[Rollout]]]:
-        outputs: dict[str, list[Rollout]] = {}
-        gs = self.program.run_slots(gs, 0, len(self.wiring.slots), outputs, inside)
-        return self.program.run_world(gs, outputs, inside), outputs
+    def _counts(self) -> np.ndarray:
+        """Return the number of the supervisor's steps in each episode, shape ``(E,)``."""
+        return (self._places < self._behind).sum(axis=1)
+
+    def _first_turn(self) -> int:
+        """Return the supervisor's first slot; raise a ``UsageError`` if it has none."""
+        if self._turns:
+            return self._turns[0]
+        if self.supervisor == self.wiring.world:
+            raise UsageError(
+                f"the supervisor {self.supervisor!r} is the world: it ticks in every row, and its steps have no turn",
+                hint="make the node that acts the supervisor, or use rollout(), which works with any",
+            )
+        raise UsageError(f"the outputs of the supervisor {self.supervisor!r} are given: it makes no steps")
+
+    def _only_turn(self) -> int:
+        """Return the supervisor's only slot; raise a ``UsageError`` if it has none, or several."""
+        first = self._first_turn()
+        if len(self._turns) > 1:
+            raise UsageError(
+                f"the supervisor {self.supervisor!r} makes up to {len(self._turns)} steps in a row of these timelines",
+                hint="draw timelines without bursts, remove the episodes with a hiccup, or use reset() and step()",
+            )
+        return first
+
+    def _step_state(self, gs: GraphState, turn: Number) -> StepState:
+        """Return the supervisor's step state at a turn; ``seq`` is -1 if it makes no step there."""
+        step_state = self.program.step_state(gs, self._turns[0])
+        for i, slot in enumerate(self._turns[1:], start=1):
+            step_state = select(turn == i, self.program.step_state(gs, slot), step_state)
+        return step_state
+
+    def _at_step(self, gs: GraphState, turn: Number) -> tuple[GraphState, StepState]:
+        """Return the state, whose ``seq`` has the supervisor's next step, and the supervisor's step state."""
+        step_state = self._step_state(gs, turn)
+        return gs.replace(seq={self.supervisor: step_state.seq}), step_state
+
+    def _play_on(self, gs: GraphState, turn: Number, arrived: Number, hops: int) -> tuple[GraphState, Number]:
+        """Run from turn to turn until the supervisor makes a step; return the state and the turn.
+
+        The loop always runs ``hops`` turns, the most that any step needs. After the step, and after the last row, the
+        state is masked.
+        """
+        program, count = self.program, len(self._turns)
+
+        def hop(state: GraphState, i: int) -> GraphState:
+            """Run from turn ``i`` to the next turn, in this row or the next one."""
+            end = self._turns[i + 1] if i + 1 < count else len(self.wiring.slots)
+            state = program.run_slots(state, self._turns[i] + 1, end, {}, inside=True)
+            if i + 1 < count:
+                return state
+            return program.run_slots(program.run_world(state, {}, inside=True), 0, self._turns[0], {})
+
+        def sweep(
+            now: tuple[GraphState, jax.Array, jax.Array], _: None
+        ) -> tuple[tuple[GraphState, jax.Array, jax.Array], None]:
+            for i in range(count):
+                state, at, there = now
+                active = ~there & program.within(state)
+                active = active if count == 1 else active & (at == i)
+                after, following = hop(state, i), (i + 1) % count
+                reached = program.seq(after, self._turns[following]) >= 0
+                now = select(active, (after, jnp.int32(following), reached), now)
+            return now, None
+
+        # One sweep more than the hops need, as the first may start at any turn.
+        sweeps = hops if count == 1 else -(-hops // count) + (hops > 0)
+        start = (gs, jnp.asarray(turn, jnp.int32), jnp.asarray(arrived))
+        return jax.lax.scan(sweep, start, length=sweeps)[0][:2] if sweeps != 1 else sweep(start, None)[0][:2]
 
     def _awaited(self, gs: GraphState, call: str) -> Number:
         """Return the number of the supervisor's step that the caller makes next."""

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
-from sim2real.runtime.compilation.bounds import DelayBounds, bounds_of
-from sim2real.runtime.compilation.wiring import SlotTable, Wiring
+from sim2real.runtime.compiled.wiring import SlotTable, Wiring
+from sim2real.runtime.init import DelayBounds, bounds_of
 from sim2real.runtime.match import check_match, matched
 from sim2real.types import PyTree
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
-Ages = tuple[int, int]
-"""Smallest and largest age of an input's newest message, counted in the sender's outputs."""
 
 
 class Rollout(NamedTuple):
@@ -43,8 +41,6 @@ class RowProgram:
 
     Args:
         replayed: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
-        ages: For each slot: input -> smallest and largest age in the table. Without an entry, all ages of the sender's
-            ring are possible.
         reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
     """
 
@@ -54,7 +50,6 @@ class RowProgram:
         wiring: Wiring,
         replayed: Mapping[str, PyTree],
         episodes: int,
-        ages: Sequence[Mapping[str, Ages]] | None = None,
         reusable: bool = False,
     ) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
@@ -65,7 +60,6 @@ class RowProgram:
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
         self._world = jax.tree_util.tree_map(by_row, _pytree(wiring.world_table))
         self._always = [bool((t.seq >= 0).all()) and not reusable for t in wiring.tables]
-        self._ages = ages or [{} for _ in wiring.tables]
 
     @property
     def data(self) -> PyTree:
@@ -95,20 +89,18 @@ class RowProgram:
         end: int,
         outputs: dict[str, list[Rollout]],
         inside: bool = False,
-        full: bool = False,
     ) -> GraphState:
         """Run some slots of the row; outside of the timelines nothing changes.
 
         Args:
             outputs: Node -> its steps; those of these slots are appended.
             inside: Promise that the timelines have this row and episode, which saves masking every update.
-            full: Promise that each of the slots makes a step.
         """
         for i in range(begin, end):
             name = self.wiring.slots[i]
             step_state = self.step_state(gs, i, inside)
             new, output = self.call(name, step_state)
-            ran = None if full or (inside and self._always[i]) else step_state.seq >= 0
+            ran = None if inside and self._always[i] else step_state.seq >= 0
             gs = self.commit(gs, name, new, output, ran)
             outputs.setdefault(name, []).append(Rollout(step_state.seq, output))
         return gs
@@ -124,7 +116,7 @@ class RowProgram:
             # Unrolled on a GPU, where a loop adds latency. On a CPU a loop costs the pendulum nothing, and MuJoCo's
             # worlds compile in half the time.
             unroll = 1 if jax.default_backend() == "cpu" else self.wiring.ticks
-            gs, ticks = jax.lax.scan(partial(self.run_tick, name), gs, self.world_row(gs), unroll=unroll)
+            gs, ticks = jax.lax.scan(partial(self._run_tick, name), gs, _at(self._world, gs), unroll=unroll)
             if here is not None:
                 ticks = ticks._replace(seq=jnp.where(here, ticks.seq, -1))
             outputs.setdefault(name, []).extend(
@@ -133,19 +125,9 @@ class RowProgram:
         gs = gs.replace(step=gs.step + 1)
         return gs if here is None else select(here, gs, before)
 
-    def world_row(self, gs: GraphState) -> PyTree:
-        """Return the entries of the world's table for a row, leaves ``(ticks, ...)``."""
-        return _at(self._world, gs)
-
-    def run_tick(
-        self, name: str, gs: GraphState, now: Mapping[str, PyTree], ages: Mapping[str, Ages] | None = None
-    ) -> tuple[GraphState, Rollout]:
-        """Run one tick of the world.
-
-        Args:
-            now: The tick's entries of ``world_row``.
-        """
-        step_state = self._step_state(gs, name, now, ages or {})
+    def _run_tick(self, name: str, gs: GraphState, now: Mapping[str, PyTree]) -> tuple[GraphState, Rollout]:
+        """Run one tick of the world; ``now`` has the tick's entries of the table."""
+        step_state = self._step_state(gs, name, now)
         new, output = self.call(name, step_state)
         return self.commit(gs, name, new, output, None), Rollout(step_state.seq, output)
 
@@ -166,7 +148,7 @@ class RowProgram:
         table = _at(self._tables[slot], gs)
         if not inside:
             table["seq"] = self.seq(gs, slot)
-        return self._step_state(gs, self.wiring.slots[slot], table, self._ages[slot])
+        return self._step_state(gs, self.wiring.slots[slot], table)
 
     def seq(self, gs: GraphState, slot: int) -> jax.Array:
         """Return the number of the step that a slot makes; -1 if it makes none, and outside of the timelines."""
@@ -204,9 +186,7 @@ class RowProgram:
             changed["buffer"] = {**gs.buffer, name: pushed if ran is None else select(ran, pushed, ring)}
         return gs.replace(**changed)
 
-    def _step_state(
-        self, gs: GraphState, name: str, table: Mapping[str, PyTree], ages: Mapping[str, Ages]
-    ) -> StepState:
+    def _step_state(self, gs: GraphState, name: str, table: Mapping[str, PyTree]) -> StepState:
         inputs = {}
         for input_name, t in table["inputs"].items():
             connection = self.nodes[name].inputs[input_name]
@@ -217,7 +197,7 @@ class RowProgram:
                 data = self._look_up(gs, sender, t["seq"])
             else:
                 ring = gs.buffer[sender]
-                data = _window(ring, age, width, *ages.get(input_name, (0, len(ring) - width)))
+                data = _window(ring, age, width)
             state = InputState(t["seq"], t["sent"], t["received"], data)
 
             # A trainable delay picks or interpolates within the window.
@@ -241,15 +221,15 @@ class RowProgram:
         return jax.tree_util.tree_map(one, self._replayed[sender], gs.buffer[sender])
 
 
-def _window(ring: tuple[T, ...], age: jax.Array, width: int, min_age: int, max_age: int) -> T:
+def _window(ring: tuple[T, ...], age: jax.Array, width: int) -> T:
     """Return a window of ``width`` of a node's last outputs, oldest first, without the ``age`` newest ones.
 
     The outputs are separate arrays, chosen by selects, which XLA fuses with other elementwise operations. One stacked
     array would cost a GPU a concatenation, a copy and a gather per leaf.
     """
     begin = len(ring) - width
-    window = list(ring[begin - min_age : len(ring) - min_age])
-    for a in range(min_age + 1, max_age + 1):
+    window = list(ring[begin:])
+    for a in range(1, begin + 1):
         window = [select(age == a, ring[begin - a + i], window[i]) for i in range(width)]
     return jax.tree_util.tree_map(lambda *leaves: jnp.stack(leaves), *window)
 
@@ -293,11 +273,6 @@ def select(mask: Number, new: T, old: T) -> T:
         return b.where(mask, a) if _is_mjx_data(b) else jnp.where(mask, a, b)
 
     return jax.tree_util.tree_map(one, new, old, is_leaf=_is_mjx_data)
-
-
-def has_mjx_data(tree: PyTree) -> bool:
-    """Return whether a state of MJX is among the leaves of a tree."""
-    return any(_is_mjx_data(leaf) for leaf in jax.tree_util.tree_leaves(tree, is_leaf=_is_mjx_data))
 
 
 def _is_mjx_data(leaf: object) -> bool:

@@ -1,25 +1,23 @@
 """Turns timelines into index tables: the step that each slot of each row computes, and the messages that it reads.
 
-A row is a fixed sequence of **slots**, in which steps of the nodes are computed, followed by n world ticks. In a
-pattern (``pattern.py``) the slots stand between the ticks. ``placement.py`` decides which step is computed where. Pure
-numpy, before anything is compiled; ``tests/oracles/table_interpreter.py`` interprets the tables.
+A row is a fixed sequence of **slots**, in which steps of the nodes are computed, followed by n world ticks.
+``placement.py`` decides which step is computed where. Pure numpy, before anything is compiled;
+``tests/oracles/table_interpreter.py`` interprets the tables.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import UsageError
-from sim2real.graph.node import TICKS_PER_S, BaseNode
+from sim2real.graph.node import TICKS_PER_S, BaseNode, by_name, check_senders
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import NEVER, Edge, Vertex, search_rows
-from sim2real.graph.windows import check_bursts, longest_burst
-from sim2real.runtime.compilation.pattern import find_pattern
-from sim2real.runtime.compilation.placement import Placement, Placer
-
-EMPTY_AGE_S = 1e6
-"""Age of an empty slot in a window [s]: older than any message."""
+from sim2real.graph.windows import EMPTY_AGE_S, check_bursts, longest_burst
+from sim2real.runtime.compiled.placement import Placement, Placer
+from sim2real.types import PyTree
 
 
 @dataclass(frozen=True)
@@ -69,8 +67,6 @@ class Wiring:
         rings: Node -> number of its last outputs that the program carries.
         discarded: Fraction of the slots, over all rows, that compute no step.
         bursts: (node, input) -> the most messages that one step after the first consumes.
-        offsets: Number of the row's ticks before each slot.
-        last: Number of ticks in the last row.
     """
 
     world: str | None
@@ -82,23 +78,6 @@ class Wiring:
     rings: Mapping[str, int]
     discarded: float
     bursts: Mapping[tuple[str, str], int]
-    offsets: tuple[int, ...]
-    last: int
-
-    @property
-    def total(self) -> int:
-        """Number of world ticks in an episode."""
-        return (self.rows - 1) * self.ticks + self.last
-
-    @property
-    def full(self) -> tuple[int, int]:
-        """The longest range of whole rows, begin and end, in which each slot makes a step in all episodes."""
-        gaps = np.any([(t.seq < 0).any(axis=0) for t in self.tables], axis=0)
-        gaps[-1] |= self.last < self.ticks
-        ends = np.flatnonzero([*gaps, True])
-        begins = np.concatenate([[0], ends[:-1] + 1])
-        i = int(np.argmax(ends - begins))
-        return int(begins[i]), int(ends[i])
 
 
 def wire(
@@ -121,13 +100,6 @@ def wire(
     check_bursts(nodes, timeline)
     placer = Placer(nodes, supervisor, timeline, replayed)
     return _Tables(placer, placer.place(), reusable).wiring()
-
-
-def wire_pattern(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> Wiring | None:
-    """Turn timelines into index tables whose rows are patterns; None if they have no pattern."""
-    placer = Placer(nodes, supervisor, timeline, frozenset())
-    placement = find_pattern(placer)
-    return None if placement is None else _Tables(placer, placement).wiring()
 
 
 def messages_read(
@@ -155,7 +127,6 @@ class _Tables:
         self.placer, self.placement, self.reusable = placer, placement, reusable
         self.timeline, self.nodes, self.world = placer.timeline, placer.nodes, placer.world
         self.rows, self.ticks = placement.rows, placement.ticks
-        self.total = (placement.rows - 1) * placement.ticks + placement.last
         # When the program computes each step, as a number that increases with row and slot.
         self.done = {
             n: np.where(placer.valid(n), self._moment(placement.row[n], placement.slot[n]), NEVER)
@@ -178,8 +149,6 @@ class _Tables:
             rings=self._rings(names, tables, world_table),
             discarded=1.0 - float(np.mean(ran)) if ran else 0.0,
             bursts={k: longest_burst(e, self.timeline.vertices[k[0]]) for k, e in self.placer.edges.items()},
-            offsets=self.placement.offsets,
-            last=self.placement.last,
         )
 
     def _moment(self, row: np.ndarray, slot: np.ndarray | int) -> np.ndarray:
@@ -191,17 +160,13 @@ class _Tables:
         e, k = np.nonzero((slots == slot) & (rows < self.rows) & self.placer.valid(name))
         seq[e, rows[e, k]] = k
         row = np.arange(self.rows, dtype=np.int64)
-        # In the last row, which may have fewer ticks, the slots behind its last tick run too.
-        ticks = np.minimum(row * self.ticks + self.placement.offsets[slot], self.total)
-        return self._table(name, seq, self._moment(row, slot), ticks)
+        return self._table(name, seq, self._moment(row, slot), row * self.ticks)
 
     def _world_table(self) -> SlotTable:
         world = self.world or ""
         episodes = self.timeline.episodes
-        # The last row's table is as long as the others', also where the row has fewer ticks.
-        tick = np.minimum(np.arange(self.rows * self.ticks, dtype=np.int64), self.total - 1)
-        before = np.searchsorted(self.placement.offsets, tick % self.ticks, side="right")
-        after = self._moment(tick // self.ticks, before)  # the slots before this tick are done
+        tick = np.arange(self.rows * self.ticks, dtype=np.int64)
+        after = self._moment(tick // self.ticks, len(self.placement.slots))  # the row's slots are done
         seq = np.broadcast_to(tick, (episodes, tick.size))
         flat = self._table(world, seq, after, tick)
         split = lambda a: a.reshape(episodes, self.rows, self.ticks, *a.shape[2:])  # noqa: E731
@@ -273,3 +238,82 @@ class _Tables:
                     room = max(2, 1 << (room - 1).bit_length())
                 rings[sender] = max(rings[sender], room + connection.total_window)
         return rings
+
+
+def nodes_of(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], timeline: Timeline) -> dict[str, BaseNode]:
+    """Return the nodes of a timeline by name."""
+    named = by_name(nodes)
+    missing = [n for n in timeline.vertices if n not in named]
+    if missing:
+        raise UsageError(f"the timeline holds node {missing[0]!r}, which was not given. Nodes: {', '.join(named)}")
+    return {n: node for n, node in named.items() if n in timeline.vertices}
+
+
+def supervisor_of(supervisor: BaseNode | str, nodes: Mapping[str, BaseNode]) -> str:
+    """Return the supervisor's name; ``supervisor`` is the name or the node."""
+    if not isinstance(supervisor, str | BaseNode):
+        raise UsageError(f"the supervisor is one node, or its name, got {supervisor!r}")
+    if isinstance(supervisor, BaseNode) and nodes.get(supervisor.name, supervisor) is not supervisor:
+        raise UsageError(f"the supervisor {supervisor!r} is another object than the node of its name in the graph")
+    return supervisor if isinstance(supervisor, str) else supervisor.name
+
+
+def check_fit(nodes: Mapping[str, BaseNode], timeline: Timeline, replayed: Mapping[str, PyTree]) -> None:
+    """Check that nodes, connections and timeline fit each other, and that the nodes can be compiled.
+
+    Args:
+        replayed: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
+    """
+    # Nodes, and recorded outputs.
+    for name, node in nodes.items():
+        if not node.jittable and name not in replayed:
+            raise UsageError(
+                f"node {name!r} steps in plain Python (jittable = False) and cannot be compiled",
+                hint="give its recorded outputs, or put a simulated node in its place",
+            )
+    check_senders(nodes, among=nodes)
+    unknown = [n for n in replayed if n not in nodes]
+    if unknown:
+        raise UsageError(
+            f"the outputs of {unknown[0]!r} are given, which is not in the graph. Nodes: {', '.join(nodes)}"
+        )
+    for name, recorded in replayed.items():
+        _check_replayed(name, recorded, timeline)
+
+    # Every input of a node has messages in the timeline, and the reverse.
+    wanted = {(n, i) for n, node in nodes.items() for i, c in node.inputs.items() if c.output_node.name in nodes}
+    for name, input_name in sorted(wanted - set(timeline.edges)):
+        raise UsageError(
+            f"the timeline has no messages for input {input_name!r} of node {name!r}",
+            hint="draw them: sim2real.graph.schedule.draw(nodes, duration_s, recorded=timeline)",
+        )
+    for name, input_name in sorted(set(timeline.edges) - wanted):
+        raise UsageError(
+            f"the timeline has messages for input {input_name!r} of node {name!r}, which has no such input"
+        )
+
+    # Steps and messages are in the order of time.
+    for name, vertex in timeline.vertices.items():
+        if (np.diff(vertex.start, axis=1) < 0).any():
+            raise UsageError(f"the steps of node {name!r} are not in the order of time")
+    for (name, input_name), edge in timeline.edges.items():
+        consumed = np.where(edge.seq_in < 0, NEVER, edge.seq_in)
+        if edge.seq_in.shape != timeline.vertices[edge.sender].start.shape or (np.diff(consumed, axis=1) < 0).any():
+            raise UsageError(
+                f"the messages for input {input_name!r} of node {name!r} are not one for each step of {edge.sender!r}, "
+                "consumed in order",
+                hint="make timelines with draw() or Timeline.from_episode()",
+            )
+
+
+def _check_replayed(name: str, recorded: PyTree, timeline: Timeline) -> None:
+    """Check that there is a recorded output for every step of every episode."""
+    steps = int(timeline.vertices[name].count.max(initial=0))
+    for path, leaf in pytree.flatten_with_path(recorded)[0]:
+        shape = np.shape(leaf)
+        if len(shape) < 2 or shape[0] != timeline.episodes or shape[1] < steps:
+            raise UsageError(
+                f"the given outputs of node {name!r}{''.join(map(str, path))} have shape {shape}: its timeline has "
+                f"{timeline.episodes} episodes of up to {steps} steps",
+                hint=f"give leaves of shape ({timeline.episodes}, {steps}, ...), an output for each step",
+            )

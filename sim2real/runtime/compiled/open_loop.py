@@ -1,7 +1,7 @@
 """A graph without a loop of computed messages, run node by node, with its timing as an argument.
 
 Identification replays recorded commands to the world, and the world's outputs to the sensor. Such a graph needs no rows
-and no rings of outputs (``sim2real.runtime.compilation.compiled``): each node makes all of its steps, then its readers
+and no rings of outputs (``sim2real.runtime.compiled.graph``): each node makes all of its steps, then its readers
 make their steps and look messages up by ``seq``. The program depends only on the number of steps: it serves every log.
 """
 
@@ -18,8 +18,7 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import check_bursts, newest_message
 from sim2real.installation import has_jax
 from sim2real.later import jax, jnp
-from sim2real.runtime.compilation.fit import check_fit
-from sim2real.runtime.compilation.wiring import messages_read
+from sim2real.runtime.compiled.wiring import check_fit, messages_read
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.match import matched
 from sim2real.types import PyTree
