@@ -39,13 +39,14 @@ class PendulumPlant:
         friction: Factor on both kinds of friction.
         inertia: Factor on the moment of inertia.
         motor: Factor on the motor constant.
-        step_s: MuJoCo's time step [s].
+        step_s: MuJoCo's time step [s]. Its integrator is of first order, and forces act half a step early: with 0.5 ms
+            an identification finds the round trip 0.25 ms too short, and gravity 0.1 % too small.
     """
 
     servo_ids = (1,)
 
     def __init__(
-        self, friction: float = 1.6, inertia: float = 1.15, motor: float = 0.9, step_s: float = 0.0005
+        self, friction: float = 1.6, inertia: float = 1.15, motor: float = 0.9, step_s: float = 0.0001
     ) -> None:
         # Not above: the robot's own module takes the supply's voltage from here, and need not wait for MuJoCo.
         from mujoco import MjData, MjModel, mj_forward, mj_step  # pyright: ignore[reportAttributeAccessIssue]

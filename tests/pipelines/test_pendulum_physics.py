@@ -62,7 +62,7 @@ def test_the_model_moves_and_sticks_as_c_mujoco_does(start, voltage):
     plant.command(1, PWM, voltage / PLANT.SUPPLY_V)
     in_c = trajectory(plant, 5.0)[::20][1:]
     ours = simulate(plant.truth(), start, voltage, len(in_c))
-    np.testing.assert_allclose(ours[:, 0], in_c[:, 0], atol=0.015)
+    np.testing.assert_allclose(ours[:, 0], in_c[:, 0], atol=0.004)
     if abs(in_c[-1, 1]) < 1e-3:
         assert ours[-1, 1] == 0.0, "it sticks"
         assert ours[-1, 0] == ours[-100, 0], "and does not creep"
