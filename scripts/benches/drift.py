@@ -227,8 +227,8 @@ def one_change(
 ) -> dict[str, Any]:
     """Return the test's results for a robot after one change, from a deployment with the small steps."""
     from sim2real.artifacts.recording import Recording
+    from sim2real.stages.deploy.replay import tested
     from sim2real.stages.deploy.verdict import model_advice
-    from sim2real.stages.estimation.replay import tested
 
     now, first = robot.changed(change), 1 + list(CAUSES).index(change) * (options.episodes + 2)
     logs = [folder / f"{change}_{e}.mcap" for e in range(options.episodes + 1)]

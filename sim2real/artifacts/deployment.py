@@ -66,7 +66,7 @@ class Replay:
         name: The position's name in tables.
         horizon_s: Time between the last fitted sample and the prediction [s].
         rmse: Model -> root mean square error; None if the model diverged. ``as in this log`` is fitted to this log.
-        promised: Bound on the error of the identified model, scaled up if this log moves more; None if unknown.
+        expected: Expected error of the identified model, scaled up if this log moves more; None if unknown.
         column: The position's name among the columns.
         free_run: Mean error of the identified model in free runs over held-out recordings; None without free runs.
     """
@@ -75,7 +75,7 @@ class Replay:
     unit: str
     horizon_s: float
     rmse: Mapping[str, float | None]
-    promised: float | None = None
+    expected: float | None = None
     column: str = ""
     free_run: float | None = None
 
@@ -255,7 +255,7 @@ class Deployment(Shown):
         """Return the prediction errors of each model on the recorded commands: a row for each position."""
         models = list(self.replay[0].rmse) if self.replay else []
         horizon = f"commands played again, RMSE {self.replay[0].horizon_s:g} s ahead" if self.replay else ""
-        rows = [[r.name, *(r.rmse.get(m) for m in models), r.promised, r.unit] for r in self.replay]
+        rows = [[r.name, *(r.rmse.get(m) for m in models), r.expected, r.unit] for r in self.replay]
         return ArtifactTable((horizon, *models, "expected", "unit"), rows)
 
     def save(self, folder: Path | str) -> dict[str, str]:

@@ -351,13 +351,15 @@ class ExpectedError:
 
 @dataclass(frozen=True)
 class ComparedError:
-    """An error on held-out data beside the error that the held-out parts let expect.
+    """An error on data that was not fitted, beside the expected one.
 
     Attributes:
         source: The predicted data: the held-out end of a log, or a log.
-        error: Root mean square error; None if it is infinite.
-        expected: None if too few parts let expect one.
+        error: Root mean square error; None if the model diverges.
+        expected: None if there were too few held-out parts.
         wider: Factor in ``expected`` for a motion that is faster or goes further than the fitted one.
+        beaten_by: Baselines with an error that is not larger.
+        baselines: Model -> its error; None if it diverges.
     """
 
     source: str
@@ -369,6 +371,8 @@ class ComparedError:
     error: float | None
     expected: float | None = None
     wider: float = 1.0
+    beaten_by: tuple[str, ...] = ()
+    baselines: Mapping[str, float | None] = field(default_factory=dict)
 
     @property
     def ratio(self) -> float | None:
@@ -386,9 +390,28 @@ class ComparedError:
         size = "diverges" if self.error is None else f"is off by {with_small_unit(self.error, self.unit)}"
         if self.expected is None or self.ratio is None:
             return f"{self.name} {size} {how} on {self.source}"
-        times = "" if self.error is None else f", {self.ratio:.2f} times as much"
+        times = "" if self.error is None else f": {self.ratio:.2f} times"
         expected = with_small_unit(self.expected, self.unit)
-        return f"{self.name} {size} {how} on {self.source}, where {expected} were expected{times}"
+        return f"{self.name} {size} {how} on {self.source}; expected was {expected}{times}"
+
+
+def compared_table(rows: Sequence[ComparedError], source: str) -> ArtifactTable:
+    """Return a row for each error, with those of the baselines if there are some; ``source`` heads the data's names."""
+    models = list(dict.fromkeys(model for row in rows for model in row.baselines))
+    cells = [
+        [
+            *(r.name, r.source, f"{r.seconds:.3g} s {'ahead' if r.kind == AHEAD else r.kind}"),
+            *(
+                math.inf if r.error is None else r.error,
+                r.expected,
+                "" if r.ratio is None else f"{r.ratio:.2f}",
+                r.unit,
+            ),
+            *(r.baselines.get(m, "") for m in models),
+        ]
+        for r in rows
+    ]
+    return ArtifactTable(("joint", source, "predicted", "error", "expected", "ratio", "unit", *models), cells)
 
 
 _WINDOW_S = 1.0
@@ -650,15 +673,8 @@ class Identification(Shown):
 
     def compared_table(self) -> ArtifactTable:
         """Return a row for each error on held-out data beside the expected one, the largest ratio first."""
-        cells = [
-            [
-                *(r.name, r.source, f"{r.seconds:.3g} s {'ahead' if r.kind == AHEAD else r.kind}"),
-                *(math.inf if r.error is None else r.error, r.expected, f"{r.ratio:.2f}", r.unit),
-            ]
-            for r in sorted(self.compared, key=lambda row: -(row.ratio or 0.0))
-            if r.ratio is not None
-        ]
-        return ArtifactTable(("joint", "held out", "predicted", "error", "expected", "ratio", "unit"), cells)
+        known = [row for row in self.compared if row.ratio is not None]
+        return compared_table(sorted(known, key=lambda row: -(row.ratio or 0.0)), "held out")
 
     @property
     def values(self) -> dict[str, float]:

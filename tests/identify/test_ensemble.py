@@ -14,7 +14,7 @@ from sim2real.identify.search.refine import refine
 from sim2real.identify.uncertainty import ensemble
 from sim2real.identify.uncertainty.uncertainty import from_linearised, linearise
 from sim2real.identify.validation.optional_terms import Selection
-from sim2real.stages.estimation.estimate import Findings
+from sim2real.stages.identify.judgement import Findings
 
 
 def of(found, every=None, choice=None):

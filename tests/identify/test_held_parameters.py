@@ -10,10 +10,10 @@ from test_fit import GAIN, LENGTH_S, SPANS, LagParams, Model, episode  # noqa: F
 from sim2real.identify import fit as fitting
 from sim2real.identify.fit import fit
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.stages.estimation.estimate import Findings
-from sim2real.stages.estimation.segment_split import long_spans
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import Fits, determined
+from sim2real.stages.identify.judgement import Findings
+from sim2real.stages.shared.identification import long_spans
 
 CONFIG = IdentifyConfig(max_delay_s=0.02, generations=0, terms="auto", horizon_s=LENGTH_S, settle_s=0.0)
 
@@ -38,13 +38,14 @@ def test_one_factor_of_a_product_is_held_and_the_other_is_for_that_value(episode
     assert bool(longer) == bool(long_s)
     model = Twice()
     wide = fit(model, [episode], SPANS, LENGTH_S, config, long_spans=longer)
-    assert Findings.of(wide, ()).check.undetermined
+    found = Findings.of(wide, ())
+    assert found.check.undetermined
     inputs = SimpleNamespace(model=model, episodes=[episode], fitted=1, windows=SPANS, config=config)
     lengths, descend = [], fitting._refine
     monkeypatch.setattr(
         fitting, "_refine", lambda problem, *rest: lengths.append(problem.segment_s) or descend(problem, *rest)
     )
-    fits, sentences = determined(inputs, Fits(wide, wide, None), Findings.of(wide, ()))
+    fits, sentences = determined(inputs, Fits(wide, wide, None), found.check, found.spread)
     values, (sentence,) = fits.estimate.values, sentences
     held, other = ("first", "second") if "first is held" in sentence else ("second", "first")
     assert f"{held} is held at its nominal value" in sentence

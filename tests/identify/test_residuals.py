@@ -10,7 +10,7 @@ from sim2real.artifacts.identification import Noise
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation import prediction
-from sim2real.stages.estimation.replay import _of_noise
+from sim2real.stages.deploy.replay import _of_noise
 
 LENGTH_S, SPLIT_S = 0.93, 0.4
 SPANS = [Span(0, 0.4 + 0.9 * i, fitted=i != 4) for i in range(9)]

@@ -29,7 +29,7 @@ from sim2real.robots.from_model.mjcf_parameters import (
 )  # fmt: skip
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.from_model.usual_parameters import usual_terms
-from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.shared.identification import offering, with_wanted_terms
 from sim2real.worlds.drive_terms import NO_LIMIT, DriveLaw, DriveTerms
 from sim2real.worlds.rollouts import Rollouts, Start
 
@@ -232,13 +232,13 @@ def test_what_a_delay_of_nothing_would_change_is_known(by_hands_log, share):
 def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
     terms = (*usual_terms(("goal",)), PER_TURN)
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms[:-1]))
-    assert held_out_parts.offering(robot, "own") is robot
+    assert offering(robot, "own") is robot
     assert robot.make_nodes()[2].law is None
-    table = held_out_parts.offering(robot, "auto").identifiable(0.02).parameters
+    table = offering(robot, "auto").identifiable(0.02).parameters
     assert {p.term for p in table} - {""} == set(MECHANICAL) - set(ONLY_NAMED)
     assert table.terms == ()  # none is free by itself
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms))
-    every = held_out_parts.widest(held_out_parts.offering(robot, "all").identifiable(0.02).parameters, "all")
+    every = with_wanted_terms(offering(robot, "all").identifiable(0.02).parameters, "all")
     assert set(every.terms) == set(MECHANICAL)
     off = {p.name: p.without for p in every if p.term}
     assert off == {name: OFF[name] for name in set(ON) - {"cogging_per_turn"}}
@@ -246,14 +246,14 @@ def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
     either = {"bias", "damping_bias", "tilt_x", "tilt_y"}
     either |= {"cogging_cos", "cogging_sin", "eccentric_cos", "eccentric_sin"}
     assert all(values[what] > 0.0 for what in set(off) - either)  # at a bound nothing would move
-    assert held_out_parts.widest(table, "load").terms == ("load",)
+    assert with_wanted_terms(table, "load").terms == ("load",)
 
 
 @pytest.mark.parametrize("one", ONLY_NAMED)
 def test_terms_that_few_robots_tell_are_offered_where_they_are_asked_for(model_file, one):
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=(*usual_terms(("goal",)), PER_TURN)))
-    table = held_out_parts.offering(robot, f"load,{one}").identifiable(0.02).parameters
-    assert held_out_parts.widest(table, f"load,{one}").terms == ("load", one)
+    table = offering(robot, f"load,{one}").identifiable(0.02).parameters
+    assert with_wanted_terms(table, f"load,{one}").terms == ("load", one)
     own = optional((ParameterPattern(OPTIONAL[one][0]),), "auto")
     assert {t.term for t in own} == set(OPTIONAL) - set(ONLY_NAMED) | {one}
     assert [t.what for t in own if t.term == one] == [OPTIONAL[one][0]], "a robot may feel tilt_y and not tilt_x"
@@ -262,7 +262,7 @@ def test_terms_that_few_robots_tell_are_offered_where_they_are_asked_for(model_f
 def test_cogging_is_refused_without_how_often_it_repeats(model_file):
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_terms(("goal",))))
     with pytest.raises(UsageError, match="number of repeats"):
-        held_out_parts.offering(robot, "cogging")
+        offering(robot, "cogging")
     with pytest.raises(UsageError, match="counted"):
         ParameterPattern("cogging_per_turn")
     with pytest.raises(UsageError, match="whole robot"):

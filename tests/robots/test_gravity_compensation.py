@@ -18,7 +18,7 @@ from sim2real.identify.validation.term_trials import Trials
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.shared.identification import offering
 
 STEP_S, PERIOD, SECONDS, SHARE, NOISE = 0.002, 5, 4.0, 0.9, 2e-4
 XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="upper">
@@ -51,7 +51,7 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch
     """Sets of terms are compared on fewer segments where all would take long: a part has as many errors as ever."""
     robot, episode = recorded
     config = IdentifyConfig(terms="auto", generations=0, folds=3, max_delay_s=0.02, free_run_s=0.0)
-    model = held_out_parts.offering(robot, "gravcomp").identifiable(0.02)
+    model = offering(robot, "gravcomp").identifiable(0.02)
     table = model.parameters.with_terms(["gravcomp"])
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     widest = fit(model, [episode], spans, 0.6, config, table)

@@ -18,8 +18,8 @@ from sim2real.identify.validation.refits import Refits
 from sim2real.identify.validation.term_trials import Trials
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.estimate import Findings
+from sim2real.stages.identify.judgement import Findings
+from sim2real.stages.shared.identification import offering, with_wanted_terms
 from sim2real.worlds.drive_terms import NO_LIMIT
 
 STEP_S, PERIOD, SECONDS, NOISE = 0.005, 2, 4.0, 5e-4
@@ -49,8 +49,8 @@ def recorded(tmp_path, torque=np.inf, speed=np.inf):
 
 def fitted(robot, episode, terms):
     """Return the fit with optional terms, whose bounds are from the recording."""
-    model = held_out_parts.offering(robot, terms).identifiable(0.02)
-    table = held_out_parts.widest(model.parameters.with_reached(model.reached([episode])), terms)
+    model = offering(robot, terms).identifiable(0.02)
+    table = with_wanted_terms(model.parameters.with_reached(model.reached([episode])), terms)
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     return fit(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02), table)
 
@@ -102,7 +102,7 @@ def test_tables_omit_a_limit_that_the_model_does_not_have():
 
 def test_bounds_of_a_limit_are_around_what_the_recording_reaches(tmp_path):
     robot, episode = recorded(tmp_path, torque=TORQUE)
-    model = held_out_parts.offering(robot, "auto").identifiable(0.02)
+    model = offering(robot, "auto").identifiable(0.02)
     reached = model.reached([episode])
     assert reached["torque"] == pytest.approx(TORQUE, rel=0.5)
     fastest = np.abs(np.gradient(episode.outputs["sensor"]["position"][:, 0], 0.01)).max()

@@ -8,8 +8,8 @@ import pytest
 
 from sim2real.emulation.plant import load_plant
 from sim2real.robots.control_loop.messages import EpisodeStart
-from sim2real.stages.estimation.held_out_parts import widest
 from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.shared.identification import with_wanted_terms
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +31,8 @@ def free(table):
 def test_a_payload_is_identified_where_it_is_asked_for_and_always_watched(arm):
     identified, watched = arm.identifiable(0.06).parameters, arm.watched(0.06).parameters
     assert free(watched) - free(identified) == {"payload"}
-    assert free(widest(identified, "payload")) == free(watched)
-    assert free(widest(identified, "none")) == free(identified)
+    assert free(with_wanted_terms(identified, "payload")) == free(watched)
+    assert free(with_wanted_terms(identified, "none")) == free(identified)
     payload = watched["payload"]
     assert (payload.nominal, payload.unit) == (0.0, "kg")
 

@@ -13,7 +13,7 @@ from sim2real.robots.from_model.joints.sharing import like_joints, sharing
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.robots.from_model.usual_parameters import usual_terms
-from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.shared.identification import offering, with_wanted_terms
 
 GO2 = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
 ARM = ["shoulder_pan", "shoulder_lift", "elbow_flex", "gripper"]
@@ -60,10 +60,10 @@ def recorded(tmp_path_factory):
 @pytest.mark.night
 def test_a_joint_with_another_stiffness_gets_a_factor(recorded):
     robot, episode = recorded
-    robot = held_out_parts.offering(robot, "kp_by_joint")
+    robot = offering(robot, "kp_by_joint")
     model = robot.identifiable(0.02)
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
-    table = held_out_parts.widest(model.parameters, "kp_by_joint")
+    table = with_wanted_terms(model.parameters, "kp_by_joint")
     found = fit(model, [episode], spans, 0.6, FitConfig(generations=0, max_delay_s=0.02), table)
     # Without the factor, in the same programs.
     problem, shared = found.problem, np.array([name != "kp_of_lift_alone" for name in found.problem.table.names])

@@ -20,8 +20,8 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.prediction import labels
 from sim2real.robots.walking.plain.episodes import twin_of
-from sim2real.stages.estimation.segment_split import spans
 from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.shared.identification import spans
 
 SEED, SECONDS, SEGMENT_S = 5, 2.0, 0.8
 

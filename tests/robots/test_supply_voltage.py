@@ -12,7 +12,7 @@ from sim2real.identify.fit import fit
 from sim2real.identify.problem.segments import Span
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.stages.estimation import held_out_parts
+from sim2real.stages.shared.identification import offering
 
 STEP_S, PERIOD, SECONDS, NOISE, KP, VOLTS = 0.002, 5, 4.0, 2e-4, 12.0, 7.4
 XML = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body>
@@ -46,5 +46,5 @@ def test_the_term_is_offered_for_a_log_with_a_voltage_alone(tmp_path):
     path.write_text(XML)
     for commands, there in ((("goal",), False), (("goal", "volts"), True)):
         robot = MjcfRobot(RobotConfig(path, ("servo",), commands, terms=(ParameterPattern("kp"),)))
-        offered = held_out_parts.offering(robot, "auto").identifiable(0.02).parameters
+        offered = offering(robot, "auto").identifiable(0.02).parameters
         assert ("voltage" in {p.term for p in offered}) == there

@@ -8,22 +8,18 @@ import pytest
 
 from sim2real.commands import flags
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.estimation import recording_advice
 from sim2real.stages.pipeline.pipeline import load_pipeline, pipeline_of
+from sim2real.stages.shared.identification import command, continuing
 
 ARM = load_pipeline("arm")
 
 
-def parsed(command):
+def parsed(text):
     """Return what the command line makes of a printed command: the pipeline, and its flags."""
-    program, stage, pipeline, *rest = shlex.split(command)
+    program, stage, pipeline, *rest = shlex.split(text)
     assert (program, stage) == ("sim2real", "identify")
     kind = flags.StageFlags[IdentifyConfig]
     return pipeline, flags.parse(flags.StageFlags(ARM.identify), rest, "sim2real identify", "", kind=kind)
-
-
-def test_nothing_new_is_no_command():
-    assert recording_advice.again(ARM, IdentifyConfig(), Path("runs"), "") == ""
 
 
 @pytest.mark.parametrize(
@@ -48,14 +44,14 @@ def test_what_was_asked_before_is_asked_again_with_what_is_new(new, bounds, fix,
         initial_state="rest",
         max_delay_s=0.05,
     )
-    pipeline, asked = parsed(recording_advice.again(ARM, before, Path("elsewhere"), new))
+    pipeline, asked = parsed(command(ARM, before, Path("elsewhere"), new))
     assert (pipeline, asked.runs) == ("arm", Path("elsewhere"))
     assert asked.config == replace(before, bounds=bounds, fix=fix, max_delay_s=max_delay_s)
 
 
 def test_a_robot_of_python_alone_gets_no_command_that_does_not_find_it():
     own = pipeline_of(type("Spare", (type(ARM.load()),), {})())
-    said = recording_advice.onward(own, own.identify, Path("runs"), Path("runs/my robot/partial.json"))
+    said = continuing(own, own.identify, Path("runs"), Path("runs/my robot/partial.json"))
     call = "sim2real.identify(robot, recording, ...)"
     assert said.startswith(f"{call} with the settings --begin 'runs/my robot/partial.json'")
-    assert recording_advice.command(own, own.identify, Path("runs")) == call
+    assert command(own, own.identify, Path("runs")) == call

@@ -59,8 +59,8 @@ def test_a_slide_has_no_turns():
     assert "6.3 m or more beside" in sentences(swing(0.01), off, replace(ROW, unit="m"), "x")[0]
 
 
-@pytest.mark.parametrize("row", [replace(ROW, promised=None), replace(ROW, column="other")])
-def test_without_a_promise_nothing_is_judged(row):
+@pytest.mark.parametrize("row", [replace(ROW, expected=None), replace(ROW, column="other")])
+def test_without_an_expected_error_nothing_is_judged(row):
     own = courses([(T, {"th": swing(0.5)})], [(T, {"th": s}) for s in SIMULATED], UNITS, [0.0])
     assert not list(off_course(Deployment((Scores({}),), (), replay=(row,), courses=own), False))
 

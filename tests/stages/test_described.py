@@ -14,11 +14,11 @@ from sim2real.errors import UsageError
 from sim2real.log import read_log
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import RobotConfig
-from sim2real.stages.estimation import recording_advice
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
+from sim2real.stages.shared.identification import command, continuing
 
 XML = """<mujoco>
   <option timestep="0.002"/>
@@ -77,14 +77,12 @@ def test_the_next_command_describes_the_robot_again(workplace):
     told = RobotFlags(mjcf=Path("robot.xml"), joints=("lift_joint", "pan_joint"), parameter=("kp=20",), contacts=True)
     found = from_model.from_flags(told, ["run.npz"])
     asked = replace(found.identify, log=("run.npz",), fix={"delay": 0.0})
-    program, stage, *rest = shlex.split(recording_advice.command(found, asked, Path("runs")))
+    program, stage, *rest = shlex.split(command(found, asked, Path("runs")))
     assert (program, stage) == ("sim2real", "identify")
     again = model_flags.parse_identify(rest, "")
     assert (again.robot, again.config) == (told, asked)
     asked = replace(asked, refine_steps=3)
-    _, _, *rest = shlex.split(
-        recording_advice.onward(found, asked, Path("all runs"), Path("all runs/robot/partial.json"))
-    )
+    _, _, *rest = shlex.split(continuing(found, asked, Path("all runs"), Path("all runs/robot/partial.json")))
     onward = model_flags.parse_identify(rest, "")
     assert (onward.robot, onward.runs) == (told, Path("all runs"))
     assert (onward.config.begin, onward.config.log) == ("all runs/robot/partial.json", ("run.npz",))

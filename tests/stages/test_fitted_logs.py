@@ -11,7 +11,7 @@ from sim2real.artifacts.run.run_folder import Source
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.model import Channel
-from sim2real.stages.estimation.fitted_logs import require_apart, require_new
+from sim2real.stages.shared.identification import require_apart, require_new
 
 CHANNELS = (
     Channel("position", "velocity", 0.001, 0.01, index=0, label="a"),

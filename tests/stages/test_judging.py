@@ -11,9 +11,8 @@ from sim2real.artifacts.deployment import Advice, Changed, Course, Deployment, D
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Steps
-from sim2real.stages.deploy import verdict
+from sim2real.stages.deploy import replay, verdict
 from sim2real.stages.deploy.next_command import with_command
-from sim2real.stages.estimation import replay
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)

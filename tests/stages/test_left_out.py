@@ -12,9 +12,10 @@ from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.uncertainty.uncertainty import Uncertainty
 from sim2real.identify.validation.verdict import Position
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.estimation.held_out_parts import widened, widest
 from sim2real.stages.identify import fitting
-from sim2real.stages.identify.interrupted import Best
+from sim2real.stages.identify.fitting import widened
+from sim2real.stages.identify.progress import Best
+from sim2real.stages.shared.identification import with_wanted_terms
 
 ANGLE = Position("th", "tilt", "rad", 0.001)
 
@@ -97,14 +98,14 @@ def test_the_flag_says_which_terms_are_there():
             Parameter("bias", "1", 0.0, -1.0, 1.0, "linear", free=False, term="bias"),
         ]
     )
-    assert widest(table, "own") is table
-    assert widest(table, "auto").terms == widest(table, "all").terms == ("cogging", "bias")
-    assert widest(table, "none").terms == ()
-    assert widest(table, "bias, cogging").terms == ("cogging", "bias")
+    assert with_wanted_terms(table, "own") is table
+    assert with_wanted_terms(table, "auto").terms == with_wanted_terms(table, "all").terms == ("cogging", "bias")
+    assert with_wanted_terms(table, "none").terms == ()
+    assert with_wanted_terms(table, "bias, cogging").terms == ("cogging", "bias")
     with pytest.raises(UsageError, match="unknown term 'drag'"):
-        widest(table, "drag")
+        with_wanted_terms(table, "drag")
     with pytest.raises(UsageError, match="no optional terms"):
-        widest(ParameterTable([table["gain"]]), "auto")
+        with_wanted_terms(ParameterTable([table["gain"]]), "auto")
 
 
 @pytest.mark.parametrize("options", [{"folds": 1}, {"folds": -1}, {"folds": 0, "terms": "auto"}])
@@ -133,7 +134,7 @@ def test_the_second_fit_holds_what_was_left_out_and_what_a_flag_holds(monkeypatc
     chosen = ParameterTable(p for p in table if p.free)
     z = chosen.encode({"gain": 1.4, "cogging": 0.4, "bias": 0.6})
     selection = SimpleNamespace(names=lambda _: ("cogging",), near=[SimpleNamespace(z=z)])
-    monkeypatch.setattr(fitting.held_out_parts, "chosen", lambda *_: selection)
+    monkeypatch.setattr(fitting, "chosen", lambda *_: selection)
     config = IdentifyConfig(terms="auto", fix={"swing": 0.3})
     inputs = SimpleNamespace(
         config=config, table=table, model=None, episodes=[], fitted=1, windows=[], names=["log"], refits=None

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim2real.stages.estimation.segment_split import covering, long_spans, reach, spans, split_of, with_length
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY
+from sim2real.stages.shared.identification import covering, long_spans, spans, split_of, usable, with_length
 
 CONFIG = IdentifyConfig(initial_state="measured", held_out=0.25, long_s=5.0)
 
@@ -36,9 +36,9 @@ def test_fitted_and_held_out_segments_begin_on_one_grid(seconds, initial_state):
     config = replace(CONFIG, initial_state=initial_state, long_s=0.0)
     (episode,) = lasting(seconds)
     some = [*spans([episode], 1, config, 1.3), *long_spans([episode], 1, replace(config, long_s=5.0))]
-    steps = [(s.begin_s - reach(episode, config)[0]) / 0.01 for s in some]
+    steps = [(s.begin_s - usable(episode, config)[0]) / 0.01 for s in some]
     assert steps == pytest.approx(np.round(steps), abs=1e-3)
-    begin, end = reach(episode, config)
+    begin, end = usable(episode, config)
     earlier = begin + 0.75 * (end - begin) - split_of(episode, True, config)
     assert -1e-6 <= earlier < 0.1, "a rounding of the share below a multiple counts as the multiple"
     left = seconds - (0.2 if initial_state == "free" else 0.0) - end
@@ -52,7 +52,7 @@ def test_logs_of_nearly_one_length_have_the_same_segments(tenths, one, other, in
     a, b = lasting(tenths / 10 + one, tenths / 10 + other)
     assert spans([a], 1, config, 1.3) == spans([b], 1, config, 1.3)
     assert long_spans([a], 1, config) == long_spans([b], 1, config)
-    assert (reach(a, config), split_of(a, True, config)) == (reach(b, config), split_of(b, True, config))
+    assert (usable(a, config), split_of(a, True, config)) == (usable(b, config), split_of(b, True, config))
 
 
 @given(st.floats(10.0, 200.0), st.integers(10, 80))

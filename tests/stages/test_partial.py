@@ -18,7 +18,7 @@ from sim2real.artifacts.run.run_folder import attempts
 from sim2real.errors import Sim2RealError
 from sim2real.stages.identify import fitting
 from sim2real.stages.identify import stage as identify_stage
-from sim2real.stages.identify.interrupted import Best, left_behind
+from sim2real.stages.identify.progress import Best, kept
 from sim2real.stages.pipeline.open_parameters import open_identification
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -112,10 +112,9 @@ def test_a_log_that_is_moved_during_the_fit_keeps_its_hash(pendulum, tmp_path, m
 
 
 def test_a_thread_that_still_computes_ends_once_its_stage_has(tmp_path):
-    with (
-        pytest.raises(ZeroDivisionError),
-        left_behind(SimpleNamespace(folder=tmp_path), "pendulum", (), lambda path: "") as best,
-    ):
+    stage = SimpleNamespace(folder=tmp_path, run_dir=tmp_path)
+    inputs = SimpleNamespace(config=SimpleNamespace(view=None))
+    with pytest.raises(ZeroDivisionError), kept(stage, inputs, lambda path: "") as best:
         raise ZeroDivisionError
     with pytest.raises(RuntimeError):
         best.advance("search", 0.1, 1.0, np.zeros(1))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Noise, Prediction
-from sim2real.stages.estimation import replay
+from sim2real.stages.deploy import replay
 
 
 @pytest.mark.parametrize(("errors", "limit"), [([0.1] * 16, 0.1), ([0.1] * 14 + [math.nan, None], math.inf)])

@@ -6,21 +6,30 @@ from pathlib import Path
 
 import pytest
 
-from sim2real.artifacts.identification import AHEAD, FREE_RUN, Estimate, ExpectedError, Identification, Judgement
+from sim2real.artifacts.identification import (
+    AHEAD,
+    FREE_RUN,
+    ComparedError,
+    Estimate,
+    ExpectedError,
+    Identification,
+    Judgement,
+)
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import UsageError
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.shared.identification import identified_robot
 from sim2real.stages.validate import stage
 from sim2real.stages.validate.config import ValidateConfig
-from sim2real.stages.validate.stage import LaterError, Validation, identified_robot
+from sim2real.stages.validate.stage import Validation
 
 ROOT = Path(__file__).parents[2]
 LOGS = [ROOT / "datasets" / "pendulum" / f"{name}.mcap" for name in ("chirp", "multisine")]
 
 
 def error(log="b.mcap", size=0.004, expected=0.02, kind=AHEAD, **changes):
-    row = LaterError(log, "elbow", "rad", kind, 8.0, size, expected, baselines={"hold": 0.2})
+    row = ComparedError(log, "q", "elbow", "rad", kind, 8.0, size, expected, baselines={"hold": 0.2})
     return replace(row, **changes)
 
 
@@ -86,7 +95,7 @@ def test_each_log_is_scored_alone_and_a_bad_one_does_not_stop_the_others():
     config = ValidateConfig(horizon_s=1.0, free_run_s=2.0)
     scored = stage.score(found, pipeline, [good, lacking, short], config, {"unreadable.csv": "no columns"})
     assert set(scored.refused) == {"lacking.mcap", "unreadable.csv"}
-    ahead = {e.log: e for e in scored.errors if e.kind == AHEAD}
+    ahead = {e.source: e for e in scored.errors if e.kind == AHEAD}
     assert set(ahead) == {good.path.name, short.path.name}
     assert all(e.ratio == pytest.approx(e.error / 1e-6) for e in ahead.values())
     assert {e.seconds for e in scored.errors if e.kind == FREE_RUN} == {2.0}

@@ -22,11 +22,12 @@ from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation import prediction
 from sim2real.stages.config import IdentifyConfig
-from sim2real.stages.estimation import held_out_parts, segment_split
+from sim2real.stages.identify import fitting
 from sim2real.stages.pipeline import from_model
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
+from sim2real.stages.shared import identification as shared
 
 SETTLE_S = 0.3
 """Length of the samples from which the initial state of the disk's free run is estimated [s]."""
@@ -152,11 +153,11 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
             flags = RobotFlags(mjcf=model, **{**constants.get("flags", {}), "as_told": True})
             pipeline = from_model.from_flags(flags, [str(p) for p in logs])
         wanted = "auto" if name in CHOOSES else constants.get("terms", "own")
-        robot = held_out_parts.offering(pipeline.load(), wanted)
+        robot = shared.offering(pipeline.load(), wanted)
         fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}
     config = replace(pipeline.identify, seed=seed)
     model = robot.identifiable(config.max_delay_s)
-    case = Case(name, segment_split.with_length(config, model), robot, model)
+    case = Case(name, shared.with_length(config, model), robot, model)
     identified = _fit_with_terms(case, fitted) if wanted == "auto" else identify(case, fitted)
 
     def predict(test_recordings: Sequence[Recording]) -> list[np.ndarray]:
@@ -174,13 +175,13 @@ def _fit_with_terms(case: Case, fitted: dict[str, Any]) -> Any:
     """Identify with optional terms chosen on held-out parts, as ``--terms auto`` does."""
     c, episodes = replace(case.config, terms="auto"), list(fitted.values())
     model, length = case.model, c.settle_s + c.horizon_s
-    table = held_out_parts.widest(model.parameters, c.terms)
+    table = shared.with_wanted_terms(model.parameters, c.terms)
     spans = windows(episodes, length, c.spacing_s, c.initial_state == "free")
     every = fit_model(model, episodes, spans, length, c, table, as_start=True)
-    selection = held_out_parts.chosen(every, c, list(fitted))
+    selection = fitting.chosen(every, c, list(fitted))
     fewer, values = table.with_terms(selection.names(table)), as_numbers(every.problem.table, selection.near[0].z)
     fewer = fewer.with_begin({p.name: float(np.squeeze(values[p.name])) for p in fewer if p.free})
-    longer = segment_split.covering([(0.0, e.duration_s) for e in episodes], c.long_s or 0.0)
+    longer = shared.covering([(0.0, e.duration_s) for e in episodes], c.long_s or 0.0)
     return fit_model(model, episodes, spans, length, c, fewer, longer)
 
 

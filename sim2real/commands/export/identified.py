@@ -30,8 +30,8 @@ from sim2real.stages.pipeline.from_model import pipeline_beside
 from sim2real.stages.pipeline.pipeline import Pipeline, available
 from sim2real.stages.pipeline.pipeline import pipeline_of as pipeline_of_robot
 from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyPath, identification_of
+from sim2real.stages.shared.identification import identified_robot
 from sim2real.stages.terminal.console import note, wrote
-from sim2real.stages.validate.stage import identified_robot
 from sim2real.types import Json
 
 FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json",

@@ -15,8 +15,8 @@ from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.uncertainty import identifiability, uncertainty
-from sim2real.stages.estimation.segment_split import reach
 from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.shared.identification import side_by_side, usable
 
 _MIN_SEGMENT_S = 0.3
 _MAX_SEGMENTS = 120
@@ -86,19 +86,15 @@ def determine(
 
 def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:
     """Return segments side by side, all of them fitted, and their length [s]."""
-    usable = [reach(e, config) for e in episodes]
-    shortest_s = min(end - begin for begin, end in usable)
+    ends = [usable(e, config) for e in episodes]
+    shortest_s = min(end - begin for begin, end in ends)
     length_s = min(config.settle_s + config.horizon_s, shortest_s)
     if length_s < _MIN_SEGMENT_S:
         raise UsageError(
             f"the shortest recording lasts {min(e.duration_s for e in episodes):.2f} s: too short for a segment",
             hint="record for at least 12 s",
         )
-    spans = [
-        Span(r, float(b))
-        for r, (begin, end) in enumerate(usable)
-        for b in np.arange(begin, end - length_s + 1e-6, length_s)
-    ]
+    spans = [Span(r, begin) for r, e in enumerate(episodes) for begin in side_by_side(e, config, length_s)]
     if len(spans) > _MAX_SEGMENTS:
         spans = [spans[i] for i in np.linspace(0, len(spans) - 1, _MAX_SEGMENTS).round().astype(int)]
     return spans, length_s

@@ -20,13 +20,13 @@ from sim2real.robots.contract import RecordedRobot, Robot
 from sim2real.robots.worlds import in_world
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.check.coverage import Coverage, coverage, problems
-from sim2real.stages.estimation import recording_advice
 from sim2real.stages.excitation.played import played
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
+from sim2real.stages.shared.identification import command
 from sim2real.stages.terminal.console import artifact_table, note, pairs, progress, shown
 from sim2real.types import Json
 
@@ -161,7 +161,7 @@ def check(
     with progress(None, "check: simulate"):
         found = determine(model, list(logs.values()), fitting, parameters)
     flags = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}
-    identify = recording_advice.command(pipeline, replace(pipeline.identify, **flags), config.runs)
+    identify = command(pipeline, replace(pipeline.identify, **flags), config.runs)
     following = f"sim2real record {pipeline.name}" if planned else identify
     checked = Checked(pipeline.name, PLANNED if planned else "log", covered, found)
     return replace(checked, recommendation=tuple(recommend(checked, following)))

@@ -10,8 +10,8 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.manifest import MANIFEST
 from sim2real.robots.worlds import in_world
 from sim2real.stages.deploy.trajectories import PAUSED
-from sim2real.stages.estimation import recording_advice
 from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.shared.identification import command
 from sim2real.stages.terminal.console import shown
 
 LATER = "take longer than"
@@ -44,7 +44,7 @@ def with_command(
         identify = shlex.join(["sim2real", "identify", *pipeline.words, "--terms", terms])
         return replace(advice, next=record if terms == pipeline.identify.terms else f"{record} && {identify}")
     config = replace(pipeline.identify, log=logs, terms=terms)
-    identify = recording_advice.command(pipeline, config, Path("runs"), shlex.join(run))
+    identify = command(pipeline, config, Path("runs"), shlex.join(run))
     if advice.status == "re-identify":
         return replace(advice, next=identify)
     return replace(advice, next=f"{identify} && {train}" if needs_timing(advice) else train)

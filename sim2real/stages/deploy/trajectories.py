@@ -19,7 +19,7 @@ _IGNORED_SHARE = 0.1
 _MIN_SAMPLES = 10
 _HALVES = ("first", "second")
 _MAX_ERROR_RATIO = 3.0
-"""Largest ratio to the promised error at which the model holds, as for commands that are played again."""
+"""Largest ratio to the expected error at which the model holds, as for commands that are played again."""
 Columns = tuple[np.ndarray, Mapping[str, np.ndarray]]
 """Times ``(N,)`` [s] and columns ``(N,)``."""
 
@@ -61,12 +61,12 @@ def off_course(deployed: Deployment, paused: bool) -> Iterator[str]:
     """Return sentences about joints whose episodes differ from all simulations.
 
     Args:
-        deployed: With courses, and the promised error of each position.
+        deployed: With courses, and the expected error of each position.
         paused: Whether to judge the episodes that lost more than 0.1 s in pauses, or the others.
     """
-    promised = {row.column: row for row in deployed.replay if row.promised is not None}
+    expected = {row.column: row for row in deployed.replay if row.expected is not None}
     for course in deployed.courses:
-        row = promised.get(course.column)
+        row = expected.get(course.column)
         if row is not None and (course.paused_s > _MAX_SHIFT_S) is paused:
             yield from _sentences(course, row)
 
@@ -103,11 +103,11 @@ def _course(number: int, name: str, t_s: np.ndarray, real: np.ndarray, beside: n
 
 
 def _sentences(course: Course, row: Replay) -> Iterator[str]:
-    """Return the sentences about one column; ``row`` has the promised error of its position."""
-    promised = row.promised or 0.0
+    """Return the sentences about one column; ``row`` has the expected error of its position."""
+    expected = row.expected or 0.0
     unit = f" {row.unit}".rstrip()
     where = f"{row.name} in episode {course.episode}"
-    far = max(promised, row.free_run or 0.0)
+    far = max(expected, row.free_run or 0.0)
     if course.beside > _MAX_ERROR_RATIO * far:
         yield (
             f"{where} is {course.beside:.2g}{unit} or more beside all simulations of the policy "
@@ -115,7 +115,7 @@ def _sentences(course: Course, row: Replay) -> Iterator[str]:
         )
     for half, moved, least, most in zip(_HALVES, course.moved, course.least, course.most, strict=True):
         motion = f"{where} moves by {moved:.2g}{unit} in the {half} half"
-        if least > _MAX_ERROR_RATIO * (moved + promised):
+        if least > _MAX_ERROR_RATIO * (moved + expected):
             yield f"{motion}, in each simulation of the policy by {least:.2g}{unit} or more"
-        elif moved > _MAX_ERROR_RATIO * (most + promised):
+        elif moved > _MAX_ERROR_RATIO * (most + expected):
             yield f"{motion}, in no simulation of the policy by more than {most:.2g}{unit}"

@@ -60,7 +60,7 @@ def judge(
         if not has_jax():
             log = shown(deployment.logs[0].path)
             raise Sim2RealError(f"a computer with JAX tests the model: `sim2real validate RUN/identify --log {log}`")
-        from sim2real.stages.estimation.replay import tested
+        from sim2real.stages.deploy.replay import tested
 
         with progress(None, "test the model on the deployment"):
             replay, drift = patiently(lambda: tested(pipeline, identification, [r.episode for r in deployment.logs]))
@@ -111,9 +111,9 @@ def model_advice(replay: Sequence[Replay], drift: Drift | None) -> Advice | None
     """Return the finding about the model; None if it holds.
 
     The order: motion that no parameters explain, where another identification would not help; drift; an error above
-    the promise.
+    the expected error.
     """
-    # Compare the model fitted to these logs with the promise: a large error of it is no error of the parameters.
+    # Compare the model fitted to these logs with the expected error: a large error of it is no error of the parameters.
     unexplained = {r.name: _error_ratio(r, AS_HERE) / max(_error_ratio(r, "identified"), 1e-9) for r in replay}
     faulty = [
         r for r in replay if _error_ratio(r, AS_HERE) > _FAULTY_RATIO and not unexplained[r.name] <= _MAX_UNEXPLAINED
@@ -191,17 +191,17 @@ def _late_nodes(deployment: Deployment, bundle: Bundle) -> list[str]:
 
 
 def _error_ratio(row: Replay, model: str) -> float:
-    """Return the ratio of a model's error to the promised one: 1 without a promise, infinite if the model diverged."""
+    """Return the ratio of a model's error to the expected one: 1 without one, infinite if the model diverged."""
     error = row.rmse.get(model)
-    if row.promised is None:
+    if row.expected is None:
         return 1.0
-    return math.inf if error is None else error / row.promised
+    return math.inf if error is None else error / row.expected
 
 
 def _error(row: Replay, model: str) -> str:
-    error, promised = row.rmse.get(model), row.promised or 0.0
+    error, expected = row.rmse.get(model), row.expected or 0.0
     size = "it diverges" if error is None else f"off by {error:.2g} {row.unit}"
-    return f"{size} {row.horizon_s:g} s ahead, expected were {promised:.2g} {row.unit}"
+    return f"{size} {row.horizon_s:g} s ahead, expected were {expected:.2g} {row.unit}"
 
 
 def _change(c: Changed) -> str:

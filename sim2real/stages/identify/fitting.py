@@ -1,22 +1,29 @@
-"""The fit of an identification: all optional terms, then the selected ones."""
+"""The fits of an identification: with all optional terms, with the selected ones, and without parts of the logs."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2real.identify.fit import Fit, OnProgress, as_numbers
+from sim2real.artifacts.identification import Determined, HeldOutPart
+from sim2real.graph.episode import Episode
+from sim2real.identify.fit import Fit, OnProgress, as_numbers, fit
+from sim2real.identify.model import IdentifiableModel
+from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
 from sim2real.identify.uncertainty.identifiability import from_linearised
 from sim2real.identify.uncertainty.negligible import ABSENT
-from sim2real.identify.uncertainty.uncertainty import linearise
-from sim2real.identify.validation.optional_terms import Selection
-from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.estimate import Findings
-from sim2real.stages.estimation.free_run import fitted_to
+from sim2real.identify.uncertainty.uncertainty import Uncertainty, between_parts, linearise
+from sim2real.identify.validation.folds import MOST, Fold, folds_of, leave_out
+from sim2real.identify.validation.optional_terms import Selection, select
+from sim2real.identify.validation.refits import Refits
+from sim2real.identify.validation.term_trials import Trials
+from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.inputs import Inputs
-from sim2real.stages.identify.interrupted import Best
+from sim2real.stages.identify.progress import Best
+from sim2real.stages.shared.identification import long_spans
 from sim2real.stages.terminal.console import note, progress
 from sim2real.stages.terminal.interruption import patiently
 
@@ -24,6 +31,12 @@ _PERCENT_OF_SEARCH, _PERCENT_OF_REFINEMENT = 70, 30
 """Shares of a progress bar."""
 _AS_GOOD = 3e-4
 """Relative excess of the loss up to which a fit with a held parameter is as good."""
+LEAST_SEGMENTS = 4
+"""Fewest segments from which parts are held out."""
+_LEAST_TO_CHOOSE = 3
+"""Fewest parts for a selection of terms: one is held out, and the others predict each other."""
+_LEAST_PARTS = 4
+"""Fewest parts from which the spread of estimates is computed."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +85,7 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     # Select the terms without which held-out parts are predicted worse.
     with progress(None, "identify: sets of terms") as bar:
         on_set = bar.set_postfix_str
-        selection = patiently(lambda: held_out_parts.chosen(widest, config, inputs.names, inputs.refits, on_set))
+        selection = patiently(lambda: chosen(widest, config, inputs.names, inputs.refits, on_set))
     terms: Sequence[str] = selection.names(widest.problem.table)
     # Refine the model with the selected terms. A value fixed by a flag stays fixed, in whichever term the parameter is;
     # the parameters of all other terms have their values without the term.
@@ -87,15 +100,15 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     return Fits(widest, estimate, selection)
 
 
-def determined(inputs: Inputs, fits: Fits, findings: Findings) -> tuple[Fits, list[str]]:
+def determined(inputs: Inputs, fits: Fits, check: Determined, spread: Uncertainty) -> tuple[Fits, list[str]]:
     """Hold parameters that the data does not determine at their nominal values, as long as the fit stays as good.
 
     Returns:
         The fits, and a sentence for each held parameter.
     """
-    estimate, groups, sentences = fits.estimate, findings.check.undetermined, list[str]()
+    estimate, groups, sentences = fits.estimate, check.undetermined, list[str]()
     table, tried, data = estimate.problem.table, set[str](), (inputs.model, inputs.episodes, inputs.fitted)
-    absent = [n for n, verdict in zip(table.names, findings.spread.verdict, strict=True) if verdict in ABSENT]
+    absent = [n for n, verdict in zip(table.names, spread.verdict, strict=True) if verdict in ABSENT]
     config, able = inputs.config, {p.name for p in table if p.kind == "dynamics" and not (p.term or p.per_recording)}
     while names := [n for group in groups for n in group if n in able - tried]:
         # Begin with parameters that a model may be without, such as an inertia of the rotor.
@@ -115,6 +128,92 @@ def determined(inputs: Inputs, fits: Fits, findings: Findings) -> tuple[Fits, li
             "data as well; the other estimates are for this value"
         )
     return replace(fits, estimate=estimate), sentences
+
+
+def fitted_to(
+    model: IdentifiableModel,
+    episodes: Sequence[Episode],
+    fitted: int,
+    windows: Sequence[Span],
+    config: IdentifyConfig,
+    table: ParameterTable,
+    report: OnProgress | None = None,
+    on_begin: Callable[[Problem], None] | None = None,
+    as_start: bool = False,
+    end: np.ndarray | None = None,
+) -> Fit:
+    """Return the fit of a model to logs.
+
+    Args:
+        windows: Segments to fit, and segments to predict.
+        as_start: Whether it only has to be a start for fits with some of the optional terms.
+        end: Where a fit of nearly this model ended, as in ``fit``.
+    """
+    longer, length_s = long_spans(episodes, fitted, config), config.settle_s + config.horizon_s
+    return fit(model, list(episodes), windows, length_s, config, table, longer, report, on_begin, as_start, end)
+
+
+def chosen(
+    estimate: Fit,
+    config: IdentifyConfig,
+    names: Sequence[str],
+    refits: Refits | None = None,
+    on_set: Callable[[str], None] = lambda names: None,
+) -> Selection:
+    """Return the optional terms without which held-out parts are predicted worse.
+
+    Args:
+        estimate: The fit with all optional terms.
+        names: A name for each recording; recordings of different names are different parts.
+        refits: Finished refits, which are not computed again.
+        on_set: Called with the names of each set of terms before it is fitted.
+    """
+    parts = parts_of(estimate, config, names, _LEAST_TO_CHOOSE)
+    trials = Trials(estimate, parts, config.settle_s, config.free_run_s, refits or Refits(), on_set)
+    if trials.segments < (count := len(estimate.problem.train)):
+        note(f"sets of terms are compared on {trials.segments} of {count} segments, those with most motion")
+    return select(trials.grown())
+
+
+def without_parts(inputs: Inputs, fits: Fits) -> tuple[HeldOutPart, ...]:
+    """Return the estimates without each part of the recordings, and their errors on that part.
+
+    There are none without a converged fit, whose errors would bound no later error.
+    """
+    config, estimate = inputs.config, fits.widest
+    if not (config.folds and fits.estimate.converged):
+        return ()
+    if (segments := len(estimate.problem.train)) < LEAST_SEGMENTS:
+        note(f"{segments} segments are too few to hold parts out of the fit")
+        return ()
+    if fits.selection is not None:  # the trials have these errors
+        return tuple(trial.rows[k] for k, trial in enumerate(fits.selection.by_part))
+    parts = parts_of(estimate, config, inputs.names)
+    return tuple(leave_out(estimate, parts, config.settle_s, config.free_run_s, inputs.refits))
+
+
+def parts_of(estimate: Fit, config: IdentifyConfig, names: Sequence[str], least: int = 2) -> list[Fold]:
+    """Return the parts to hold out: recordings of different names, or blocks if there are fewer than ``least``."""
+    return folds_of(estimate.problem, max(2, min(config.folds, len(estimate.problem.train) // 2)), names, least)
+
+
+def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[HeldOutPart]) -> Uncertainty:
+    """Return an uncertainty that includes the spread of the estimates without one part.
+
+    Args:
+        x: Shape ``(P,)``: the estimate, on the parameters' scales.
+    """
+    if len(rows) < _LEAST_PARTS:
+        return spread
+    values = [[np.ravel(row.values[c.parameter.name])[c.recording or 0] for c in table.columns] for row in rows]
+    moved = np.array(
+        [[c.parameter.to_scale(v) for c, v in zip(table.columns, estimates, strict=True)] for estimates in values]
+    )
+    share = np.array([[row.share.get(name, 0.0) for name in table.names] for row in rows])
+    if len(rows) > MOST:  # parts that were held out together have one estimate
+        moved, of = np.unique(moved, axis=0, return_inverse=True)
+        share = np.array([share[np.ravel(of) == g].sum(axis=0) for g in range(len(moved))])
+    return between_parts(spread, table, x, moved, share)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import sim2real
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.run_folder import Source, portable
+from sim2real.errors import OtherMotion
 from sim2real.graph.episode import Episode
 from sim2real.identify.delays.links import measured
 from sim2real.identify.model import IdentifiableModel, measured_channels
@@ -20,12 +21,18 @@ from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.refits import REFITS, Refits
 from sim2real.robots.contract import RecordedRobot, Robot
 from sim2real.robots.worlds import in_world
-from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.fitted_logs import hash_of, require_apart, require_standing, with_load
-from sim2real.stages.estimation.segment_split import spans, with_length
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.open_log import require_units
 from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.shared.identification import (
+    hash_of,
+    offering,
+    require_apart,
+    spans,
+    with_length,
+    with_wanted_terms,
+)
+from sim2real.stages.terminal.console import note
 
 _WITHOUT_EFFECT = (
     *("log", "hold_out", "begin", "standing", "force", "each", "links", "reveal", "view"),
@@ -64,10 +71,6 @@ class Inputs:
     def undetermined(self) -> tuple[str, ...]:
         """Parameters of training that no log of the robot determines."""
         return tuple(self.robot.model.unidentified()) if isinstance(self.robot, Robot) else ()
-
-    def weighed(self, document: Identification, truth: Mapping[str, float]) -> Identification:
-        """Return an identification with the load from the recording of a robot on its feet, if there is one."""
-        return document if self.standing is None else with_load(document, self.robot, self.standing, truth)
 
     @property
     def digest(self) -> str:
@@ -133,10 +136,28 @@ def prepare(
     table = table_of(model, config, episodes).with_begin(begin or {})
     config = with_length(config, model)
     if standing:
-        require_standing(robot, standing, model)
+        from sim2real.robots.walking.plain import weighing
+
+        weighing.check(robot, standing.episode, {p.name: p.nominal for p in model.parameters})
     windows = spans([log.episode for log in logs], len(fitted), config, config.settle_s + config.horizon_s)
     hashes = tuple(hash_of(log) for log in logs)
     return Inputs(pipeline, config, robot, model, table, logs, hashes, len(fitted), windows, standing=standing)
+
+
+def with_load(
+    document: Identification, robot: RecordedRobot, log: Recording, truth: Mapping[str, float]
+) -> Identification:
+    """Return an identification with the load, from a log of the robot on its feet; see ``weighing.weighed``.
+
+    A load outside of its bounds is a warning: the rest is identified.
+    """
+    from sim2real.robots.walking.plain import weighing  # the modules of walking robots alone
+
+    try:
+        return weighing.weighed(robot, document, log.episode, truth)
+    except OtherMotion as error:
+        note(f"warning: the load is not identified: {error}")
+        return document
 
 
 @contextmanager
@@ -156,7 +177,7 @@ def storing_refits(inputs: Inputs, folder: Path, root: Path) -> Iterator[Inputs]
 
 def robot_of(pipeline: Pipeline, config: IdentifyConfig) -> RecordedRobot:
     """Return the pipeline's robot in the configured world, with the optional terms that the configuration names."""
-    return held_out_parts.offering(in_world(pipeline.load(), config.world), config.terms)
+    return offering(in_world(pipeline.load(), config.world), config.terms)
 
 
 def table_of(model: IdentifiableModel, config: IdentifyConfig, episodes: Sequence[Episode]) -> ParameterTable:
@@ -168,7 +189,7 @@ def table_of(model: IdentifiableModel, config: IdentifyConfig, episodes: Sequenc
     bounded = model.parameters.with_bounds(config.bounds)
     if config.terms not in ("own", "none"):
         bounded = bounded.with_reached(model.reached(episodes))
-    table = held_out_parts.widest(bounded, config.terms).with_fixed(config.fix)
+    table = with_wanted_terms(bounded, config.terms).with_fixed(config.fix)
     # A data sheet's delay of one side fixes how the delay is shared: then the other side's is identified.
     for p in table:
         held = p.kind == "delay" and p.side == "measurement" and not p.free and p.name not in config.fix

@@ -1,27 +1,60 @@
-"""From a fit to an identification: intervals, predictions, free runs and the verdict."""
+"""From a fit to an identification: intervals, predictions, what the model lacks, and the verdict."""
 
+from __future__ import annotations
+
+import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.identification import HeldOutPart, Identification
+from sim2real.artifacts.files import number
+from sim2real.artifacts.identification import (
+    ROUND_TRIP,
+    Determined,
+    Estimate,
+    FreeRun,
+    HeldOutPart,
+    Identification,
+    Judgement,
+    Matrix,
+    Noise,
+    TriedTerm,
+    with_small_unit,
+)
+from sim2real.artifacts.posterior import Posterior
+from sim2real.graph.episode import Episode
 from sim2real.identify.delays.links import links
 from sim2real.identify.expected import wider_for, with_expected_errors
 from sim2real.identify.fit import Fit, Value, as_numbers, refit
-from sim2real.identify.problem.segments import beyond, ranges
-from sim2real.identify.uncertainty import ensemble
+from sim2real.identify.model import measured_channels
+from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span, beyond, ranges
+from sim2real.identify.uncertainty import ensemble, identifiability, noise, uncertainty
+from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
 from sim2real.identify.uncertainty.per_recording import compare_recordings
-from sim2real.identify.validation import prediction
+from sim2real.identify.validation import prediction, verdict
 from sim2real.identify.validation.replays import replays
-from sim2real.identify.validation.verdict import NO_DELAY, positions
-from sim2real.stages.estimation import estimate, held_out_parts
-from sim2real.stages.estimation.free_run import free_runs
-from sim2real.stages.identify.fitting import Fits, determined
-from sim2real.stages.identify.inputs import Inputs
-from sim2real.stages.identify.missing_terms import lack, of_selection
+from sim2real.identify.validation.term_gains import gains
+from sim2real.identify.validation.term_trials import Trials
+from sim2real.identify.validation.verdict import ACCEPTED, CHANGE, NO_DELAY, Position, positions, scores, state_of
+from sim2real.identify.validation.worst_second import worst_second
+from sim2real.robots.worlds import in_world
+from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.identify.fitting import (
+    LEAST_SEGMENTS,
+    Fits,
+    determined,
+    fitted_to,
+    parts_of,
+    widened,
+    without_parts,
+)
+from sim2real.stages.identify.inputs import Inputs, table_of, with_load
 from sim2real.stages.identify.true_values import true_values
+from sim2real.stages.shared.identification import offering, split_of, usable, with_wanted_terms
 from sim2real.stages.terminal.console import note, progress, shown
 from sim2real.stages.terminal.interruption import patiently
 
@@ -29,6 +62,18 @@ _NO_DELAY_S = 1e-4
 """Estimates of delays below this count as no delay [s]."""
 _HORIZONS = (0.1, 0.25, 0.5, 1.0)
 """Shares of the horizon at which prediction errors are listed."""
+_MOST = 3
+"""Most errors above the expected ones that are named."""
+_FAR = 3.0
+"""Ratio of residuals to noise above which a term is missing."""
+_FLOOR = 0.1
+"""Smallest noise, in assumed deviations of a measurement: simulated logs have none, and residuals of integrators."""
+_FAR_RUN = 0.1
+"""Error of a free run, as a share of the position's range, above which a term is missing."""
+_MENDS = 0.5
+"""The model lacks a term if the error with it is below this share."""
+_USUAL_TERM = "direction"
+"""A constant force, or friction that differs by direction: the term that models lack most often."""
 
 
 def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
@@ -39,23 +84,18 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
     """
     config = inputs.config
     with progress(None, "identify: held-out parts") as bar:
-        # Refit without each part of the recordings. The errors of a fit that did not converge bound no later error.
-        examine = config.folds and fits.estimate.converged
-        parts = (
-            patiently(lambda: held_out_parts.examined(fits.widest, config, inputs.names, fits.selection, inputs.refits))
-            if examine
-            else ()
-        )
+        # Refit without each part of the recordings.
+        parts = patiently(lambda: without_parts(inputs, fits))
         if inputs.refits.source and inputs.refits.reused:
             same = "logs, parameters and settings are the same"
             note(f"{inputs.refits.reused} refits are from {shown(inputs.refits.source)}: {same}")
         # Compute intervals; they widen where estimates without one part differ.
         bar.set_description_str("identify: intervals")
-        findings, held = patiently(lambda: estimate.Findings.of(fits.estimate, parts)), list[str]()
+        findings, held = patiently(lambda: Findings.of(fits.estimate, parts)), list[str]()
         # A choice of the model includes which parameters it has: hold those that the data does not determine.
         if config.terms == "auto" and fits.estimate.converged and findings.check.undetermined:
-            fits, held = patiently(lambda f=findings: determined(inputs, fits, f))
-            findings = patiently(lambda: estimate.Findings.of(fits.estimate, parts)) if held else findings
+            fits, held = patiently(lambda f=findings: determined(inputs, fits, f.check, f.spread))
+            findings = patiently(lambda: Findings.of(fits.estimate, parts)) if held else findings
         fit = findings.fit
         truth = true_values(inputs.logs[0], inputs.robot.roles) if config.reveal else {}
         # Collect the models that explain the recordings as well, for training to draw from.
@@ -63,7 +103,7 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         posterior = patiently(
             lambda: ensemble.posterior(fit, findings.at, findings.spread, fits.widest, fits.selection)
         )
-        document = estimate.document(inputs.pipeline.name, findings, posterior, truth, time.monotonic() - started_s)
+        document = _estimates(inputs.pipeline.name, findings, posterior, truth, time.monotonic() - started_s)
         # Predict held-out data, beside baselines.
         bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, inputs, fit))
@@ -75,31 +115,152 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
         # Try further terms where residuals are far above the noise.
         bar.set_description_str("identify: terms that may be missing")
         if fits.selection is not None:
-            document = replace(document, tried=of_selection(fits.selection, fits.widest.problem.table))
+            tried = gains(fits.selection.trials, fits.selection.near[0], fits.widest.problem.table)
+            document = replace(document, tried=tried)
         document, lacks = patiently(lambda: lack(document, inputs, fit))
-    document = inputs.weighed(document, truth)
+    if inputs.standing is not None:
+        document = with_load(document, inputs.robot, inputs.standing, truth)
     document, outside = _compared(document, inputs, fit, parts)
     names = [n for n in inputs.undetermined if n not in document.values]
     # A pipeline's own bounds may be widened once.
-    widened = {n for n, both in config.bounds.items() if inputs.pipeline.identify.bounds.get(n) != both}
+    set_by_user = {n for n, both in config.bounds.items() if inputs.pipeline.identify.bounds.get(n) != both}
     open_ = [f"not determined by this log: {', '.join(names)}"] if names else []
-    doubts = [*outside, *held, *open_]
-    return estimate.judged(document, findings, inputs.units, config.max_delay_s, doubts, lacks, widened)
+    return _judged(document, findings, inputs, [*outside, *held, *open_], lacks, set_by_user)
 
 
-def _compared(
-    document: Identification, inputs: Inputs, fit: Fit, parts: Sequence[HeldOutPart]
-) -> tuple[Identification, list[str]]:
-    """Return the document with expected errors and ranges, and sentences about held-out data outside the ranges."""
-    names, measured = [log.path.stem for log in inputs.logs], positions(inputs.model, inputs.units)
-    fitted = [s for s in inputs.windows if s.fitted]
-    held_out = [[s for s in inputs.windows if s.recording == r and not s.fitted] for r in range(len(inputs.logs))]
-    before, *later = (ranges(inputs.model, inputs.episodes, s, fit.windows.segment_s) for s in (fitted, *held_out))
-    document = replace(document, ranges=before)
-    wider = [wider_for(before, log, measured) for log in later]
-    document = with_expected_errors(document, measured, parts, names, inputs.fitted, wider)
-    outside = dict.fromkeys(text for log in later for text in beyond(before, log))
-    return document, [f"held-out data extrapolates: {text}" for text in outside]
+@dataclass(frozen=True)
+class Findings:
+    """A fit with its uncertainty.
+
+    Attributes:
+        at: The residuals at the estimate.
+        check: The combinations of parameters that the data determines.
+        widening: Factor on deviations with which draws cover the errors of the model.
+    """
+
+    fit: Fit
+    at: uncertainty.Linearised
+    spread: uncertainty.Uncertainty
+    check: Determined
+    widening: float
+
+    @property
+    def x(self) -> np.ndarray:
+        """The estimate on the parameters' scales, ``(P,)``."""
+        return self.at.x
+
+    @staticmethod
+    def of(fit: Fit, without: Sequence[HeldOutPart] = ()) -> Findings:
+        """Compute the uncertainty of a fit.
+
+        Args:
+            without: The estimates without one part of the recordings each.
+        """
+        at = uncertainty.linearise(fit.problem, fit.z)
+        spread = widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
+        check = identifiability.from_linearised(fit.problem, at)
+        # Give parameters that the model does not need a single bound.
+        spread, check = negligible(fit.problem, fit.z, at, spread, check)
+        fit, at = _with_nominal_limits(fit, at, spread)
+        return Findings(fit, at, spread, check, noise.widening(at, spread))
+
+
+def _with_nominal_limits(
+    fit: Fit, at: uncertainty.Linearised, spread: uncertainty.Uncertainty
+) -> tuple[Fit, uncertainty.Linearised]:
+    """Return a fit with limits that no motion reaches at their nominal values: the loss does not depend on them."""
+    table, x = fit.problem.table, at.x.copy()
+    for i in np.flatnonzero([v == NOT_REACHED for v in spread.verdict]):
+        p = table.columns[i].parameter
+        x[i] = p.to_scale(indifferent(p, float(spread.low[i])))
+    z = np.where(x == at.x, fit.z, table.at_scale(x))
+    return replace(fit, z=z), replace(at, x=x)
+
+
+def _estimates(
+    pipeline: str, findings: Findings, posterior: Posterior, truth: Mapping[str, float], seconds: float
+) -> Identification:
+    """Return the estimates with their uncertainty; predictions and verdict are added later.
+
+    Args:
+        truth: Known parameters of the embedded robot.
+        seconds: Duration of the search [s].
+    """
+    fit, spread, check = findings.fit, findings.spread, findings.check
+    names = tuple(fit.problem.table.names)
+    search = replace(fit.record, seconds=seconds)
+    if not fit.converged:  # away from a minimum no interval, covariance or condition means anything
+        rows = tuple(_without_interval(row) for row in _rows(findings, truth))
+        return Identification(
+            pipeline=pipeline, logs=(), verdict=Judgement("", ()), parameters=rows, search=search, misfit=spread.misfit
+        )
+    return Identification(
+        pipeline=pipeline,
+        logs=(),
+        verdict=Judgement("", ()),
+        parameters=tuple(_rows(findings, truth)),
+        search=search,
+        covariance=Matrix(names, spread.covariance),
+        correlation=Matrix(names, spread.correlation),
+        misfit=spread.misfit,
+        check=check,
+        posterior=posterior,
+        widening=findings.widening,
+    )
+
+
+def _rows(findings: Findings, truth: Mapping[str, float]) -> list[Estimate]:
+    parameters, spread = findings.fit.problem.table, findings.spread
+    # How the delay is shared between both sides of the world is a convention: only the sum has a true value.
+    own_truth = lambda p: None if p.kind == "delay" and ROUND_TRIP in truth else truth.get(p.name)  # noqa: E731
+    rows = []
+    for i, column in enumerate(parameters.columns):
+        p = column.parameter
+        value = np.ravel(findings.fit.values[p.name])[column.recording or 0]
+        upper = bool(parameters.high[i] - findings.x[i] < findings.x[i] - parameters.low[i])
+        rows.append(
+            Estimate(
+                name=column.label,
+                unit=p.unit,
+                kind=p.kind,
+                about=p.about,
+                nominal=p.nominal,
+                estimate=float(value),
+                standard_error=float(spread.standard_error[i]),
+                low95=float(spread.low[i]),
+                high95=float(spread.high[i]),
+                lower=p.low,
+                upper=p.high,
+                verdict=state_of(spread.verdict[i], p, upper),
+                truth=own_truth(p),
+            )
+        )
+    for p in (p for p in parameters if not p.free):
+        numbers = {"standard_error": 0.0, "low95": p.nominal, "high95": p.nominal, "lower": p.low, "upper": p.high}
+        columns_ = (p.name, p.unit, p.kind, p.about, p.nominal, p.nominal)
+        rows.append(Estimate(*columns_, verdict="fixed", truth=own_truth(p), **numbers))
+    return rows + round_trip(rows, truth)
+
+
+def _without_interval(row: Estimate) -> Estimate:
+    """Return the row of a parameter of a fit that did not converge."""
+    if row.verdict == "fixed":
+        return row
+    return replace(row, standard_error=None, low95=None, high95=None, verdict="not determined")
+
+
+def round_trip(rows: Sequence[Estimate], truth: Mapping[str, float]) -> list[Estimate]:
+    """Return the row of the sum of all delays, of which one is identified: at most one row."""
+    delays = [row for row in rows if row.kind == "delay"]
+    free = [row for row in delays if row.verdict != "fixed"]
+    if len(free) != 1 or "@" in free[0].name:
+        return []
+    held = sum(row.estimate for row in delays if row.verdict == "fixed")
+    moved = {n: getattr(free[0], n) for n in ("estimate", "low95", "high95", "lower", "upper")}
+    moved = {n: None if value is None else value + held for n, value in moved.items()}
+    about = " + ".join(row.name for row in delays)
+    own = truth.get(ROUND_TRIP)
+    return [replace(free[0], name=ROUND_TRIP, kind="derived", about=about, nominal=0.0, truth=own, **moved)]
 
 
 def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identification:
@@ -136,3 +297,244 @@ def _without_delays(fit: Fit) -> dict[str, Mapping[str, Value]]:
     if largest_s < _NO_DELAY_S:
         return {NO_DELAY: as_numbers(table, fit.z, kept)}
     return {NO_DELAY: refit(fit.problem, kept, fit.z)}
+
+
+def free_runs(
+    estimate: Fit,
+    episodes: Sequence[Episode],
+    fitted: int,
+    config: IdentifyConfig,
+    models: Mapping[str, Any],
+) -> tuple[list[FreeRun], dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Simulate the held-out part of each log in one run; return its errors, its columns, and its commands and starts.
+
+    Args:
+        fitted: Number of fitted logs; the later ones are held out whole.
+        models: Model -> values of all parameters.
+    """
+    splits = [split_of(episode, r < fitted, config) for r, episode in enumerate(episodes)]
+    ends = [usable(episode, config)[1] for episode in episodes]
+    least_s = config.settle_s + config.horizon_s
+    # Take the held-out part of each log that is long enough, each to its own end.
+    held_out = [Span(r, split, False) for r, split in enumerate(splits) if ends[r] - split > least_s]
+    if not held_out or not config.free_run_s:
+        return [], {}, {}
+    lengths_s = [min(config.free_run_s, ends[s.recording] - s.begin_s) for s in held_out]
+    problem = estimate.windows.recut(held_out, max(lengths_s), ends_s=lengths_s)
+    columns = prediction.samples(problem, models, config.settle_s)
+    rows = prediction.free_runs(columns, prediction.labels(problem), list(models), config.settle_s)
+    return rows, columns, replays(problem, estimate.values, config.settle_s, "free")
+
+
+def _compared(
+    document: Identification, inputs: Inputs, fit: Fit, parts: Sequence[HeldOutPart]
+) -> tuple[Identification, list[str]]:
+    """Return the document with expected errors and ranges, and sentences about held-out data outside the ranges."""
+    names, measured = [log.path.stem for log in inputs.logs], positions(inputs.model, inputs.units)
+    fitted = [s for s in inputs.windows if s.fitted]
+    held_out = [[s for s in inputs.windows if s.recording == r and not s.fitted] for r in range(len(inputs.logs))]
+    before, *later = (ranges(inputs.model, inputs.episodes, s, fit.windows.segment_s) for s in (fitted, *held_out))
+    document = replace(document, ranges=before)
+    wider = [wider_for(before, log, measured) for log in later]
+    document = with_expected_errors(document, measured, parts, names, inputs.fitted, wider)
+    outside = dict.fromkeys(text for log in later for text in beyond(before, log))
+    return document, [f"held-out data extrapolates: {text}" for text in outside]
+
+
+@dataclass(frozen=True)
+class Lack:
+    """What the model lacks: sentences, and flags with which to identify again; "" if no term mends it."""
+
+    reasons: tuple[str, ...] = ()
+    flags: str = ""
+
+
+def lack(document: Identification, inputs: Inputs, fit: Fit) -> tuple[Identification, Lack]:
+    """Return the document with the tried terms, and what the model lacks.
+
+    Where residuals are far above the noise, further terms are compared on held-out parts, one at a time. Where free
+    runs are far off, the model is fitted with the best of these terms.
+    """
+    config, measured = inputs.config, positions(inputs.model, inputs.robot.units)
+    automatic, chosen = config.terms == "auto", [*(document.terms or ())]
+    reasons, flags, term = list[str](), "", _USUAL_TERM
+    worst = largest_residual(document, noise.noises(document.samples, inputs.units), measured)
+    if worst is not None and worst[1] > _FAR:
+        position, ratio, level = worst
+        unit = f" {position.unit}".rstrip()
+        sentence = f"residuals of {position.name} are {ratio:.2g} times its noise of {level:.2g}{unit}"
+        # The terms of ``auto`` were compared already.
+        if not automatic and fit.converged and config.folds and len(fit.problem.train) >= LEAST_SEGMENTS:
+            tried = inputs.refits.tried(fit.problem.table.terms, lambda: _tried(inputs, fit))
+            document = replace(document, tried=tried)
+        best = next((t for t in document.tried if t.outcome == "mends"), None)
+        if not document.tried:
+            reasons.append(f"{sentence}: the model lacks something; no optional term was tried")
+        elif automatic or best is None:
+            none = "no further term" if automatic else "none of the terms, one at a time,"
+            reasons.append(f"{sentence}; {none} lowers the error on held-out parts by 5 %")
+        else:
+            term, gain, with_it = best.term, best.gain or 0.0, f"--terms {','.join([*chosen, best.term])}"
+            flags = with_it if gain > 1.0 - _MENDS else ""
+            reasons.append(f"{sentence}; {term} lowers the error on held-out parts by {gain:.0%}: {with_it}")
+    if (run := farthest_run(document, measured)) is None:
+        return document, Lack(tuple(reasons), flags)
+    # Describe the free runs, and fit the model with a further term where they are far off.
+    position, error, share = run
+    of_position = [r for r in document.free_run if r.held_out and r.field == position.column]
+    size = "diverges"
+    if math.isfinite(error):
+        size = f"is off by {with_small_unit(error, position.unit)}, {share:.1%} of its range"
+    seconds = max(r.seconds for r in of_position)
+    reasons.append(f"in free runs of {seconds:.3g} s on held-out data {position.name} {size}")
+    if share <= _FAR_RUN or automatic or term in chosen or not fit.converged:
+        return document, Lack(tuple(reasons), flags)
+    wanted = ",".join([*chosen, term])
+    if (rows := _free_runs_with(inputs, wanted, term)) is None:
+        return document, Lack(tuple(reasons), flags)
+    mended = mean_error(rows, position)
+    if mended is None or not mended < _MENDS * error:
+        reasons.append(f"the term {term} does not mend that")
+    else:
+        such = ", such as a constant force," if term == _USUAL_TERM else ""
+        size = with_small_unit(mended, position.unit)
+        reasons.append(f"with the term {term}{such} it would be off by {size}: the model lacks it")
+        flags = f"--terms {wanted}"
+    return document, Lack(tuple(reasons), flags)
+
+
+def largest_residual(
+    document: Identification, noises: Sequence[Noise], positions: Sequence[Position]
+) -> tuple[Position, float, float] | None:
+    """Return the position whose residuals are largest beside its noise, the ratio, and the noise; None if unknown."""
+    rows = []
+    for p in positions:
+        of = next((n for n in noises if n.column == p.column), None)
+        if of is None:
+            continue
+        off = document.samples[f"{p.column}_measured"] - document.samples[f"{p.column}_identified"]
+        off = off[np.isfinite(off) & (document.samples["into"] > document.settle_s)]
+        level = max(float(np.hypot(of.deviation, of.quantum / np.sqrt(12.0))), _FLOOR * p.sigma)
+        if off.size:
+            rows.append((p, float(np.sqrt(np.mean(off**2))) / level, level))
+    return max(rows, key=lambda row: row[1], default=None)
+
+
+def farthest_run(document: Identification, positions: Sequence[Position]) -> tuple[Position, float, float] | None:
+    """Return the position whose free runs have the largest error as a share of its range, the error, and the share."""
+    errors = [(p, error) for p in positions if (error := mean_error(document.free_run, p)) is not None]
+    sizes = [max(float(np.ptp(document.samples[f"{p.column}_measured"])), 1e-300) for p, _ in errors]
+    rows = [(p, error, error / size) for (p, error), size in zip(errors, sizes, strict=True)]
+    return max(rows, key=lambda row: row[2], default=None)
+
+
+def mean_error(rows: Sequence[FreeRun], position: Position) -> float | None:
+    """Return the mean error of the identified model in a position's free runs on held-out data; None without one."""
+    own = [r for r in rows if r.held_out and (r.model, r.field) == ("identified", position.column)]
+    errors = [number(r.rmse, math.inf) for r in own]
+    return float(np.mean(errors)) if errors else None
+
+
+def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
+    """Return what optional terms gain, one at a time, beside the model of a fit.
+
+    The three most promising ones by linear algebra and the limits are fitted, without refits: about as long as the fit.
+    """
+    config, chosen = inputs.config, fit.problem.table.terms
+    robot = offering(in_world(inputs.pipeline.load(), config.world), ",".join(["auto", *chosen]))
+    model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
+    bounded = model.parameters.with_bounds(config.bounds).with_reached(model.reached(episodes[: inputs.fitted]))
+    table = with_wanted_terms(bounded, "all").with_fixed(config.fix)
+    further = set(table.terms) - set(chosen)
+    if not further or not set(fit.values) <= {p.name for p in table}:
+        return ()
+    # Put the estimate into the model with all terms, and compare single terms.
+    length_s = config.settle_s + config.horizon_s
+    problem = Problem(model, episodes, inputs.windows, length_s, config, table)
+    values = {p.name: p.without for p in problem.table} | fit.values
+    z = problem.table.encode(values)
+    whole = replace(fit, problem=problem, windows=problem, z=z, refined=(), search=None)
+    parts = parts_of(whole, config, inputs.names)
+    present = np.array([name in chosen for name in problem.table.terms])
+    trials = Trials(whole, parts, config.settle_s, 0.0).singles(z, present)
+    return tuple(r for r in gains(trials, trials[0], problem.table) if r.term in further)
+
+
+def _free_runs_with(inputs: Inputs, wanted: str, term: str) -> Sequence[FreeRun] | None:
+    """Return the free runs of the model with further terms; None if the robot has no free parameter of the last one."""
+    config = replace(inputs.config, terms=wanted, generations=0)
+    robot = offering(in_world(inputs.pipeline.load(), config.world), wanted)
+    model, episodes = measured_channels(robot.identifiable(config.max_delay_s), inputs.episodes), inputs.episodes
+    if {p.name for p in model.parameters if p.term == term} <= set(config.fix):
+        return None
+    # Search from the start, as the printed command does: a fit without the term has distorted other parameters.
+    table = table_of(model, config, episodes[: inputs.fitted])
+    refitted = fitted_to(model, episodes, inputs.fitted, inputs.windows, config, table)
+    return free_runs(refitted, episodes, inputs.fitted, config, {"identified": refitted.values})[0]
+
+
+def _judged(
+    document: Identification,
+    findings: Findings,
+    inputs: Inputs,
+    doubts: Sequence[str],
+    lacks: Lack,
+    set_by_user: Collection[str],
+) -> Identification:
+    """Return the document with its verdict, whose ``next`` are flags with which to identify again.
+
+    Args:
+        doubts: Sentences about held-out data outside the range of the fitted data, and parameters that are held.
+        set_by_user: Parameters whose bounds the user has set.
+    """
+    fit, measured = findings.fit, positions(findings.fit.problem.model, inputs.units)
+    # Judge the errors on held-out data, the intervals and the bounds.
+    rows = scores(document.prediction, measured)
+    judged = verdict.judge(
+        rows,
+        fit.problem.table,
+        findings.x,
+        findings.spread,
+        findings.check,
+        max_delay_s=inputs.config.max_delay_s,
+        widened=set_by_user,
+        beyond=doubts,
+        left=None if fit.converged else fit.left,
+    )
+    # Add errors above the expected ones, and what the free runs show; the reason for the status comes first.
+    status, reasons = judged.status, list(judged.reasons)
+    exceeded = [str(row) for row in sorted(document.compared, key=lambda r: -(r.ratio or 0.0)) if row.exceeded]
+    more = exceeded[:_MOST] + [f"{len(exceeded) - _MOST} more errors are above"] * (len(exceeded) > _MOST)
+    if status == ACCEPTED and lacks.flags:
+        status, reasons = CHANGE, [*lacks.reasons, *more, *reasons]
+    elif status == ACCEPTED and exceeded:
+        status, reasons = CHANGE, [*more, *reasons, *lacks.reasons]
+    else:
+        reasons += [*more, *lacks.reasons]
+    # A term that mends the model comes before wider bounds: a model without it bends its other parameters.
+    flags = lacks.flags or judged.next
+    if status == CHANGE and not flags and _offers_more(inputs, fit):
+        flags = "--terms auto"
+    # A fault in fitted data changes no held-out error, so it does not change the status.
+    worst = worst_second(document.samples, measured, document.settle_s)
+    if worst is not None and worst.unexplained:
+        where = f"the model does not explain {worst.name} in the second from {worst.begin_s:.1f} s on: {worst.error}"
+        reasons.append(f"{where}; look at the log there")
+    # In a fit that is not accepted no parameter is ok.
+    parameters = document.parameters
+    if status != ACCEPTED:
+        doubted = {"ok": "not determined"}
+        parameters = tuple(replace(p, verdict=doubted.get(p.verdict, p.verdict)) for p in parameters)
+    judgement = Judgement(status, tuple(reasons), flags)
+    return replace(document, verdict=judgement, parameters=parameters, held_out=tuple(rows), worst=worst)
+
+
+def _offers_more(inputs: Inputs, fit: Fit) -> bool:
+    """Return whether ``--terms auto`` would compare terms that the model lacks."""
+    config = inputs.config
+    if config.terms == "auto" or not config.folds or len(fit.problem.train) < LEAST_SEGMENTS:
+        return False
+    robot = offering(in_world(inputs.pipeline.load(), config.world), "auto")
+    return bool(
+        {p.term for p in robot.identifiable(config.max_delay_s).parameters if p.term} - set(fit.problem.table.terms)
+    )

@@ -14,16 +14,16 @@ from sim2real.errors import UsageError
 from sim2real.identify.uncertainty.noise import noises
 from sim2real.identify.validation.refits import REFITS
 from sim2real.robots.contract import RecordedRobot
-from sim2real.stages.estimation import recording_advice
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
 from sim2real.stages.identify.inputs import Inputs, prepare, robot_of, storing_refits
 from sim2real.stages.identify.judgement import judge
-from sim2real.stages.identify.live_fit import Best, searching
+from sim2real.stages.identify.progress import Best, kept
 from sim2real.stages.identify.show import show, summary
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
+from sim2real.stages.shared.identification import command, continuing
 
 
 def identify(
@@ -98,15 +98,16 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     with (
         open_stage(root, pipeline.name, "identify", config, files, run_dir) as stage,
         storing_refits(inputs, stage.folder, root) as inputs,
-        searching(stage, inputs, lambda file: recording_advice.onward(pipeline, config, root, file)) as best,
+        kept(stage, inputs, lambda file: continuing(pipeline, config, root, file)) as best,
     ):
         identification = _identify(inputs, best)
         if inputs.refits.stored:
             stage.output("refits", REFITS)
         # Complete the verdict's flags to a command, and name the logs by their paths in the run folder.
-        again = recording_advice.again(pipeline, config, root, identification.verdict.next)
+        flags = identification.verdict.next
+        again = command(pipeline, config, root, flags) if flags else ""
         if identification.verdict.status == "not finished":
-            again = recording_advice.onward(pipeline, config, root, stage.folder / PARAMETERS)
+            again = continuing(pipeline, config, root, stage.folder / PARAMETERS)
         verdict = replace(identification.verdict, next=again)
         identification = replace(identification, logs=inputs.sources(stage.run_dir), verdict=verdict)
         _write(identification, stage, pipeline, robot)

@@ -1,8 +1,7 @@
 """Replay of a deployment: its commands drive the models of its robot, and its log tests the parameters."""
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Container, Mapping, Sequence
 
 import numpy as np
 
@@ -12,19 +11,26 @@ from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
 from sim2real.identify.drift import drift_test
 from sim2real.identify.expected import expected_at
+from sim2real.identify.model import ChecksLogs, IdentifiableModel
+from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.problem import Problem
+from sim2real.identify.problem.segments import Span
 from sim2real.identify.search.refine import refine
 from sim2real.identify.validation import prediction
-from sim2real.identify.validation.verdict import positions
-from sim2real.robots.worlds import in_world
-from sim2real.stages.estimation import held_out_parts
-from sim2real.stages.estimation.replay_problem import longest_delay_s, problem_of_logs
+from sim2real.identify.validation.folds import MOVES
+from sim2real.identify.validation.verdict import NOISE, positions
+from sim2real.robots.contract import RecordedRobot
+from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.shared.identification import identified_robot, side_by_side
 
 _REPETITIONS = 16
 """Measurements with noise, from which the errors of an unchanged robot follow."""
-_NOISE = 2.0
-"""Errors below this many deviations of the measurement count as noise."""
+_SEGMENT_S = 0.4
+"""Shortest segment [s]. Errors of a balanced pendulum grow tenfold in 0.2 s, so long segments do not separate
+models."""
+_LEAST, _LEAST_S = 4, 5.0
+"""Fewest segments with motion for a test, and the shortest length of all logs [s]."""
 
 
 def tested(
@@ -37,13 +43,8 @@ def tested(
     Raises:
         Sim2RealError: When the logs are too short, or the identification does not fit the robot.
     """
-    robot = held_out_parts.having(
-        in_world(pipeline.load(), identification.world), [p.name for p in identification.parameters]
-    )
-    longest_s = longest_delay_s(robot, identification, pipeline.identify.max_delay_s)
-    config = replace(pipeline.identify, settle_s=identification.settle_s, max_delay_s=longest_s)
-    # Cut the logs into segments.
-    problem, ahead_s = problem_of_logs(robot, identification, episodes, config)
+    robot, config = identified_robot(identification, pipeline)
+    problem, ahead_s = _problem(robot, identification, episodes, config)
     if identification.posterior is None:
         ended = UNFINISHED.get(identification.verdict.status, "has no intervals")
         raise Sim2RealError(
@@ -71,16 +72,88 @@ def tested(
     for position in positions(problem.model, robot.units):
         rmse = {e.model: e.rmse.get(position.column) for e in errors if e.held_out}
         rmse = {m: e if e is not None and math.isfinite(e) else None for m, e in rmse.items()}
-        promise, moved, now = held_out.get(position.column), held.get(position.column), rmse.get("hold")
-        if promise is not None:  # a model's error grows with the motion
-            promise = expected_at(identification, position.column, promise)
-            promise = max(promise, _NOISE * position.sigma) * max(1.0, now / moved if now and moved else 1.0)
-            promise = math.hypot(promise, alike.get(position.column, 0.0))
+        expected, moved, now = held_out.get(position.column), held.get(position.column), rmse.get("hold")
+        if expected is not None:  # a model's error grows with the motion
+            expected = expected_at(identification, position.column, expected)
+            expected = max(expected, NOISE * position.sigma) * max(1.0, now / moved if now and moved else 1.0)
+            expected = math.hypot(expected, alike.get(position.column, 0.0))
             # A model that diverges on its own motion bounds nothing.
-            promise = promise if math.isfinite(promise) else None
+            expected = expected if math.isfinite(expected) else None
         free = _free_run(identification, position.column)
-        rows.append(Replay(position.name, position.unit, ahead_s, rmse, promise, position.column, free))
+        rows.append(Replay(position.name, position.unit, ahead_s, rmse, expected, position.column, free))
     return rows, drifted
+
+
+def _problem(
+    robot: RecordedRobot, identification: Identification, episodes: Sequence[Episode], config: IdentifyConfig
+) -> tuple[Problem, float]:
+    """Return later logs in short segments, with the identified parameters, and the horizon of the predictions [s].
+
+    Raises:
+        Sim2RealError: When the logs are too short or of another motion, or parameters differ between recordings.
+    """
+    model = robot.watched(config.max_delay_s)
+    if separate := [p.name for p in model.parameters if p.free and p.per_recording]:
+        raise Sim2RealError(f"{', '.join(separate)} differ between recordings: a new log has no values for them")
+    if isinstance(model, ChecksLogs):
+        for episode in episodes:
+            model.check(episode)
+    # Choose the length of segments and the horizon.
+    horizons = sorted({p.horizon_s for p in identification.prediction})
+    length_s = max(_SEGMENT_S, config.settle_s + (horizons[0] if horizons else 0.0))
+    ahead_s = max([h for h in horizons if config.settle_s + h <= length_s + 1e-9], default=length_s - config.settle_s)
+
+    # Cut the logs; parts without motion are dropped.
+    spans = [
+        Span(r, begin)
+        for r, episode in enumerate(episodes)
+        for begin in side_by_side(episode, config, length_s)
+        if _moves(model, episode, begin, length_s)
+    ]
+    seconds = sum(e.duration_s for e in episodes)
+    if len(spans) < _LEAST or seconds < _LEAST_S:
+        moving = f", {length_s * len(spans):.1f} s of them in motion,"
+        raise Sim2RealError(f"{seconds:.1f} s of deployment{moving} are too little to test the model on")
+
+    # Free the parameters that may have changed since.
+    identified = {p.name for p in robot.identifiable(config.max_delay_s).parameters if p.free}
+    watched = {p.name for p in model.parameters if p.free} - identified
+    table = _table(model.parameters, identification, watched)
+    return Problem(model, list(episodes), spans, length_s, config, table), ahead_s
+
+
+def _table(parameters: ParameterTable, identification: Identification, watched: Container[str] = ()) -> ParameterTable:
+    """Return parameters with the identified terms, the values that were fixed, and bounds that include the search's.
+
+    Args:
+        watched: Names of parameters that are free although they were fixed, such as a payload.
+    """
+    terms = {p.term for p in parameters if p.term and (p.free or p.term in (identification.terms or ()))}
+    names = {p.name for p in parameters}
+    fixed = {p.name: p.estimate for p in identification.parameters if p.verdict == "fixed" and p.name in names}
+    table = parameters.with_terms(terms).with_nominal(fixed)
+    table = table.with_fixed({n: v for n, v in fixed.items() if n not in watched})
+    free = {p.name for p in table if p.free}
+    wider = {
+        p.name: (min(p.lower, table[p.name].low), max(p.upper, table[p.name].high))
+        for p in identification.parameters
+        if p.name in free and p.kind != "delay" and p.lower is not None and p.upper is not None
+    }
+    return table.with_bounds(wider)
+
+
+def _moves(model: IdentifiableModel, episode: Episode, begin_s: float, length_s: float) -> bool:
+    """Return whether any joint moves in a part of a log [s].
+
+    Segments without motion do not count: all are alike, and a joint that sticks creeps in a model with smooth friction.
+    """
+    t = episode.steps[model.sensor].begun_s
+    inside = (t >= begin_s) & (t <= begin_s + length_s)
+    read = episode.outputs[model.sensor]
+    return any(
+        inside.any() and float(np.ptp(c.of(read[c.position][inside]))) > MOVES * c.position_sigma
+        for c in model.channels
+    )
 
 
 def _of_noise(

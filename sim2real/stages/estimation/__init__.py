@@ -1,1 +1,0 @@
-"""Estimates, as the stages identify, validate, check and deploy share them: held-out parts, replays, free runs."""

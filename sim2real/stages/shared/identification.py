@@ -1,0 +1,324 @@
+"""What stages share about an identification: its robot, its segments, the logs it may use, and the command of another.
+
+Imports no JAX: the robot's computer checks recordings, too.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+
+from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run.manifest import sha256
+from sim2real.errors import UsageError
+from sim2real.graph.episode import Episode
+from sim2real.identify.model import IdentifiableModel, position_of
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.problem.segments import GRID_S, Span, on_grid
+from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.worlds import in_world
+from sim2real.stages.identify.config import IdentifyConfig
+from sim2real.stages.pipeline.pipeline import Pipeline
+from sim2real.stages.terminal.console import note
+
+_ANY_DELAY_S = 0.1
+"""The names of a model's parameters do not depend on its longest delay, so any does [s]."""
+_WINDOW_SPACING_S = 0.5
+"""Distance between the starts of held-out segments [s]."""
+_LONG_S = 5.0
+"""Length of the segments of the last refinement of a robot that follows no goals [s]."""
+_EDGES_S = (0.3, 0.2)
+"""Unused time at the beginning and at the end of a log whose initial states are estimated [s]."""
+_PIECE = 50
+"""Samples in a piece of motion; two logs that hold the same piece hold the same recording."""
+_SAME = 1e-5
+"""Largest difference by rounding, as a share of the range of a piece."""
+
+
+# The robot of an identification, and its optional terms.
+
+
+def with_wanted_terms(table: ParameterTable, wanted: str) -> ParameterTable:
+    """Return the table with the optional terms of a flag; with ``auto``, all of them.
+
+    Args:
+        wanted: ``own``, ``auto``, ``all``, ``none``, or names separated by commas.
+    """
+    if wanted == "own":
+        return table
+    known = tuple(dict.fromkeys(p.term for p in table if p.term))
+    if wanted == "auto" and not known:
+        raise UsageError(
+            "this robot's model has no optional terms to choose from",
+            hint="give parameters a term in the pipeline: Parameter(..., term='cogging', off=0.0)",
+        )
+    names = {"auto": known, "all": known, "none": ()}.get(wanted, tuple(n.strip() for n in wanted.split(",")))
+    return table.with_terms(names)
+
+
+def offering(robot: RecordedRobot, wanted: str) -> RecordedRobot:
+    """Return the robot with the optional terms that its kind offers, if a flag selects among them.
+
+    Args:
+        wanted: As in ``with_wanted_terms``.
+    """
+    return robot if wanted in ("own", "none") else robot.with_optional_terms(wanted)
+
+
+def identified_robot(identification: Identification, pipeline: Pipeline) -> tuple[RecordedRobot, IdentifyConfig]:
+    """Return the robot in the world of an identification, with its terms, and settings with its longest delay.
+
+    Raises:
+        UsageError: Its world is not installed.
+    """
+    robot = in_world(pipeline.load(), identification.world)
+    present, offered = (
+        {p.name: p.term for p in r.identifiable(_ANY_DELAY_S).parameters} for r in (robot, offering(robot, "all"))
+    )
+    names = [p.name for p in identification.parameters]
+    if lacking := sorted({offered[name] for name in names if name in offered and name not in present}):
+        robot = offering(robot, ",".join(lacking))
+    # The model needs room for the identified delays, which may be longer than the pipeline's longest one.
+    highs = {p.name: p.high for p in robot.identifiable(1.0).parameters if p.kind == "delay"}
+    uppers = {p.name: p.upper for p in identification.parameters if p.kind == "delay" and p.verdict != "fixed"}
+    needed_s = [u / highs[n] for n, u in uppers.items() if u is not None and n in highs]
+    longest_s = max([pipeline.identify.max_delay_s, *needed_s])
+    return robot, replace(pipeline.identify, settle_s=identification.settle_s, max_delay_s=longest_s)
+
+
+# The segments of logs.
+
+
+def spans(episodes: Sequence[Episode], fitted: int, config: IdentifyConfig, length_s: float) -> list[Span]:
+    """Return segments of one length, fitted and held out.
+
+    Args:
+        episodes: The logs; those that are held out whole come last.
+        length_s: Length of a segment [s].
+
+    Raises:
+        UsageError: When the logs are too short.
+    """
+    segments: list[Span] = []
+    for r, episode in enumerate(episodes):
+        begin, end = usable(episode, config)
+        split = split_of(episode, r < fitted, config)
+        last = end - length_s + 1e-6
+        step_s = config.spacing_s or length_s
+        segments += [Span(r, float(b)) for b in np.arange(begin, min(split - length_s, last) + 1e-6, step_s)]
+        segments += [Span(r, float(b), False) for b in np.arange(split, last, _WINDOW_SPACING_S)]
+    fit_count = sum(s.fitted for s in segments)
+    if not fit_count or fit_count == len(segments) or (config.initial_state == "free" and fit_count < 3):
+        lengths = ", ".join(f"{e.duration_s:.1f} s" for e in episodes)
+        raise UsageError(
+            f"the logs last {lengths}: that makes {fit_count} segments of {length_s:g} s to fit and "
+            f"{len(segments) - fit_count} to hold out",
+            hint="record for at least 12 s, or shorten --settle-s and --horizon-s",
+        )
+    return segments
+
+
+def with_length(config: IdentifyConfig, model: IdentifiableModel) -> IdentifyConfig:
+    """Return the configuration with the length of the segments of the last refinement."""
+    follows_goals = any(channel.goal for channel in model.channels)
+    return replace(config, long_s=0.0 if follows_goals else _LONG_S) if config.long_s is None else config
+
+
+def long_spans(episodes: Sequence[Episode], fitted: int, config: IdentifyConfig) -> list[Span]:
+    """Return the segments of the last refinement, which together contain all fitted samples; none if no log has two.
+
+    Args:
+        fitted: Number of fitted logs; the later ones are held out whole.
+    """
+    ends = [(usable(e, config)[0], split_of(e, True, config)) for e in episodes[:fitted]]
+    return covering(ends, config.long_s or 0.0)
+
+
+def covering(ends: Sequence[tuple[float, float]], length_s: float) -> list[Span]:
+    """Return segments of a length that contain all samples between begin and end [s] of each recording."""
+    segments: list[Span] = []
+    for r, (begin, end) in enumerate(ends if length_s else ()):
+        # The last segment ends at the end; the others are spread evenly, and may overlap.
+        if (count := math.ceil((end - begin) / length_s - 1e-6)) > 1:
+            after = np.linspace(0.0, end - length_s - begin, count)
+            after[:-1] = on_grid(after[:-1], np.ceil)
+            segments += [Span(r, float(begin + a)) for a in after]
+    return segments
+
+
+def side_by_side(episode: Episode, config: IdentifyConfig, length_s: float) -> list[float]:
+    """Return the begins of segments of a length, side by side, in the usable part of a log [s]."""
+    begin, end = usable(episode, config)
+    return np.arange(begin, end - length_s + 1e-6, length_s).tolist()
+
+
+def usable(episode: Episode, config: IdentifyConfig) -> tuple[float, float]:
+    """Return the begin and the end of the part of a log that can be cut into segments [s].
+
+    An estimate of an initial state needs samples before and after the start of the segment. The end is 0.05 to
+    0.15 s early, at a multiple of the grid: logs of 19.96 s and 20.04 s have the same segments and share programs.
+    """
+    before, after = _EDGES_S if config.initial_state == "free" else (0.0, 0.0)
+    begin = max(before, config.after_s)
+    return begin, begin + float(on_grid(episode.duration_s - after - begin - GRID_S / 2, np.floor))
+
+
+def split_of(episode: Episode, fitted: bool, config: IdentifyConfig) -> float:
+    """Return the begin of the held-out part of a log [s].
+
+    Args:
+        fitted: Whether the log is fitted; else it is held out whole.
+    """
+    begin, end = usable(episode, config)
+    return begin + float(on_grid((1.0 - config.held_out) * (end - begin), np.floor)) if fitted else begin
+
+
+# A log that was fitted is no test of the fit.
+
+
+def require_new(
+    identification: Identification, logs: Sequence[Recording], model: IdentifiableModel, force: bool
+) -> list[str]:
+    """Return sentences about logs that the parameters were identified from; by default such a log is an error.
+
+    A copy, an import of the same file and a part of a fitted log have the same measurements.
+
+    Args:
+        force: Whether to warn, and use such logs.
+
+    Raises:
+        UsageError: A log was fitted, and ``force`` is False.
+    """
+    # Collect the hashes and the measurements of the fitted logs.
+    rows = identification.samples
+    fitted = set(rows["recording"][~rows["held_out"]].tolist()) if rows else set(range(len(identification.logs)))
+    paths = {s.sha256: s.path for i, s in enumerate(identification.logs) if i in fitted and s.sha256}
+    names, pieces = [f"{position_of(c)}_measured" for c in model.channels], list[np.ndarray]()
+    if rows and all(name in rows for name in names):
+        read = np.stack([rows[name] for name in names], axis=1).astype(np.float64)
+        segments = np.where(rows["held_out"].astype(bool), -1, rows["segment"])
+        pieces = [piece for s in np.unique(segments[segments >= 0]) for piece in _pieces(read[segments == s])]
+    # Compare each log with them.
+    messages = []
+    for log in logs:
+        if (path := paths.get(hash_of(log))) is not None:
+            messages.append(f"{log.path} is {path}, which these parameters were identified from")
+        elif any(_contains(_measured(log, model), piece) for piece in pieces):
+            messages.append(f"{log.path} holds measurements that these parameters were identified from")
+    return _refuse(messages, "take a log of later motion: errors there are no test of a fit", force)
+
+
+def require_apart(
+    fitted: Sequence[Recording], held_out: Sequence[Recording], model: IdentifiableModel, force: bool
+) -> None:
+    """Raise an error if a log is given twice: fitted and held out, or fitted two times.
+
+    Args:
+        force: Whether to warn, and use such logs.
+
+    Raises:
+        UsageError: A log is given twice, and ``force`` is False.
+    """
+    hashes = [hash_of(log) for log in fitted]
+    messages = [
+        f"{a.path} and {b.path} are the same log: fitted twice, it would count twice"
+        for (a, ha), (b, hb) in combinations(zip(fitted, hashes, strict=True), 2)
+        if ha and ha == hb
+    ]
+    for log in held_out:
+        digest, pieces = hash_of(log), list(_pieces(_measured(log, model)))
+        for other, other_digest in zip(fitted, hashes, strict=True):
+            whole = _measured(other, model)
+            if (digest and digest == other_digest) or any(_contains(whole, p) for p in pieces):
+                messages.append(f"{log.path} is to be held out, and {other.path}, with the same measurements, fitted")
+    _refuse(messages, "name each log once: held-out errors of a fitted log are no test of the fit", force)
+
+
+def hash_of(log: Recording) -> str:
+    """Return the SHA-256 of a log's file; "" if there is no such file."""
+    return sha256(log.path) if log.path.is_file() else ""
+
+
+def _refuse(messages: list[str], hint: str, force: bool) -> list[str]:
+    if messages and not force:
+        raise UsageError("; ".join(messages), hint=f"{hint}; --force (in Python {{'force': True}}) uses it anyway")
+    for sentence in messages:
+        note(f"warning: {sentence}")
+    return messages
+
+
+def _measured(log: Recording, model: IdentifiableModel) -> np.ndarray:
+    """Return all measured positions of a log, ``(N, C)``."""
+    read = log.episode.outputs.get(model.sensor, {})
+    columns = [np.asarray(c.of(read[c.position]), np.float64) for c in model.channels if c.position in read]
+    return np.stack(columns, axis=1) if columns else np.zeros((0, 0))
+
+
+def _pieces(read: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield pieces of measurements with motion; measurements shorter than a piece are one piece."""
+    for first in range(0, max(len(read) - _PIECE, 0) + 1, _PIECE):
+        piece = read[first : first + _PIECE]
+        if len(piece) > 1 and max(len(np.unique(column)) for column in piece.T) > len(piece) // 4:
+            yield piece
+
+
+def _contains(read: np.ndarray, piece: np.ndarray) -> bool:
+    """Return whether measurements ``(N, C)`` contain a piece ``(n, C)``."""
+    size = len(piece)
+    if len(read) < size or read.shape[1:] != piece.shape[1:]:
+        return False
+    slack = _SAME * np.ptp(piece, axis=0).max()
+    # Compare the ends and the middle first: few places match there.
+    ends = [
+        np.abs(read[i : len(read) - size + 1 + i] - piece[i]).max(axis=1) <= slack for i in (0, size // 2, size - 1)
+    ]
+    return any(np.abs(read[i : i + size] - piece).max() <= slack for i in np.flatnonzero(np.all(ends, axis=0)))
+
+
+# The command that identifies again.
+
+
+def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str = "") -> str:
+    """Return the command of an identification.
+
+    Args:
+        pipeline: The robot; settings that equal its defaults need no flag.
+        flags: Further flags; they replace those of the settings, bounds and fixed values parameter by parameter.
+    """
+    further = shlex.split(flags)
+    if not pipeline.has_commands:
+        call = "sim2real.identify(robot, recording, ...)"
+        return f"{call} with the settings {flags}" if flags else call
+    named = {name for flag, name in pairwise(further) if flag in ("--bounds", "--fix")}
+    words = ["sim2real", "identify", *pipeline.words]
+    # Add a flag for each setting that differs from the pipeline's default.
+    for f in fields(config):
+        flag, value = "--" + f.name.replace("_", "-"), getattr(config, f.name)
+        if isinstance(value, Mapping):
+            for name, numbers in value.items():
+                values = numbers if isinstance(numbers, tuple) else (numbers,)
+                words += [] if name in named else [flag, name, *(f"{v:g}" for v in values)]
+        elif isinstance(value, tuple):
+            words += [word for file in value for word in (flag, str(file))]
+        elif value != getattr(pipeline.identify, f.name) and flag not in further:
+            words += (
+                [flag if value else flag.replace("--", "--no-", 1)] if isinstance(value, bool) else [flag, str(value)]
+            )
+    words += ["--runs", str(root)] if Path(root) != Path("runs") else []
+    return shlex.join([*words, *further])
+
+
+def continuing(pipeline: Pipeline, config: IdentifyConfig, root: Path, file: Path) -> str:
+    """Return the command that continues an identification that was interrupted or did not converge."""
+    usual = pipeline.identify
+    generations = max(config.generations, usual.generations)
+    steps = max(2 * config.refine_steps, usual.refine_steps)
+    flags = f"--begin {shlex.quote(str(file))} --generations {generations} --refine-steps {steps}"
+    return command(pipeline, config, root, flags)

@@ -1,0 +1,111 @@
+"""What a model lacks: residuals far above the noise and free runs that are far off, and the term that mends them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sim2real.artifacts.identification import FreeRun, Identification, Judgement, Noise, TriedTerm
+from sim2real.identify.validation.refits import Refits
+from sim2real.identify.validation.verdict import Position
+from sim2real.stages.identify import judgement
+from sim2real.stages.identify.judgement import farthest_run, lack, largest_residual
+
+AXIS, ARM = Position("x[0]", "axis", "m", 1e-5), Position("x[1]", "arm", "rad", 1e-3)
+NOISE = (Noise("x[1]", "rad", 1e-3, 0.0, 0.0),)
+
+
+def run(field, rmse, recording=0, model="identified", held_out=True):
+    return FreeRun(model, recording, 18.0, 6.0, held_out, field, rmse, rmse)
+
+
+def document(times_noise, *runs, tried=(), terms=()):
+    """Positions that move by 0.2 m and 2 rad; the arm's residuals are some times its noise of 1 mrad."""
+    read, off = np.linspace(0.0, 1.0, 50), 1e-3 * times_noise * np.array([1.0, -1.0] * 25)
+    columns = {"x[0]_measured": 0.2 * read, "x[1]_measured": 2.0 * read, "x[1]_identified": 2.0 * read + off}
+    columns |= {"into": np.full(50, 1.0)}
+    return Identification(
+        "rig", (), Judgement("", ()), (), free_run=runs, samples=columns, terms=terms, tried=tried, settle_s=0.3
+    )
+
+
+def lacked(found, monkeypatch, tried=None, again=None, terms="own"):
+    """Return what a document lacks; ``tried`` and ``again``: what fits with further terms give; None: no fit."""
+
+    def fitted(*_):
+        assert tried is not None
+        return tried
+
+    def ran(inputs, wanted, term):
+        assert again is not None
+        return again and [run("x[0]", again), run("x[0]", 0.2, model="hold")]
+
+    monkeypatch.setattr(judgement, "_tried", fitted)
+    monkeypatch.setattr(judgement, "_free_runs_with", ran)
+    monkeypatch.setattr(judgement, "positions", lambda *_: [AXIS, ARM])
+    monkeypatch.setattr(judgement.noise, "noises", lambda *_: NOISE)
+    refits = Refits()
+    refits.begin(("drag",), np.zeros(1), 1.0)
+    inputs = SimpleNamespace(
+        config=SimpleNamespace(terms=terms, folds=5),
+        model=None,
+        units={},
+        robot=SimpleNamespace(units={}),
+        refits=refits,
+    )
+    table = SimpleNamespace(terms=("drag",))
+    fit = SimpleNamespace(converged=True, problem=SimpleNamespace(train=np.arange(9), table=table))
+    return lack(found, inputs, fit)[1]
+
+
+@pytest.mark.parametrize(
+    ("times_noise", "tried", "terms", "named", "flags"),
+    [
+        (3.0, None, "own", (), ""),
+        (3.1, (), "own", ("no optional term was tried",), ""),
+        (75.0, (TriedTerm("load", 8.0, 0.4, "mends"),), "own", ("75 times", "load", "95%"), "--terms drag,load"),
+        (75.0, (TriedTerm("load", 8.0, 5.0, "mends"),), "own", ("load", "--terms drag,load"), ""),
+        (75.0, (TriedTerm("load", 8.0, 7.9, "no gain"),), "own", ("none of the terms",), ""),
+        (75.0, None, "auto", ("no further term",), ""),
+    ],
+)
+def test_a_model_lacks_the_term_that_halves_its_errors(times_noise, tried, terms, named, flags, monkeypatch):
+    before = (TriedTerm("load", 8.0, 0.4, "mends"),) if terms == "auto" else ()
+    found = lacked(document(times_noise, tried=before, terms=("drag",)), monkeypatch, tried, terms=terms)
+    assert found.flags == flags
+    assert len(found.reasons) == bool(named)
+    assert all(word in found.reasons[0] for word in named)
+
+
+@pytest.mark.parametrize(
+    ("runs", "again", "named", "flags"),
+    [
+        ([], None, [], ""),
+        ([run("x[0]", 0.002), run("x[1]", 0.01)], None, ["axis is off by 2 mm, 1.0%"], ""),
+        ([run("x[0]", 0.002), run("x[1]", 0.19)], None, ["arm is off by 190 mrad, 9.5%"], ""),
+        ([run("x[0]", 0.05)], (), ["axis is off by 50 mm, 25.0%", "does not mend"], ""),  # offers no term
+        ([run("x[0]", 0.05)], 0.004, ["25.0%", "off by 4 mm"], "--terms load,direction"),
+        ([run("x[0]", 0.04), run("x[0]", 0.06, 1)], 0.004, ["off by 50 mm", "4 mm"], "--terms load,direction"),
+        ([run("x[0]", 0.05)], 0.04, ["25.0%", "direction does not mend"], ""),
+        ([run("x[0]", None)], 0.004, ["axis diverges", "4 mm"], "--terms load,direction"),
+        ([run("x[0]", 0.05)], float("nan"), ["25.0%", "direction does not mend"], ""),
+        ([run("x[0]", 0.002), run("x[0]", 0.09, model="nominal")], None, ["2 mm"], ""),
+        ([run("x[0]", 0.002), run("x[0]", 0.09, held_out=False)], None, ["2 mm"], ""),
+    ],
+)  # fmt: skip
+def test_the_worst_free_run_is_named_and_mended_where_a_term_does(runs, again, named, flags, monkeypatch):
+    found = lacked(document(1.0, *runs, terms=("load",)), monkeypatch, None, again)
+    assert found.flags == flags
+    assert len(found.reasons) == len(named)
+    assert all(word in reason for word, reason in zip(named, found.reasons, strict=True))
+
+
+def test_positions_are_compared_by_their_own_noise_and_range():
+    found = document(20.0, run("x[0]", 0.05), run("x[1]", 0.3))
+    position, ratio, noise = largest_residual(found, NOISE, [AXIS, ARM])
+    assert (position, noise) == (ARM, 1e-3)
+    assert ratio == pytest.approx(20.0)
+    # A noise of zero, as in a simulation, counts as a tenth of the assumed deviation.
+    assert largest_residual(found, (Noise("x[1]", "rad", 0.0, 0.0, 0.0),), [ARM])[2] == pytest.approx(1e-4)
+    assert largest_residual(found, (), [ARM]) is None
+    assert farthest_run(found, [AXIS, ARM]) == (AXIS, 0.05, pytest.approx(0.25))
