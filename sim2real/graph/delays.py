@@ -273,11 +273,12 @@ def _interpolate(inputs: InputState, knots: Array, query: Array, slack: float) -
     Times ``knots (W,)`` and ``query (w,)`` are relative to the reader's start [s]. A message holds from its knot on;
     ``slack`` [s] is added to the queries, so that exact ties are recognised.
     """
-    above = jnp.clip(jnp.sum(knots[None] <= query[:, None], axis=1), 1, knots.shape[0] - 1)
-    low, high = _take(knots, above - 1), _take(knots, above)
-    span = jnp.where(high > low, high - low, 1.0)
-    weight = jnp.clip((query - low) / span, 0.0, 1.0)
     held = jnp.maximum(jnp.sum(knots[None] < query[:, None] + slack, axis=1) - 1, 0)
+    above = jnp.clip(held + 1, 1, knots.shape[0] - 1)
+    low, high = _take(knots, above - 1), _take(knots, above)
+    # In a burst two messages may arrive at the same time: the value jumps, and that of the later one holds.
+    span = jnp.where(high > low, high - low, 1.0)
+    weight = jnp.where(held >= above, 1.0, jnp.clip((query - low) / span, 0.0, 1.0))
 
     def between(leaf: Array) -> Array:
         leaf = jnp.asarray(leaf)

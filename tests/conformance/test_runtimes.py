@@ -2,8 +2,10 @@
 
 import jax
 import numpy as np
+import pytest
+from contractions import contracting_node
 from oracles.conformance import Played, RuntimeConformance
-from oracles.hash_nodes import jax_hash_node
+from oracles.hash_nodes import jax_hash_node, random_graph
 from oracles.table_interpreter import interpret_hashes
 
 from sim2real.graph.episode import MemoryRecorder
@@ -59,3 +61,13 @@ class TestCompiled(RuntimeConformance):
             assert np.asarray(r.seq)[ran].tolist() == list(range(ran.sum()))
             outputs[name] = np.asarray(r.output.x)[ran]
         return Played(gs.state, defaults(nodes, supervisor)[1], outputs)
+
+
+@pytest.mark.night
+@pytest.mark.parametrize("seed", range(500))
+@pytest.mark.parametrize("runtime", [TestSimulatedClock, TestCompiled])
+def test_500_random_graphs(runtime, seed):
+    """Timing options at random; every third with trainable delays, every third with trainable delays of floats."""
+    kind = seed % 3
+    make = contracting_node if kind == 2 else runtime.make
+    runtime().check(random_graph(seed, make=make, trainable=kind > 0), seed, floats=kind == 2)

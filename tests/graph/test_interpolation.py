@@ -87,3 +87,13 @@ def test_before_the_first_message_an_integer_is_the_default():
         wide = InputState(jnp.asarray([-1, -1, 0]), stamps, stamps, jnp.asarray([7, 7, 200], jnp.uint8))
         got = dist.apply(wide, jnp.asarray([1e6, 1e6, 0.02], jnp.float32), 1, PERIOD, TS)
         assert (int(got.seq[0]), int(got.data[0])) == (-1, 7)
+
+
+@pytest.mark.parametrize(("skip", "expected"), [(False, 3.0), (True, 2.0)])
+def test_of_two_messages_that_arrive_at_once_the_later_one_holds_from_then_on(skip, expected):
+    """A burst: the second and the third message were sent at the same time, and arrive with the start."""
+    dist = TrainableDist.create(0.034, LOW, HIGH, "linear")
+    stamps = jnp.asarray([0.12, 0.166, 0.166], jnp.float32)
+    wide = InputState(jnp.arange(3), stamps, stamps + LOW, jnp.asarray([1.0, 2.0, 3.0]))
+    got = dist.apply(wide, jnp.float32(TS) - stamps, 1, PERIOD, TS, skip)
+    assert float(got.data[0]) == pytest.approx(expected)

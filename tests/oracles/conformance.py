@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from contractions import contracting_node
 from oracles.hash_nodes import MakeNode, hash_node, random_graph
 from oracles.reference import Reference
 
@@ -129,25 +130,34 @@ class RuntimeConformance(ABC):
     def test_every_step_sees_what_the_rules_say(self) -> None:
         """The hash of all messages that a node has read equals that of the reference implementation."""
         for seed in self.seeds:
-            self._check(random_graph(seed, make=type(self).make), seed)
+            self.check(random_graph(seed, make=type(self).make), seed)
 
     def test_messages_of_every_dtype_arrive_as_they_were_sent(self) -> None:
         """The same with messages of random dtypes, and trainable delays, at which integers and booleans hold."""
-        for seed in self.seeds if self.trainable else ():
-            self._check(random_graph(seed, make=type(self).make, trainable=True), seed)
+        for seed in self.seeds[:3] if self.trainable else ():
+            self.check(random_graph(seed, make=type(self).make, trainable=True), seed)
 
-    def _check(self, nodes: Mapping[str, BaseNode], seed: int) -> None:
-        timeline = draw(nodes, self.duration_s, 2, seed)
+    def test_floats_lie_between_the_messages_that_the_rules_say(self) -> None:
+        """Values of trainable delays, which interpolate, under blocking inputs and bursts."""
+        for seed in self.seeds[:3] if self.trainable else ():
+            self.check(random_graph(seed, make=contracting_node, trainable=True), seed, floats=True)
+
+    def check(self, nodes: Mapping[str, BaseNode], seed: int, floats: bool = False) -> None:
+        """Compare an episode of hash nodes, or of contractions, with the reference implementation."""
+        timeline, kind = draw(nodes, self.duration_s, 2, seed), float if floats else int
         played = self.play(nodes, "n0", timeline, seed % 2)
-        states = {n: int(x) for n, x in played.states.items()}
-        defaults = {n: int(x) for n, x in played.defaults.items()}
+        start = [{n: kind(x) for n, x in values.items()} for values in (played.states, played.defaults)]
         reference = Reference(nodes, timeline, seed % 2)
-        expected = reference.hashes(states, defaults)
-        for name, hashes in expected.items():
-            got = [int(x) for x in played.outputs.get(name, ())]
-            sent = [reference.message(name, h) for h in hashes]
-            assert got == sent[: len(got)], f"seed {seed}: node {name!r} read other messages"
-            assert len(got) >= 0.6 * len(hashes) - 3, f"seed {seed}: node {name!r} made {len(got)} steps"
+        expected = reference.floats(*start) if floats else reference.hashes(*start)
+        for name, states in expected.items():
+            got = [kind(x) for x in played.outputs.get(name, ())]
+            where = f"seed {seed}: node {name!r}"
+            if floats:
+                np.testing.assert_allclose(got, np.tanh(states)[: len(got)], atol=2e-4, err_msg=where)
+            else:
+                sent = [reference.message(name, h) for h in states]
+                assert got == sent[: len(got)], f"{where} read other messages"
+            assert len(got) >= 0.6 * len(states) - 3, f"{where} made {len(got)} steps"
 
 
 def _without_keys(tree: T) -> T:

@@ -172,7 +172,7 @@ def random_graph(
     Args:
         size: Number of nodes that are not worlds, 1 to 6; default: random.
         worlds: Number of worlds, 0 to 2; default: random.
-        trainable: Whether hash nodes have messages of random dtypes, and some connections a trainable delay.
+        trainable: Whether some connections have a trainable delay, and hash nodes messages of random dtypes.
     """
     rng = np.random.default_rng(seed)
     size = int(rng.integers(2, 5)) if size is None else size
@@ -193,7 +193,8 @@ def random_graph(
     # Make some delays trainable.
     if trainable:
         for sender in nodes:
-            sender.dtype = DTYPES[int(rng.integers(len(DTYPES)))]
+            if isinstance(sender, HashInPython):
+                sender.dtype = DTYPES[int(rng.integers(len(DTYPES)))]
         for reader in nodes:
             _make_trainable(rng, reader)
     return {n.name: n for n in nodes}
@@ -202,14 +203,15 @@ def random_graph(
 def _make_trainable(rng: np.random.Generator, reader: BaseNode) -> None:
     """Give most of a reader's connections that may have one a trainable delay, in whole milliseconds.
 
-    Floats are only read without interpolation: the hash of a number that is rounded differs from runtime to runtime.
+    Floats of hash nodes are only read without interpolation: the hash of a number that is rounded differs from runtime
+    to runtime.
     """
     for connection in reader.inputs.values():
         sender = connection.output_node
         free = not connection.blocking and connection.jitter is Jitter.LATEST
-        if not free or not isinstance(sender, HashInPython) or rng.random() < 0.2:
+        if not free or rng.random() < 0.2:
             continue
-        kinds = ["zoh"] if sender.dtype.startswith("float") else ["zoh", "linear"]
+        kinds = ["zoh"] if getattr(sender, "dtype", "").startswith("float") else ["zoh", "linear"]
         low = int(rng.integers(0, 5))
         high = low + int(rng.integers(1, 40))
         delay = int(rng.integers(low, high + 1))

@@ -1,15 +1,22 @@
 """A second, slow implementation of the timing rules, message by message in Python integers, to test schedule.py."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from functools import cached_property
+from typing import TypeVar
 
 from oracles.hash_nodes import as_message, hash_step, mix
 
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.node import BaseNode, Connection, Jitter, Scheduling
 from sim2real.graph.timeline import Timeline
+
+T = TypeVar("T")
+Windows = list[tuple[str, list[tuple[int, int, float]]]]
+"""The inputs of a step, in the order of their names: the sender, and the entries of ``Reference.window``."""
+Step = Callable[[int, T, Windows, Mapping[str, list[T]]], T]
+"""Number of the step, state before, windows, all states so far -> state after."""
 
 
 class Reference:
@@ -78,28 +85,35 @@ class Reference:
             arrivals.append(max([direct, *arrivals[-1:]]))
         return arrivals[i]
 
-    def window(self, node: str, name: str, k: int, width: int) -> list[int]:
-        """Return the messages that a step sees on an input, oldest first; -1 in empty slots (rule 7)."""
-        messages = [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k]
-        connection = self.nodes[node].inputs[name]
-        if isinstance(connection.delay_dist, TrainableDist):
-            return self._held(connection, connection.delay_dist, [-1] * width + messages, self.starts[node][k], width)
-        return ([-1] * width + messages)[-width:]
+    def window(self, node: str, name: str, k: int) -> list[tuple[int, int, float]]:
+        """Return the entries of the window that a step sees on an input, oldest first (rule 7).
 
-    def _held(self, c: Connection, dist: TrainableDist, messages: list[int], start: int, width: int) -> list[int]:
-        """Return the messages that hold when a step starts, and at the earlier times of its window."""
-        delay, ends = round(float(dist.delay) * 1e6), self.ends[c.output_node.name]
+        An entry is the message that holds; the next one; and the weight of the next one, above 0 between two messages
+        of a trainable delay with ``linear``. -1 is the default output.
+        """
+        c = self.nodes[node].inputs[name]
+        messages = [-1] * c.window + [m for m, s in enumerate(self.seq_in[node, name]) if 0 <= s <= k]
+        dist = c.delay_dist
+        if not isinstance(dist, TrainableDist):
+            return [(m, m, 0.0) for m in messages[-c.window :]]
+        delay, ends, start = round(float(dist.delay) * 1e6), self.ends[c.output_node.name], self.starts[node][k]
         before = 0 if dist.interp == "linear" else -(10**15)
-        arrival = {m: ends[m] + delay if m >= 0 else before for m in messages}
+        arrival = [ends[m] + delay if m >= 0 else before for m in messages]
 
         def last(t: int) -> int:
-            return max(i for i, m in enumerate(messages) if m < 0 or (arrival[m] < t if c.skip else arrival[m] <= t))
+            come = (m < 0 or (at < t if c.skip else at <= t) for m, at in zip(messages, arrival, strict=True))
+            return max(i for i, here in enumerate(come) if here)
 
-        newest = max(last(start), width - 1)
-        entries = range(newest - width + 1, newest + 1)
-        if dist.interp == "zoh":
-            return [messages[i] for i in entries]
-        return [messages[last(start - arrival[messages[newest]] + arrival[messages[i]])] for i in entries]
+        newest = max(last(start), c.window - 1)
+        entries = []
+        for i in range(newest - c.window + 1, newest + 1):
+            t = start - arrival[newest] + arrival[i]
+            held = last(t) if dist.interp == "linear" else i
+            following = held + 1 if dist.interp == "linear" and held + 1 < len(messages) else held
+            span = arrival[following] - arrival[held]
+            weight = min(1.0, max(0.0, (t - arrival[held]) / span)) if span else 0.0
+            entries.append((messages[held], messages[following], weight))
+        return entries
 
     def message(self, node: str, state: int) -> int:
         """Return the number that a hash node sends in a state."""
@@ -107,28 +121,49 @@ class Reference:
 
     def hashes(self, states: Mapping[str, int], outputs: Mapping[str, int]) -> dict[str, list[int]]:
         """Return the state of each hash node after each of its steps."""
-        hashes: dict[str, list[int]] = {n: [] for n in self.nodes}
-        order = sorted((self.starts[n][k], k, n) for n in self.nodes for k in range(self.count[n]))
+
+        def step(k: int, state: int, windows: Windows, made: Mapping[str, list[int]]) -> int:
+            read = []
+            for sender, entries in windows:
+                seqs = [held for held, _, _ in entries]
+                values = [self.message(sender, made[sender][m]) if m >= 0 else outputs[sender] for m in seqs]
+                read.append((seqs, values))
+            return hash_step(state, k, read)[0]
+
+        return self._play(step, states)
+
+    def floats(self, states: Mapping[str, float], outputs: Mapping[str, float]) -> dict[str, list[float]]:
+        """Return the state of each contraction (``contractions``) after each of its steps, in double precision."""
+
+        def step(k: int, state: float, windows: Windows, made: Mapping[str, list[float]]) -> float:
+            means = []
+            for sender, entries in windows:
+                pairs = [[math.tanh(made[sender][m]) if m >= 0 else outputs[sender] for m in e[:2]] for e in entries]
+                values = [a + e[2] * (b - a) for (a, b), e in zip(pairs, entries, strict=True)]
+                means.append(sum(values) / len(values))
+            return 0.5 * state + 0.4 * sum(means) / max(len(means), 1) + math.sin(1.3 * k)
+
+        return self._play(step, states)
+
+    def _play(self, step: Step[T], states: Mapping[str, T]) -> dict[str, list[T]]:
+        """Make all steps, each after those whose messages it reads; return the states after them."""
+        made: dict[str, list[T]] = {n: [] for n in self.nodes}
+        order = [
+            (k, n, [(c.output_node.name, self.window(n, i, k)) for i, c in sorted(self.nodes[n].inputs.items())])
+            for _, k, n in sorted((self.starts[n][k], k, n) for n in self.nodes for k in range(self.count[n]))
+        ]
         while order:  # steps that start at the same time may need each other's outputs: repeat until all are done
-            # A step needs its own previous hash, and those of the messages in its windows.
             waiting = []
-            for t, k, n in order:
-                windows = []
-                for i, c in sorted(self.nodes[n].inputs.items()):
-                    seqs, sender = self.window(n, i, k, c.window), c.output_node.name
-                    if seqs[-1] >= len(hashes[sender]) or len(hashes[n]) < k:
-                        break
-                    sent = (hashes[sender][m] if m >= 0 else None for m in seqs)
-                    values = [outputs[sender] if s is None else self.message(sender, s) for s in sent]
-                    windows.append((seqs, values))
+            for k, n, windows in order:
+                known = all(m < len(made[sender]) for sender, entries in windows for e in entries for m in e[:2])
+                if known and len(made[n]) == k:
+                    made[n].append(step(k, made[n][-1] if k else states[n], windows, made))
                 else:
-                    hashes[n].append(hash_step(hashes[n][-1] if k else states[n], k, windows)[0])
-                    continue
-                waiting.append((t, k, n))
+                    waiting.append((k, n, windows))
             if len(waiting) == len(order):
                 raise ValueError(f"steps wait for each other: {waiting[:4]}")
             order = waiting
-        return hashes
+        return made
 
     @cached_property
     def _phases(self) -> dict[str, int]:
