@@ -10,10 +10,9 @@ import numpy as np
 
 from sim2real.arrays import namespace
 from sim2real.later import jax, jnp
-from sim2real.robots.contract import Robot
-from sim2real.robots.control_loop.hardware import Embedded
-from sim2real.robots.control_loop.messages import JointReading
+from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
+from sim2real.robots.robot import Robot
 from sim2real.robots.servo import parameters
 from sim2real.robots.servo.drive import JointSensor, ServoDrive
 from sim2real.robots.servo.model import ComposedModel
@@ -21,6 +20,7 @@ from sim2real.robots.servo.observation import ServoAgent
 from sim2real.robots.servo.payload import Hand
 from sim2real.robots.servo.servos import Servos
 from sim2real.robots.servo.task import Aim, AimTask, uniform
+from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
 
 from .parts import JOINTS, LINK_M, SHEET, Arm

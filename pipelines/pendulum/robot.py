@@ -15,12 +15,12 @@ from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask, Session
-from sim2real.robots.control_loop.hardware import Embedded, ServoSession
-from sim2real.robots.control_loop.loop import Draw
-from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.loop import Draw
+from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.probe import Probe
+from sim2real.robots.robot import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
 from sim2real.robots.servo.agent import AgentParams
+from sim2real.robots.session import Embedded, Session
 from sim2real.types import Key, Scalar
 
 from .mjcf import HINGE, STEP_S, mjcf_of
@@ -52,9 +52,12 @@ class HingeSensor(RobotSensor):
     """The servo's encoder."""
 
     channels = (Channel("th", "thdot", position_sigma=0.002, velocity_sigma=0.05),)
-    joints = {HINGE: {"position": "th", "velocity": "thdot"}}
     units = {"th": "rad", "thdot": "rad/s"}
     at_rest = Measurement(th=np.float64(np.pi), thdot=np.float64(0.0))
+
+    @property
+    def joints(self) -> Mapping[str, Mapping[str, str]]:
+        return {HINGE: {"position": "th", "velocity": "thdot"}}
 
     def read(self, reading: Reading) -> Measurement:
         """Return the sensor's message of a reading."""
@@ -87,7 +90,7 @@ class HingeDrive(RobotDrive):
         )
         return Embedded(f"{Path(__file__).with_name('plant.py')}:PendulumPlant", emulator)
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False) -> Session:
         """Open the servo, with torque off; see ``RobotDrive.connect``."""
 
         def device(port: str) -> DynamixelServos:
@@ -97,7 +100,7 @@ class HingeDrive(RobotDrive):
 
         mounting = self._mounting or (Joint(HINGE),)
         embedded = self.embedded.mounted(mounting, zero_rad=0.0)
-        return ServoSession(port, device, self.gate(limits), embedded, truth_path, seed, mounting)
+        return Session(port, device, self.gate(limits), embedded, truth_path, seed, mounting)
 
     def make_device(self, port: str, silence_s: float) -> DynamixelServos:
         """Return the servo on a port, not opened yet; ``silence_s``: longest silence while torque is on [s]."""

@@ -11,7 +11,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameter_paths import get_leaf
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.from_model.recorded import LoggedRobot
+from sim2real.robots.identified import LoggedRobot
 from sim2real.worlds.recorded import RecordedActuator
 
 from .model import JOINTS, ArmWorld, Goal, Sensor, nominal

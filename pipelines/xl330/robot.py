@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.from_model.recorded import LoggedRobot
+from sim2real.robots.identified import LoggedRobot
 from sim2real.worlds.recorded import RecordedActuator, RecordedSensor
 
 from .model import Command, Measurement, ServoWorld

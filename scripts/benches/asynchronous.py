@@ -9,7 +9,7 @@ import jax
 
 from benches.rows import Report, Row, row
 from sim2real.graph.node import BaseNode
-from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
+from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import Clock
 from sim2real.stages.pipeline.pipeline import load_pipeline

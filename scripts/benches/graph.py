@@ -21,7 +21,7 @@ from sim2real.graph.delays import StaticDist
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
-from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
+from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.runtime.compiled.wiring import wire
 from sim2real.stages.pipeline.pipeline import load_pipeline

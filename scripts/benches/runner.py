@@ -21,10 +21,9 @@ from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, PolicyRunner
 from sim2real.policy.bundle import make_runner
-from sim2real.robots.control_loop.hardware import ServoActuator, ServoSensor
-from sim2real.robots.control_loop.loop import control_nodes
-from sim2real.robots.control_loop.messages import Goals, JointReading
-from sim2real.robots.control_loop.policy_node import PolicyNode
+from sim2real.robots.loop import control_nodes
+from sim2real.robots.messages import Goals, JointReading
+from sim2real.robots.nodes import PolicyNode, ServoActuator, ServoSensor
 from sim2real.robots.servo.agent import DirectAgent
 from sim2real.robots.walking.messages import LegCommand
 from sim2real.runtime.asynchronous import AsyncGraph

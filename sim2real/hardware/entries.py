@@ -7,7 +7,7 @@ from typing import Any, Final
 DEVICES: Final = "sim2real.devices"
 """The entry point group of devices, see `sim2real.hardware.registry`."""
 WORLDS: Final = "sim2real.worlds"
-"""The entry point group of worlds, see `sim2real.robots.worlds`."""
+"""The entry point group of worlds, see `sim2real.robots.robot`."""
 BUILT_IN: Final[Mapping[str, Mapping[str, str]]] = {
     DEVICES: {
         "dynamixel": "sim2real.hardware.dynamixel.device:servos",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 from sim2real.artifacts.run.run_folder import STAGES, attempts
 from sim2real.interop.environment import RobotEnvironment
-from sim2real.robots.contract import Robot
+from sim2real.robots.robot import Robot
 from sim2real.stages.pipeline.find_run import find_run
 from sim2real.stages.pipeline.open_parameters import open_identification
 from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline, pipeline_of

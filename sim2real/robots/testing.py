@@ -1,4 +1,4 @@
-"""For tests of robots: ``check_robot`` checks that a robot keeps the contract in ``sim2real.robots.contract``.
+"""For tests of robots: ``check_robot`` checks that a robot keeps the contract in ``sim2real.robots.robot``.
 
     def test_it_is_a_robot(tmp_path):
         check_robot(load_pipeline("mine").load(), tmp_path)
@@ -21,10 +21,9 @@ from sim2real.graph.episode import named_leaves
 from sim2real.graph.schedule import draw
 from sim2real.hardware.device import OperatingMode
 from sim2real.identify.model import IdentifiableModel
-from sim2real.robots import score_columns
-from sim2real.robots.contract import RecordedRobot, Robot
 from sim2real.robots.gate_limits import GateLimits
-from sim2real.robots.loading import checked
+from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
+from sim2real.robots.robot import RecordedRobot, Robot, as_columns, as_sent, checked
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.training.environment.graph_environment import TrainingTask
 from sim2real.training.environment.tasks import EndingTask, PrivilegedTask, terms_of
@@ -58,20 +57,20 @@ def check_identification(robot: RecordedRobot, max_delay_s: float = 0.06) -> Non
     Args:
         max_delay_s: Upper bound of delays [s].
     """
-    model, roles = robot.identifiable(max_delay_s), robot.roles
-    _hold(model.sensor == roles.sensor, f"the model's sensor is {model.sensor!r}, the robot's {roles.sensor!r}")
-    _hold(roles.actuator in model.given, f"the model is not driven by {roles.actuator!r}")
+    model = robot.identifiable(max_delay_s)
+    _hold(model.sensor == SENSOR, f"the model's sensor is {model.sensor!r}, the robot's {SENSOR!r}")
+    _hold(ACTUATOR in model.given, f"the model is not driven by {ACTUATOR!r}")
     for p in model.parameters:
         _hold(p.low <= p.nominal <= p.high, f"{p.name} = {p.nominal} is outside its bounds, {p.low} to {p.high}")
     nodes = model.nodes(max_delay_s)
-    _include(nodes, {model.sensor, *model.given, roles.world}, "nodes of the model")
+    _include(nodes, {model.sensor, *model.given, WORLD}, "nodes of the model")
     read, commanded = (
         jax.eval_shape(lambda node=nodes[name]: node.init_output(jax.random.key(0), None))
-        for name in (roles.sensor, roles.actuator)
+        for name in (SENSOR, ACTUATOR)
     )
     measured = {name for c in model.channels for name, _ in c.fields}
     _include(named_leaves(read), measured, "fields that the sensor measures")
-    commands = set(jax.tree_util.tree_leaves(model.given[roles.actuator]))
+    commands = set(jax.tree_util.tree_leaves(model.given[ACTUATOR]))
     _include(named_leaves(commanded), commands, "fields of a command")
     _include(robot.units, measured, "units")
     _check_start(model, nodes)
@@ -80,15 +79,15 @@ def check_identification(robot: RecordedRobot, max_delay_s: float = 0.06) -> Non
 def check_simulation(robot: Robot) -> None:
     """Check names, shapes and scores by an episode in simulation at the nominal values; it is compiled."""
     # Parameters and nodes.
-    roles, values, size = robot.roles, robot.nominal(), robot.agent.observation_size
+    values, size = robot.nominal(), robot.agent.observation_size
     identifiable = {p.name: p for p in robot.identifiable(0.06).parameters}
     _include(identifiable, set(values), "parameters that can be identified")
     for name, value in values.items():
         p = identifiable[name]
         _hold(p.low <= value <= p.high, f"{name} = {value} is outside its bounds")
     nodes, task = robot.training(values, {}, {}, False)
-    _include(nodes, {roles.sensor, roles.supervisor, roles.actuator, roles.world}, "nodes of the loop")
-    _hold(task.supervisor == roles.supervisor, f"the task's supervisor is {task.supervisor!r}")
+    _include(nodes, {SENSOR, AGENT, ACTUATOR, WORLD}, "nodes of the loop")
+    _hold(task.supervisor == AGENT, f"the task's supervisor is {task.supervisor!r}")
     for sign, limit in (("low", task.action_low), ("high", task.action_high)):
         limits = np.array([getattr(term, sign) for term in robot.agent.action], np.float32)
         _hold(np.shape(limit) == limits.shape, f"the task has {np.shape(limit)} actions, the robot {limits.shape}")
@@ -96,8 +95,8 @@ def check_simulation(robot: Robot) -> None:
         _hold(bool((excess <= 0).all()), f"the task's actions are outside of the robot's limits: {limit} and {limits}")
 
     # One episode, compiled.
-    graph = CompiledGraph(nodes, roles.supervisor, draw(nodes, _EPISODE_S))
-    recorded = (roles.sensor, roles.supervisor, roles.actuator)
+    graph = CompiledGraph(nodes, AGENT, draw(nodes, _EPISODE_S))
+    recorded = (SENSOR, AGENT, ACTUATOR)
 
     def episode(key: jax.Array) -> PyTree:
         gs = graph.init(key, params=robot.simulation_params(values, None, 0))
@@ -113,14 +112,14 @@ def check_simulation(robot: Robot) -> None:
     # Fields, units and score of its messages.
     outputs = {name: _ran(records[name]) for name in recorded}
     fields = {field for row in robot.sensor.joints.values() for field in row.values()}
-    measured = score_columns.as_columns(outputs[roles.sensor])
+    measured = as_columns(outputs[SENSOR])
     _include(measured, fields, "fields of joints")
-    _include(outputs[roles.actuator], {robot.drive.command}, "fields of a command")
-    _include(robot.units, {*outputs[roles.sensor], robot.drive.command}, "units")
-    command, actions = outputs[roles.actuator][robot.drive.command], len(robot.agent.action)
+    _include(outputs[ACTUATOR], {robot.drive.command}, "fields of a command")
+    _include(robot.units, {*outputs[SENSOR], robot.drive.command}, "units")
+    command, actions = outputs[ACTUATOR][robot.drive.command], len(robot.agent.action)
     width = command.reshape(len(command), -1).shape[1]
     _hold(width == actions, f"a command has {width} entries, and there are {actions} actions")
-    _check_score(robot, measured, score_columns.as_sent(robot, outputs[roles.supervisor], outputs[roles.actuator]))
+    _check_score(robot, measured, as_sent(robot, outputs[AGENT], outputs[ACTUATOR]))
 
 
 def check_embedded(robot: Robot, folder: Path, limits: GateLimits) -> None:

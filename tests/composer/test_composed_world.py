@@ -16,7 +16,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph import Base, BaseNode
 from sim2real.graph.base import GraphState
 from sim2real.graph.schedule import draw
-from sim2real.robots.control_loop.loop import DelayParams
+from sim2real.robots.loop import DelayParams
 from sim2real.runtime.compiled.graph import CompiledGraph
 
 CART = """

@@ -9,7 +9,7 @@ import pytest
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
 from sim2real.log.reader import read_log
-from sim2real.robots.control_loop.loop import BURST
+from sim2real.robots.loop import BURST
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"

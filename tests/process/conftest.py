@@ -21,8 +21,8 @@ FAULTY = """
 import time
 from dataclasses import replace
 import numpy as np
-from sim2real.robots.control_loop import hardware
-from sim2real.robots.control_loop.loop import control_nodes
+from sim2real.robots import nodes as hardware
+from sim2real.robots.loop import control_nodes
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 pendulum = load_pipeline("pendulum")

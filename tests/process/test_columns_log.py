@@ -11,10 +11,9 @@ from sim2real.hardware.clock import SYSTEM_CLOCK
 from sim2real.hardware.safety.rig import Rig
 from sim2real.log.reader import read_log
 from sim2real.log.writer import McapRecorder
-from sim2real.robots.control_loop.hardware import Excitation, ServoActuator, ServoSensor
-from sim2real.robots.control_loop.loop import control_nodes
-from sim2real.robots.control_loop.messages import Goals
-from sim2real.robots.roles import ROLES
+from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, control_nodes
+from sim2real.robots.messages import Goals
+from sim2real.robots.nodes import Excitation, ServoActuator, ServoSensor
 from sim2real.robots.walking.drive import BodySensor
 from sim2real.runtime.asynchronous import AsyncGraph
 
@@ -56,9 +55,9 @@ def test_the_log_has_every_part_and_every_column_with_its_unit(tmp_path):
         return JointCommands(goal, np.zeros(N), np.full(N, 200.0), np.full(N, 1.0), np.zeros(N))
 
     with Rig(device, gate()) as rig:
-        sensor = ServoSensor(ROLES.sensor, 50.0, rig, body.read, body.at_rest, delay=0.002)
-        player = Excitation(ROLES.supervisor, 50.0, np.zeros((20, N)), Goals, delay=0.002)
-        actuator = ServoActuator(ROLES.actuator, 50.0, rig, "goal", controllers, delay=0.002)
+        sensor = ServoSensor(SENSOR, 50.0, rig, body.read, body.at_rest, delay=0.002)
+        player = Excitation(AGENT, 50.0, np.zeros((20, N)), Goals, delay=0.002)
+        actuator = ServoActuator(ACTUATOR, 50.0, rig, "goal", controllers, delay=0.002)
         graph = AsyncGraph(control_nodes(sensor, player, actuator), player)
         state = graph.init(jax.random.key(0), {})
         graph.warmup(state)
@@ -71,10 +70,10 @@ def test_the_log_has_every_part_and_every_column_with_its_unit(tmp_path):
         graph.recorder.close("finished", 0, {})
     outputs = read_log(log).outputs
     found = read_log(log).units
-    assert found[ROLES.sensor]["gyro"] == "rad/s"
-    assert UNITS.items() <= found[ROLES.actuator].items()
-    np.testing.assert_allclose(outputs[ROLES.sensor]["gyro"][-1], [0.1, 0.2, 0.3], rtol=1e-6)
-    np.testing.assert_allclose(outputs[ROLES.sensor]["quaternion"][-1], [1.0, 0.0, 0.0, 0.0])
+    assert found[SENSOR]["gyro"] == "rad/s"
+    assert UNITS.items() <= found[ACTUATOR].items()
+    np.testing.assert_allclose(outputs[SENSOR]["gyro"][-1], [0.1, 0.2, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(outputs[SENSOR]["quaternion"][-1], [1.0, 0.0, 0.0, 0.0])
     # The gate's limit of 100 N m/rad is in the log, and on the motors.
-    np.testing.assert_allclose(outputs[ROLES.actuator]["kp"][-1], [100.0, 100.0])
+    np.testing.assert_allclose(outputs[ACTUATOR]["kp"][-1], [100.0, 100.0])
     assert any(np.all(sent[:, 2] == 100.0) for sent in device.heard)

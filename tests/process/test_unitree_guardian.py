@@ -27,10 +27,9 @@ from sim2real.hardware.safety.rig import Rig
 from sim2real.hardware.unitree.device import UnitreeLegs
 from sim2real.hardware.unitree.legs import LegDrive
 from sim2real.log.writer import McapRecorder
-from sim2real.robots.control_loop.hardware import Excitation, ServoActuator, ServoSensor
-from sim2real.robots.control_loop.loop import control_nodes
-from sim2real.robots.control_loop.messages import Goals
-from sim2real.robots.roles import ROLES
+from sim2real.robots.nodes import Excitation, ServoActuator, ServoSensor
+from sim2real.robots.loop import control_nodes
+from sim2real.robots.messages import Goals
 from sim2real.robots.walking.drive import BodySensor
 from sim2real.robots.walking.messages import leg_command
 from sim2real.runtime.asynchronous import AsyncGraph
@@ -46,9 +45,9 @@ stood = np.clip(np.arange(3000) / 30.0, 0.0, 1.0)[:, None]
 goals = LYING + stood * (np.array([0.0, 0.8, -1.5] * 4) - LYING)
 
 with Rig(device, gate) as rig:
-    sensor = ServoSensor(ROLES.sensor, 50.0, rig, body.read, body.at_rest, delay=0.002)
-    player = Excitation(ROLES.supervisor, 50.0, goals, Goals, delay=0.002)
-    actuator = ServoActuator(ROLES.actuator, 50.0, rig, "goal", lambda q: leg_command(q, 60.0, 4.0), delay=0.002)
+    sensor = ServoSensor(SENSOR, 50.0, rig, body.read, body.at_rest, delay=0.002)
+    player = Excitation(AGENT, 50.0, goals, Goals, delay=0.002)
+    actuator = ServoActuator(ACTUATOR, 50.0, rig, "goal", lambda q: leg_command(q, 60.0, 4.0), delay=0.002)
     graph = AsyncGraph(control_nodes(sensor, player, actuator), player)
     state = graph.init(jax.random.key(0), {{}})
     graph.warmup(state)

@@ -8,8 +8,8 @@ import numpy as np
 
 from sim2real import composer
 from sim2real.graph.base import GraphState, InputState, StepState
-from sim2real.robots.contract import Robot
-from sim2real.robots.control_loop.messages import EpisodeStart, Goals
+from sim2real.robots.messages import EpisodeStart, Goals
+from sim2real.robots.robot import Robot
 from sim2real.robots.servo.datasheet import DataSheet
 from sim2real.robots.servo.drive import JointSensor, ServoDrive
 from sim2real.robots.servo.model import ComposedModel

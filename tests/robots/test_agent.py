@@ -9,7 +9,7 @@ from oracles.conformance import NodeConformance
 
 from sim2real.graph import BaseNode
 from sim2real.graph.base import GraphState, InputState, StepState
-from sim2real.robots.control_loop.messages import Goals, JointReading
+from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.servo.agent import AgentParams, DirectAgent, GoalAgent
 
 LOW, HIGH, RATE_HZ = np.array([-1.0, -0.5]), np.array([0.8, 1.2]), 50.0

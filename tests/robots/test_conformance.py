@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sim2real.robots import testing
-from sim2real.robots.roles import Roles
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 
@@ -44,13 +43,12 @@ def too_strong(robot, values, draws, computation, delays):
     ("part", "changes", "message"),
     [
         (None, {"units": {"action": "V"}}, "units: there are action, but not th, thdot"),
-        (None, {"roles": Roles(world="plant")}, "nodes of the model: there are .* but not plant"),
         (None, {"nominal": lambda _: {"gain": 1e9}}, "gain = 1000000000.0 is outside its bounds"),
         (None, {"nominal": lambda _: {"mass": 1.0}}, "parameters that can be identified: .* but not mass"),
         (None, {"training": too_strong}, "are outside of the robot's limits"),
         (
             "sensor",
-            {"joints": {"hinge": {"position": "angle"}}},
+            {"joints": property(lambda _: {"hinge": {"position": "angle"}})},
             "fields of joints: there are th, thdot, but not angle",
         ),
         ("task", {"score": lambda _, t_s, states: {"success": np.nan}}, "success is nan, not a share"),

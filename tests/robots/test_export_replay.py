@@ -22,7 +22,7 @@ from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.identify.problem.problem import Problem
 from sim2real.identify.problem.segments import Span
-from sim2real.robots.from_model.recorded import LoggedRobot
+from sim2real.robots.identified import LoggedRobot
 from sim2real.worlds.mjx import MjxWorld
 from sim2real.worlds.recorded import RecordedActuator, command_delay
 

@@ -1,6 +1,5 @@
 """A servo robot on hardware: the real nodes, rig and bus, on the arm's embedded robot."""
 
-from copy import copy
 from dataclasses import asdict, dataclass, replace
 from types import SimpleNamespace
 
@@ -12,9 +11,9 @@ from sim2real.emulation.truth import Kind, read_truth
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
-from sim2real.robots.control_loop.hardware import Excitation
-from sim2real.robots.control_loop.messages import Goals
 from sim2real.robots.gate_limits import GateLimits
+from sim2real.robots.messages import Goals
+from sim2real.robots.nodes import Excitation
 from sim2real.stages.on_robot.episode import run_episode
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -210,13 +209,11 @@ def test_a_robot_without_an_embedded_twin_has_no_such_port(pair, tmp_path):
 @pytest.mark.parametrize("name", ["go2", "so101", "arm", "pendulum"])
 def test_no_command_leaps_where_a_recording_outlasts_its_excitation(name):
     """A Go2 on its feet was told to stretch all legs for the last one or two steps of each log of its load."""
-    robot = copy(moving_robot(load_pipeline(name)))
-    robot.drive = copy(robot.drive)
-    robot.drive.on_feet = name == "go2"
+    robot = moving_robot(load_pipeline(name))
     rest = SimpleNamespace(position_rad=np.full(len(robot.agent.action), 0.1))
     session = SimpleNamespace(rig=SimpleNamespace(measure=lambda: rest, wait_until_still=lambda *_: rest))
     signal = 0.5 + 0.1 * np.linspace(0.0, 1.0, 100)[:, None] * np.ones(len(robot.agent.action))
-    agent = robot.recording_nodes(session, signal)["agent"]
+    agent = robot.recording_nodes(session, signal, standing=name == "go2")["agent"]
     played = np.array([getattr(agent.step(SimpleNamespace(seq=k))[1], robot.drive.command) for k in range(200)])
     assert np.abs(np.diff(played[98:], axis=0)).max() < 0.03
     np.testing.assert_array_equal(played[-50:], np.tile(played[-1], (50, 1)))
@@ -225,5 +222,5 @@ def test_no_command_leaps_where_a_recording_outlasts_its_excitation(name):
 def test_an_excitation_of_no_numbers_is_refused():
     signal = np.zeros((4, 3))
     signal[2, 1] = np.nan
-    with pytest.raises(UsageError, match="no numbers"):
+    with pytest.raises(UsageError, match="not finite"):
         Excitation("agent", 50.0, signal, Goals)

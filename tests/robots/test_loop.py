@@ -11,7 +11,7 @@ from sim2real.graph.node import BaseWorld
 from sim2real.graph.schedule import derive, draw
 from sim2real.graph.windows import bursty_episodes, make_room, newest_message
 from sim2real.identify.parameters import ParameterTable
-from sim2real.robots.control_loop.loop import (
+from sim2real.robots.loop import (
     BURST,
     DELAYS,
     DelayParams,
@@ -20,10 +20,10 @@ from sim2real.robots.control_loop.loop import (
     delay_of,
     delay_parameters,
     draw_values,
-    drawn_in_a_loop,
-    in_a_loop,
     recorded_loop,
     simulated_loop,
+    split_delay,
+    split_drawn_delay,
 )
 
 TICK_S, SPREAD_S, LEAD_S = 0.01, 0.002, 0.00125
@@ -74,11 +74,11 @@ def test_delays_to_identify_may_be_as_short_as_any_robots():
 )
 def test_a_closed_loop_gets_the_round_trip_as_it_can_simulate_it(delays, expected):
     values = dict(zip(DELAYS, delays, strict=True)) | {"gain": 2.0}
-    found = in_a_loop(values, TICK_S, SPREAD_S)
+    found = split_delay(values, TICK_S, SPREAD_S)
     assert [found[n] for n in DELAYS] == pytest.approx(expected)
     assert sum(found[n] for n in DELAYS) == pytest.approx(sum(delays))
     assert found["gain"] == 2.0
-    assert in_a_loop({"gain": 2.0}, TICK_S, SPREAD_S) == {"gain": 2.0}
+    assert split_delay({"gain": 2.0}, TICK_S, SPREAD_S) == {"gain": 2.0}
 
 
 def test_a_delay_comes_from_the_nodes_parameters_where_they_have_one():
@@ -90,7 +90,7 @@ def test_a_delay_comes_from_the_nodes_parameters_where_they_have_one():
 
 
 def test_delays_are_drawn_with_the_dynamics_and_their_sum_is_kept():
-    found = drawn_in_a_loop(VALUES, {"gain": np.arange(3.0), **LATE}, TICK_S, SPREAD_S)
+    found = split_drawn_delay(VALUES, {"gain": np.arange(3.0), **LATE}, TICK_S, SPREAD_S)
     np.testing.assert_allclose(found["sensor_delay"] + found["actuator_delay"], [0.016, 0.023, 0.005])
     # What the loop's sensor needs, as long as the sum has it.
     np.testing.assert_allclose(found["sensor_delay"], [0.013, 0.013, 0.005])
@@ -100,7 +100,7 @@ def test_delays_are_drawn_with_the_dynamics_and_their_sum_is_kept():
     row = drawn["gain"].astype(int)
     for name in DELAYS:
         np.testing.assert_allclose(drawn[name], found[name][row], rtol=1e-6)
-    assert drawn_in_a_loop(VALUES, {"gain": np.arange(3.0)}, TICK_S, SPREAD_S).keys() == {"gain"}
+    assert split_drawn_delay(VALUES, {"gain": np.arange(3.0)}, TICK_S, SPREAD_S).keys() == {"gain"}
 
 
 @pytest.mark.parametrize("draws", [{}, LATE])

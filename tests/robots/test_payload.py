@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from sim2real.emulation.plant import load_plant
-from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.loop import WORLD
+from sim2real.robots.messages import EpisodeStart
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.shared.identification import with_wanted_terms
 
@@ -20,7 +21,7 @@ def arm():
 def at_zero(robot, values):
     """Return the world's parameters of a robot at rest at 0."""
     still = np.zeros(len(robot.drive.servos.joints))
-    return robot.model.params(values, EpisodeStart(still, still, np.zeros(robot.task.aim_size)))
+    return robot.model.params(values, EpisodeStart(still, still, np.zeros(len(robot.task.aim.entries))))
 
 
 def free(table):
@@ -40,7 +41,7 @@ def test_a_payload_is_identified_where_it_is_asked_for_and_always_watched(arm):
 def test_a_hand_weighs_something_whatever_it_holds(arm):
     for robot in (arm, load_pipeline("so101").load()):
         lightest = robot.model.place(
-            robot.nominal() | {"payload": robot.model.hand.least_kg}, np.zeros(robot.task.aim_size)
+            robot.nominal() | {"payload": robot.model.hand.least_kg}, np.zeros(len(robot.task.aim.entries))
         )
         assert lightest["mass of the hand"][0] > 0.005
 
@@ -51,8 +52,8 @@ def test_it_is_the_point_mass_that_the_plant_carries(name):
     robot, carried_kg = load_pipeline(name).load(), 0.1
     model, start = robot.watched(0.06), jnp.zeros(2 * len(robot.drive.servos.joints))
     values = {p.name: jnp.float32(p.nominal) for p in model.parameters} | {"payload": jnp.float32(carried_kg)}
-    world = model.nodes(0.06)[robot.roles.world]
-    found = world._model(model.params(values, start)[robot.roles.world])
+    world = model.nodes(0.06)[WORLD]
+    found = world._model(model.params(values, start)[WORLD])
     plant = load_plant(robot.drive.embedded.plant, {"carried_kg": carried_kg}).model
     carried = plant.body("carried").id
     hand = int(plant.body_parentid[carried])

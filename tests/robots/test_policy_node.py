@@ -8,7 +8,8 @@ import pytest
 from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.policy import ActionTerm, PolicyContract
 from sim2real.policy.bundle import make_runner
-from sim2real.robots.control_loop.policy_node import PolicyNode, in_numpy
+from sim2real.robots.loop import SENSOR
+from sim2real.robots.nodes import PolicyNode, in_numpy
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.training.networks.policy import Policy
 
@@ -48,7 +49,7 @@ def steps_of(node, robot, policy):
     for k in range(STEPS):
         reading = jax.tree_util.tree_map(lambda x, k=k: np.asarray(x, np.float32)[None] + 0.1 * k, robot.sensor.at_rest)
         seen = InputState(np.array([k], np.int32), none, none, reading)
-        state, message = node.step(state.replace(inputs={robot.roles.sensor: seen}, seq=np.int32(k)))
+        state, message = node.step(state.replace(inputs={SENSOR: seen}, seq=np.int32(k)))
         messages.append(message)
     return messages, state
 

@@ -9,7 +9,7 @@ import pytest
 from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.graph.episode import named_leaves
-from sim2real.robots.control_loop.messages import Decision, EpisodeStart
+from sim2real.robots.messages import Decision, EpisodeStart
 from sim2real.robots.servo import parameters
 from sim2real.robots.servo.datasheet import DataSheet
 

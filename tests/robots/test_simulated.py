@@ -12,8 +12,8 @@ from sim2real.artifacts.identification import Noise
 from sim2real.composer.physics.mjx.environment import State
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
-from sim2real.robots.control_loop.loop import DelayParams
-from sim2real.robots.control_loop.messages import Decision, JointReading
+from sim2real.robots.loop import DelayParams
+from sim2real.robots.messages import Decision, JointReading
 from sim2real.robots.servo.agent import AgentParams
 from sim2real.robots.servo.simulated_world import SimActuator, SimSensor
 

@@ -9,7 +9,7 @@ import pytest
 from small_robot import VALUES
 
 from sim2real.graph.schedule import draw
-from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.messages import EpisodeStart
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.training.environment.graph_environment import GraphEnvironment
 
@@ -33,7 +33,7 @@ def loop(pair):
 def trained(pair, loop):
     """Half a second in which the goals move at one speed; MJX compiles for 20 s, so its tests run at night."""
     nodes, task = loop
-    graph = CompiledGraph(nodes, pair.roles.supervisor, draw(nodes, 0.5))
+    graph = CompiledGraph(nodes, "agent", draw(nodes, 0.5))
     env = GraphEnvironment(graph, task)
 
     def run(key):

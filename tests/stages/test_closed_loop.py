@@ -21,7 +21,7 @@ from sim2real.artifacts.run.iterations import Iterations
 from sim2real.artifacts.run.run_folder import STAGES, attempts, finished, open_stage
 from sim2real.commands.flags import RunFlags
 from sim2real.commands.loop import retry, run_loop
-from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.robots.loop import DELAYS
 from sim2real.stages.deploy.verdict import judge
 from sim2real.stages.pipeline.pipeline import load_pipeline
 

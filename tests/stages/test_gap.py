@@ -14,8 +14,7 @@ from sim2real.graph.base import Base
 from sim2real.graph.episode import Episode, MemoryRecorder, MessageRecord, StepRecord, Steps
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
-from sim2real.robots.control_loop.loop import control_nodes
-from sim2real.robots.roles import ROLES
+from sim2real.robots.loop import control_nodes
 from sim2real.stages.deploy import simulation_gap, simulations
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -61,7 +60,7 @@ def test_the_arms_score_reads_them(states):
 
 def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
     """One message of the recording is used 80 ms late; simulated timelines have 2 ms everywhere."""
-    robot = SimpleNamespace(roles=ROLES)
+    robot = SimpleNamespace()
     recorder = MemoryRecorder()
     for k in range(50):
         begin = 20_000 * k + (80_000 if k == 30 else 0)

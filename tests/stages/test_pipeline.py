@@ -7,7 +7,7 @@ from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import available, load_pipeline, pipeline_of
 
 ROBOT = """
-from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.robot import RecordedRobot
 
 class Robot(RecordedRobot):
     units = {{"about": {about!r}}}
@@ -48,14 +48,14 @@ def test_the_robot_is_an_object_of_its_module(tmp_path, monkeypatch):
     [
         ("UNITS = {}\ndef identifiable(max_delay_s): ...\n", "is missing"),
         ("class Mine: ...\nROBOT = Mine()\n", "Mine object"),
-        ("from sim2real.robots.contract import RecordedRobot as ROBOT\n", "RecordedRobot"),
+        ("from sim2real.robots.robot import RecordedRobot as ROBOT\n", "RecordedRobot"),
     ],
 )
 def test_a_module_without_a_robot_says_how_to_write_one(tmp_path, monkeypatch, text, said):
     name = f"no_robot_{len(said)}"
     write(tmp_path, name, robot=text)
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UsageError, match=f"ROBOT of pipeline .*{said}.*sim2real.robots.contract.Robot") as caught:
+    with pytest.raises(UsageError, match=f"ROBOT of pipeline .*{said}.*sim2real.robots.robot.Robot") as caught:
         load_pipeline(name).load()
     assert "end with `ROBOT = MyRobot()`" in (caught.value.hint or "")
 

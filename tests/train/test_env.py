@@ -8,6 +8,7 @@ from advantages import slow
 
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
+from sim2real.robots.loop import AGENT
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.training.environment.graph_environment import GraphEnvironment
@@ -35,7 +36,7 @@ def robot():
 @pytest.fixture(scope="module")
 def env(robot):
     nodes, task = robot.training(robot.nominal(), {}, {}, False)
-    return GraphEnvironment(CompiledGraph(nodes, robot.roles.supervisor, draw(nodes, 0.6)), task)
+    return GraphEnvironment(CompiledGraph(nodes, AGENT, draw(nodes, 0.6)), task)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from sim2real.artifacts.episodes import Episodes
 from sim2real.errors import UsageError
 from sim2real.graph.node import BaseNode
 from sim2real.graph.schedule import draw
+from sim2real.robots.loop import AGENT
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.train.show import training_summary
@@ -39,7 +40,7 @@ def loop(robot):
     """The graph and the task of a pendulum whose gain differs, with a noisy sensor's parameters."""
     values = robot.nominal()
     nodes, task = robot.training(values, {"gain": values["gain"] + np.array([-4.0, 4.0])}, {}, False)
-    return nodes, task, CompiledGraph(nodes, robot.roles.supervisor, draw(nodes, 0.2))
+    return nodes, task, CompiledGraph(nodes, AGENT, draw(nodes, 0.2))
 
 
 @pytest.fixture

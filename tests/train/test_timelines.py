@@ -7,7 +7,7 @@ from sim2real.artifacts.timing import NodeTiming, Spread, Timing
 from sim2real.errors import Sim2RealError
 from sim2real.graph.node import TICKS_PER_S, BaseNode, BaseWorld
 from sim2real.graph.schedule import draw
-from sim2real.robots.control_loop.loop import delay_bounds, simulated_loop
+from sim2real.robots.loop import delay_bounds, simulated_loop
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.runtime.compiled.wiring import wire
 from sim2real.training.environment.timelines import RecordedTiming, Stretches, draw_timelines

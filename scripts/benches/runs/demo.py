@@ -11,7 +11,6 @@ from benches.rows import Report, Row, markdown, row
 from benches.runs import stages
 
 from sim2real.artifacts.recording import Recording
-from sim2real.robots.roles import ROLES
 from sim2real.stages.identify.true_values import true_values
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -85,7 +84,7 @@ def prediction_ratio(log: Path, truth: Path, predictions: Path) -> tuple[float, 
         Ratio, RMSE of the identified model, RMSE of the true model [rad].
     """
     recording = Recording.load(log, truth)
-    episode, true = recording.episode, true_values(recording, ROLES)
+    episode, true = recording.episode, true_values(recording)
     samples = np.load(predictions)
     plant_class = load_pipeline("pendulum").load("plant").PendulumPlant
     ours, theirs = [], []

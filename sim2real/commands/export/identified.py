@@ -24,7 +24,8 @@ from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
 from sim2real.installation import version
 from sim2real.log.reader import read_log
-from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.loop import SENSOR
+from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
 from sim2real.stages.pipeline.from_model import pipeline_beside
 from sim2real.stages.pipeline.pipeline import Pipeline, available
@@ -151,7 +152,7 @@ def write_model_card(
     plain = robot.plain_simulation({p.name: p.nominal for p in model.parameters} | values_of(identification))
     about = [row for row in about if row[0] != "log"]  # a path of the own machine is no part of a card
     delays = find_delays(identification, {p.name: p.side for p in model.parameters})
-    session = _session(identification, robot.roles.sensor, run_dir)
+    session = _session(identification, SENSOR, run_dir)
     card, signals = write_card(folder, identification, model, plain, terms, delays, about, session)
     for sentence in [*card["notes"], *differing(folder)]:
         note(sentence)

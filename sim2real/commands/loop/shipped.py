@@ -14,7 +14,7 @@ def why_shipped(pipeline: Pipeline) -> str:
         return ""
     import jax
 
-    from sim2real.robots.contract import Robot
+    from sim2real.robots.robot import Robot
 
     robot = pipeline.load()
     if not isinstance(robot, Robot) or not robot.model.needs_gpu or jax.default_backend() == "gpu":

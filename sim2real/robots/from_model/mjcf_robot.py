@@ -53,7 +53,8 @@ from sim2real.robots.from_model.mjcf_parameters import (
 )
 from sim2real.robots.from_model.plain import driven_simulation
 from sim2real.robots.from_model.reached import Recordings, reached
-from sim2real.robots.from_model.recorded import IdentifiableRecording, LoggedRobot
+from sim2real.robots.identified import IdentifiableRecording, LoggedRobot
+from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.types import PyTree, Scalar
 from sim2real.worlds.driven import OF_PAYLOAD, DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
@@ -218,8 +219,8 @@ class MjcfRobot(LoggedRobot):
         Raises:
             UsageError: When a joint moves further than its range is wide.
         """
-        position, file = np.asarray(outputs[self.roles.sensor]["position"], np.float64), self.config.model.name
-        check_payload(outputs.get(self.roles.actuator, {}), self.config.commands)
+        position, file = np.asarray(outputs[SENSOR]["position"], np.float64), self.config.model.name
+        check_payload(outputs.get(ACTUATOR, {}), self.config.commands)
         beyond = beyond_ranges(self.model, self.config.joints, position, file)
         return [*beyond, *open_loops(self.make_nodes()[2].gaps, position, self.config.joints, file)]
 
@@ -352,7 +353,7 @@ class IdentifiableMjcf(IdentifiableRecording):
 
     def loaded(self, params: dict[str, PyTree], first: Mapping[str, PyTree]) -> dict[str, PyTree]:
         """Return node parameters with the payload of a log's first command; see ``identify.model.CarriesPayload``."""
-        command = first[self._robot.roles.actuator]
+        command = first[ACTUATOR]
         return {**params, "world": self._world.holding(params["world"], command)}
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:

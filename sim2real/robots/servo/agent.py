@@ -13,8 +13,8 @@ from sim2real import pytree
 from sim2real.arrays import namespace
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode, NodeOptions
-from sim2real.robots.control_loop.messages import Decision, JointReading
-from sim2real.robots.roles import ROLES
+from sim2real.robots.loop import SENSOR
+from sim2real.robots.messages import Decision, JointReading
 from sim2real.types import Array, Key, PyTree
 
 Features = Callable[[JointReading, Array, Array], Array]
@@ -89,7 +89,7 @@ class GoalAgent(BaseNode):
         features: Features,
         history: int,
         aims: int,
-        sensor: str = ROLES.sensor,
+        sensor: str = SENSOR,
         **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
@@ -172,7 +172,7 @@ class DirectAgent(BaseNode):
         sizes: tuple[int, int],
         history: int,
         message: Callable[[PyTree], PyTree],
-        sensor: str = ROLES.sensor,
+        sensor: str = SENSOR,
         **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)

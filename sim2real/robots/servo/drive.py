@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sim2real.identify.model import Channel
-from sim2real.robots.contract import RobotDrive, RobotSensor, Session
-from sim2real.robots.control_loop.hardware import Embedded, ServoSession
-from sim2real.robots.control_loop.messages import EpisodeStart, Goals, JointReading
+from sim2real.robots.loop import ACTUATOR
+from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.probe import Probe
-from sim2real.robots.roles import ROLES
+from sim2real.robots.robot import RobotDrive, RobotSensor
 from sim2real.robots.servo.homing import HOME_RAD_S, bring_home
 from sim2real.robots.servo.servos import Servos
+from sim2real.robots.session import Embedded, Session
 
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
@@ -38,9 +38,6 @@ class JointSensor(RobotSensor):
         self.channels = tuple(
             Channel("position", "velocity", *sigmas, index=i, label=name, goal="goal") for i, name in enumerate(names)
         )
-        self.joints = {
-            name: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, name in enumerate(names)
-        }
         self.at_rest = JointReading(servos.at_rest, np.zeros(len(names)))
 
     def read(self, reading: Reading) -> JointReading:
@@ -67,9 +64,8 @@ class ServoDrive(RobotDrive):
         probe: Probe | None = None,
         embedded: Callable[[], Embedded | None] | None = None,
         settings: Callable[[str], Any] | None = None,
-        actuator: str = ROLES.actuator,
     ) -> None:
-        self.servos, self.rate_hz, self.probe, self._actuator = servos, rate_hz, probe, actuator
+        self.servos, self.rate_hz, self.probe = servos, rate_hz, probe
         self._embedded, self._settings = embedded, settings
 
     @property
@@ -77,7 +73,7 @@ class ServoDrive(RobotDrive):
         """The emulated robot, for the port ``embedded``."""
         return self._embedded() if self._embedded else None
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False) -> Session:
         """Open the servos, with torque off; see ``RobotDrive.connect``."""
         settings = self._settings(port) if self._settings else self.servos.sheet.drive
 
@@ -87,7 +83,7 @@ class ServoDrive(RobotDrive):
         # Position 0 of a plain joint is where the servo's encoder is at half a turn.
         embedded, mounting = self.embedded, self.servos.mounting
         embedded = embedded and embedded.mounted(mounting, math.pi)
-        return ServoSession(port, device, self.gate(limits), embedded, truth_path, seed, mounting)
+        return Session(port, device, self.gate(limits), embedded, truth_path, seed, mounting)
 
     def make_device(self, port: str, settings: Any, silence_s: float) -> Device:
         """Return the servos on a port, not opened yet; ``silence_s``: longest silence while torque is on [s]."""
@@ -100,7 +96,7 @@ class ServoDrive(RobotDrive):
         """Return a gate that holds the last goals when commands are stale."""
         s = self.servos
         low, high = np.maximum(s.low, -limits.limit), np.minimum(s.high, limits.limit)
-        return limits.gate((tuple(low), tuple(high)), stale="hold", node=self._actuator, joints=s.names)
+        return limits.gate((tuple(low), tuple(high)), stale="hold", node=ACTUATOR, joints=s.names)
 
     def prepare(self, session: Session, settle_s: float) -> None:
         """Bring the joints to rest, slowly; torque is off before and afterwards.
@@ -115,13 +111,9 @@ class ServoDrive(RobotDrive):
         """Return goals ``(N, joints)`` [rad] of an excitation around the middle positions."""
         return signal + np.asarray(self.servos.middle or 0.0)
 
-    def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
-        """Return goals ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s instead of in a leap."""
-        return approached(self.around(signal), session.rig.measure().position_rad, self.rate_hz)
-
-    def measured_start(self, session: Session, start: EpisodeStart) -> EpisodeStart:
-        """Return a start at the measured positions: goals start there."""
-        return start.replace(position=np.asarray(session.rig.measure().position_rad, np.float32))
+    def approach(self, session: Session, commands: np.ndarray) -> np.ndarray:
+        """Return goals ``(N, joints)`` [rad]: joints move to the first ones at 1 rad/s instead of in a leap."""
+        return approached(commands, session.rig.measure().position_rad, self.rate_hz)
 
 
 def approached(goals: np.ndarray, position_rad: np.ndarray, rate_hz: float) -> np.ndarray:

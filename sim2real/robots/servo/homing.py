@@ -5,7 +5,7 @@ import time
 import numpy as np
 
 from sim2real.errors import SafetyStop
-from sim2real.robots.robot_parts import Session
+from sim2real.robots.robot import Session
 from sim2real.robots.servo.servos import Servos
 
 HOME_RAD_S = 1.0

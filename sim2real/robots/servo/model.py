@@ -15,15 +15,15 @@ from sim2real.errors import UsageError
 from sim2real.identify.export.plain import PlainSimulation, converged
 from sim2real.identify.parameters import Parameter
 from sim2real.later import at_once, jnp
-from sim2real.robots.contract import RobotModel
-from sim2real.robots.control_loop.hardware import Embedded
-from sim2real.robots.control_loop.messages import EpisodeStart
-from sim2real.robots.roles import ROLES, Roles
+from sim2real.robots.loop import ACTUATOR, WORLD
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import RobotModel
 from sim2real.robots.servo import parameters
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.robots.servo.payload import PAYLOAD, Hand
 from sim2real.robots.servo.servos import Servos, gear_of
 from sim2real.robots.servo.task import NO_AIM, Aim
+from sim2real.robots.session import Embedded
 from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
@@ -51,10 +51,9 @@ class ComposedModel(RobotModel):
         hand: Hand | None = None,
         dynamics: Callable[[], list[Parameter]] | None = None,
         causes: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
-        roles: Roles = ROLES,
     ) -> None:
         self.servos, self.make_task, self.aim, self.hand, self.causes = servos, make_task, aim, hand, causes
-        self._dynamics, self._roles = dynamics, roles
+        self._dynamics = dynamics
         self.profile_rad_s = servos.sheet.profile_rad_s
         self.watched_terms = (PAYLOAD,) if hand else ()
 
@@ -100,8 +99,8 @@ class ComposedModel(RobotModel):
         """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
         from sim2real.robots.servo.plain_world import servo_world  # record imports no physics
 
-        fields, worn, roles = self.fields(self.task), self.servos.sheet.worn, self._roles
-        return servo_world(roles.world, self.task, fields, resumed, roles.actuator, worn)
+        fields, worn = self.fields(self.task), self.servos.sheet.worn
+        return servo_world(WORLD, self.task, fields, resumed, ACTUATOR, worn)
 
     def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
         """Return the world's parameters for an episode."""

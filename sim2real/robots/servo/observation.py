@@ -9,9 +9,9 @@ import numpy as np
 from sim2real.arrays import namespace
 from sim2real.graph.node import NodeOptions
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.contract import RobotAgent
-from sim2real.robots.control_loop.messages import EpisodeStart, JointReading
-from sim2real.robots.roles import ROLES, Roles
+from sim2real.robots.loop import AGENT, SENSOR
+from sim2real.robots.messages import EpisodeStart, JointReading
+from sim2real.robots.robot import RobotAgent
 from sim2real.robots.servo.agent import AgentParams, GoalAgent
 from sim2real.robots.servo.servos import Servos
 from sim2real.robots.servo.task import NO_AIM, Aim
@@ -46,9 +46,8 @@ class ServoAgent(RobotAgent):
         features: tuple[Feature, ...] | None = None,
         observe: Observe | None = None,
         history: int = 3,
-        roles: Roles = ROLES,
     ) -> None:
-        self._servos, self._aim, self.history, self._roles = servos, aim, history, roles
+        self._servos, self._aim, self.history = servos, aim, history
         self.observe = observe or observe_all
         self.observation = servo_terms(servos, aim.entries, features, history)
         speed, names = servos.speed, servos.names
@@ -59,10 +58,8 @@ class ServoAgent(RobotAgent):
 
     def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> GoalAgent:
         """Return the policy's node."""
-        s, roles, aims = self._servos, self._roles, len(self._aim.entries)
-        return GoalAgent(
-            roles.supervisor, rate_hz, s.low, s.high, self.observe, self.history, aims, roles.sensor, **options
-        )
+        s, aims = self._servos, len(self._aim.entries)
+        return GoalAgent(AGENT, rate_hz, s.low, s.high, self.observe, self.history, aims, SENSOR, **options)
 
     def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
         """Return the node's parameters: goals start at the joints' positions."""

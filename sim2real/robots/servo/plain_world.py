@@ -17,8 +17,8 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, StepState
 from sim2real.graph.node import BaseWorld
 from sim2real.installation import has_jax
-from sim2real.robots.control_loop.loop import delay_of
-from sim2real.robots.control_loop.messages import JointReading
+from sim2real.robots.loop import delay_of
+from sim2real.robots.messages import JointReading
 from sim2real.robots.servo.parameters import STRIBECK
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.types import Key, MjModel, PyTree

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, Value
-from sim2real.robots.control_loop.messages import JointReading
-from sim2real.robots.control_loop.simulated_devices import SimActuator, SimSensor
-from sim2real.robots.roles import ROLES
+from sim2real.robots.loop import ACTUATOR
+from sim2real.robots.messages import JointReading
+from sim2real.robots.nodes import SimActuator, SimSensor
 from sim2real.robots.servo.parameters import STRIBECK
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.types import Array, Key, PyTree
@@ -38,7 +38,7 @@ class ServoWorld(ComposedWorld):
         task: GoalTask,
         parameters: Mapping[str, tuple[PyTree, str]],
         resumed: bool = False,
-        actuator: str = ROLES.actuator,
+        actuator: str = ACTUATOR,
         worn: bool = False,
         **options: Any,
     ) -> None:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim2real.later import jax, jnp
-from sim2real.robots.contract import RobotTask
-from sim2real.robots.control_loop.loop import Draw
-from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.loop import Draw
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import RobotTask
 from sim2real.robots.servo.servos import Servos
 from sim2real.training.environment.tasks import Rewards
 from sim2real.types import Array, Key, PyTree
@@ -66,7 +66,7 @@ class AimTask(RobotTask):
         score: Callable[[np.ndarray, Mapping[str, np.ndarray]], dict[str, float]],
         reward: Callable[[PyTree, jax.Array], Rewards] | None = None,
     ) -> None:
-        self._servos, self.aim, self.aim_size = servos, aim, len(aim.entries)
+        self._servos, self.aim = servos, aim
         self._success, self._score, self._reward = success, score, reward
 
     def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], EpisodeStart]:

@@ -14,9 +14,9 @@ from sim2real.arrays import namespace
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.contract import RobotAgent
-from sim2real.robots.control_loop.messages import EpisodeStart
-from sim2real.robots.roles import ROLES
+from sim2real.robots.loop import AGENT, SENSOR
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import RobotAgent
 from sim2real.robots.servo.agent import AgentParams, decide, first_carry
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.messages import BodyReading, WalkDecision, gravity_of
@@ -64,7 +64,7 @@ class WalkingNode(BaseNode):
         scale: float,
         history: int,
         commands: Commands,
-        sensor: str = ROLES.sensor,
+        sensor: str = SENSOR,
         **options: Unpack[NodeOptions],
     ) -> None:
         super().__init__(name, rate, **options)
@@ -146,9 +146,7 @@ class WalkingAgent(RobotAgent):
 
     def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> WalkingNode:
         """Return the policy's node."""
-        return WalkingNode(
-            ROLES.supervisor, rate_hz, self._stance, self._scale, self._history, self._commands, **options
-        )
+        return WalkingNode(AGENT, rate_hz, self._stance, self._scale, self._history, self._commands, **options)
 
     def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
         """Return the node's parameters for an episode: its commands are the aim."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from sim2real.artifacts.identification import Noise
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.identify.model import Channel
-from sim2real.robots.contract import RobotDrive, RobotSensor, Session
-from sim2real.robots.control_loop.hardware import Embedded, ServoSession
+from sim2real.robots.robot import RobotDrive, RobotSensor
 from sim2real.robots.servo.drive import approached
+from sim2real.robots.session import Embedded, Session
 from sim2real.robots.walking.messages import BodyReading, LegCommand, gravity_of, leg_command
 
 if TYPE_CHECKING:
@@ -79,18 +80,26 @@ class StandUp:
 
 
 class BodySensor(RobotSensor):
-    """Encoders, and the IMU: its orientation and gyro."""
+    """Encoders, and the IMU: its orientation and gyro.
+
+    Args:
+        noise: Field of the reading -> deviation and bias of the noise without an identification, in the field's unit.
+    """
 
     units = MappingProxyType({"position": "rad", "velocity": "rad/s", "quaternion": "1", "gyro": "rad/s"})
 
-    def __init__(self, joints: Sequence[str], stance: np.ndarray) -> None:
+    def __init__(
+        self, joints: Sequence[str], stance: np.ndarray, noise: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    ) -> None:
         self.channels = tuple(
             Channel("position", "velocity", 5e-4, 0.03, index=i, label=name, goal="q") for i, name in enumerate(joints)
         )
-        self.joints = {
-            name: {"position": f"position[{i}]", "velocity": f"velocity[{i}]"} for i, name in enumerate(joints)
-        }
         self.at_rest = BodyReading(stance, np.zeros_like(stance), np.array([1.0, 0, 0, 0]), np.zeros(3))
+        self.noise = tuple(
+            Noise(f"{field}[{i}]", self.units[field], deviation, 0.0, bias)
+            for field, (deviation, bias) in noise.items()
+            for i in range(len(np.ravel(getattr(self.at_rest, field))))
+        )
 
     def read(self, reading: Reading) -> BodyReading:
         """Return the message of a reading."""
@@ -130,20 +139,12 @@ class WalkingDrive(RobotDrive):
         """The emulated robot on the floor, for the port ``embedded``."""
         return self._emulated("floor")
 
-    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
-        """Open the motors, with torque off; see ``RobotDrive.connect``."""
-        return self._connect(port, limits, truth_path, seed, "floor")
-
-    def connect_to_record(self, port: str, limits: GateLimits, truth_path: Path, seed: int) -> ServoSession:
-        """Open the motors of a robot in a stand, whose legs hang in the air, with torque off."""
-        return self._connect(port, limits, truth_path, seed, "stand")
-
     def _emulated(self, place: Place) -> Embedded | None:
         motors = self._motors
         return motors.embedded(place) if motors is not None and motors.embedded is not None else None
 
-    def _connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, place: Place) -> ServoSession:
-        motors = self._motors
+    def connect(self, port: str, limits: GateLimits, truth_path: Path, seed: int, hanging: bool = False) -> Session:
+        motors, place = self._motors, "stand" if hanging else "floor"
         if motors is None:
             raise UsageError(
                 f"this robot has no device for port {port!r}",
@@ -156,7 +157,7 @@ class WalkingDrive(RobotDrive):
         def device(port: str) -> Device:
             return make(port, range(len(self._joints)), motors.settings, baud_rate=0, silence_s=limits.servo_watchdog_s)
 
-        return ServoSession(port, device, self._gate(limits, device(port)), self._emulated(place), truth_path, seed)
+        return Session(port, device, self._gate(limits, device(port)), self._emulated(place), truth_path, seed)
 
     def prepare(self, session: Session, settle_s: float) -> None:
         """Wait, with torque off, until the robot lies still."""
@@ -173,10 +174,10 @@ class WalkingDrive(RobotDrive):
         folded = self._stance if self._motors is None else np.asarray(self._motors.folded)
         return bent[:, None] * (folded - self._stance)
 
-    def approach(self, session: Session, signal: np.ndarray) -> np.ndarray:
-        """Return targets ``(N, joints)`` [rad]: joints move to the signal at 1 rad/s, from legs that hang at rest."""
+    def approach(self, session: Session, commands: np.ndarray) -> np.ndarray:
+        """Return targets ``(N, joints)`` [rad]: joints move to the first at 1 rad/s, from legs that hang at rest."""
         hanging = session.rig.wait_until_still(_HANG_S, _STILL_RAD_S)
-        return approached(self.around(signal), hanging.position_rad, self.rate_hz)
+        return approached(commands, hanging.position_rad, self.rate_hz)
 
     def begin(self, session: Session) -> None:
         """Let the robot stand up.

@@ -7,10 +7,12 @@ from functools import cached_property
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.contract import RobotModel
-from sim2real.robots.control_loop.messages import EpisodeStart
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import RobotModel
 from sim2real.robots.walking.joints import STRENGTH as MOTOR_STRENGTH
 from sim2real.robots.walking.joints import JointParameters
 from sim2real.robots.walking.scene import Ground
@@ -29,6 +31,7 @@ class WalkingModel(RobotModel):
         joints: Parameters of the joints, in the order of the actuators.
         height_m: Height of the base at the start of an episode [m].
         terrain: Largest roughness, and where in the task's ground it is.
+        make_task: Makes the composed task; True: on rough ground.
         rooms: Contacts and rows of constraints that Warp has room for in a copy.
     """
 
@@ -36,20 +39,21 @@ class WalkingModel(RobotModel):
 
     def __init__(
         self,
-        make_task: Callable[[], Ground],
+        make_task: Callable[[bool], Ground],
         joints: JointParameters,
         height_m: float,
         terrain: Terrain,
         loads: tuple[float, float] = (-1.0, 3.0),
         rooms: tuple[int, int] = (16, 96),
+        rough: bool = False,
     ) -> None:
         self._make_task, self.joints, self._height_m, self._terrain = make_task, joints, height_m, terrain
-        self._loads, self._rooms = loads, rooms
+        self._loads, self._rooms, self._rough = loads, rooms, rough
 
     @cached_property
     def task(self) -> Ground:
         """The composed task."""
-        return self._make_task()
+        return self._make_task(self._rough)
 
     @property
     def tick_s(self) -> float:
@@ -72,6 +76,21 @@ class WalkingModel(RobotModel):
             Parameter(STRENGTH, "1", 1.0, 0.5, 1.5, about="factor on the motors' gains"),
             Parameter(ROUGHNESS, "m", 0.0, 0.0, self._terrain.most_m, "linear", about="height of bumps of the ground"),
         ]
+
+    def for_training(self, values: Mapping[str, float], draws: Mapping[str, np.ndarray]) -> WalkingModel:
+        """Return a model whose ground is a height field if episodes have roughness: a plane costs less."""
+        bumps_m = np.asarray(draws.get(ROUGHNESS, values.get(ROUGHNESS, 0.0)))
+        if not bumps_m.any():
+            return self
+        low, high, most_m = float(bumps_m.min()), float(bumps_m.max()), self._terrain.most_m
+        if low < 0.0 or high > most_m:
+            raise UsageError(
+                f"roughness must lie in [0, {most_m:g}] m, got {low:.3g} to {high:.3g}",
+                hint="`terrain = Terrain(most_m=0.2)` in the robot's file makes its ground rougher",
+            )
+        return WalkingModel(
+            self._make_task, self.joints, self._height_m, self._terrain, self._loads, self._rooms, rough=True
+        )
 
     def make_world(self, resumed: bool = False) -> WalkingWorld:
         """Return the world's node."""

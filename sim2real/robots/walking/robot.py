@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import copy
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import numpy as np
 
-from sim2real.artifacts.identification import Noise
-from sim2real.errors import UsageError
-from sim2real.graph.node import BaseNode
-from sim2real.robots.contract import Robot, RobotDrive
-from sim2real.robots.control_loop.loop import DELAYS
-from sim2real.robots.control_loop.training_task import LoopTask
+from sim2real.robots.loop import DELAYS
+from sim2real.robots.robot import Robot, RobotDrive
 from sim2real.robots.walking.agent import WalkingAgent
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.drive import BodySensor, LegMotors, WalkingDrive
 from sim2real.robots.walking.joints import JointParameters
-from sim2real.robots.walking.model import ROUGHNESS, STRENGTH, WalkingModel
+from sim2real.robots.walking.model import STRENGTH, WalkingModel
 from sim2real.robots.walking.moment import Moment
 from sim2real.robots.walking.scene import Ground
 from sim2real.robots.walking.stand import LegsInAStand
@@ -73,11 +67,11 @@ class ComposedRobot(Robot):
 
     def __init__(self) -> None:
         stance = np.asarray(self.stance, np.float32)
-        self.sensor = BodySensor(self.joints, stance)
+        self.sensor = BodySensor(self.joints, stance, self.noise)
         self.drive: RobotDrive = self.make_drive()
         self.agent = WalkingAgent(self.joints, stance, self.scale, self.history, self.commands)
-        self.walking = WalkingModel(self.make_task, self._parameters(), self.height_m, self.terrain)
-        self.model = self.walking
+        joints = JointParameters(self.joints, self.groups or {"joint": range(len(self.joints))})
+        self.model: WalkingModel = WalkingModel(self.make_task, joints, self.height_m, self.terrain)
         self.task = WalkingTask(self.commands, stance, 1.0 / self.rate_hz, self.terms(), self.falls)
 
     @abstractmethod
@@ -106,40 +100,9 @@ class ComposedRobot(Robot):
         """Return the nominal values of the model's parameters, and the delays."""
         return super().nominal() | dict(zip(DELAYS, self.delays_s, strict=True))
 
-    def _parameters(self) -> JointParameters:
-        return JointParameters(self.joints, self.groups or {"joint": range(len(self.joints))})
-
     def identifiable(self, max_delay_s: float) -> LegsInAStand:
         """Return the model to identify: the robot in a stand, as ``record`` expects it."""
         # The strengths of the motors take the place of a factor on all of them.
-        fixed = [replace(p, free=False) for p in self.walking.around() if p.name == STRENGTH]
+        fixed = [replace(p, free=False) for p in self.model.around() if p.name == STRENGTH]
         loop = self.sensor.channels, self.rate_hz, self.gains[1]
-        return LegsInAStand(self.mjcf, self.walking.joints, fixed, *loop, max_delay_s)
-
-    def training(
-        self, values: Mapping[str, float], draws: Mapping[str, np.ndarray], *arguments: Any, **options: Any
-    ) -> tuple[dict[str, BaseNode], LoopTask]:
-        """Return the graph in simulation, whose sensor has the nominal noise, and the training task.
-
-        The ground is a height field only if episodes have roughness: a plane costs less.
-        """
-        robot, bumps_m = self, np.asarray(draws.get(ROUGHNESS, values.get(ROUGHNESS, 0.0)))
-        if bumps_m.any():
-            low, high = float(bumps_m.min()), float(bumps_m.max())
-            if low < 0.0 or high > self.terrain.most_m:
-                raise UsageError(
-                    f"roughness must lie in [0, {self.terrain.most_m:g}] m, got {low:.3g} to {high:.3g}",
-                    hint="`terrain = Terrain(most_m=0.2)` in the robot's file makes its ground rougher",
-                )
-            robot = copy.copy(self)
-            make_rough = partial(self.make_task, rough=True)
-            robot.model = WalkingModel(make_rough, self._parameters(), self.height_m, self.terrain)
-        nodes, task = super(ComposedRobot, robot).training(values, draws, *arguments, **options)
-        sensor: Any = nodes[self.roles.sensor]
-        sizes = {field: len(np.ravel(getattr(self.sensor.at_rest, field))) for field in self.noise}
-        sensor.noise = tuple(
-            Noise(f"{field}[{i}]", self.sensor.units[field], deviation, 0.0, bias)
-            for field, (deviation, bias) in self.noise.items()
-            for i in range(sizes[field])
-        )
-        return nodes, task
+        return LegsInAStand(self.mjcf, self.model.joints, fixed, *loop, max_delay_s)

@@ -16,10 +16,9 @@ from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.control_loop.loop import DelayParams, delay_of, delay_parameters, recorded_loop
 from sim2real.robots.from_model.encoders import EncoderParams, Encoders
 from sim2real.robots.from_model.mjcf import driven_spec, read_spec
-from sim2real.robots.roles import ROLES
+from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, DelayParams, delay_of, delay_parameters, recorded_loop
 from sim2real.robots.walking.joints import STRENGTH, JointParameters
 from sim2real.robots.walking.messages import gravity_of
 from sim2real.types import Array, Key, MjModel, PyTree, Scalar
@@ -53,21 +52,21 @@ class LegsInAStand:
         kd: float,
         max_delay_s: float,
     ) -> None:
-        self.sensor, self.channels, self.ahead_s, self._rate_hz = ROLES.sensor, channels, STEP_S, rate_hz
+        self.sensor, self.channels, self.ahead_s, self._rate_hz = SENSOR, channels, STEP_S, rate_hz
         self._joints, self._model, self._kd = joints, stand_model(mjcf), kd
         rows = [*joints.dynamics(), *fixed, *joints.zeros(), *delay_parameters(max_delay_s)]
         self.parameters = ParameterTable(rows)
         columns: dict[str, PyTree] = {"goal": "q", "goal_velocity": "dq", "torque": "tau", "kp": "kp", "kd": "kd"}
-        self.given: Mapping[str, PyTree] = {ROLES.actuator: DriveCommand(**columns)}
+        self.given: Mapping[str, PyTree] = {ACTUATOR: DriveCommand(**columns)}
         self._world = self._make_world()
         self._plain = self._world.init_params()
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world, connected with delays of up to ``max_delay_s`` [s]."""
         world, still = self._make_world(), jnp.zeros(len(self._joints.motors))
-        sensor = _Sensor(ROLES.sensor, self._rate_hz, world, velocity=True)
+        sensor = _Sensor(SENSOR, self._rate_hz, world, velocity=True)
         command = DriveCommand(goal=still, goal_velocity=still, torque=still, kp=still, kd=still)
-        actuator = RecordedActuator(ROLES.actuator, self._rate_hz, command)
+        actuator = RecordedActuator(ACTUATOR, self._rate_hz, command)
         return recorded_loop(sensor, actuator, world, max_delay_s, self.ahead_s, world.lead_s)
 
     def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
@@ -113,13 +112,13 @@ class LegsInAStand:
         world = self._plain.replace(model=self._plain.model.tree_replace(fields), **drive)
         late_s = values["sensor_delay"] + self.ahead_s
         return {
-            ROLES.world: self._world.started(world, state[:count] - zero, state[count:]),
-            ROLES.sensor: _SensorParams(zero=zero, delay=late_s),
-            ROLES.actuator: DelayParams(values["actuator_delay"]),
+            WORLD: self._world.started(world, state[:count] - zero, state[count:]),
+            SENSOR: _SensorParams(zero=zero, delay=late_s),
+            ACTUATOR: DelayParams(values["actuator_delay"]),
         }
 
     def _make_world(self) -> DrivenWorld:
-        return _World(ROLES.world, 1.0 / STEP_S, self._model)
+        return _World(WORLD, 1.0 / STEP_S, self._model)
 
 
 def stand_model(mjcf: Path) -> MjModel:
@@ -152,4 +151,4 @@ class _Sensor(Encoders):
 
     def init_delays(self, rng: Key | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         del rng
-        return delay_of(self.name, ROLES.world, graph_state)
+        return delay_of(self.name, WORLD, graph_state)

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2real.graph.base import GraphState
-from sim2real.robots.contract import RobotTask
-from sim2real.robots.control_loop.loop import Draw
-from sim2real.robots.control_loop.messages import EpisodeStart
-from sim2real.robots.roles import Roles
+from sim2real.robots.loop import AGENT, WORLD, Draw
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import RobotTask
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.messages import gravity_of, into_base
 from sim2real.robots.walking.moment import Moment
@@ -44,7 +43,6 @@ class WalkingTask(RobotTask):
     ) -> None:
         self._commands, self._stance, self._period_s = commands, np.asarray(stance, np.float32), period_s
         self._terms, self._falls, self._close = terms, falls, close
-        self.aim_size = commands.size
 
     def random(self, key: Key, draw: Draw) -> tuple[dict, EpisodeStart]:
         """Return parameters, and a start in the stance with random commands."""
@@ -60,14 +58,14 @@ class WalkingTask(RobotTask):
         """Return a start whose commanded velocities are smaller by a share."""
         return start.replace(aim=share * start.aim)
 
-    def judged(self, graph_state: GraphState, roles: Roles) -> Moment:
+    def judged(self, graph_state: GraphState) -> Moment:
         """Return the moment after a step, from the true state."""
-        world, agent = graph_state.state[roles.world], graph_state.state[roles.supervisor]
+        world, agent = graph_state.state[WORLD], graph_state.state[AGENT]
         data, v = world.data, world.variables
         t_s = (graph_state.step - 1) * self._period_s
         turn, feet = data.qpos[3:7], v["at_m"]
         moment = Moment(
-            command=jnp.asarray(self._commands.at(graph_state.params[roles.supervisor].aim, t_s)),
+            command=jnp.asarray(self._commands.at(graph_state.params[AGENT].aim, t_s)),
             linear=jnp.asarray(into_base(turn, data.qvel[:3])),
             angular=data.qvel[3:6],
             gravity=jnp.asarray(gravity_of(turn)),

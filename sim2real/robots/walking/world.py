@@ -12,7 +12,7 @@ import numpy as np
 
 from sim2real.composer.physics.mjx.warp import warp_fields
 from sim2real.graph.base import GraphState
-from sim2real.robots.roles import ROLES
+from sim2real.robots.loop import ACTUATOR, WORLD
 from sim2real.robots.walking.messages import BodyReading
 from sim2real.robots.walking.scene import Ground
 from sim2real.worlds.composed import ComposedWorld, WorldParams
@@ -46,7 +46,7 @@ class WalkingWorld(ComposedWorld):
     def __init__(
         self, task: Ground, parameters: Mapping[str, tuple[Any, str]], loads: tuple[float, float], **options: Any
     ) -> None:
-        super().__init__(ROLES.world, task, ROLES.actuator, "q", parameters, **options)
+        super().__init__(WORLD, task, ACTUATOR, "q", parameters, **options)
         model = self.environment.model
         base = model.body(task.base.full_identifier).id
         kilograms = np.linspace(*loads, _ROWS)

@@ -16,8 +16,7 @@ from sim2real.identify.model import IdentifiableModel, measured_channels
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import check_log
 from sim2real.installation import has_jax
-from sim2real.robots.contract import RecordedRobot, Robot
-from sim2real.robots.worlds import in_world
+from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.check.coverage import Coverage, coverage, problems
 from sim2real.stages.excitation.played import played

@@ -9,8 +9,8 @@ from sim2real.artifacts.recording import TRUTH
 from sim2real.errors import UsageError
 from sim2real.policy.blended import BlendedRunner
 from sim2real.policy.upright import UprightRunner
-from sim2real.robots.contract import Robot, Session
 from sim2real.robots.probe import Witness
+from sim2real.robots.robot import Robot, Session
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.preflight import check_delay
 from sim2real.stages.deploy.probe_log import write_probe

@@ -8,7 +8,7 @@ from pathlib import Path
 from sim2real.artifacts.deployment import Advice, Deployment, Drift
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.manifest import MANIFEST
-from sim2real.robots.worlds import in_world
+from sim2real.robots.robot import in_world
 from sim2real.stages.deploy.trajectories import PAUSED
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.shared.identification import command

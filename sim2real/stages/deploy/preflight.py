@@ -11,8 +11,8 @@ from sim2real.artifacts.run.manifest import sha256
 from sim2real.artifacts.run.run_folder import StageFolder, newest
 from sim2real.errors import DelayChanged, Sim2RealError
 from sim2real.policy.contract import ActionTerm, ObservationTerm, PolicyContract
-from sim2real.robots.contract import Robot
 from sim2real.robots.probe import StepAnswers, Witness, measure_delay
+from sim2real.robots.robot import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.pipeline.find_run import warn_of_stale
 from sim2real.stages.pipeline.pipeline import Pipeline

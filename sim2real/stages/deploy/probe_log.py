@@ -7,8 +7,9 @@ import numpy as np
 from sim2real.artifacts.deployment import PROBE
 from sim2real.graph.episode import StepRecord
 from sim2real.log.writer import McapRecorder
-from sim2real.robots.contract import Robot
+from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.robots.probe import Witness
+from sim2real.robots.robot import Robot
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 
@@ -24,7 +25,7 @@ def write_probe(folder: Path, pipeline: Pipeline, robot: Robot, witness: Witness
     if not witness.measured or not witness.sent:
         return None
     # Select the measurements and commands at the robot's rate; a command that changes is always selected.
-    sensor, actuator = robot.roles.sensor, robot.roles.actuator
+    sensor, actuator = SENSOR, ACTUATOR
     period_ns, start_ns = round(1e9 / robot.rate_hz), min(witness.measured[0][0], witness.sent[0][0])
     measured = _apart([begin_ns for begin_ns, *_ in witness.measured], period_ns)
     changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]

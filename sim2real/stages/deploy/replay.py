@@ -19,7 +19,7 @@ from sim2real.identify.search.refine import refine
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.folds import MOVES
 from sim2real.identify.validation.verdict import NOISE, positions
-from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.shared.identification import identified_robot, side_by_side

@@ -18,8 +18,8 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import newest_message
 from sim2real.installation import has_jax
 from sim2real.log.session import input_ages
-from sim2real.robots.contract import Robot
-from sim2real.robots.score_columns import as_columns, as_sent
+from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
+from sim2real.robots.robot import Robot, as_columns, as_sent
 from sim2real.stages.deploy.trajectories import courses, lost_s
 from sim2real.stages.terminal.console import progress
 from sim2real.stages.terminal.interruption import patiently
@@ -66,7 +66,7 @@ def compare(
 
         policy = Policy.from_weights(bundle.weights, bundle.spec)
         parameters = plausible_parameters(identification, len(recordings))
-        node = robot.roles.world if use_truth else robot.roles.sensor
+        node = WORLD if use_truth else SENSOR
         rest = [_rest(robot, recording.episode) for recording in recordings]
         with progress(None, "simulate the same"):
             simulated, timeline = patiently(
@@ -80,8 +80,8 @@ def compare(
     gap += _age_rows(robot, [r.episode for r in recordings], timeline)
     columns = [{"t": t, **states} for t, states in measured[: len(recordings)]]
     columns += [{}] * (len(recordings) - len(columns))
-    sensed = [(r.episode.steps[robot.roles.sensor].begun_s, _sensed(robot, r.episode)) for r in recordings]
-    nodes = (robot.roles.sensor, robot.roles.supervisor, robot.roles.actuator)
+    sensed = [(r.episode.steps[SENSOR].begun_s, _sensed(robot, r.episode)) for r in recordings]
+    nodes = (SENSOR, AGENT, ACTUATOR)
     trajectories = courses(sensed, measured, robot.units, [lost_s(r.episode, nodes) for r in recordings])
     units = dict(robot.units)
     return Deployment(scores, tuple(gap), units, tuple(columns), tuple(recordings), courses=trajectories)
@@ -90,27 +90,27 @@ def compare(
 def _states(recording: Recording, robot: Robot, use_truth: bool) -> States:
     """Return times [s] and columns of an episode on the robot: true states if they are used, else measured ones."""
     episode = recording.episode
-    sent = as_sent(robot, episode.outputs[robot.roles.supervisor], episode.outputs[robot.roles.actuator])
+    sent = as_sent(robot, episode.outputs[AGENT], episode.outputs[ACTUATOR])
     if use_truth and (true_states := recording.true_states()) is not None:
         t_s, states = true_states
         return t_s, {**sent, **states}
-    return episode.steps[robot.roles.sensor].begun_s, {**sent, **_sensed(robot, episode)}
+    return episode.steps[SENSOR].begun_s, {**sent, **_sensed(robot, episode)}
 
 
 def _sensed(robot: Robot, episode: Episode) -> dict[str, np.ndarray]:
-    return as_columns(episode.outputs[robot.roles.sensor])
+    return as_columns(episode.outputs[SENSOR])
 
 
 def _rest(robot: Robot, episode: Episode) -> np.ndarray:
     """Return the first measured position of each channel ``(channels,)``."""
-    fields = dict(named_leaves(episode.outputs[robot.roles.sensor]))
+    fields = dict(named_leaves(episode.outputs[SENSOR]))
     return np.array([float(c.of(np.asarray(fields[c.position])).ravel()[0]) for c in robot.sensor.channels])
 
 
 def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:
     """Return rows of the gap report: the ages of the data that policy and actuator use, on the robot and simulated."""
     rows = []
-    for reader in (robot.roles.supervisor, robot.roles.actuator):
+    for reader in (AGENT, ACTUATOR):
         measured = [input_ages(e, reader) for e in episodes]
         for name in measured[0]:
             ages = [a[name][np.isfinite(a[name])] for a in measured if name in a]

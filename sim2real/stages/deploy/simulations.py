@@ -14,8 +14,8 @@ from sim2real.graph.node import TICKS_PER_S
 from sim2real.graph.schedule import draw
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import make_room
-from sim2real.robots.contract import Robot
-from sim2real.robots.score_columns import as_columns, as_sent
+from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
+from sim2real.robots.robot import Robot, as_columns, as_sent
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.terminal.console import note
 from sim2real.training.environment.draws import draw_robots
@@ -80,21 +80,21 @@ def simulate(
     count = len(parameters)
     timeline = draw(nodes, duration_s, count, 0)
     make_room(nodes, timeline)
-    graph = CompiledGraph(nodes, robot.roles.supervisor, timeline)
+    graph = CompiledGraph(nodes, AGENT, timeline)
 
     # Each simulation does the trial of its episode, from where the robot rested: friction holds it beside the task's
     # start, and a swing-up from there may go to the other side.
     episodes = [(e % len(rest), rest[e % len(rest)]) for e in range(count)]
     trials = [robot.simulation_params(v, policy, *e) for v, e in zip(parameters, episodes, strict=True)]
     params = jax.tree_util.tree_map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trials)
-    recorded = tuple({scored_node, robot.roles.sensor, robot.roles.supervisor, robot.roles.actuator})
+    recorded = tuple({scored_node, SENSOR, AGENT, ACTUATOR})
 
     def rollout(eps: jax.Array, params: PyTree) -> PyTree:
         return graph.rollout(graph.init(jax.random.key(0), params, eps=eps), record=recorded)[1]
 
     records = jax.tree_util.tree_map(np.asarray, jax.jit(jax.vmap(rollout))(np.arange(count), params))
     return [
-        (_states(graph, records, robot, e, scored_node), _states(graph, records, robot, e, robot.roles.sensor))
+        (_states(graph, records, robot, e, scored_node), _states(graph, records, robot, e, SENSOR))
         for e in range(count)
     ], timeline
 
@@ -114,10 +114,10 @@ def _states(graph: CompiledGraph, records: Mapping[str, Any], robot: Robot, e: i
         ran = records[name].seq[e] >= 0
         return {n: np.asarray(leaf)[e][ran] for n, leaf in named_leaves(records[name].output).items()}
 
-    actuator, vertices = robot.roles.actuator, graph.timeline.vertices
+    actuator, vertices = ACTUATOR, graph.timeline.vertices
     command_s = vertices[actuator].end[e][steps(actuator)] / TICKS_PER_S
-    columns = {**as_sent(robot, sent(robot.roles.supervisor), sent(actuator)), **as_columns(sent(node))}
-    if node == robot.roles.world:
+    columns = {**as_sent(robot, sent(AGENT), sent(actuator)), **as_columns(sent(node))}
+    if node == WORLD:
         # The message of a tick is the state at its end.
         t_s = (steps(node) + 1) / graph.nodes[node].rate
     else:

@@ -12,7 +12,7 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, finished, open_stage
 from sim2real.errors import UsageError
-from sim2real.robots.contract import Robot
+from sim2real.robots.robot import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import check_timing, require_tilt, run_episodes
 from sim2real.stages.deploy.preflight import find_bundle, require_fit

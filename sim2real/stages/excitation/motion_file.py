@@ -12,7 +12,8 @@ from sim2real.log.importing.importer import import_file
 from sim2real.log.importing.propose import joint_motion
 from sim2real.log.importing.readers import open_tables
 from sim2real.log.reader import read_log
-from sim2real.robots.contract import Robot
+from sim2real.robots.loop import ACTUATOR, SENSOR
+from sim2real.robots.robot import Robot
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 _LEAST_S = 1.0
@@ -52,8 +53,8 @@ def read_motion(path: Path, pipeline: Pipeline, robot: Robot, names: Sequence[st
         motion = _of_log(path, robot)
     elif (mapping := pipeline.mapping_of(path)) is not None:
         episode = import_file(path, mapping)
-        rows = episode.outputs[robot.roles.actuator][robot.drive.command]
-        motion = FileMotion(episode.steps[robot.roles.actuator].begun_s, rows, f"{robot.drive.command} of {path.name}")
+        rows = episode.outputs[ACTUATOR][robot.drive.command]
+        motion = FileMotion(episode.steps[ACTUATOR].begun_s, rows, f"{robot.drive.command} of {path.name}")
     else:
         motion = FileMotion(*joint_motion(open_tables(path)[0], names, robot.units[robot.drive.command]))
     return _whole(motion, path, len(names))
@@ -61,20 +62,18 @@ def read_motion(path: Path, pipeline: Pipeline, robot: Robot, names: Sequence[st
 
 def _of_log(path: Path, robot: Robot) -> FileMotion:
     """Return the commands of a log; of one that was guided by hand the measured positions."""
-    episode, roles = read_log(path), robot.roles
-    sent = episode.outputs.get(roles.actuator, {}).get(robot.drive.command)
+    episode = read_log(path)
+    sent = episode.outputs.get(ACTUATOR, {}).get(robot.drive.command)
     if sent is not None and len(sent):
-        return FileMotion(
-            episode.steps[roles.actuator].end / TICKS_PER_S, sent, f"{robot.drive.command} of {path.name}"
-        )
+        return FileMotion(episode.steps[ACTUATOR].end / TICKS_PER_S, sent, f"{robot.drive.command} of {path.name}")
     field = next((c.position for c in robot.sensor.channels if c.goal == robot.drive.command), None)
-    measured = episode.outputs.get(roles.sensor, {}).get(field or "")
+    measured = episode.outputs.get(SENSOR, {}).get(field or "")
     if measured is None:
         raise UsageError(
-            f"{path} has no {robot.drive.command!r} of {roles.actuator!r}",
+            f"{path} has no {robot.drive.command!r} of {ACTUATOR!r}",
             hint="is it a log of this robot? Measured positions are a motion only for position-controlled joints",
         )
-    return FileMotion(episode.steps[roles.sensor].begun_s, measured, f"{field} of {path.name}")
+    return FileMotion(episode.steps[SENSOR].begun_s, measured, f"{field} of {path.name}")
 
 
 def _whole(motion: FileMotion, path: Path, commands: int) -> FileMotion:

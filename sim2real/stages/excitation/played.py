@@ -3,7 +3,7 @@
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.robots.contract import Robot
+from sim2real.robots.robot import Robot
 from sim2real.stages.excitation.motion_file import FileMotion, read_motion
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.pipeline.pipeline import Pipeline

@@ -14,7 +14,8 @@ from sim2real.graph.times import Vertex
 from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.problem.engine import CRollouts, choose
-from sim2real.robots.contract import Robot
+from sim2real.robots.loop import ACTUATOR
+from sim2real.robots.robot import Robot
 from sim2real.runtime.compiled.open_loop import OpenLoopGraph
 
 
@@ -44,7 +45,7 @@ def simulate(
         message = nodes[name].init_output(jax.random.key(0), None)
         count = timeline.vertices[name].start.shape[1]
         rows = {n: np.repeat(np.asarray(v)[None], count, axis=0) for n, v in named_leaves(message).items()}
-        if name == robot.roles.actuator:
+        if name == ACTUATOR:
             played = signal[np.minimum(np.arange(count), len(signal) - 1)]
             rows[robot.drive.command] = played.reshape(rows[robot.drive.command].shape)
         leaves, kind = jax.tree_util.tree_flatten(message)

@@ -19,8 +19,7 @@ from sim2real.identify.model import IdentifiableModel, measured_channels
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import Span
 from sim2real.identify.validation.refits import REFITS, Refits
-from sim2real.robots.contract import RecordedRobot, Robot
-from sim2real.robots.worlds import in_world
+from sim2real.robots.robot import RecordedRobot, Robot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.open_log import require_units
 from sim2real.stages.pipeline.pipeline import Pipeline

@@ -41,7 +41,7 @@ from sim2real.identify.validation.term_gains import gains
 from sim2real.identify.validation.term_trials import Trials
 from sim2real.identify.validation.verdict import ACCEPTED, CHANGE, NO_DELAY, Position, positions, scores, state_of
 from sim2real.identify.validation.worst_second import worst_second
-from sim2real.robots.worlds import in_world
+from sim2real.robots.robot import in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import (
     LEAST_SEGMENTS,
@@ -97,7 +97,7 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
             fits, held = patiently(lambda f=findings: determined(inputs, fits, f.check, f.spread))
             findings = patiently(lambda: Findings.of(fits.estimate, parts)) if held else findings
         fit = findings.fit
-        truth = true_values(inputs.logs[0], inputs.robot.roles) if config.reveal else {}
+        truth = true_values(inputs.logs[0]) if config.reveal else {}
         # Collect the models that explain the recordings as well, for training to draw from.
         bar.set_description_str("identify: posterior")
         posterior = patiently(

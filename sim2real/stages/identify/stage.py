@@ -13,7 +13,7 @@ from sim2real.artifacts.run.run_folder import OpenStage, StageFolder, newest, op
 from sim2real.errors import UsageError
 from sim2real.identify.uncertainty.noise import noises
 from sim2real.identify.validation.refits import REFITS
-from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
 from sim2real.stages.identify.inputs import Inputs, prepare, robot_of, storing_refits

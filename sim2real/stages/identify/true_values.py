@@ -7,14 +7,14 @@ import numpy as np
 from sim2real.artifacts.recording import Recording
 from sim2real.emulation.truth import Kind, Truth
 from sim2real.graph.episode import Steps
-from sim2real.robots.roles import Roles
+from sim2real.robots.loop import ACTUATOR, SENSOR
 from sim2real.stages.terminal.console import note
 
 _NEAR_NS = 3_000_000
 """Largest distance between a sample of the robot and a step of the sensor that read it [ns]."""
 
 
-def true_values(recording: Recording, roles: Roles) -> dict[str, float]:
+def true_values(recording: Recording) -> dict[str, float]:
     """Return true parameters and true mean delays in the log's terms; an empty dict if the robot is not embedded.
 
     ``sensor_delay`` is from the motion to the measurement's time stamp, ``actuator_delay`` from the end of the
@@ -31,8 +31,8 @@ def true_values(recording: Recording, roles: Roles) -> dict[str, float]:
     episode, origin_ns = recording.episode, recording.end.get("monotonic_ns")
     if origin_ns is None:  # the session crashed before it wrote its start
         return values
-    sensing = sensing_delay_s(truth, episode.steps[roles.sensor], origin_ns)
-    actuation = actuation_delay_s(truth, episode.steps[roles.actuator], origin_ns)
+    sensing = sensing_delay_s(truth, episode.steps[SENSOR], origin_ns)
+    actuation = actuation_delay_s(truth, episode.steps[ACTUATOR], origin_ns)
     delays = {"sensor_delay": sensing, "actuator_delay": actuation, "round_trip_delay": sensing + actuation}
     return {**values, **{name: delay for name, delay in delays.items() if math.isfinite(delay)}}
 

@@ -4,7 +4,8 @@ from pathlib import Path
 
 from sim2real.artifacts.recording import LOG, TRUTH
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
-from sim2real.robots.contract import Robot
+from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR
+from sim2real.robots.robot import Robot
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.identify.stage import identify
 from sim2real.stages.latency.config import LatencyConfig
@@ -58,4 +59,4 @@ def run(pipeline: Pipeline, config: LatencyConfig, root: Path, run_dir: Path | N
 
 def chain_of(robot: Robot) -> tuple[str, str, str]:
     """Return the nodes that a measurement passes on its way to a motor, in this order."""
-    return robot.roles.sensor, robot.roles.supervisor, robot.roles.actuator
+    return SENSOR, AGENT, ACTUATOR

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from sim2real.robots.contract import RecordedRobot, Robot
+from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
 from sim2real.types import Json
 from sim2real.view.model_scene import ModelScene

@@ -19,7 +19,8 @@ from sim2real.hardware.safety.rig import Rig
 from sim2real.installation import has_jax
 from sim2real.later import jax
 from sim2real.log.writer import McapRecorder
-from sim2real.robots.contract import Robot, Session
+from sim2real.robots.loop import ACTUATOR, AGENT, ROLES, SENSOR
+from sim2real.robots.robot import Robot, Session
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.failure import noted
 from sim2real.stages.on_robot.come_to_rest import come_to_rest
@@ -102,12 +103,12 @@ def run_episode(
         Sim2RealError: What stopped the robot.
     """
     # Without an agent, as in a recording by hand, the sensor is the only node.
-    graph = AsyncGraph(nodes, nodes.get(robot.roles.supervisor) or nodes[robot.roles.sensor])
+    graph = AsyncGraph(nodes, nodes.get(AGENT) or nodes[SENSOR])
     state = graph.init(jax.random.key(0) if has_jax() else None, params)
     graph.warmup(state)  # every program is compiled before torque goes on
     # Start the log, and run; an interrupted episode comes to rest before torque goes off.
     recorder = _recorder(pipeline, robot, graph, state, log, config, session.rig)
-    watch = Watch(recorder, robot.roles.actuator, robot.drive.command)
+    watch = Watch(recorder, ACTUATOR, robot.drive.command)
     graph.recorder = watch
     try:
         try:
@@ -204,7 +205,7 @@ def _recorder(
         "dry_run": rig.torque_withheld,
         "config": plain(asdict(config)),
         "graph": topology,
-        "roles": asdict(robot.roles),
+        "roles": ROLES,
         "versions": plain(versions()),
         "git": plain(git_state()),
         "seed": config.seed,
@@ -213,7 +214,7 @@ def _recorder(
     }
     # The writer, which starts with a mark if the run is dry.
     inputs = [(n, i) for n, node in graph.nodes.items() for i in node.inputs]
-    joints, units = {robot.roles.sensor: robot.sensor.joints}, dict.fromkeys(graph.nodes, robot.units)
+    joints, units = {SENSOR: robot.sensor.joints}, dict.fromkeys(graph.nodes, robot.units)
     recorder = McapRecorder(log, metadata, {}, state.aux["outputs"], inputs, joints, units)
     if rig.torque_withheld:
         recorder.write_event(

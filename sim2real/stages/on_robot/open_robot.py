@@ -10,7 +10,8 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.hardware.safety.rig import Rig
-from sim2real.robots.contract import Robot, Session
+from sim2real.robots.loop import ACTUATOR, SENSOR
+from sim2real.robots.robot import Robot, Session
 from sim2real.runtime.clock import realtime
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.record.config import RecordConfig
@@ -32,9 +33,8 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     """
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
-    hangs = isinstance(config, RecordConfig) and not robot.drive.on_feet
-    connect = robot.drive.connect_to_record if hangs else robot.drive.connect
-    with connect(config.port, config.gate, truth_path, config.seed) as session, realtime():
+    hanging = isinstance(config, RecordConfig) and not config.standing
+    with robot.drive.connect(config.port, config.gate, truth_path, config.seed, hanging) as session, realtime():
         _require_rig(session.rig)
         if config.dry_run:
             session.rig.withhold_torque()
@@ -71,7 +71,7 @@ def rig_summary(rig: Rig) -> dict[str, Any]:
 
 def bus_use(robot: Robot, rig: Rig) -> dict[str, dict[str, list[int]]]:
     """Return for each node that talks to the device how long its transactions took; see ``BusUse`` [us]."""
-    users = {robot.roles.sensor: rig.measuring, robot.roles.actuator: rig.commanding}
+    users = {SENSOR: rig.measuring, ACTUATOR: rig.commanding}
     return {name: {kind: values.tolist() for kind, values in asdict(use).items()} for name, use in users.items()}
 
 

@@ -1,8 +1,7 @@
 """The robot of a pipeline, for the stages that need hardware or training."""
 
 from sim2real.errors import UsageError
-from sim2real.robots.contract import Robot
-from sim2real.robots.worlds import in_world
+from sim2real.robots.robot import Robot, in_world
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 

@@ -7,7 +7,8 @@ from sim2real.errors import Sim2RealError
 from sim2real.identify.problem.segments import require_moved
 from sim2real.log.importing.importer import import_file
 from sim2real.log.schema import unit_of
-from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.loop import ACTUATOR, SENSOR
+from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note
 
@@ -55,10 +56,8 @@ def _require_fitting(recording: Recording, robot: RecordedRobot) -> None:
 
 def require_units(recording: Recording, robot: RecordedRobot) -> None:
     """Check that what the robot's sensor and actuator sent is in the units that the robot computes in."""
-    recorded_units = recording.episode.units or dict.fromkeys(
-        (robot.roles.sensor, robot.roles.actuator), recording.units
-    )
-    for node in (robot.roles.sensor, robot.roles.actuator):
+    recorded_units = recording.episode.units or dict.fromkeys((SENSOR, ACTUATOR), recording.units)
+    for node in (SENSOR, ACTUATOR):
         for field, unit in recorded_units.get(node, {}).items():
             if unit != (expected := unit_of(field, robot.units) or unit):
                 raise Sim2RealError(

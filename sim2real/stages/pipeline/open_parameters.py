@@ -4,7 +4,7 @@ from pathlib import Path
 
 from sim2real.artifacts.identification import UNFINISHED, Identification
 from sim2real.errors import Sim2RealError
-from sim2real.robots.worlds import in_world
+from sim2real.robots.robot import in_world
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 

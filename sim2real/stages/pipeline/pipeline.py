@@ -23,7 +23,7 @@ from sim2real.stages.train.config import TrainConfig
 
 if TYPE_CHECKING:
     from sim2real.log.importing.mapping import ImportMapping
-    from sim2real.robots.contract import RecordedRobot
+    from sim2real.robots.robot import RecordedRobot
 
 ENTRY_POINT_GROUP = "sim2real.pipelines"
 
@@ -39,7 +39,7 @@ class Pipeline:
         name: The folder's name, used on the command line.
         summary: One line for ``sim2real info``.
         package: ``__name__`` of the pipeline's package.
-        robot: Module in the package whose ``ROBOT`` is a ``sim2real.robots.contract.Robot``, or ``RecordedRobot``.
+        robot: Module in the package whose ``ROBOT`` is a ``sim2real.robots.robot.Robot``, or ``RecordedRobot``.
         scene: Module in the package with ``log_scene``, which draws the robot for ``sim2real view``; None: not drawn.
         record: Defaults of the stage; its fields become flags.
         identify: Defaults of the stage.
@@ -117,10 +117,16 @@ class Pipeline:
         Raises:
             UsageError: The robot is incomplete, or an attribute has the wrong type.
         """
-        imported = importlib.import_module(f"{self.package}.{module or self.robot}")
+        try:
+            imported = importlib.import_module(f"{self.package}.{module or self.robot}")
+        except TypeError as error:  # Python's own for a class that lacks methods of its contract
+            if "abstract" not in str(error):
+                raise
+            hint = "sim2real.robots.robot describes each method"
+            raise UsageError(f"the robot of pipeline {self.name!r} is not complete: {error}", hint=hint) from error
         if module:
             return imported
-        from sim2real.robots.loading import checked  # imports JAX
+        from sim2real.robots.robot import checked  # imports JAX
 
         robot = checked(getattr(imported, "ROBOT", None), f"pipeline {self.name!r} ({imported.__file__})")
         _LOADED[robot] = self
@@ -152,8 +158,7 @@ def pipeline_of(robot: RecordedRobot | Pipeline | str) -> Pipeline:
         return robot
     if isinstance(robot, str):
         return load_pipeline(robot)
-    from sim2real.robots.contract import RecordedRobot, Robot  # imports JAX
-    from sim2real.robots.loading import checked
+    from sim2real.robots.robot import RecordedRobot, Robot, checked  # imports JAX
 
     if not isinstance(robot, Robot | RecordedRobot):
         raise UsageError(

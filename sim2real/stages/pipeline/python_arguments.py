@@ -12,7 +12,7 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
-from sim2real.robots.contract import RecordedRobot
+from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sim2real.artifacts.recording import Recording
-from sim2real.robots.contract import Robot
+from sim2real.robots.loop import SENSOR
+from sim2real.robots.robot import Robot
 from sim2real.stages.on_robot.episode import timing_rows
 from sim2real.stages.on_robot.open_robot import show_withheld, warn
 from sim2real.stages.terminal.console import note, shown, table
@@ -39,7 +40,7 @@ def show_open(checked: Checked) -> None:
 
 def show_by_hand(recording: Recording, robot: Robot, pipeline: str) -> None:
     """Print how far each joint was moved by hand, and the command that plays the motion."""
-    outputs, rows = recording.episode.outputs[robot.roles.sensor], []
+    outputs, rows = recording.episode.outputs[SENSOR], []
     for channel in robot.sensor.channels:
         values = np.asarray(channel.of(outputs[channel.position]), np.float64)
         rows.append([channel.label or channel.position, values.min(), values.max(), np.ptp(values)])

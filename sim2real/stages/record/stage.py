@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from sim2real.artifacts.recording import LOG, TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
 from sim2real.installation import has_jax
-from sim2real.robots.contract import Robot
+from sim2real.robots.robot import Robot
 from sim2real.stages.check.config import CheckConfig
 from sim2real.stages.excitation.played import played
 from sim2real.stages.live.scene import scene_of
@@ -47,10 +46,6 @@ def record(
     pipeline, folder = pipeline_of(robot), folder_of(folder)
     config = config_of(config, pipeline.record)
     robot = moving_robot(pipeline)
-    if config.standing:
-        robot = copy.copy(robot)
-        robot.drive = copy.copy(robot.drive)
-        robot.drive.on_feet = True
     log, truth = folder / LOG, folder / TRUTH
     scene = partial(scene_of, pipeline, robot)
     signal = None if config.by_hand else _planned(config, pipeline, robot)
@@ -60,7 +55,7 @@ def record(
         if signal is None:
             session.rig.withhold_torque()
             note("torque is off: move the robot by hand", urgent=True)
-        nodes = robot.recording_nodes(session, signal)
+        nodes = robot.recording_nodes(session, signal, config.standing)
         run_episode(pipeline, robot, session, nodes, {}, log, duration_s, config, "record")
     return Recording.load(log, truth)
 

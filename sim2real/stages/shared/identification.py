@@ -22,8 +22,7 @@ from sim2real.graph.episode import Episode
 from sim2real.identify.model import IdentifiableModel, position_of
 from sim2real.identify.parameters import ParameterTable
 from sim2real.identify.problem.segments import GRID_S, Span, on_grid
-from sim2real.robots.contract import RecordedRobot
-from sim2real.robots.worlds import in_world
+from sim2real.robots.robot import RecordedRobot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note

@@ -11,9 +11,8 @@ from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.identification import ROUND_TRIP, Identification, Noise
 from sim2real.artifacts.timing import Timing
 from sim2real.graph.node import TICKS_PER_S, BaseNode
-from sim2real.robots.control_loop.loop import DELAYS
-from sim2real.robots.control_loop.simulated_devices import SimSensor
-from sim2real.robots.control_loop.training_task import LoopTask
+from sim2real.robots.loop import DELAYS, LoopTask
+from sim2real.robots.nodes import SimSensor
 from sim2real.stages.terminal.console import note
 from sim2real.stages.train.config import TrainConfig
 from sim2real.training.environment.graph_environment import TrainingTask
@@ -50,10 +49,7 @@ def set_noise(sensor: BaseNode, identification: Identification | None, config: T
         for n in identification.noise
     )
     if not isinstance(sensor, SimSensor):
-        note(
-            f"readings are exact: {type(sensor).__name__} takes no noise, as "
-            "sim2real.robots.control_loop.simulated_devices.SimSensor does"
-        )
+        note(f"readings are exact: {type(sensor).__name__} takes no noise, as sim2real.robots.nodes.SimSensor does")
         return ()
     nominal, logged = {n.column: n for n in sensor.noise}, {n.column for n in noise}
     biases = {column: factor * n.bias for column, n in nominal.items()}

@@ -14,9 +14,8 @@ from sim2real.artifacts.sensitivity import Moved, Sensitivity
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
 from sim2real.identify.problem.programs import Program
-from sim2real.robots.contract import Robot
-from sim2real.robots.control_loop.loop import DELAYS, in_a_loop
-from sim2real.robots.control_loop.training_task import LoopTask
+from sim2real.robots.loop import DELAYS, LoopTask, split_delay
+from sim2real.robots.robot import Robot
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.training_setup import prepare
@@ -145,9 +144,9 @@ def _round_trip(values: Mapping[str, float]) -> float:
 def _for_one_graph(robot: Robot, models: Sequence[Mapping[str, float]]) -> list[dict[str, float]]:
     """Return the models with the actuator's delay of the first; the sensor's delay takes the whole difference.
 
-    Only the sum of both delays affects a policy's observations of its commands; see ``in_a_loop``.
+    Only the sum of both delays affects a policy's observations of its commands; see ``split_delay``.
     """
-    base = in_a_loop(models[0], robot.model.tick_s, robot.delay_spread_s)
+    base = split_delay(models[0], robot.model.tick_s, robot.delay_spread_s)
     if not set(DELAYS) <= set(base):
         return [dict(m) for m in models]
     sensor, actuator = DELAYS

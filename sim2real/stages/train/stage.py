@@ -8,7 +8,7 @@ from typing import cast
 
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
-from sim2real.robots.contract import Robot
+from sim2real.robots.robot import Robot
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import (

@@ -12,8 +12,8 @@ from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.policy.bundle import make_runner
 from sim2real.policy.contract import PolicyContract
-from sim2real.robots.contract import Robot
-from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.robots.loop import DELAYS
+from sim2real.robots.robot import Robot
 from sim2real.stages.train.config import TrainConfig
 from sim2real.stages.train.parity import MAX_OBSERVATIONS, observations_of, reference_of
 from sim2real.stages.train.show import training_summary

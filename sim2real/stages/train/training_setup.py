@@ -9,8 +9,8 @@ from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.timing import Timing
 from sim2real.errors import UsageError
-from sim2real.robots.contract import Robot
-from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.robots.loop import AGENT, DELAYS, SENSOR, WORLD
+from sim2real.robots.robot import Robot
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -79,15 +79,15 @@ def prepare(
     nodes, task = robot.training(values, draws, recorded.computation if recorded else {}, delayed)
     if recorded:
         recorded.set_transport(nodes)
-    noise = set_noise(nodes[robot.roles.sensor], identification, config)
+    noise = set_noise(nodes[SENSOR], identification, config)
 
     # Draw timelines, and compile them into index tables.
-    drawn = draw_timelines(nodes, robot.roles.supervisor, config.episode_s, config.timelines, config.seed, recorded)
-    graph = CompiledGraph(nodes, robot.roles.supervisor, drawn.timeline, reusable=True)
+    drawn = draw_timelines(nodes, AGENT, config.episode_s, config.timelines, config.seed, recorded)
+    graph = CompiledGraph(nodes, AGENT, drawn.timeline, reusable=True)
 
     # Add starts and pushes.
     set_start(task, config)
-    pushes = Pushes.of(config.vary, nodes[robot.roles.world], robot.rate_hz)
+    pushes = Pushes.of(config.vary, nodes[WORLD], robot.rate_hz)
     curriculum = config.vary.curriculum if config.vary.grows else None
     env = GraphEnvironment(graph, task, drawn.steps, pushes, curriculum, config.vary.follow)
     episodes = episodes_of(identification, values, draws, noise, drawn, timing, config)

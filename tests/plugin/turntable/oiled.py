@@ -9,7 +9,8 @@ from flax import struct
 from sim2real.graph.base import GraphState
 from sim2real.graph.node import BaseNode
 from sim2real.identify.parameters import Parameter
-from sim2real.robots.worlds import WorldModel
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import Robot, RobotModel
 from sim2real.worlds.joint import Forces
 
 from .robot import TICK_HZ, Table, TableParams
@@ -36,14 +37,23 @@ class Oiled(Table):
         return own._replace(damping=own.damping + params.drag)
 
 
-class OiledTable(WorldModel):
+class OiledTable(RobotModel):
     """What the entry point makes, called with the robot."""
+
+    tick_s = 1 / TICK_HZ
+
+    def __init__(self, robot: Robot) -> None:
+        self._own = robot.model
 
     def dynamics(self) -> list[Parameter]:
         """Return the robot's own parameters, and the drag."""
-        drag = Parameter("drag", "1/s", 1.0, 0.0, 10.0, "linear", about="viscous friction", leaf="world.drag")
-        return [*self.robot.model.dynamics(), drag]
+        return [*self._own.dynamics(), Parameter("drag", "1/s", 1.0, 0.0, 10.0, "linear", about="viscous friction")]
 
     def make_world(self, resumed: bool = False) -> BaseNode:
         """Return the node; all of its state is measured, so a resumed one is no other."""
-        return Oiled(self.robot.roles.world, TICK_HZ)
+        return Oiled("world", TICK_HZ)
+
+    def params(self, values: Any, start: EpisodeStart) -> OiledParams:
+        """Return the robot's own parameters, and the drag."""
+        own = self._own.params(values, start)
+        return OiledParams(own.loop, own.friction, own.start, values["drag"])

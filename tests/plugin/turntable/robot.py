@@ -13,11 +13,11 @@ from sim2real.graph.base import Base, GraphState
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.contract import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
-from sim2real.robots.control_loop.hardware import Embedded, ServoSession
-from sim2real.robots.control_loop.loop import delay_of
-from sim2real.robots.control_loop.messages import EpisodeStart, Goals, JointReading
+from sim2real.robots.loop import delay_of
+from sim2real.robots.messages import EpisodeStart, Goals, JointReading
+from sim2real.robots.robot import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
 from sim2real.robots.servo.agent import AgentParams, GoalAgent
+from sim2real.robots.session import Embedded, Session
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 
 TICK_HZ = 100.0
@@ -72,7 +72,6 @@ class TableSensor(RobotSensor):
     """Angle and speed of the table."""
 
     channels = (Channel("position", "velocity", 0.002, 0.05, index=0, label="table"),)
-    joints = {"table": {"position": "position", "velocity": "velocity"}}
     units = {"position": "rad", "velocity": "rad/s"}
     at_rest = JointReading(np.zeros(1), np.zeros(1))
 
@@ -92,7 +91,7 @@ class TableDrive(RobotDrive):
         emulator = ODriveEmulation(sensing_latency_s=0.004, actuation_latency_s=0.01)
         return Embedded("turntable.plant:Turntable", emulator)
 
-    def connect(self, port, limits, truth_path, seed):
+    def connect(self, port, limits, truth_path, seed, hanging=False):
         def device(port):
             from sim2real.hardware.registry import load_device
 
@@ -102,7 +101,7 @@ class TableDrive(RobotDrive):
             return load_device("odrive")(port, (0,), SpeedLoop(), baud_rate=115_200, silence_s=silence_s)
 
         gate = limits.gate(limits.limit, joints=("table",))
-        return ServoSession(port, device, gate, self.embedded, truth_path, seed)
+        return Session(port, device, gate, self.embedded, truth_path, seed)
 
     def prepare(self, session, settle_s):
         session.rig.wait_until_still(settle_s)
@@ -148,8 +147,6 @@ class TableModel(RobotModel):
 class KeepSpeed(RobotTask):
     """Turn at the speed of the episode, its aim [rad/s]."""
 
-    aim_size = 1
-
     def random(self, key, draw):
         of_values, of_aim = jax.random.split(key)
         aim = jax.random.uniform(of_aim, (1,), minval=-8.0, maxval=8.0)
@@ -158,7 +155,7 @@ class KeepSpeed(RobotTask):
     def at_rest(self, trial):
         return EpisodeStart(jnp.zeros(1), jnp.zeros(1), jnp.array([(4.0, -6.0, 8.0)[trial % 3]]))
 
-    def judged(self, graph_state, roles):
+    def judged(self, graph_state):
         return graph_state.state["world"].velocity - graph_state.params["agent"].aim
 
     def reward(self, error, action):

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sim2real.policy.upright import Runner
-from sim2real.robots.contract import Robot
-from sim2real.robots.control_loop.loop import DELAYS
+from sim2real.robots.loop import DELAYS
+from sim2real.robots.robot import Robot
 from sim2real.robots.walking.joints import STRENGTH as MOTOR_STRENGTH
 from sim2real.robots.walking.messages import into_base
 from sim2real.robots.walking.model import FRICTION, STRENGTH
@@ -36,7 +36,7 @@ def plain_episodes(
 
 def twin_of(robot: ComposedRobot, values: Mapping[str, float], seed: int = 0) -> Twin:
     """Return the twin with parameters and delays by name; the policy's computation adds to the actuator's delay."""
-    joints = robot.walking.joints
+    joints = robot.model.joints
     hidden = HiddenTwin(
         friction=values[FRICTION],
         load_kg=values[PAYLOAD],

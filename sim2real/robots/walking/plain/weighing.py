@@ -19,8 +19,7 @@ from sim2real.artifacts.identification import Estimate, Identification
 from sim2real.artifacts.posterior import Posterior, from_scale
 from sim2real.errors import OtherMotion, UsageError
 from sim2real.graph.episode import Episode
-from sim2real.robots.control_loop.loop import DELAYS
-from sim2real.robots.roles import ROLES
+from sim2real.robots.loop import ACTUATOR, DELAYS, SENSOR
 from sim2real.robots.walking.joints import STRENGTH
 from sim2real.robots.walking.messages import gravity_of
 from sim2real.robots.walking.robot import ComposedRobot
@@ -61,7 +60,7 @@ class Balances:
 
     def load(self, robot: ComposedRobot, values: Mapping[str, float], part: slice = slice(None)) -> float:
         """Return the load with which a part of the balances agrees best [kg]."""
-        joints = robot.walking.joints
+        joints = robot.model.joints
         damping, friction = (joints.of_group(values, name) for name in ("damping", "friction"))
         torque = joints.of_motor(values, STRENGTH) * self.law - damping * self.speed - friction * self.direction
         return float((self.rest - (self.share * torque).sum(axis=1))[part].sum() / self.size[part].sum())
@@ -82,7 +81,7 @@ def weighed(
         return identification
     values, balances = identification.values, balances_of(robot, episode, identification.values)
     load = balances.load(robot, values)
-    row = next(p for p in robot.walking.around() if p.name == PAYLOAD)
+    row = next(p for p in robot.model.around() if p.name == PAYLOAD)
     # The spread of parts of the log is the error of the balances; the posterior adds that of the other parameters.
     edges = np.linspace(0, len(balances.size), _BLOCKS + 1).astype(int)
     parts = [balances.load(robot, values, slice(a, b)) for a, b in pairwise(edges)]
@@ -122,8 +121,8 @@ def require_load(load: float, low: float, high: float, error: float = 0.0) -> No
 
 def balances_of(robot: ComposedRobot, episode: Episode, values: Mapping[str, float]) -> Balances:
     """Return a log as balances; refuse one in which the robot does not stand upright, or hardly moves."""
-    sensed, sent = episode.outputs[ROLES.sensor], episode.outputs[ROLES.actuator]
-    t_s, position = episode.steps[ROLES.sensor].begun_s, sensed["position"].astype(np.float64)
+    sensed, sent = episode.outputs[SENSOR], episode.outputs[ACTUATOR]
+    t_s, position = episode.steps[SENSOR].begun_s, sensed["position"].astype(np.float64)
     smooth = np.ones(_SMOOTHED) / _SMOOTHED
     speed = np.stack([np.convolve(v, smooth, "same") for v in sensed["velocity"].T.astype(np.float64)], axis=1)
     upright = np.array([gravity_of(q.astype(np.float64))[2] for q in sensed["quaternion"]])
@@ -139,11 +138,11 @@ def balances_of(robot: ComposedRobot, episode: Episode, values: Mapping[str, flo
         )
     used = used[moving][:: max(1, int(moving.sum()) // _MOST_SAMPLES)]
     # The command in effect when the state was sampled.
-    acts_s = 1e-6 * episode.steps[ROLES.actuator].end + values[DELAYS[1]]
+    acts_s = 1e-6 * episode.steps[ACTUATOR].end + values[DELAYS[1]]
     row = np.clip(np.searchsorted(acts_s, t_s[used] - values[DELAYS[0]], "right") - 1, 0, None)
     q, dq, kp, kd, tau = (sent[name].astype(np.float64)[row] for name in ("q", "dq", "kp", "kd", "tau"))
     law = tau + kp * (q - position[used]) + kd * (dq - sensed["velocity"][used])
-    zero = robot.walking.joints.of_motor(values, "zero")
+    zero = robot.model.joints.of_motor(values, "zero")
     model = _mj.MjModel.from_xml_path(str(robot.mjcf))
     data = _mj.MjData(model)
     rows = [_balance(model, data, robot.feet, sensed["quaternion"][i], position[i] - zero) for i in used]

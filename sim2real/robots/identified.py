@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import math
+import copy
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
-from typing import ClassVar
+from typing import Self
 
+from sim2real import pytree
+from sim2real.errors import UsageError
 from sim2real.graph.delays import TrainableDist
 from sim2real.graph.episode import Episode, named_leaves
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.later import jax
-from sim2real.robots.completeness import tuple_of
-from sim2real.robots.contract import Identified
-from sim2real.robots.roles import ROLES, Roles
+from sim2real.later import jnp
+from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD
+from sim2real.robots.messages import EpisodeStart
+from sim2real.robots.robot import RecordedRobot, RobotModel
 from sim2real.types import PyTree, Scalar
 from sim2real.worlds.recorded import RecordedActuator
 
 
-class LoggedRobot(Identified):
+class LoggedRobot(RecordedRobot):
     """A ``RecordedRobot`` without a device; subclasses define its nodes and parameters.
 
     Attributes:
@@ -31,19 +32,14 @@ class LoggedRobot(Identified):
         tick_s: The world's period, where samples fall between its ticks: the sensor then needs a tick of delay to
             interpolate. 0 where samples fall on ticks.
         burst: Extra commands in a delay's window, for commands that came faster than their rate.
+        other: The model of another world, in place of its own; None: its own.
     """
 
-    units: Mapping[str, str]
-    roles: Roles = ROLES
-    profile_rad_s: float = math.inf
-    export_lead_s: float = 0.0
-    causes: Mapping[str, Mapping[str, float]] = MappingProxyType({})
     channels: tuple[Channel, ...]
     delayed: str = "command to measurement"
     tick_s: float = 0.0
     burst: int = 0
-
-    _DATA: ClassVar = {"channels": ("a tuple of sim2real.identify.model.Channel", tuple_of(Channel))}
+    other: RobotModel | None = None
 
     @abstractmethod
     def dynamics(self) -> list[Parameter]:
@@ -51,7 +47,7 @@ class LoggedRobot(Identified):
 
     @abstractmethod
     def make_nodes(self) -> tuple[BaseNode, RecordedActuator, BaseNode]:
-        """Return sensor, actuator and world, not connected yet; their names are those of the roles."""
+        """Return sensor, actuator and world, not connected yet."""
 
     def started(self, params: Mapping[str, PyTree], start: PyTree) -> dict[str, PyTree]:
         """Return node parameters with an initial state; default: ``start`` of the world's parameters.
@@ -59,17 +55,16 @@ class LoggedRobot(Identified):
         Args:
             start: Shape ``(2 * channels,)``: measured positions, then velocities.
         """
-        world = self.roles.world
-        return {**params, world: params[world].replace(start=start)}
+        return {**params, WORLD: params[WORLD].replace(start=start)}
 
     def identifiable(self, max_delay_s: float) -> IdentifiableRecording:
         """Return the model to identify, with a delay of up to ``max_delay_s`` [s]."""
         return IdentifiableRecording(self, max_delay_s)
 
-    def with_optional_terms(self, wanted: str) -> LoggedRobot:
-        """Return the robot with further optional terms; default: the robot, which has all of them."""
-        del wanted
-        return self
+    def in_model(self, model: RobotModel) -> Self:
+        robot = copy.copy(self)
+        robot.other = model
+        return robot
 
 
 class IdentifiableRecording:
@@ -80,34 +75,44 @@ class IdentifiableRecording:
     """
 
     ahead_s = 0.0
+    sensor = SENSOR
 
     def __init__(self, robot: LoggedRobot, max_delay_s: float) -> None:
-        self._robot, self.sensor, self.channels = robot, robot.roles.sensor, robot.channels
-        tick_s, actuator = robot.tick_s, robot.roles.actuator
-        held = []
+        self._robot, self.channels = robot, robot.channels
+        rows, tick_s = robot.dynamics(), robot.tick_s
+        if robot.other is not None:
+            beside = [p for p in rows if not (p.leaf or "").startswith(f"{WORLD}.")]
+            rows = [*(replace(p, leaf=None) for p in robot.other.dynamics()), *beside]
         if tick_s:
             tick = Parameter("sensor_delay", "s", tick_s, 0.0, 2 * tick_s, "linear", "delay")
-            held.append(replace(tick, about="the sensor's interpolation", free=False, side="measurement"))
-        late = Parameter("delay", "s", 0.0, 0.0, max_delay_s, "linear", "delay", robot.delayed, f"{actuator}.delay")
-        self.parameters = ParameterTable([*robot.dynamics(), *held, replace(late, side="command")])
-        nodes = robot.make_nodes()
-        message = nodes[1].init_output()
-        fields = jax.tree_util.tree_structure(message).unflatten(list(named_leaves(message)))
-        self.given: Mapping[str, PyTree] = {actuator: fields}
-        self._params = {node.name: node.init_params() for node in nodes}
+            rows.append(replace(tick, about="the sensor's interpolation", free=False, side="measurement"))
+        late = Parameter("delay", "s", 0.0, 0.0, max_delay_s, "linear", "delay", robot.delayed, f"{ACTUATOR}.delay")
+        self.parameters = ParameterTable([*rows, replace(late, side="command")])
+        own = robot.make_nodes()
+        message = own[1].init_output()
+        fields = pytree.structure(message).unflatten(list(named_leaves(message)))
+        self.given: Mapping[str, PyTree] = {ACTUATOR: fields}
+        self._params = {node.name: node.init_params() for node in own}
 
     def nodes(self, max_delay_s: float) -> dict[str, BaseNode]:
         """Return sensor, actuator and world; the world receives commands up to ``max_delay_s`` [s] late."""
-        sensor, actuator, world = self._robot.make_nodes()
-        to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=self._robot.burst)
+        robot = self._robot
+        sensor, actuator, world = robot.make_nodes()
+        if robot.other is not None:
+            own, world = world, robot.other.make_world(resumed=True)
+            if world.rate != own.rate:
+                raise UsageError(
+                    f"this world has {world.rate:g} ticks a second, that of these recordings {own.rate:g}",
+                    hint="samples of the recordings must fall on ticks of the world",
+                )
+        to_world = TrainableDist.create(max_delay_s / 4, 0.0, max_delay_s, "zoh_mean", burst=robot.burst)
         world.connect(actuator, skip=True, delay_dist=to_world)
-        tick_s = self._robot.tick_s
+        tick_s = robot.tick_s
         sensor.connect(world, delay_dist=TrainableDist.create(tick_s, 0.0, 2 * tick_s, "linear") if tick_s else None)
         return {n.name: n for n in (sensor, actuator, world)}
 
     def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
         """Return an empty dict: there are no limits among the optional terms."""
-        del recordings
         return {}
 
     def params(self, values: Mapping[str, Scalar], start: PyTree) -> dict[str, PyTree]:
@@ -116,4 +121,9 @@ class IdentifiableRecording:
         Args:
             start: Shape ``(2 * channels,)``: initial positions, then velocities.
         """
-        return self._robot.started(self.parameters.placed(self._params, values), start)
+        other = self._robot.other
+        params = self._robot.started(self.parameters.placed(self._params, values), start)
+        if other is None:
+            return params
+        position, velocity = jnp.split(jnp.asarray(params[WORLD].start), 2)
+        return {**params, WORLD: other.params(values, EpisodeStart(position, velocity, jnp.zeros(0)))}

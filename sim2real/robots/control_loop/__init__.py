@@ -1,1 +1,0 @@
-"""Robots in the loop of sensor, agent, actuator and world."""

@@ -1,0 +1,324 @@
+"""The nodes of a robot's loop: sensor and actuator in simulation, sensor, actuator and agent on hardware.
+
+Imports no MuJoCo, which would take seconds.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple, Unpack
+
+import numpy as np
+
+from sim2real import pytree
+from sim2real.artifacts.identification import Noise
+from sim2real.errors import UsageError
+from sim2real.graph.base import Base, GraphState, StepState, Value
+from sim2real.graph.node import BaseNode, NodeOptions
+from sim2real.later import jax, jnp
+from sim2real.policy.upright import Runner
+from sim2real.robots.loop import AGENT, DelayParams, delay_of
+from sim2real.robots.messages import Goals
+from sim2real.types import Array, Key, PyTree
+
+if TYPE_CHECKING:
+    from sim2real.hardware.device import Reading
+    from sim2real.hardware.safety.rig import Rig
+
+
+# -- in simulation
+
+
+class NoiseSizes(NamedTuple):
+    """Sizes of a sensor's noise, each of shape ``(noise,)`` in the units of ``Noise``."""
+
+    deviation: Array
+    quantum: Array
+    bias: Array
+
+
+@pytree.dataclass
+class SensorBias(Base):
+    """The constant error of a simulated sensor's readings in an episode.
+
+    Attributes:
+        bias: Shape ``(noise,)``, each in the unit of its noise.
+    """
+
+    bias: Array
+
+
+class SimSensor(BaseNode):
+    """The encoders in simulation: passes on the world's message, with the delay in ``DelayParams``.
+
+    Attributes:
+        noise: Noise of the readings; empty: they are exact.
+    """
+
+    def __init__(self, name: str, rate: float, world: BaseNode, **options: Unpack[NodeOptions]) -> None:
+        super().__init__(name, rate, **options)
+        self._world = world
+        self.noise: tuple[Noise, ...] = ()
+        self._sizes: NoiseSizes | None = None
+
+    @property
+    def data(self) -> NoiseSizes | None:
+        """The sizes of the noise; see ``HoldsData``."""
+        if self._sizes is not None or not self.noise:
+            return self._sizes
+        numbers = np.array([(n.deviation, n.quantum, n.bias) for n in self.noise], np.float32)
+        return NoiseSizes(*numbers.T)
+
+    def with_data(self, data: NoiseSizes) -> SimSensor:
+        """Return a copy whose noise has other sizes, which may be traced."""
+        sensor = copy.copy(self)
+        sensor._sizes = data
+        return sensor
+
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> DelayParams:
+        return DelayParams()
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        return self._world.init_output(rng, graph_state)
+
+    def init_delays(self, rng: Key | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
+        return delay_of(self.name, self._world.name, graph_state)
+
+    def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        """Return the biases of an episode, ``(noise,)``; without any noise there is no state."""
+        if (sizes := self.data) is None:
+            return super().init_state(rng, graph_state)
+        drawn = jnp.zeros(len(self.noise)) if rng is None else jax.random.normal(rng, (len(self.noise),))
+        params = (graph_state or GraphState()).params.get(self.name)
+        return SensorBias(_noise_factor(params) * drawn * sizes.bias)
+
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
+        message = step_state.inputs[self._world.name][-1].data
+        return step_state, message if (sizes := self.data) is None else self._noisy(message, step_state, sizes)
+
+    def _noisy(self, message: PyTree, step_state: StepState, sizes: NoiseSizes) -> PyTree:
+        if step_state.rng is None:
+            raise UsageError(f"sensor {self.name!r} has noise and no random numbers to draw it from")
+        # A key of its own for each step; the sensor has no other use for its random numbers.
+        key = jax.random.fold_in(step_state.rng, step_state.seq)
+        added = jax.random.normal(key, (len(self.noise),)) * sizes.deviation
+        added = _noise_factor(step_state.params) * added + step_state.state.bias
+        changed: dict[str, PyTree] = {}
+        for noise, error, quantum in zip(self.noise, added, sizes.quantum, strict=True):
+            field, index = noise.place
+            value = jnp.asarray(changed.get(field, getattr(message, field)))
+            entry = (value if index is None else value[index]) + error
+            entry = quantum * jnp.round(entry / quantum) if noise.quantum else entry
+            changed[field] = entry if index is None else value.at[index].set(entry)
+        return message.replace(**changed)
+
+
+def _noise_factor(params: PyTree) -> PyTree:
+    noise = getattr(params, "noise", None)
+    return 1.0 if noise is None else noise
+
+
+class SimActuator(BaseNode):
+    """The bus in simulation: passes on the agent's commands.
+
+    The default output is ``start`` of the agent's parameters, at which the joints are held, or zeros if they have none.
+
+    Args:
+        field: Field of the agent's message that is the command, shape ``(joints,)``.
+        message: Makes the node's message from this command.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        rate: float,
+        joints: int,
+        field: str = "goal",
+        message: Callable[[PyTree], PyTree] = Goals,
+        **options: Unpack[NodeOptions],
+    ) -> None:
+        super().__init__(name, rate, **options)
+        self._joints, self._field, self._message = joints, field, message
+
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> DelayParams:
+        return DelayParams()
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        start = getattr((graph_state or GraphState()).params.get(AGENT), "start", None)
+        return self._message(np.zeros(self._joints, np.float32) if start is None else jnp.asarray(start, jnp.float32))
+
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
+        return step_state, self._message(getattr(step_state.inputs[AGENT][-1].data, self._field))
+
+
+# -- on hardware
+
+
+class ServoSensor(BaseNode):
+    """Reads all motors in one transaction; the message's time stamp is when the read instruction was sent.
+
+    Args:
+        message: Makes the node's message from a reading.
+        rest: The message of a robot at rest, which is the default output.
+    """
+
+    jittable = False
+
+    def __init__(
+        self,
+        name: str,
+        rate: float,
+        rig: Rig,
+        message: Callable[[Reading], Any],
+        rest: PyTree,
+        **options: Unpack[NodeOptions],
+    ) -> None:
+        super().__init__(name, rate, **options)
+        self._rig, self._message, self._rest = rig, message, rest
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        return self._rest
+
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
+        reading = self._rig.measure()
+        ts = max(self.at(reading.transaction.t_sent_ns), float(step_state.ts))
+        return step_state.replace(ts=ts), self._message(reading)
+
+
+class ServoActuator(BaseNode):
+    """Sends the agent's commands through the safety gate; its output is the command that was sent.
+
+    Args:
+        field: Field of the agent's message that is the command, shape ``(motors,)``.
+        message: Makes the node's message from this command. If the device's commands have columns, it has a field of
+            the shape ``(motors,)`` for each, by the column's name.
+        begin: Called after the torque is on: brings the robot to the start of the task.
+    """
+
+    jittable = False
+
+    def __init__(
+        self,
+        name: str,
+        rate: float,
+        rig: Rig,
+        field: str,
+        message: Callable[[np.ndarray], Any],
+        begin: Callable[[], None] | None = None,
+        **options: Unpack[NodeOptions],
+    ) -> None:
+        super().__init__(name, rate, **options)
+        self._rig, self._field, self._message, self._begin = rig, field, message, begin
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        return self._message(np.zeros(len(self._rig.device.motors)))
+
+    def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
+        """Switch the torque on, and bring the robot to the start of the task."""
+        self._rig.start()
+        if self._begin is not None:
+            self._begin()
+        return True
+
+    def stop(self, timeout: float | None = None) -> bool:
+        """Switch the torque off."""
+        self._rig.stop()
+        return True
+
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
+        """Send the newest command.
+
+        Raises:
+            SafetyStop: The newest measurement is too old, or what the gate stopped.
+        """
+        self._rig.require_fresh()
+        message = step_state.inputs[AGENT]
+        now_s = self.now()
+        age_s = now_s - float(message.ts_sent[-1]) if int(message.seq[-1]) >= 0 else 0.0
+        wanted = np.asarray(getattr(message.data, self._field)[-1], np.float64)
+        names = [column.name for column in self._rig.device.commanded.columns]
+        if not names:
+            return step_state, self._message(self._rig.command(wanted, age_s, now_s))
+        # With columns, the message is made first, and its fields are sent.
+        sent = self._message(wanted)
+        table = np.stack([np.asarray(getattr(sent, name), np.float64) for name in names], axis=-1)
+        allowed = self._rig.command(table, age_s, now_s)
+        return step_state, sent.replace(**{name: allowed[:, i].astype(np.float32) for i, name in enumerate(names)})
+
+
+class Excitation(BaseNode):
+    """Takes the agent's place during a recording: sends an excitation signal.
+
+    Args:
+        signal: Shape ``(N, motors)``: one command a step; after its end the last one again: a goal of 0 may be a leap.
+
+    Raises:
+        UsageError: The signal is not finite.
+    """
+
+    jittable = False
+
+    def __init__(
+        self,
+        name: str,
+        rate: float,
+        signal: np.ndarray,
+        message: Callable[[np.ndarray], Any],
+        **options: Unpack[NodeOptions],
+    ) -> None:
+        super().__init__(name, rate, **options)
+        if not np.isfinite(signal).all():
+            raise UsageError("the excitation has values that are not finite")
+        self._signal, self._message = signal, message
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        return self._message(np.zeros(self._signal.shape[1]))
+
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
+        row = min(int(step_state.seq), len(self._signal) - 1)
+        return step_state, self._message(self._signal[row])
+
+
+class PolicyNode(BaseNode):
+    """The agent's node on the wall clock; it calls the bundle's runner instead of a policy in JAX.
+
+    The agent makes observations and messages, from numpy arrays; its own ``step`` is not called.
+
+    Args:
+        agent: The agent's node, with ``observe(step_state)`` and ``act(step_state, action)``; it is left unconnected.
+    """
+
+    jittable = False
+
+    def __init__(self, agent: Any, runner: Runner) -> None:
+        super().__init__(agent.name, agent.rate, delay=agent.delay, delay_dist=agent.delay_dist)
+        self._agent, self._runner = agent, runner
+
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        return in_numpy(self._agent.init_params(rng, graph_state))
+
+    def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        return in_numpy(self._agent.init_state(rng, graph_state))
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
+        return in_numpy(self._agent.init_output(rng, graph_state))
+
+    def startup(self, graph_state: GraphState, timeout: float | None = None) -> bool:
+        """Begin an episode."""
+        self._runner.reset()
+        return True
+
+    def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
+        """Make a step with the policy's action.
+
+        Raises:
+            SafetyStop: An observation or the action is not finite.
+        """
+        action = self._runner(np.asarray(self._agent.observe(step_state), np.float32))
+        return self._agent.act(step_state, action)
+
+
+def in_numpy(tree: PyTree) -> PyTree:
+    """Return a pytree with numpy arrays for leaves: an array of JAX turns every later computation into one of JAX."""
+    return pytree.map(np.asarray, tree)
