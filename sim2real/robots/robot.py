@@ -565,7 +565,7 @@ def checked(robot: Any, where: str) -> RecordedRobot:
 
 def _unset(owner: object, kind: type) -> list[str]:
     """Return the attributes that a class declares without a default and an object does not have."""
-    return [name for name in kind.__annotations__ if not hasattr(owner, name)]
+    return [name for name in kind.__annotations__ if name not in vars(kind) and not hasattr(owner, name)]
 
 
 def in_world(robot: AnyRobot, name: str | None) -> AnyRobot:
