@@ -343,10 +343,10 @@ class ExpectedError:
     seconds: float
     error: float
 
-    def __str__(self) -> str:
-        """Return the error with its unit and horizon."""
-        how = f"{self.seconds:.3g} s ahead" if self.kind == AHEAD else f"in a free run of {self.seconds:.3g} s"
-        return f"{self.name} {with_small_unit(self.error, self.unit)} {how}"
+    @property
+    def how(self) -> str:
+        """The horizon, or the free run, as text."""
+        return _how(self.kind, self.seconds)
 
 
 @dataclass(frozen=True)
@@ -386,13 +386,16 @@ class ComparedError:
 
     def __str__(self) -> str:
         """Return the error and the expected error as a sentence."""
-        how = f"{self.seconds:.3g} s ahead" if self.kind == AHEAD else f"in a free run of {self.seconds:.3g} s"
         size = "diverges" if self.error is None else f"is off by {with_small_unit(self.error, self.unit)}"
+        text = f"{self.name} {size} {_how(self.kind, self.seconds)} on {self.source}"
         if self.expected is None or self.ratio is None:
-            return f"{self.name} {size} {how} on {self.source}"
-        times = "" if self.error is None else f": {self.ratio:.2f} times"
-        expected = with_small_unit(self.expected, self.unit)
-        return f"{self.name} {size} {how} on {self.source}; expected was {expected}{times}"
+            return text
+        times = "" if self.error is None else f", {self.ratio:.3g} times as much"
+        return f"{text}, where {with_small_unit(self.expected, self.unit)} were expected{times}"
+
+
+def _how(kind: ErrorKind, seconds: float) -> str:
+    return f"{seconds:.3g} s ahead" if kind == AHEAD else f"in a free run of {seconds:.3g} s"
 
 
 def compared_table(rows: Sequence[ComparedError], source: str) -> ArtifactTable:

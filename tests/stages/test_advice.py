@@ -25,10 +25,10 @@ def parsed(text):
 @pytest.mark.parametrize(
     ("new", "bounds", "fix", "max_delay_s"),
     [
-        ("--bounds gain 1 16", {"gain": (1.0, 16.0), "mass": (0.1, 0.4)}, {"friction": 0.5}, 0.05),
+        ("--bounds gain 1 16", {"gain": (1.0, 16.0), "mass": (0.1, 0.4000000123)}, {"friction": 0.5}, 0.05),
         ("--bounds mass -3 1", {"gain": (1.0, 4.0), "mass": (-3.0, 1.0)}, {"friction": 0.5}, 0.05),
-        ("--fix gain 0", {"mass": (0.1, 0.4)}, {"gain": 0.0, "friction": 0.5}, 0.05),
-        ("--max-delay-s 0.12", {"gain": (1.0, 4.0), "mass": (0.1, 0.4)}, {"friction": 0.5}, 0.12),
+        ("--fix gain 0", {"mass": (0.1, 0.4000000123)}, {"gain": 0.0, "friction": 0.5}, 0.05),
+        ("--max-delay-s 0.12", {"gain": (1.0, 4.0), "mass": (0.1, 0.4000000123)}, {"friction": 0.5}, 0.12),
     ],
 )
 def test_what_was_asked_before_is_asked_again_with_what_is_new(new, bounds, fix, max_delay_s):
@@ -36,7 +36,7 @@ def test_what_was_asked_before_is_asked_again_with_what_is_new(new, bounds, fix,
         ARM.identify,
         log=("my log.mcap", "b.mcap"),
         hold_out=("c.mcap",),
-        bounds={"gain": (1.0, 4.0), "mass": (0.1, 0.4)},
+        bounds={"gain": (1.0, 4.0), "mass": (0.1, 0.4000000123)},
         fix={"friction": 0.5},
         each=True,
         generations=7,

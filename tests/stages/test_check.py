@@ -12,12 +12,17 @@ import pytest
 
 from sim2real import cli, pytree
 from sim2real.errors import NotInstalled, UsageError
-from sim2real.stages.check import determination
 from sim2real.stages.check import stage as check_stage
 from sim2real.stages.check.config import CheckConfig
-from sim2real.stages.check.coverage import CommandCoverage, Coverage, JointCoverage, Motion, coverage, problems
-from sim2real.stages.check.determination import Determination, ParameterCheck
-from sim2real.stages.check.stage import Checked, recommend
+from sim2real.stages.check.stage import (
+    Checked,
+    CommandCoverage,
+    Coverage,
+    JointCoverage,
+    Motion,
+    ParameterCheck,
+    coverage,
+)
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.excitation.simulated_log import simulate
@@ -76,34 +81,35 @@ def test_the_log_is_described(judged):
     ],
 )
 def test_what_is_wrong_with_a_recording_is_named(found, named):
-    texts = problems([found])
+    *texts, _ = checked(recordings=(found,)).recommendation
     assert len(texts) == (named is not None)
     assert all(named in text for text in texts)
-    assert all(text.startswith("a.mcap: ") for text in problems([found, GOOD]) if "only" not in text)
+    *several, _ = checked(recordings=(found, GOOD)).recommendation
+    assert all(text.startswith("a.mcap: ") for text in several if "only" not in text)
 
 
-def checked(percent=0.5, undetermined=()):
+def checked(percent=0.5, undetermined=(), recordings=(GOOD,)):
     rows = (
         ParameterCheck("gain", "1", 2.0, 0.02 * percent, "alone"),
         ParameterCheck("swing", "1", 1.0, 9.0, "in a group", "a slow sine"),
     )
-    return Checked("arm", "log", (GOOD,), Determination(9, 1.3, 12.0, undetermined, (), rows))
+    return Checked("arm", "log", recordings, 9, 1.3, 12.0, undetermined, (), rows)
 
 
 def test_how_long_to_record_follows_from_the_worst_parameter():
-    assert recommend(checked(), "sim2real identify arm")[-1] == "next: sim2real identify arm"
-    assert any("gain" in text and "9 min" in text for text in recommend(checked(3.0), "x"))
+    assert "9 min" in checked(3.0).recommendation[-1]
+    assert "gain" in checked(3.0).recommendation[-1]
+    assert "enough" in checked().recommendation[-1]
 
 
 def test_an_open_direction_ends_with_code_1_and_names_it(monkeypatch, capsys):
-    texts = recommend(checked(undetermined=(("swing",),)), "sim2real identify arm")
-    assert any("swing" in text for text in texts)
-    assert any("a slow sine" in text for text in texts)
-    assert not any("next:" in text for text in texts)
-    found = checked(undetermined=(("swing",),)).determination
-    monkeypatch.setattr(determination, "determine", lambda *_: found)
+    found = checked(undetermined=(("swing",),))
+    monkeypatch.setattr(check_stage, "determine", lambda *_: found)
     assert cli.main(["check", "pendulum", "--log", str(LOG)]) == 1
-    assert "swing" in capsys.readouterr().out
+    verdict, following, *rest = capsys.readouterr().out.splitlines()
+    assert "swing" in verdict
+    assert following.startswith("next: sim2real check pendulum --plan")
+    assert any("a slow sine" in line for line in rest)
 
 
 def test_without_jax_the_coverage_is_printed(monkeypatch, capsys):
@@ -117,7 +123,7 @@ def test_an_error_with_jax_is_not_reported_as_a_missing_package(monkeypatch):
     def broken(*_):
         raise AttributeError("a defect")
 
-    monkeypatch.setattr(determination, "determine", broken)
+    monkeypatch.setattr(check_stage, "determine", broken)
     with pytest.raises(AttributeError, match="a defect"):
         check_stage.check("pendulum", LOG)
 
@@ -166,9 +172,9 @@ def test_a_plan_and_a_log_exclude_each_other():
 def test_segments_lie_side_by_side_and_are_not_too_many(judged):
     pipeline = load_pipeline("pendulum")
     episode = open_recording(LOG, pipeline).episode
-    spans, length_s = determination.cut_segments([episode], pipeline.identify)
+    spans, length_s = check_stage.cut_segments([episode], pipeline.identify)
     assert len(spans) == judged[1]["segments"]
     assert np.diff([s.begin_s for s in spans]) == pytest.approx(length_s)
-    many, _ = determination.cut_segments([episode] * 20, pipeline.identify)
+    many, _ = check_stage.cut_segments([episode] * 20, pipeline.identify)
     assert len(many) == 120
     assert {s.recording for s in many} == set(range(20))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sim2real.stages.check.coverage import motion, motion_of, sampling, speed
+from sim2real.stages.check.stage import motion, motion_of, sampling, speed
 
 T = np.arange(0, 40, 0.02)
 

@@ -1,40 +1,171 @@
-"""Predict which parameters a recording, or a planned one, can determine, before a search."""
+"""Predict which parameters a recording, or a planned one, can determine, before a search.
+
+The coverage of a recording needs no JAX: its sampling times, the motion of its joints, and the ranges of its commands.
+Which parameters it determines follows from the residuals, linearised at the nominal values.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from sim2real.artifacts.files import plain, to_json
+import numpy as np
+
+from sim2real import pytree
+from sim2real.artifacts.files import number, plain, to_json
 from sim2real.artifacts.run.run_folder import newest
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.errors import NotInstalled, Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
-from sim2real.identify.model import IdentifiableModel, measured_channels
+from sim2real.identify.model import Channel, IdentifiableModel, measured_channels, position_of
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.segments import check_log
+from sim2real.identify.problem.segments import Span, check_log
 from sim2real.installation import has_jax
-from sim2real.robots.robot import RecordedRobot, Robot, in_world
+from sim2real.log.importing.names import about_torque
+from sim2real.log.schema import unit_of
+from sim2real.robots.robot import Robot, in_world
 from sim2real.stages.check.config import CheckConfig
-from sim2real.stages.check.coverage import Coverage, coverage, problems
 from sim2real.stages.excitation.played import played
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
-from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
-from sim2real.stages.shared.identification import command
+from sim2real.stages.pipeline.python_arguments import AnyRecording, AnyRobot, config_of, recordings_of
+from sim2real.stages.shared.identification import command, side_by_side, usable
 from sim2real.stages.terminal.console import artifact_table, note, pairs, progress, shown
 from sim2real.types import Json
-
-if TYPE_CHECKING:
-    from sim2real.stages.check.determination import Determination, ParameterCheck
 
 PLANNED = "planned excitation"
 _GOAL = 0.01
 """Standard error to reach, as a fraction of the nominal value."""
+_MIN_SEGMENT_S = 0.3
+_MAX_SEGMENTS = 120
+"""Of a longer log this many segments are simulated, evenly distributed: more do not change the result."""
+_GAP = 2.5
+"""Pauses longer than this many periods are gaps."""
+_STILL = 0.05
+"""A joint stands still below this share of its highest speed, or below three deviations of a measured speed."""
+_NOISE_ORDER = 6
+"""Differences of this order keep 0.2 % of a motion at a tenth of the sampling rate, and all white noise."""
+_WINDOW_S = 0.03
+_SHORT_S = 12.0
+_LEAST_MOVING, _ONE_SIDED = 0.3, 0.2
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The time in motion of a joint.
+
+    Attributes:
+        moving: Share of the time in motion.
+        forward: Share of that time in which the position increases.
+        reversals: Number of changes of direction.
+    """
+
+    moving: float
+    forward: float
+    reversals: int
+
+
+@dataclass(frozen=True)
+class JointCoverage:
+    """The range of a joint's position, its highest speed, and its time in motion."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    fastest: float
+    motion: Motion
+
+
+@dataclass(frozen=True)
+class CommandCoverage:
+    """The range of a command."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What a recording covers.
+
+    Attributes:
+        duration_s: From the first to the last sample [s].
+        rate_hz: Median rate [Hz].
+        gaps: Number of pauses longer than two and a half periods.
+        longest_gap_s: 0 without gaps [s].
+        about_torque: Doubts that a torque is a command.
+    """
+
+    name: str
+    samples: int
+    duration_s: float
+    rate_hz: float
+    gaps: int
+    longest_gap_s: float
+    joints: tuple[JointCoverage, ...] = ()
+    commands: tuple[CommandCoverage, ...] = ()
+    about_torque: tuple[str, ...] = ()
+
+    def problems(self) -> Iterator[str]:
+        """Yield a sentence for each reason why this recording determines little."""
+        if self.gaps:
+            yield f"{self.gaps} gaps in the measurements, the longest {self.longest_gap_s:.3g} s"
+        for name, m in ((joint.name, joint.motion) for joint in self.joints):
+            if not m.moving:
+                yield f"{name} does not move at all: nothing about it is determined"
+                continue
+            if m.moving < _LEAST_MOVING:
+                yield f"{name} moves {m.moving:.0%} of the time: excite it more, or for longer"
+            if not _ONE_SIDED < m.forward < 1 - _ONE_SIDED:
+                yield f"{name} moves almost only one way: friction and an offset then look alike"
+        yield from self.about_torque
+        if self.commands and all(c.high == c.low for c in self.commands):
+            yield "no command changes: gains and delays of the actuator are not determined"
+
+    def show(self) -> None:
+        """Print the sampling, the motion of the joints and the ranges of the commands."""
+        gaps = f"{self.gaps}, the longest {self.longest_gap_s:.3g} s" if self.gaps else "none"
+        sampling = f"{self.samples} samples in {self.duration_s:.1f} s, {self.rate_hz:.4g} Hz, gaps: {gaps}"
+        rows = [
+            [
+                *(j.name, f"{j.low:.3g} to {j.high:.3g} {j.unit}".rstrip(), f"{j.fastest:.3g}"),
+                *(f"{j.motion.moving:.0%}", f"{j.motion.forward:.0%}", j.motion.reversals),
+            ]
+            for j in self.joints
+        ]
+        rows += [[c.name, f"{c.low:.3g} to {c.high:.3g} {c.unit}".rstrip(), "", "", "", ""] for c in self.commands]
+        table = ArtifactTable(("signal", "range", "highest speed", "in motion", "of it upwards", "reversals"), rows)
+        print(f"{pairs({self.name: sampling})}\n\n{artifact_table(table)}\n")
+
+
+@dataclass(frozen=True)
+class ParameterCheck:
+    """What recordings say of one parameter.
+
+    Attributes:
+        standard_error_per_minute: Standard error to expect from one minute of such data.
+        determined: ``alone``, or ``in a group`` of which only combinations are determined.
+        excite: The motion that determines it, as text.
+    """
+
+    name: str
+    unit: str
+    nominal: float | None
+    standard_error_per_minute: float
+    determined: str
+    excite: str = ""
+
+    @property
+    def percent_of_nominal(self) -> float | None:
+        """The standard error as a share of the nominal value [%]; None without one."""
+        return 100 * self.standard_error_per_minute / abs(self.nominal) if self.nominal else None
 
 
 @dataclass(frozen=True, repr=False)
@@ -43,24 +174,24 @@ class Checked(Shown):
 
     Attributes:
         source: ``log``, or ``planned excitation``.
-        recommendation: The problems of the data, then the next step.
+        segments: Number of simulated segments.
+        segment_s: Length of a segment [s].
+        condition: Condition number of the Jacobian, its columns in widths of the bounds; None if it is infinite.
+        undetermined: Groups of parameters; only combinations of the parameters in a group are determined.
+        messages: A sentence for each group.
+        following: The command to run next.
     """
 
     pipeline: str
     source: str
     recordings: tuple[Coverage, ...]
-    determination: Determination
-    recommendation: tuple[str, ...] = ()
-
-    @property
-    def parameters(self) -> tuple[ParameterCheck, ...]:
-        """What the recordings say of each parameter."""
-        return self.determination.parameters
-
-    @property
-    def undetermined(self) -> tuple[tuple[str, ...], ...]:
-        """Groups of parameters; only combinations of the parameters in a group are determined."""
-        return self.determination.undetermined
+    segments: int
+    segment_s: float
+    condition: float | None
+    undetermined: tuple[tuple[str, ...], ...]
+    messages: tuple[str, ...]
+    parameters: tuple[ParameterCheck, ...]
+    following: str = ""
 
     @property
     def determined(self) -> bool:
@@ -68,14 +199,39 @@ class Checked(Shown):
         return not self.undetermined
 
     @property
-    def messages(self) -> tuple[str, ...]:
-        """A sentence for each group."""
-        return self.determination.messages
+    def verdict(self) -> str:
+        """The result in one sentence."""
+        if self.undetermined:
+            names = ", ".join(dict.fromkeys(n for group in self.undetermined for n in group))
+            return f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one"
+        several = self.source != PLANNED and len(self.recordings) > 1
+        what = "this plan determines" if self.source == PLANNED else "this log determines"
+        return f"{'these logs determine' if several else what} every parameter"
+
+    @property
+    def recommendation(self) -> tuple[str, ...]:
+        """Sentences: the problems of the data, the motion to record instead, and how long to record."""
+        have_s, several = sum(r.duration_s for r in self.recordings), len(self.recordings) > 1
+        texts = [f"only {have_s:.1f} s: too little to fit one part and check on another"] if have_s < _SHORT_S else []
+        texts += [f"{r.name}: {text}" if several else text for r in self.recordings for text in r.problems()]
+        names = {n for group in self.undetermined for n in group}
+        if motions := dict.fromkeys(p.excite for p in self.parameters if p.excite and p.name in names):
+            texts.append(f"record instead: {'; '.join(motions)}")
+        # How long to record follows from the parameter with the largest standard error.
+        alone = [(p.percent_of_nominal, p.name) for p in self.parameters if p.determined == "alone"]
+        if known := [(percent, name) for percent, name in alone if percent]:
+            percent, worst = max(known)
+            seconds = 60.0 * (percent / (100 * _GOAL)) ** 2
+            enough = f"{have_s:.0f} s are enough for {_GOAL:.0%}, if the model is right"
+            more = f"{_GOAL:.0%} takes {_time(seconds)} of such data, or a better excitation"
+            about = f"{worst} is least certain: {percent:.2g} % of nominal from a minute"
+            texts.append(f"{about}; {enough if seconds <= have_s else more}")
+        return tuple(texts)
 
     def about(self) -> dict[str, Json]:
         """Return name -> value of the main figures."""
         figures = {"pipeline": self.pipeline, "source": self.source, "determined": "yes" if self.determined else "no"}
-        return figures | {"why": "; ".join(self.messages), "next": "; ".join(self.recommendation)}
+        return {**figures, "why": "; ".join([*self.messages, *self.recommendation]), "next": self.following}
 
     def rows(self) -> ArtifactTable:
         """Return a row for each parameter."""
@@ -88,28 +244,31 @@ class Checked(Shown):
 
 
 def run(pipeline: Pipeline, config: CheckConfig) -> bool:
-    """Judge recordings and print the result.
+    """Judge recordings and print the result: the verdict and the next command first.
 
     Returns:
         Whether every parameter is determined; of the delays the sum suffices.
     """
     checked = check(pipeline, None, config)
     if config.json:
-        document = {**plain(checked), "determined": checked.determined, **plain(checked.determination)}
-        print(to_json({n: v for n, v in document.items() if n != "determination"}).decode())
+        more = {"determined": checked.determined, "verdict": checked.verdict, "recommendation": checked.recommendation}
+        print(to_json({**plain(checked), **more}).decode())
         return checked.determined
-    show_coverage(checked.recordings)
-    print(artifact_table(checked.rows()))
-    condition, left = checked.determination.condition, len(checked.undetermined)
-    about = {"condition number": "infinite" if condition is None else f"{condition:.2g}", "directions left open": left}
-    print(f"\n{pairs(about)}")
+    print(f"verdict: {checked.verdict}")
+    print(f"next: {checked.following}")
     for message in [*checked.messages, *checked.recommendation]:
         print(f"- {message}")
+    print()
+    for recording in checked.recordings:
+        recording.show()
+    print(artifact_table(checked.rows()))
+    condition = "infinite" if checked.condition is None else f"{checked.condition:.2g}"
+    print(f"\n{pairs({'condition number': condition, 'directions left open': len(checked.undetermined)})}")
     return checked.determined
 
 
 def check(
-    robot: RecordedRobot | Pipeline | str,
+    robot: AnyRobot,
     recording: AnyRecording | Sequence[AnyRecording] | None = None,
     config: CheckConfig | Mapping[str, Json] | None = None,
 ) -> Checked:
@@ -150,45 +309,25 @@ def check(
         if config.json:
             print(to_json({"recordings": covered}).decode())
         else:
-            show_coverage(covered)
+            for recording_ in covered:
+                recording_.show()
         raise NotInstalled(
             "which parameters this recording determines is computed with JAX, which is not installed here",
             hint=f"copy it to a computer with sim2real: `sim2real check {pipeline.name} --log LOG`",
         )
-    from sim2real.stages.check.determination import determine  # imports JAX
-
     with progress(None, "check: simulate"):
-        found = determine(model, list(logs.values()), fitting, parameters)
+        checked = determine(model, list(logs.values()), fitting, parameters)
+    # Name the next command: where a parameter is not determined, it plans or records another motion.
     flags = {"log": config.log, "bounds": config.bounds, "fix": config.fix, "world": config.world}
-    identify = command(pipeline, replace(pipeline.identify, **flags), config.runs)
-    following = f"sim2real record {pipeline.name}" if planned else identify
-    checked = Checked(pipeline.name, PLANNED if planned else "log", covered, found)
-    return replace(checked, recommendation=tuple(recommend(checked, following)))
-
-
-def recommend(checked: Checked, following: str) -> list[str]:
-    """Return sentences: first the problems of the data, then the next step.
-
-    Args:
-        following: The command that follows if every parameter is determined.
-    """
-    texts = problems(checked.recordings)
-    if not checked.determined:
-        names = ", ".join(dict.fromkeys(n for group in checked.undetermined for n in group))
-        texts.append(f"do not identify yet: some of {names} would be guesses; --fix NAME VALUE holds a known one")
-        motions = [p.excite for p in checked.parameters if p.excite and p.name in names.split(", ")]
-        texts += [f"record instead: {'; '.join(dict.fromkeys(motions))}"] if motions else []
-    # How long to record follows from the parameter with the largest standard error.
-    alone = [(p.percent_of_nominal, p) for p in checked.parameters if p.determined == "alone" and p.percent_of_nominal]
-    if alone:
-        percent, worst = max(alone, key=lambda pair: pair[0])
-        seconds, have_s = 60.0 * (percent / (100 * _GOAL)) ** 2, sum(r.duration_s for r in checked.recordings)
-        about = f"{worst.name} is least certain: {percent:.2g} % of nominal from a minute"
-        if seconds <= have_s:
-            texts.append(f"{about}; {have_s:.0f} s are enough for {_GOAL:.0%}, if the model is right")
-        else:
-            texts.append(f"{about}; {_GOAL:.0%} takes {_time(seconds)} of such data, or a better excitation")
-    return [*texts, f"next: {following}"] if checked.determined else texts
+    following = command(pipeline, replace(pipeline.identify, **flags), config.runs)
+    if isinstance(robot, Robot) and not checked.determined:
+        following = f"sim2real check {pipeline.name} --plan --record.excitation KIND, then record what suffices"
+    elif not checked.determined:
+        following = f"record such a motion, or hold a known value: {following} --fix {checked.undetermined[0][0]} VALUE"
+    elif planned:
+        following = f"sim2real record {pipeline.name}"
+    source = PLANNED if planned else "log"
+    return replace(checked, pipeline=pipeline.name, source=source, recordings=covered, following=following)
 
 
 def find_logs(pipeline: Pipeline, config: CheckConfig) -> dict[str, Episode]:
@@ -206,12 +345,6 @@ def find_logs(pipeline: Pipeline, config: CheckConfig) -> dict[str, Episode]:
                 ) from error
             note(f"no recording of {pipeline.name} in {shown(config.runs)}: the planned excitation is simulated")
     return {shown(p): open_recording(p, pipeline, robot).episode for p in paths}
-
-
-def show_coverage(recordings: Sequence[Coverage]) -> None:
-    """Print the sampling of recordings, the motion of their joints and the ranges of their commands."""
-    for recording in recordings:
-        print(f"{pairs({recording.name: recording.sampling()})}\n\n{artifact_table(recording.rows())}\n")
 
 
 def _planned(
@@ -246,3 +379,145 @@ def _planned(
 
 def _time(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min" if seconds < 7200 else "hours"
+
+
+def coverage(name: str, episode: Episode, model: IdentifiableModel, units: Mapping[str, str]) -> Coverage:
+    """Return what a recording covers.
+
+    Args:
+        model: Names the nodes and fields that are compared.
+        units: Field -> unit.
+    """
+    begun_s = episode.steps[model.sensor].begun_s
+    gaps, longest_s, rate_hz = sampling(begun_s)
+    duration_s = float(begun_s[-1] - begun_s[0]) if len(begun_s) else 0.0
+    joints = tuple(_joint(c, episode.outputs[model.sensor], units, begun_s) for c in model.channels)
+    doubts = tuple(about_torque(episode.metadata.get("mapping") or {}))
+    commands = tuple(_commands(episode, model, units))
+    return Coverage(name, len(begun_s), duration_s, rate_hz, gaps, longest_s, joints, commands, doubts)
+
+
+def _joint(
+    channel: Channel, outputs: Mapping[str, np.ndarray], units: Mapping[str, str], begun_s: np.ndarray
+) -> JointCoverage:
+    position = np.asarray(channel.of(outputs[channel.position]), np.float64)
+    # A robot that does not measure velocities gets them from differences of positions.
+    velocity = speed(begun_s, position) if channel.velocity is None else channel.of(outputs[channel.velocity])
+    low, high, fastest = float(position.min()), float(position.max()), float(np.abs(velocity).max())
+    unit = unit_of(position_of(channel), dict(units))
+    return JointCoverage(channel.name, unit, low, high, fastest, motion_of(begun_s, position))
+
+
+def _commands(episode: Episode, model: IdentifiableModel, units: Mapping[str, str]) -> Iterator[CommandCoverage]:
+    """Yield each command, named by its joint where the field has a value for each joint."""
+    for node, message in model.given.items():
+        for field in pytree.leaves(message):
+            values = np.asarray(episode.outputs[node][field], np.float64)
+            columns = values.reshape(len(values), -1).T
+            names = [f"{node}.{field}[{i}]" for i in range(len(columns))]
+            if len(columns) == 1:
+                names = [f"{node}.{field}"]
+            elif len(columns) == len(model.channels):
+                names = [f"{field} of {channel.name}" for channel in model.channels]
+            for i, (name, column) in enumerate(zip(names, columns, strict=True)):
+                low, high = float(column.min()), float(column.max())
+                yield CommandCoverage(name, unit_of(f"{field}[{i}]", dict(units)), low, high)
+
+
+def sampling(t_s: np.ndarray) -> tuple[int, float, float]:
+    """Return the number of gaps, the longest gap [s] and the median rate [Hz] of times ``(N,)`` [s]."""
+    steps = np.diff(np.asarray(t_s, np.float64))
+    if not steps.size:
+        return 0, 0.0, 0.0
+    period = float(np.median(steps))
+    gaps = steps[steps > _GAP * period]
+    return int(gaps.size), float(gaps.max(initial=0.0)), 1.0 / period if period > 0 else 0.0
+
+
+def speed(t_s: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return the rate of a sampled position ``(N,)``, by differences; 0 with fewer than three samples."""
+    if len(position) < 3:
+        return np.zeros(len(position))
+    times = np.asarray(t_s, np.float64)
+    steps = np.maximum(np.diff(times), 1e-9)  # equal stamps must not make it infinite
+    return np.gradient(np.asarray(position, np.float64), times[0] + np.concatenate([[0.0], np.cumsum(steps)]))
+
+
+def motion(velocity: np.ndarray, sigma: float = 0.0) -> Motion:
+    """Return the motion of a joint with velocities ``(N,)`` and their deviation."""
+    velocity = np.asarray(velocity, np.float64)
+    # Compare with the 99 % quantile: a rare spike must not make the other speeds count as standing still.
+    still = max(_STILL * float(np.quantile(np.abs(velocity), 0.99)), 3.0 * sigma)
+    fast = np.abs(velocity) > still
+    if not fast.any():
+        return Motion(0.0, 0.0, 0)
+    signs = np.sign(velocity[fast])
+    return Motion(float(fast.mean()), float((signs > 0).mean()), int((np.diff(signs) != 0).sum()))
+
+
+def motion_of(t_s: np.ndarray, position: np.ndarray) -> Motion:
+    """Return the motion of a joint with positions ``(N,)`` at times ``(N,)`` [s]; noise and quantisation do not count.
+
+    Speeds are those of positions averaged over 30 ms, so that the noise of fast samples does not hide slow motion.
+    """
+    t_s, position = np.asarray(t_s, np.float64), np.asarray(position, np.float64)
+    good = np.isfinite(position) & np.isfinite(t_s)
+    t_s, position = t_s[good], position[good]
+    if len(position) < 3 * _NOISE_ORDER:
+        return motion(speed(t_s, position))
+    period_s = max(float(np.median(np.diff(t_s))), 1e-9)
+    # Average over 30 ms.
+    width = min(max(1, round(_WINDOW_S / period_s)), len(position) // 3)
+    mean = np.full(width, 1.0 / width)
+    deviation = _noise(position)
+    times, smooth = (np.convolve(values, mean, "valid") for values in (t_s - t_s[0], position))
+    # Compare the range of the averages with the noise and the steps of the readings.
+    least = max(1.5 * float(np.diff(np.unique(position)).min(initial=np.inf)), 8.0 * deviation / np.sqrt(width))
+    if not np.ptp(np.quantile(smooth, [0.005, 0.995])) > least:
+        return Motion(0.0, 0.0, 0)
+    return motion(speed(times, smooth), deviation / (width * period_s))
+
+
+def _noise(values: np.ndarray) -> float:
+    """Return the deviation of white noise in values ``(N,)``, by high differences without the largest 2 %: leaps."""
+    squares = np.sort(np.diff(values, _NOISE_ORDER) ** 2)
+    return float(np.sqrt(squares[: math.ceil(0.98 * squares.size)].mean() / math.comb(2 * _NOISE_ORDER, _NOISE_ORDER)))
+
+
+def determine(
+    model: IdentifiableModel, episodes: Sequence[Episode], config: IdentifyConfig, parameters: ParameterTable
+) -> Checked:
+    """Return which parameters recordings determine: their residuals are simulated once, at the nominal values."""
+    from sim2real.identify.problem.problem import Problem  # imports JAX
+    from sim2real.identify.uncertainty import identifiability, uncertainty
+
+    spans, length_s = cut_segments(episodes, config)
+    problem = Problem(model, episodes, spans, length_s, config, parameters)
+    found = identifiability.from_linearised(problem, uncertainty.linearise(problem, problem.table.start()))
+    grouped = {name for group in found.undetermined for name in group}
+    errors = found.standard_error_per_minute.values()
+    rows = [
+        ParameterCheck(
+            *(c.label, c.parameter.unit, c.parameter.nominal, number(error)),
+            *("in a group" if c.label in grouped else "alone", c.parameter.excite),
+        )
+        for c, error in zip(problem.table.columns, errors, strict=True)
+    ]
+    groups = (found.undetermined, found.messages)
+    return Checked("", "log", (), problem.segments, length_s, found.condition, *groups, tuple(rows))
+
+
+def cut_segments(episodes: Sequence[Episode], config: IdentifyConfig) -> tuple[list[Span], float]:
+    """Return segments side by side, all of them fitted, and their length [s]."""
+    ends = [usable(e, config) for e in episodes]
+    shortest_s = min(end - begin for begin, end in ends)
+    length_s = min(config.settle_s + config.horizon_s, shortest_s)
+    if length_s < _MIN_SEGMENT_S:
+        raise UsageError(
+            f"the shortest recording lasts {min(e.duration_s for e in episodes):.2f} s: too short for a segment",
+            hint="record for at least 12 s",
+        )
+    spans = [Span(r, begin) for r, e in enumerate(episodes) for begin in side_by_side(e, config, length_s)]
+    if len(spans) > _MAX_SEGMENTS:
+        spans = [spans[i] for i in np.linspace(0, len(spans) - 1, _MAX_SEGMENTS).round().astype(int)]
+    return spans, length_s

@@ -1,9 +1,11 @@
-"""What identify prints: tables of estimates, errors and links, and the summary of the stage."""
+"""What identify prints: the verdict in four lines, the details below, and the summary of the stage."""
+
+from __future__ import annotations
 
 import numpy as np
 
 from sim2real.artifacts.files import number
-from sim2real.artifacts.identification import ROUND_TRIP, Identification, links_table, tried_table
+from sim2real.artifacts.identification import ROUND_TRIP, Identification, links_table, tried_table, with_small_unit
 from sim2real.stages.terminal.console import artifact_table, note
 
 _USE = {
@@ -13,18 +15,22 @@ _USE = {
     "not finished": "not finished: these parameters are no estimates yet",
 }
 """Status -> whether the parameters may be used."""
-_NEXT = {
-    "accepted": "sim2real train, or sim2real export",
-    "record again": "sim2real check --plan shows which motion determines them",
-    "change the model": "look at the first reason; no flag changes it",
-}
-"""Status -> what to do where no command follows from the reasons."""
 _MOST_ROWS = 12
 """Rows of a table of errors on the console; 120 logs have 480."""
 
 
-def show(identification: Identification) -> None:
-    """Print the estimates, held-out errors and links, then the verdict: may I use it, how far off, what next."""
+def show(identification: Identification, following: str = "") -> None:
+    """Print the verdict: may I use it, why, how far off will it be, what do I do next. Then print the details.
+
+    Args:
+        following: What to do where the verdict has no next command.
+    """
+    verdict = identification.verdict
+    note(f"verdict: {_USE.get(verdict.status, verdict.status)}")
+    for reason in verdict.reasons[:1]:
+        note(f"reason: {reason}")
+    note(f"expected error: {expected_error(identification)}")
+    note(f"next: {verdict.next or following or 'look at the reason; no flag changes it'}")
     print(artifact_table(identification.rows()))
     if identification.aggregate:
         print(artifact_table(identification.recordings_table().without("s.e.")))
@@ -38,25 +44,23 @@ def show(identification: Identification) -> None:
         print(artifact_table(compared, _MOST_ROWS))
     if identification.links:
         print(artifact_table(links_table(identification.links)))
-    verdict = identification.verdict
-    note(f"verdict: {_USE.get(verdict.status, verdict.status)}")
-    note(f"expected error: {_expected(identification)}")
-    note(f"next: {verdict.next or _NEXT.get(verdict.status, '')}")
-    for reason in verdict.reasons:
+    if len(verdict.reasons) > 1:
+        note("details:")
+    for reason in verdict.reasons[1:]:
         note(f"  {reason}")
     if identification.worst is not None:
-        note(f"worst: {identification.worst.text(identification.logs)}")
+        note(f"  the worst second: {identification.worst.text(identification.logs)}")
 
 
-def _expected(identification: Identification) -> str:
+def expected_error(identification: Identification) -> str:
     """Return the expected errors of the joint with the largest one beside its noise, as text."""
     expected, sigma = identification.expected_error, identification.sigma
     if not expected:
         return "unknown, as there are too few held-out parts, or a prediction of one diverged"
     worst = max(expected, key=lambda e: e.error / sigma.get(e.column, 1.0)).column
-    joints = {e.column for e in expected}
+    own, joints = [e for e in expected if e.column == worst], {e.column for e in expected}
     which = f", the worst of {len(joints)} joints" if len(joints) > 1 else ""
-    return ", ".join(str(e) for e in expected if e.column == worst) + which
+    return f"{own[0].name} " + ", ".join(f"{with_small_unit(e.error, e.unit)} {e.how}" for e in own) + which
 
 
 def summary(identification: Identification) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +14,7 @@ from sim2real.artifacts.run.run_folder import OpenStage, StageFolder, newest, op
 from sim2real.errors import UsageError
 from sim2real.identify.uncertainty.noise import noises
 from sim2real.identify.validation.refits import REFITS
-from sim2real.robots.robot import RecordedRobot
+from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
 from sim2real.stages.identify.inputs import Inputs, prepare, robot_of, storing_refits
@@ -24,6 +25,7 @@ from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
 from sim2real.stages.shared.identification import command, continuing
+from sim2real.stages.terminal.console import progress, shown
 
 
 def identify(
@@ -110,8 +112,9 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
             again = continuing(pipeline, config, root, stage.folder / PARAMETERS)
         verdict = replace(identification.verdict, next=again)
         identification = replace(identification, logs=inputs.sources(stage.run_dir), verdict=verdict)
-        _write(identification, stage, pipeline, robot)
-        show(identification)
+        show(identification, _following(pipeline, robot, stage, identification))
+        with progress(None, "identify: write the files and the page"):
+            _write(identification, stage, pipeline, robot)
         stage.summary(summary(identification))
     return stage.result
 
@@ -127,6 +130,20 @@ def _write(identification: Identification, stage: OpenStage, pipeline: Pipeline,
     from sim2real.view.page.page import identify_page  # matplotlib and jinja2 take 0.5 s to import
 
     stage.output("page", identify_page(stage.folder).name)
+
+
+def _following(pipeline: Pipeline, robot: RecordedRobot, stage: OpenStage, identification: Identification) -> str:
+    """Return what to do where the verdict has no next command."""
+    name, folder = shlex.join(pipeline.words), shlex.quote(shown(stage.folder))
+    if not pipeline.has_commands:
+        return ""
+    if identification.verdict.status == "record again":
+        return f"sim2real check {name}, which says what motion determines the parameters"
+    if identification.verdict.status != "accepted":
+        return ""
+    if isinstance(robot, Robot):
+        return f"sim2real train {name} --run {shlex.quote(shown(stage.run_dir))}"
+    return f"sim2real validate {folder} --log LATER_LOG, or sim2real export identified {folder}"
 
 
 def _begin(path: str, pipeline: Pipeline) -> dict[str, float]:

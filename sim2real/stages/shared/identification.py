@@ -303,7 +303,7 @@ def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str =
         if isinstance(value, Mapping):
             for name, numbers in value.items():
                 values = numbers if isinstance(numbers, tuple) else (numbers,)
-                words += [] if name in named else [flag, name, *(f"{v:g}" for v in values)]
+                words += [] if name in named else [flag, name, *map(_exactly, values)]
         elif isinstance(value, tuple):
             words += [word for file in value for word in (flag, str(file))]
         elif value != getattr(pipeline.identify, f.name) and flag not in further:
@@ -312,6 +312,11 @@ def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str =
             )
     words += ["--runs", str(root)] if Path(root) != Path("runs") else []
     return shlex.join([*words, *further])
+
+
+def _exactly(value: float) -> str:
+    """Return a number as a word: finished refits are found again only for the same bounds."""
+    return short if float(short := f"{value:g}") == value else repr(value)
 
 
 def continuing(pipeline: Pipeline, config: IdentifyConfig, root: Path, file: Path) -> str:
