@@ -14,8 +14,7 @@ from sim2real.artifacts.paths import shown
 from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
 from sim2real.artifacts.summary import ArtifactTable, Shown
 from sim2real.policy.bundle import PolicyReference, load_bundle, make_runner, read_contract, read_weights, save_bundle
-from sim2real.policy.contract import PolicyContract
-from sim2real.policy.network import NetworkSpec
+from sim2real.policy.contract import NetworkSpec, PolicyContract
 from sim2real.policy.runner import PolicyRunner
 from sim2real.types import Json
 

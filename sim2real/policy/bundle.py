@@ -17,8 +17,7 @@ from safetensors import SafetensorError
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.installation import version
-from sim2real.policy.contract import PolicyContract
-from sim2real.policy.network import NetworkSpec
+from sim2real.policy.contract import NetworkSpec, PolicyContract
 from sim2real.policy.onnx_graph import build_onnx, with_contract
 from sim2real.policy.runner import (
     BACKENDS,
@@ -127,7 +126,7 @@ def _described(weights: Mapping[str, np.ndarray], contract: PolicyContract, spec
     return {
         "format_version": FORMAT_VERSIONS[0] if plain else FORMAT_VERSIONS[1],
         **contract.to_dict(),
-        **({} if plain else {"network": spec.to_dict()}),
+        **({} if plain else {"network": dataclasses.asdict(spec)}),
         "normaliser": {"mean": weights["mean"].tolist(), "std": weights["std"].tolist(), "clip": OBSERVATION_CLIP},
         "versions": {"python": platform.python_version()}
         | {name: version(name) for name in ("sim2real", "numpy", "onnx")},

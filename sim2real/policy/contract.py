@@ -1,19 +1,26 @@
-"""The contract of a policy: its observations, actions, rate and limits."""
+"""The contract of a policy: its observations, actions, rate and limits; and the description of its network."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import TypeVar
+
+import msgspec
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.types import Json
+
+T = TypeVar("T")
 
 RATES_HZ = (1e-3, 1e5)
 """Smallest and largest number of policy steps per second."""
 MAX_DELAY_S = 60.0
 """Longest delay, and longest step of a node [s]."""
 MAX_HISTORY = 10_000
+BUILT_IN = ("mlp", "gru")
+"""Networks that numpy runs."""
 MAX_BOUND = 1e9
 """Largest magnitude of a bound or a limit, in any unit; float32 has steps of 64 there."""
 
@@ -119,6 +126,8 @@ class PolicyContract:
             raise UsageError("a policy needs at least one observation term and one action")
         for kind, terms in (("observation term", self.observation), ("action", self.action)):
             names = [term.name for term in terms]
+            if not all(names):
+                raise UsageError(f"{kind} {names.index('')} has no name")
             double = sorted({name for name in names if names.count(name) > 1})
             if double:
                 raise UsageError(f"{kind} {', '.join(double)} appears more than once")
@@ -155,74 +164,55 @@ class PolicyContract:
 
     def to_dict(self) -> dict[str, Json]:
         """Return the contract as plain data for JSON."""
-        data = dataclasses.asdict(self)
-        data["observation"] = [
-            {name: v for name, v in dataclasses.asdict(term).items() if v or name not in ("low", "high")}
-            | {"size": term.size}
-            for term in self.observation
-        ]
-        data["trained_s"] = {name: list(times) for name, times in self.trained_s.items()}
-        data["delays_s"], data["limits"], data["hashes"] = dict(self.delays_s), dict(self.limits), dict(self.hashes)
+        data: dict[str, Json] = msgspec.to_builtins(self)
+        for term, entry in zip(self.observation, data["observation"], strict=True):
+            data_of_bounds = {} if term.low else {"low": None, "high": None}
+            entry |= {"size": term.size, **data_of_bounds}
+        data["observation"] = [{n: v for n, v in entry.items() if v is not None} for entry in data["observation"]]
         return data
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Json]) -> PolicyContract:
+    def from_dict(cls, data: object) -> PolicyContract:
         """Return the contract from the data that ``to_dict`` returns.
+
+        Raises:
+            Sim2RealError: A part is missing, of the wrong type or out of its range.
+        """
+        return _read(cls, data, "contract")
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkSpec:
+    """The description of a policy's network, without its weights.
+
+    Attributes:
+        name: ``"mlp"``, ``"gru"``, or ``"package.module:Class"`` of a user's network.
+        squash: Whether the action is bounded by tanh; else it is clipped.
+    """
+
+    name: str = "mlp"
+    squash: bool = False
+
+    @property
+    def built_in(self) -> bool:
+        """Whether numpy runs it."""
+        return self.name in BUILT_IN
+
+    @classmethod
+    def from_dict(cls, data: object) -> NetworkSpec:
+        """Return the description from its entry in ``policy.json``.
 
         Raises:
             Sim2RealError: A part is missing or of the wrong type.
         """
-        try:
-            # Convert each entry, as the file may hold any JSON.
-            return cls(
-                observation=tuple(
-                    ObservationTerm(
-                        *(_text(term["name"]), tuple(map(_text, _list(term["units"]))), _count(term["history"])),
-                        *(tuple(map(_number, _list(term.get(bound, [])))) for bound in ("low", "high")),
-                    )
-                    for term in data["observation"]
-                ),
-                action=tuple(
-                    ActionTerm(_text(term["name"]), _text(term["unit"]), _number(term["low"]), _number(term["high"]))
-                    for term in data["action"]
-                ),
-                rate_hz=_number(data["rate_hz"]),
-                delays_s={name: _number(delay) for name, delay in data["delays_s"].items()},
-                trained_s={
-                    name: (_number(least), _number(most)) for name, (least, most) in data.get("trained_s", {}).items()
-                },
-                limits={name: _number(limit) for name, limit in data["limits"].items()},
-                hashes={name: _text(digest) for name, digest in data["hashes"].items()},
-            )
-        except Sim2RealError:
-            raise
-        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-            raise Sim2RealError(
-                f"the policy's contract is incomplete: {type(error).__name__} {error}",
-                hint="export the policy again: sim2real train",
-            ) from error
+        return _read(cls, data, "network")
 
 
-def _number(value: Json) -> float:
-    """Return a number of a file; a text or a truth value raises a TypeError."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{value!r} is no number")
-    return float(value)
-
-
-def _count(value: Json) -> int:
-    if type(value) is not int:
-        raise TypeError(f"{value!r} is no whole number")
-    return value
-
-
-def _text(value: Json) -> str:
-    if not isinstance(value, str) or not value:
-        raise TypeError(f"{value!r} is no text")
-    return value
-
-
-def _list(value: Json) -> list[Json]:
-    if not isinstance(value, list | tuple):
-        raise TypeError(f"{value!r} is no list")
-    return list(value)
+def _read(kind: type[T], data: object, what: str) -> T:
+    """Return an object from the data of a file."""
+    try:
+        return msgspec.convert(data, kind)
+    except (msgspec.ValidationError, UnicodeError) as error:
+        raise Sim2RealError(
+            f"the policy's {what} is incomplete or wrong: {error}", hint="export the policy again: sim2real train"
+        ) from error

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sim2real.policy.contract import PolicyContract
-from sim2real.policy.network import NetworkSpec
+from sim2real.policy.contract import NetworkSpec, PolicyContract
 from sim2real.policy.runner import INITIAL_CARRY, OBSERVATION_CLIP, gru_of, layers_of
 from sim2real.types import Json
 

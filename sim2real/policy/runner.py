@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from sim2real.errors import SafetyStop, Sim2RealError, UsageError
 from sim2real.installation import with_extra
-from sim2real.policy.contract import PolicyContract
-from sim2real.policy.network import NetworkSpec
+from sim2real.policy.contract import NetworkSpec, PolicyContract
 
 OBSERVATION_CLIP = 10.0
 """Normalised observations are clipped to this many standard deviations, which is part of the bundle's format."""
@@ -199,3 +198,68 @@ class PolicyRunner:
             names = [term.name for term, ok in zip(self.contract.action, np.isfinite(action), strict=True) if not ok]
             raise SafetyStop(f"the policy's action {', '.join(names)} is not finite", hint="train the policy again")
         return np.clip(action, self._low, self._high)
+
+
+class Runner(Protocol):
+    """What acts in an episode: ``PolicyRunner``, or one around it."""
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        ...
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return the action ``(A,)`` for the next observation ``(O,)``."""
+        ...
+
+
+class BlendedRunner:
+    """A runner whose action grows linearly from 0 to the policy's action at the start of each episode.
+
+    Args:
+        blend_s: Time until the action is the policy's [s]; 0: from the start.
+    """
+
+    def __init__(self, runner: PolicyRunner, blend_s: float) -> None:
+        self._runner, self._blend_steps, self._step = runner, blend_s * runner.contract.rate_hz, 0
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._runner.reset()
+        self._step = 0
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return a share of the policy's action, shape ``(A,)``."""
+        action = self._runner(observation)
+        share = min(1.0, self._step / self._blend_steps) if self._blend_steps else 1.0
+        self._step += 1
+        return action * np.float32(share)
+
+
+class UprightRunner:
+    """A runner that stops the robot above a tilt limit.
+
+    Args:
+        tilt_rad: Returns the robot's tilt from an observation ``(O,)`` [rad].
+        limit_rad: Largest allowed tilt [rad].
+    """
+
+    def __init__(self, runner: Runner, tilt_rad: Callable[[np.ndarray], float], limit_rad: float) -> None:
+        self._runner, self._tilt_rad, self._limit_rad = runner, tilt_rad, limit_rad
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._runner.reset()
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return the policy's action, shape ``(A,)``.
+
+        Raises:
+            SafetyStop: The robot's tilt is above the limit, or no number.
+        """
+        tilt_rad = self._tilt_rad(observation)
+        if not abs(tilt_rad) <= self._limit_rad:
+            raise SafetyStop(
+                f"the robot leans by {tilt_rad:.3g} rad, more than the {self._limit_rad:.3g} rad that are allowed",
+                hint="set it upright; max_tilt_rad sets the limit",
+            )
+        return self._runner(observation)

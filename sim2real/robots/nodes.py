@@ -17,7 +17,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseNode, NodeOptions
 from sim2real.later import jax, jnp
-from sim2real.policy.upright import Runner
+from sim2real.policy.runner import Runner
 from sim2real.robots.loop import AGENT, DelayParams, delay_of
 from sim2real.robots.messages import Goals
 from sim2real.types import Array, Key, PyTree

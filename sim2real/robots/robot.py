@@ -25,7 +25,7 @@ from sim2real.identify.model import Channel, IdentifiableModel, PlainSimulation,
 from sim2real.identify.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.policy.upright import Runner
+from sim2real.policy.runner import Runner
 from sim2real.robots.loop import (
     ACTUATOR,
     AGENT,

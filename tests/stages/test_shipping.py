@@ -15,7 +15,7 @@ from sim2real.commands.export import policy as export_policy
 from sim2real.errors import UsageError
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle, standalone
 from sim2real.policy.bundle import sealed
-from sim2real.policy.network import NetworkSpec
+from sim2real.policy.contract import NetworkSpec
 
 SAME = """
 import json, sys

@@ -10,7 +10,7 @@ from flax import linen
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle
-from sim2real.policy.network import NetworkSpec
+from sim2real.policy.contract import NetworkSpec
 from sim2real.training.config import PPOConfig
 from sim2real.training.networks.architectures import GRU, make_network
 from sim2real.training.networks.sequences import unroll
@@ -107,6 +107,6 @@ def test_a_gru_without_a_width_is_refused():
 
 
 def test_a_description_that_is_none_is_refused():
-    assert NetworkSpec.from_dict(NetworkSpec("gru", True).to_dict()) == NetworkSpec("gru", True)
+    assert NetworkSpec.from_dict({"name": "gru", "squash": True}) == NetworkSpec("gru", True)
     with pytest.raises(Sim2RealError, match=r"described by None[\s\S]*hint: "):
         NetworkSpec.from_dict(None)

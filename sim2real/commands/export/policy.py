@@ -9,7 +9,7 @@ from sim2real.commands.config import ShipConfig
 from sim2real.errors import UsageError
 from sim2real.policy import standalone
 from sim2real.policy.bundle import CONTRACT, GRAPH, WEIGHTS, load_bundle, read_contract
-from sim2real.policy.network import NetworkSpec
+from sim2real.policy.contract import NetworkSpec
 from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
 from sim2real.stages.pipeline.pipeline import available
 from sim2real.stages.terminal.console import note, wrote

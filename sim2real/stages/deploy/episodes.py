@@ -7,8 +7,7 @@ from pathlib import Path
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.recording import TRUTH
 from sim2real.errors import UsageError
-from sim2real.policy.blended import BlendedRunner
-from sim2real.policy.upright import UprightRunner
+from sim2real.policy.runner import BlendedRunner, UprightRunner
 from sim2real.robots.probe import Witness
 from sim2real.robots.robot import Robot, Session
 from sim2real.stages.deploy.config import DeployConfig

@@ -16,7 +16,7 @@ from flax import struct
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import Base
-from sim2real.policy.network import BUILT_IN, NetworkSpec
+from sim2real.policy.contract import BUILT_IN, NetworkSpec
 from sim2real.policy.runner import BESIDES, GRU_ARRAYS, OBSERVATION_CLIP, PARTS, gru_of, layers_of, require
 from sim2real.training.networks.architectures import GRU, MLP, Factory, Network, is_recurrent, make_network, name_of
 from sim2real.types import Array, PyTree

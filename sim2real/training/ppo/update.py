@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sim2real.policy.network import NetworkSpec
+from sim2real.policy.contract import NetworkSpec
 from sim2real.training.config import PPOConfig
 from sim2real.training.environment.protocol import TrainingEnvironment, widen
 from sim2real.training.networks.normaliser import Normaliser, deviations, normalise_parameters, update_normaliser

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sim2real.policy.upright import Runner
+from sim2real.policy.runner import Runner
 from sim2real.robots.loop import DELAYS
 from sim2real.robots.robot import Robot
 from sim2real.robots.walking.joints import STRENGTH as MOTOR_STRENGTH
