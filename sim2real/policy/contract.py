@@ -172,13 +172,16 @@ class PolicyContract:
         return data
 
     @classmethod
-    def from_dict(cls, data: object) -> PolicyContract:
+    def from_dict(cls, data: Json) -> PolicyContract:
         """Return the contract from the data that ``to_dict`` returns.
 
         Raises:
             Sim2RealError: A part is missing, of the wrong type or out of its range.
         """
-        return _read(cls, data, "contract")
+        contract = _read(cls, data, "contract", ("delays_s", "limits", "hashes"))
+        if not all("history" in term for term in data["observation"]):
+            raise _wrong("contract", "an observation term has no history")
+        return contract
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,20 +202,27 @@ class NetworkSpec:
         return self.name in BUILT_IN
 
     @classmethod
-    def from_dict(cls, data: object) -> NetworkSpec:
+    def from_dict(cls, data: Json) -> NetworkSpec:
         """Return the description from its entry in ``policy.json``.
 
         Raises:
             Sim2RealError: A part is missing or of the wrong type.
         """
-        return _read(cls, data, "network")
+        return _read(cls, data, "network", ("name", "squash"))
 
 
-def _read(kind: type[T], data: object, what: str) -> T:
-    """Return an object from the data of a file."""
+def _read(kind: type[T], data: Json, what: str, needed: tuple[str, ...]) -> T:
+    """Return an object from the data of a file, in which the ``needed`` entries have no default."""
     try:
-        return msgspec.convert(data, kind)
+        read = msgspec.convert(data, kind)
     except (msgspec.ValidationError, UnicodeError) as error:
-        raise Sim2RealError(
-            f"the policy's {what} is incomplete or wrong: {error}", hint="export the policy again: sim2real train"
-        ) from error
+        raise _wrong(what, str(error)) from error
+    if missing := [name for name in needed if name not in data]:
+        raise _wrong(what, f"{', '.join(missing)} is missing")
+    return read
+
+
+def _wrong(what: str, reason: str) -> Sim2RealError:
+    return Sim2RealError(
+        f"the policy's {what} is incomplete or wrong: {reason}", hint="export the policy again: sim2real train"
+    )

@@ -12,7 +12,7 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.training.config import PPOConfig
-from sim2real.training.scale.mesh import mesh_of
+from sim2real.training.scale.devices import mesh_of
 
 SCRIPT = """
 import dataclasses, json, re

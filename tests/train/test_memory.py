@@ -108,5 +108,7 @@ def test_a_gru_without_a_width_is_refused():
 
 def test_a_description_that_is_none_is_refused():
     assert NetworkSpec.from_dict({"name": "gru", "squash": True}) == NetworkSpec("gru", True)
-    with pytest.raises(Sim2RealError, match=r"described by None[\s\S]*hint: "):
+    with pytest.raises(Sim2RealError, match=r"network is incomplete or wrong[\s\S]*hint: "):
         NetworkSpec.from_dict(None)
+    with pytest.raises(Sim2RealError, match="squash is missing"):
+        NetworkSpec.from_dict({"name": "mlp"})

@@ -83,5 +83,5 @@ def test_who_does_not_know_of_it_must_refuse_the_bundle(policy, tmp_path):
     assert about["format_version"] == 2
     del about["network"]
     (folder / "policy.json").write_text(json.dumps(about))
-    with pytest.raises(Sim2RealError, match=r"network is described by None[\s\S]*hint: export"):
+    with pytest.raises(Sim2RealError, match=r"network is incomplete or wrong[\s\S]*hint: export"):
         load_bundle(folder)

@@ -12,7 +12,6 @@ from types import FrameType
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
-_LOOK_S = 0.25
 
 
 _soft = threading.Event()
@@ -81,19 +80,12 @@ class SignalHandling:
         threading.Timer(0.01, os.kill, (os.getpid(), self.received)).start()
 
 
-def patiently(work: Callable[[], Result], look: Callable[[], None] | None = None) -> Result:
+def patiently(work: Callable[[], Result]) -> Result:
     """Run a long computation in another thread, so that a signal is handled at once.
 
     Python handles signals between bytecode instructions of the main thread, and a single call into XLA may compile for
     a minute. The signal does not stop the computation itself, which ends with the process; so its callbacks must write
-    no file after the caller has left.
-
-    Args:
-        work: The computation; an exception in it is raised here.
-        look: Called every 0.25 s while it runs; an exception in it ends the wait.
-
-    Returns:
-        What ``work`` returned.
+    no file after the caller has left. An exception in it is raised here.
     """
     # Work in a thread, so that the main thread receives signals at once.
     outcome: list[Result] = []
@@ -109,9 +101,8 @@ def patiently(work: Callable[[], Result], look: Callable[[], None] | None = None
             done.set()
 
     threading.Thread(target=run, name="sim2real:work", daemon=True).start()
-    while not done.wait(_LOOK_S):  # polls: a signal that another thread receives does not wake this one
-        if look is not None:
-            look()
+    while not done.wait(0.25):  # polls: a signal that another thread receives does not wake this one
+        pass
     if failure:
         raise failure[0]
     return outcome[0]

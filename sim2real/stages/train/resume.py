@@ -1,25 +1,18 @@
 """Continuing a training that was interrupted."""
 
-import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sim2real.artifacts.files import plain
 from sim2real.artifacts.run.manifest import RUNNING, read_manifest, sha256
 from sim2real.artifacts.run.run_folder import StageFolder, attempts, run_folders
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.stages.pipeline.find_run import find_run
 from sim2real.stages.terminal.console import note, shown
 from sim2real.stages.train.config import TrainConfig
-from sim2real.types import Json
 
 CHECKPOINT = "checkpoint.safetensors"
 NEWEST = "newest"
-_HOSTS = ("hosts.found", "hosts.coordinator", "hosts.processes", "hosts.process", "hosts.timeout_s")
-_MAY_DIFFER = ("resume", "parameters", "ppo.target", "tensorboard", "checkpoint", *_HOSTS)
-"""Settings that do not change the numbers of a training. The digest of the parameters is compared instead of their
-path, and the program instead of the number of devices."""
 
 
 def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFolder | None:
@@ -32,7 +25,6 @@ def find_interrupted(pipeline: str, config: TrainConfig, root: Path) -> StageFol
             f"there is no interrupted training of {pipeline!r} in {config.resume if config.resume != NEWEST else root}",
             hint=f"name the run folder or the folder of the training, or start one with `sim2real train {pipeline}`",
         )
-    _check_same_settings(interrupted, config)
     if not (interrupted.folder / CHECKPOINT).is_file():
         raise Sim2RealError(
             f"{interrupted.folder} was interrupted before its first evaluation: it has no checkpoint",
@@ -86,23 +78,3 @@ def _newest_unfinished(pipeline: str, target: str, root: Path) -> StageFolder | 
         )
     unfinished = [attempt for attempt in unfinished if attempt.folder not in busy]
     return max(unfinished, key=lambda a: str(a.manifest.get("started", "")), default=None)
-
-
-def _check_same_settings(interrupted: StageFolder, config: TrainConfig) -> None:
-    there, here = _flat(interrupted.manifest.get("config") or {}), _flat(plain(config))
-    names = [n for n in {**there, **here} if there.get(n) != here.get(n) and n not in _MAY_DIFFER]
-    if names:
-        differences = ", ".join(f"{n} = {there.get(n)} there and {here.get(n)} here" for n in names)
-        command = shlex.join(["sim2real", *map(str, interrupted.manifest.get("command", [])[1:])])
-        raise UsageError(
-            f"{interrupted.folder} is a training with other settings: {differences}",
-            hint=f"continue with the settings of its command: {command}",
-        )
-
-
-def _flat(settings: Mapping[str, Json], prefix: str = "") -> dict[str, Json]:
-    """Return nested settings with dots in their names."""
-    flat: dict[str, Json] = {}
-    for name, value in settings.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat

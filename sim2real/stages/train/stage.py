@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import jax
+
 from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.run.run_folder import StageFolder, open_stage
 from sim2real.robots.robot import Robot
 from sim2real.stages.pipeline import python_arguments
@@ -21,17 +25,18 @@ from sim2real.stages.pipeline.python_arguments import (
     recording_of,
 )
 from sim2real.stages.terminal.console import note, progress
+from sim2real.stages.terminal.interruption import patiently
 from sim2real.stages.train.config import TrainConfig
-from sim2real.stages.train.explain import explain
 from sim2real.stages.train.inputs import find_inputs, load_recording
-from sim2real.stages.train.learn_policy import learn_policy
 from sim2real.stages.train.resume import CHECKPOINT, resumable
 from sim2real.stages.train.sensitivity import policy_sensitivity
-from sim2real.stages.train.show import Watch, show_history
+from sim2real.stages.train.show import Watch, episode_summary, show_episodes, show_history, show_progress
 from sim2real.stages.train.tensorboard import watching
 from sim2real.stages.train.trained_bundle import bundle_of_training, contract_of
-from sim2real.stages.train.training_setup import prepare
+from sim2real.stages.train.training_setup import TrainingSetup, prepare
+from sim2real.training.ppo import trainer
 from sim2real.training.scale.processes import join, leads, lost_process_errors, wait_for_all
+from sim2real.training.sweep import Sweep
 from sim2real.types import Json
 
 
@@ -80,7 +85,7 @@ def train(
 
     # Train.
     write, read = (None if path is None else Path(path) for path in (checkpoint, resume))
-    result = learn_policy(setup, config, write, read, watch)
+    result = _learn(setup, config, write, read, watch)
 
     # Move each parameter, and play the policy.
     weakness = None
@@ -108,7 +113,7 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
     inputs = find_inputs(pipeline, config, root, run_dir)
     identification, resume = inputs.identification, inputs.resume
     if config.explain:
-        return explain(pipeline, config, identification, inputs.files, root, inputs.run_dir)
+        return _explain(pipeline, config, identification, inputs.files, root, inputs.run_dir)
 
     # Wait for all processes: the first one's new folder must not be an input of a slower one.
     with lost_process_errors():
@@ -128,4 +133,45 @@ def run(pipeline: Pipeline, config: TrainConfig, root: Path, run_dir: Path | Non
         if bundle.history is not None:
             show_history(bundle.history)
         stage.summary(bundle.summary)
+    return stage.result
+
+
+def _learn(
+    setup: TrainingSetup,
+    config: TrainConfig,
+    checkpoint: Path | None,
+    resume: Path | None,
+    watch: Watch | None,
+) -> trainer.TrainResult:
+    """Train by PPO, with a progress bar."""
+    ppo = replace(config.ppo, eval_steps=setup.env.length + 1)
+    key, sweep = jax.random.key(config.seed), Sweep.parse(config.sweep)
+    with progress(ppo.evaluations, "train (compiling)", leads()) as bar, lost_process_errors():
+        show = lambda evaluation: show_progress(bar, evaluation, watch)  # noqa: E731
+        return patiently(lambda: trainer.train(setup.env, ppo, key, show, checkpoint, resume, sweep=sweep))
+
+
+def _explain(
+    pipeline: Pipeline,
+    config: TrainConfig,
+    identification: Identification | None,
+    inputs: Mapping[str, Path],
+    root: Path,
+    run_dir: Path | None,
+) -> StageFolder:
+    """Write and print the distributions into a stage folder ``explain``.
+
+    Args:
+        identification: None: the nominal model.
+        run_dir: Run folder to add to; None: a new one.
+    """
+    with open_stage(root, pipeline.name, "explain", config, inputs, run_dir) as stage:
+        episodes = prepare(pipeline, config, identification).episodes
+        for name, file in episodes.save(stage.folder).items():
+            stage.output(name, file)
+        from sim2real.view.page.episodes import picture  # matplotlib takes 0.5 s to import
+
+        picture(stage.output("picture", "episodes.png"), episodes)
+        show_episodes(episodes)
+        stage.summary(episode_summary(episodes))
     return stage.result

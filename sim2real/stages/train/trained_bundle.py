@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
+import jax
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle, History
@@ -10,18 +12,27 @@ from sim2real.artifacts.episodes import Episodes
 from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.sensitivity import Sensitivity
-from sim2real.policy.bundle import make_runner
+from sim2real.errors import Sim2RealError
+from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.graph.episode import named_leaves
+from sim2real.policy.bundle import PolicyReference, make_runner
 from sim2real.policy.contract import PolicyContract
+from sim2real.policy.runner import PolicyRunner
 from sim2real.robots.loop import DELAYS
+from sim2real.robots.nodes import in_numpy
 from sim2real.robots.robot import Robot
 from sim2real.stages.train.config import TrainConfig
-from sim2real.stages.train.parity import MAX_OBSERVATIONS, observations_of, reference_of
 from sim2real.stages.train.show import training_summary
 from sim2real.stages.train.training_setup import TrainingSetup
 from sim2real.training.environment.graph_environment import TrainingTask
 from sim2real.training.networks.onnx_export import export_graph
+from sim2real.training.networks.policy import Policy
 from sim2real.training.ppo.trainer import TrainResult
 from sim2real.training.sweep import Sweep, format_point
+from sim2real.types import Array, PyTree
+
+MAX_OBSERVATIONS = 1000
+"""Number of observations of one source that are compared."""
 
 
 def bundle_of_training(
@@ -103,3 +114,58 @@ def _trained(values: Mapping[str, float], episodes: Episodes) -> dict[str, tuple
     for node, took_s in episodes.drawn_s.items():
         trained[node] = (float(np.quantile(took_s, 0.01)), float(np.quantile(took_s, 0.99)))
     return trained
+
+
+@runtime_checkable
+class _Agent(Protocol):
+    """A supervisor with the methods of a ``TrainingTask``."""
+
+    name: str
+
+    def init_params(self, rng: jax.Array | None, graph_state: GraphState) -> PyTree:
+        """Return the parameters."""
+        ...
+
+    def init_state(self, rng: jax.Array | None, graph_state: GraphState) -> PyTree:
+        """Return the state."""
+        ...
+
+    def observe(self, step_state: StepState) -> jax.Array:
+        """Return the observation, shape ``(O,)``."""
+        ...
+
+    def act(self, step_state: StepState, action: Array) -> tuple[StepState, PyTree]:
+        """Return the new step state and the output."""
+        ...
+
+
+def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
+    """Return the observations ``(N, O)`` that a policy would get from a recording's measurements."""
+    agent, sensor = robot.agent.make(robot.rate_hz), robot.roles.sensor
+    if not isinstance(agent, _Agent):
+        raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
+
+    # Arrange the recorded readings as the leaves of a message.
+    leaves, form = jax.tree_util.tree_flatten(robot.sensor.at_rest)
+    columns = [recording.episode.outputs[sensor][name] for name in named_leaves(robot.sensor.at_rest)]
+    columns = [c.astype(np.float32).reshape(-1, *np.shape(leaf)) for c, leaf in zip(columns, leaves, strict=True)]
+
+    # Play the agent over them.
+    params = in_numpy(agent.init_params(None, GraphState()))
+    state = StepState(params=params, state=in_numpy(agent.init_state(None, GraphState(params={agent.name: params}))))
+    observations, zero = [], np.zeros(1, np.float32)
+    runner.reset()
+    for k in range(min(MAX_OBSERVATIONS, len(columns[0]))):
+        message = jax.tree_util.tree_unflatten(form, [c[k : k + 1] for c in columns])
+        state = state.replace(inputs={sensor: InputState(np.array([k], np.int32), zero, zero, message)})
+        observations.append(np.asarray(agent.observe(state), np.float32))
+        state, _ = agent.act(state, runner(observations[-1]))
+    return np.array(observations)
+
+
+def reference_of(policy: Policy, observations: np.ndarray) -> PolicyReference:
+    """Return JAX's actions for observations ``(N, O)``, as those of one episode."""
+    # On the processor: an accelerator multiplies matrices with less precision, by 1e-3 of the range.
+    policy, x = jax.device_put((policy, observations), jax.devices("cpu")[0])
+    actions = jax.jit(lambda policy, x: jax.lax.scan(policy.step, policy.initial_carry(), x)[1])(policy, x)
+    return PolicyReference(observations, np.asarray(actions))

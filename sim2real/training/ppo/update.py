@@ -17,7 +17,7 @@ from sim2real.training.networks.sequences import ActorCritic, unroll
 from sim2real.training.ppo.losses import Batch, gae, loss
 from sim2real.training.ppo.optimiser import adapt_rate, get_rate, make_optimiser, set_rate
 from sim2real.training.ppo.rollout import Copies, Rows
-from sim2real.training.scale.mesh import divide_minibatches
+from sim2real.training.scale.devices import divide_minibatches
 from sim2real.types import PyTree
 
 

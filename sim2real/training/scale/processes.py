@@ -12,7 +12,6 @@ from jax.experimental import multihost_utils
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.training.config import PPOConfig
-from sim2real.training.scale.aborts import aborted, catch_aborts
 from sim2real.training.scale.hosts import HostsConfig
 from sim2real.types import Json
 
@@ -53,22 +52,12 @@ def join(hosts: HostsConfig) -> None:
             f"the processes cannot be joined: {_first_line(error)}",
             hint="start them by srun, mpirun or as a Kubernetes job, or give their address: --hosts.coordinator ...",
         ) from error
-    catch_aborts(_lost_message("JAX ended this process, for the reason above"), _HINT, Sim2RealError.exit_code)
 
 
 def require_one_clock(config: PPOConfig) -> None:
     """Raise a ``UsageError`` for a time budget of several processes: their clocks differ."""
     if config.minutes is not None and jax.process_count() > 1:
         raise UsageError("minutes: several processes have several clocks", hint="use a target, or total_steps")
-
-
-def require_neighbours() -> None:
-    """Raise a ``Sim2RealError`` if JAX has ended this process because another one was lost.
-
-    To be called while the process waits for a computation; the process must end soon.
-    """
-    if message := aborted():
-        raise Sim2RealError(message, hint=_HINT)
 
 
 def _lost_message(reason: str) -> str:
