@@ -18,7 +18,7 @@ from sim2real.graph.episode import named_leaves
 from sim2real.policy.bundle import PolicyReference, make_runner
 from sim2real.policy.contract import PolicyContract
 from sim2real.policy.runner import PolicyRunner
-from sim2real.robots.loop import DELAYS
+from sim2real.robots.loop import DELAYS, SENSOR
 from sim2real.robots.nodes import in_numpy
 from sim2real.robots.robot import Robot
 from sim2real.stages.train.config import TrainConfig
@@ -141,7 +141,7 @@ class _Agent(Protocol):
 
 def observations_of(robot: Robot, recording: Recording, runner: PolicyRunner) -> np.ndarray:
     """Return the observations ``(N, O)`` that a policy would get from a recording's measurements."""
-    agent, sensor = robot.agent.make(robot.rate_hz), robot.roles.sensor
+    agent, sensor = robot.agent.make(robot.rate_hz), SENSOR
     if not isinstance(agent, _Agent):
         raise Sim2RealError(f"a {type(agent).__name__} has no `observe` and `act`, which a policy needs")
 
