@@ -24,7 +24,7 @@ MAY_IMPORT = {
         *("pipelines.arm.scene", "pipelines.pendulum.scene"),
     },
     "hardware": {"sim2real.policy.runner"},
-    "interop": {"sim2real.interop.brax_adapter", "sim2real.interop.gymnasium_adapter"},
+    "interop": {"sim2real.interop.brax", "sim2real.interop.vector"},
     "parquet": {"sim2real.log.importing.lerobot"},
     "tensorboard": {"sim2real.stages.train.tensorboard"},
     "unitree": {f"sim2real.hardware.unitree.{name}" for name in ("dds", "emulator", "messages")},

@@ -35,16 +35,16 @@ from sim2real.composer.variation.base import Variation as Variation
 
 if TYPE_CHECKING:
     from sim2real.composer.physics.mjx.environment import MjxEnvironment as MjxEnvironment
-    from sim2real.interop.brax_adapter import BraxEnv as BraxEnv
-    from sim2real.interop.gymnasium_adapter import MjxVectorEnv as MjxVectorEnv
+    from sim2real.interop.brax import BraxEnv as BraxEnv
+    from sim2real.interop.vector import MjxVectorEnv as MjxVectorEnv
     from sim2real.worlds.composed import ComposedWorld as ComposedWorld
 
 Model = RootElement
 _LAZY = {
-    "BraxEnv": "sim2real.interop.brax_adapter",
+    "BraxEnv": "sim2real.interop.brax",
     "ComposedWorld": "sim2real.worlds.composed",
     "MjxEnvironment": "sim2real.composer.physics.mjx.environment",
-    "MjxVectorEnv": "sim2real.interop.gymnasium_adapter",
+    "MjxVectorEnv": "sim2real.interop.vector",
 }
 
 

@@ -1,24 +1,127 @@
 """Robots with their delays, and composed tasks, as environments of gymnasium, Stable-Baselines3 and brax.
 
 ``sim2real.interop.vector_env("pendulum", 16)`` takes the parameters of the newest identification; guide:
-``docs/guides/interop.md``.
+``docs/guides/interop.md``. Composed tasks need none of the pipelines, which the functions import when they are called.
 """
 
-import importlib
-from typing import TYPE_CHECKING
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 if TYPE_CHECKING:
-    from sim2real.interop.making import baselines_env as baselines_env
-    from sim2real.interop.making import brax_env as brax_env
-    from sim2real.interop.making import robot_environment as robot_environment
-    from sim2real.interop.making import vector_env as vector_env
+    from gymnasium.vector import AutoresetMode
 
-__all__ = ["baselines_env", "brax_env", "robot_environment", "vector_env"]
+    from sim2real.interop.brax import RobotBraxEnv
+    from sim2real.interop.environments import RobotEnvironment
+    from sim2real.interop.vector import RobotVectorEnv
+    from sim2real.robots.robot import Robot
+    from sim2real.stages.pipeline.pipeline import Pipeline
+    from sim2real.stages.train.config import TrainConfig
+
+    Source = str | Path | Pipeline | Robot
+    """A run folder, or a pipeline, its name or its robot; of these the newest identification is taken."""
+
+Model = Literal["identified", "nominal"]
 
 
-def __getattr__(name: str) -> object:
-    """Import a function on first use: composed tasks need none of the pipelines that ``making`` imports."""
-    if name not in __all__:
-        raise AttributeError(f"module 'sim2real.interop' has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module("sim2real.interop.making"), name)
-    return value
+class Options(TypedDict, total=False):
+    """Options of ``robot_environment``."""
+
+    model: Model
+    values: Mapping[str, float] | None
+    config: TrainConfig | None
+    runs: Path | str
+
+
+def robot_environment(
+    source: Source,
+    model: Model = "identified",
+    values: Mapping[str, float] | None = None,
+    config: TrainConfig | None = None,
+    runs: Path | str = "runs",
+) -> RobotEnvironment:
+    """Return one copy of the environment that ``sim2real train`` trains in, as pure functions.
+
+    Args:
+        model: The estimates of identify with their uncertainty and timing, or the data sheet's values.
+        values: Parameters with other values than the model's. The nominal model has delays where both are among them:
+            ``sensor_delay`` and ``actuator_delay`` [s].
+        config: World, number and length of timelines, randomisation and seed; default: the pipeline's.
+
+    Raises:
+        UsageError: When there is no such pipeline, run or parameter.
+        Sim2RealError: When there is no identification, or not of this robot.
+    """
+    from sim2real.artifacts.run.run_folder import STAGES, attempts
+    from sim2real.interop.environments import RobotEnvironment
+    from sim2real.robots.robot import Robot
+    from sim2real.stages.pipeline.find_run import find_run
+    from sim2real.stages.pipeline.open_parameters import open_identification
+    from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline, pipeline_of
+    from sim2real.stages.train.inputs import find_parameters
+    from sim2real.stages.train.trained_bundle import contract_of
+    from sim2real.stages.train.training_setup import prepare
+
+    if isinstance(source, Robot | Pipeline):
+        pipeline, run = pipeline_of(source), None
+    elif str(source) in available():
+        pipeline, run = load_pipeline(str(source)), None
+    else:
+        run = find_run(Path(runs), source)
+        pipeline = load_pipeline(next(str(a.manifest.get("pipeline")) for s in STAGES for a in attempts(run, s)))
+    config = replace(config or pipeline.train, model=model)
+    path, _ = find_parameters(pipeline, config, Path(runs), run)
+    identification = None if path is None else open_identification(path, pipeline)
+    setup = prepare(pipeline, config, identification, changed=values)
+    return RobotEnvironment(setup.env, contract_of(setup.robot, setup.env.task, setup.values))
+
+
+def vector_env(
+    source: Source | RobotEnvironment,
+    num_envs: int,
+    autoreset_mode: AutoresetMode | str = "NextStep",
+    **options: Unpack[Options],
+) -> RobotVectorEnv:
+    """Return copies of a robot as a ``gymnasium.vector.VectorEnv``.
+
+    Args:
+        source: See ``robot_environment``; or its result.
+        autoreset_mode: When a copy that is done is reset: ``NextStep``, ``SameStep`` or ``Disabled``.
+    """
+    from sim2real.interop.vector import RobotVectorEnv
+
+    return RobotVectorEnv(_environment(source, options), num_envs, autoreset_mode)
+
+
+def baselines_env(
+    source: Source | RobotEnvironment, num_envs: int, seed: int | None = None, **options: Unpack[Options]
+) -> Any:
+    """Return copies of a robot as a ``VecEnv`` of Stable-Baselines3.
+
+    Args:
+        source: See ``robot_environment``; or its result.
+        seed: Seed of the episodes; default: a random one.
+    """
+    from sim2real.interop.baselines import to_baselines
+
+    return to_baselines(vector_env(source, num_envs, "SameStep", **options), seed)
+
+
+def brax_env(source: Source | RobotEnvironment, **options: Unpack[Options]) -> RobotBraxEnv:
+    """Return a robot as a ``brax.envs.Env``.
+
+    Args:
+        source: See ``robot_environment``; or its result.
+    """
+    from sim2real.interop.brax import RobotBraxEnv
+
+    return RobotBraxEnv(_environment(source, options))
+
+
+def _environment(source: Source | RobotEnvironment, options: Options) -> RobotEnvironment:
+    from sim2real.interop.environments import RobotEnvironment
+
+    return source if isinstance(source, RobotEnvironment) else robot_environment(source, **options)

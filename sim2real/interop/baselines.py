@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.interop.gymnasium_adapter import AutoresetMode, CopiesVectorEnv
+from sim2real.interop.vector import AutoresetMode, CopiesVectorEnv
 from sim2real.types import PyTree
 
 Indices = int | Iterable[int] | None
 """Copies; None: all."""
 
 
-def to_baselines(env: CopiesVectorEnv[Any], seed: int | None = None) -> Any:
+def to_baselines(env: CopiesVectorEnv, seed: int | None = None) -> Any:
     """Return a vector environment as a ``stable_baselines3.common.vec_env.VecEnv``.
 
     An episode that a time limit ended has ``TimeLimit.truncated`` in its info, and every episode that ended
@@ -53,7 +53,7 @@ def to_baselines(env: CopiesVectorEnv[Any], seed: int | None = None) -> Any:
 class _Copies:
     """The methods that Stable-Baselines3 calls."""
 
-    env: CopiesVectorEnv[Any]
+    env: CopiesVectorEnv
     num_envs: int
     render_mode = None
 

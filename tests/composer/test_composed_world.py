@@ -215,16 +215,6 @@ def test_brax_s_wrapper_must_not_go_on_past_the_time_limit(environment):
     assert np.isnan(reward).tolist() == [False] * 10 + [True]
 
 
-@pytest.mark.night
-def test_brax_may_save_the_fresh_starts(environment):
-    """Episodes then start from the same state, and go on with numbers of their own."""
-    env = composer.BraxEnv(environment, fresh_starts=False)
-    first = jax.jit(env.reset)(jax.random.key(0))
-    step = jax.jit(lambda key: env.step(first.replace(info={**first.info, "key": key}), jnp.ones(1)))
-    keys = [jax.random.key_data(step(jax.random.key(i)).pipeline_state.key) for i in range(2)]
-    assert (keys[0] != keys[1]).any()
-
-
 @pytest.fixture(scope="module")
 def vector(environment):
     pytest.importorskip("gymnasium", reason="the vector environment: the extra interop")
@@ -266,8 +256,8 @@ def test_the_end_of_a_task_is_no_truncation_and_divergence_is_the_end(vector):
 @pytest.mark.parametrize(
     ("name", "module", "needed"),
     [
-        ("BraxEnv", "brax_adapter", "brax.envs.base"),
-        ("MjxVectorEnv", "gymnasium_adapter", "gymnasium"),
+        ("BraxEnv", "brax", "brax.envs.base"),
+        ("MjxVectorEnv", "vector", "gymnasium"),
     ],
 )
 def test_without_the_other_library_the_error_names_the_extra(name, module, needed, monkeypatch):

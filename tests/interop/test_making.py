@@ -10,19 +10,19 @@ from sim2real.interop import robot_environment
 
 def delays(made):
     """The two delays that an environment's episodes are drawn around."""
-    return {n: v for n, v in made.steps.env.task.values.items() if n.endswith("_delay")}
+    return {n: v for n, v in made.env.task.values.items() if n.endswith("_delay")}
 
 
 def test_the_nominal_model_has_delays_where_they_are_given(pendulum):
     assert sum(delays(pendulum).values()) == pytest.approx(0.045)
     assert delays(robot_environment("pendulum", "nominal")) == {}
     robot = sim2real.load_pipeline("pendulum").load()
-    assert robot_environment(robot, "nominal").steps.env.task.values == robot.nominal()
+    assert robot_environment(robot, "nominal").env.task.values == robot.nominal()
 
 
 def test_parameters_may_have_other_values(pendulum):
     made = robot_environment("pendulum", "nominal", {"damping": 3.5})
-    assert made.steps.env.task.values["damping"] == 3.5
+    assert made.env.task.values["damping"] == 3.5
 
 
 def test_what_does_not_exist_is_named(tmp_path):
@@ -39,10 +39,10 @@ def test_what_does_not_exist_is_named(tmp_path):
 def test_a_robot_that_shows_more_than_it_names_is_refused(pendulum):
     from dataclasses import replace
 
-    from sim2real.interop.environment import RobotEnvironment
+    from sim2real.interop.environments import RobotEnvironment
     from sim2real.stages.train.trained_bundle import contract_of
 
-    env = pendulum.steps.env
+    env = pendulum.env
     contract = contract_of(sim2real.load_pipeline("pendulum").load(), env.task, {})
     contract = replace(contract, observation=contract.observation[1:])
     with pytest.raises(UsageError, match="observation terms have 16 entries, its task shows 19"):

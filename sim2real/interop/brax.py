@@ -13,9 +13,7 @@ import numpy as np
 from sim2real.composer.physics.mjx.environment import MjxEnvironment
 from sim2real.errors import Sim2RealError
 from sim2real.installation import with_extra
-from sim2real.interop.composed_task import PureTask
-from sim2real.interop.environment import RobotEnvironment
-from sim2real.interop.pure_environment import PureEnvironment, Transition
+from sim2real.interop.environments import PureEnvironment, PureTask, RobotEnvironment, Transition
 
 try:
     from brax.envs.base import Env
@@ -47,16 +45,12 @@ class PureBraxEnv(Env):
     ``info["key"]``. That costs a reset a step.
 
     ``metrics`` has the values of a whole episode in its last step, and 0 in all others.
-
-    Args:
-        fresh_starts: Whether each episode starts from a fresh state; else only the random numbers inside of episodes
-            differ, and no step costs a reset.
     """
 
-    def __init__(self, pure: PureEnvironment[PyTree], fresh_starts: bool = True) -> None:
+    def __init__(self, pure: PureEnvironment) -> None:
         if isinstance(pure.observation_spec, Mapping):
             raise TypeError("brax takes observations that are one vector, this environment has a dictionary")
-        self._pure, self._fresh_starts = pure, fresh_starts
+        self._pure = pure
         self._sizes = math.prod(pure.observation_spec.shape), math.prod(pure.action_spec.shape)
         self.max_episode_length = pure.length
 
@@ -71,20 +65,17 @@ class PureBraxEnv(Env):
         before: PyTree = state.pipeline_state
         info = {**state.info}
         info["key"], key = jax.random.split(info["key"])
-        if not self._fresh_starts:
-            # The wrapper starts every episode from the same state: only its random numbers are new.
-            before = self._pure.reseed(before, key)
-        elif _FIRST_STATE in info:
+        if _FIRST_STATE in info:
             fresh = self._pure.reset(key)
             info |= {_FIRST_STATE: fresh.state, _FIRST_OBSERVATION: fresh.observation}
         transition = self._pure.step(before, action)
         # An episode that goes on past its time limit must not train a policy without notice.
-        reward = jnp.where(self._pure.is_truncated(before), jnp.nan, transition.reward)
+        reward = jnp.where(before.truncated, jnp.nan, transition.reward)
         return self._brax_state(transition, reward, info, state.metrics)
 
     def _brax_state(
         self,
-        transition: Transition[PyTree],
+        transition: Transition,
         reward: jax.Array,
         info: dict[str, jax.Array],
         metrics: dict[str, jax.Array],
@@ -126,9 +117,9 @@ class BraxEnv(PureBraxEnv):
     ``action_spec``. ``info["failed"]`` is 1 where no acceptable initial state was drawn.
     """
 
-    def __init__(self, environment: MjxEnvironment, fresh_starts: bool = True) -> None:
+    def __init__(self, environment: MjxEnvironment) -> None:
         self.environment = environment
-        super().__init__(PureTask(environment, flat=True), fresh_starts)
+        super().__init__(PureTask(environment, flat=True))
 
 
 class RobotBraxEnv(PureBraxEnv):
@@ -141,11 +132,11 @@ class RobotBraxEnv(PureBraxEnv):
         robot: One copy; ``robot.observation`` and ``robot.action`` name each entry, with unit and bounds.
     """
 
-    def __init__(self, robot: RobotEnvironment, fresh_starts: bool = True) -> None:
+    def __init__(self, robot: RobotEnvironment) -> None:
         self.robot = robot
         low, high = np.array([(e.low, e.high) for e in robot.action], np.float32).T
         self._middle, self._half = (high + low) / 2, (high - low) / 2
-        super().__init__(robot, fresh_starts)
+        super().__init__(robot)
 
     def step(self, state: BraxState, action: jax.Array) -> BraxState:
         """Return the copy after the policy's next step.

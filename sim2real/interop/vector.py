@@ -6,19 +6,17 @@ Two compiled programs step all copies together.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
+from sim2real.composer.physics.mjx.environment import MjxEnvironment
 from sim2real.composer.task import UNLIMITED
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.installation import with_extra
-from sim2real.interop.composed_task import PureTask
-from sim2real.interop.environment import Copy, RobotEnvironment
-from sim2real.interop.pure_environment import PureEnvironment, Transition
+from sim2real.interop.environments import PureEnvironment, PureTask, RobotEnvironment, Transition
 from sim2real.training.environment.protocol import select
 
 try:
@@ -33,13 +31,12 @@ if TYPE_CHECKING:
     from sim2real.composer.types import ArrayLike
     from sim2real.types import Array, PyTree
 
-S = TypeVar("S")
 _SEEDS = 2**32
 Infos = dict[str, "PyTree"]
 """Name -> values of the copies, and ``_NAME`` -> mask of the copies that have one."""
 
 
-class CopiesVectorEnv(VectorEnv, Generic[S]):
+class CopiesVectorEnv(VectorEnv):
     """Copies of a pure environment.
 
     With ``AutoresetMode.NEXT_STEP`` a copy that is done is reset at the next step, whose action is ignored and whose
@@ -54,7 +51,7 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
     """
 
     def __init__(
-        self, pure: PureEnvironment[S], num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
+        self, pure: PureEnvironment, num_envs: int, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
     ) -> None:
         if num_envs < 1:
             raise UsageError(f"num_envs must be at least 1, got {num_envs}")
@@ -80,15 +77,15 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
         self._start, self._restart = jax.jit(self._reset_all), jax.jit(self._reset_some)
         self._keys_of = jax.jit(jax.vmap(jax.random.key))
         self._keys: jax.Array | None = None
-        self._last: Transition[S] | None = None
+        self._last: Transition | None = None
         self._done = np.zeros(num_envs, bool)
 
-    def _reset_all(self, keys: jax.Array) -> tuple[Transition[S], jax.Array]:
+    def _reset_all(self, keys: jax.Array) -> tuple[Transition, jax.Array]:
         """Return all copies at the start of an episode, and their keys for the next one."""
         next_keys, keys = jax.vmap(jax.random.split, out_axes=1)(keys)
         return jax.vmap(self._pure.reset)(keys), next_keys
 
-    def _reset_some(self, last: Transition[S], keys: jax.Array, mask: jax.Array) -> tuple[Transition[S], jax.Array]:
+    def _reset_some(self, last: Transition, keys: jax.Array, mask: jax.Array) -> tuple[Transition, jax.Array]:
         """Return the copies, those of the mask at the start of an episode, and the keys for the next ones."""
         fresh, next_keys = self._reset_all(keys)
         return select(mask, fresh, last), select(mask, next_keys, keys)
@@ -198,7 +195,7 @@ class CopiesVectorEnv(VectorEnv, Generic[S]):
         return mask
 
 
-class MjxVectorEnv(CopiesVectorEnv[State]):
+class MjxVectorEnv(CopiesVectorEnv):
     """Copies of a task; observations are dictionaries of observables. See ``CopiesVectorEnv`` for seeds and resets."""
 
     def __init__(
@@ -208,7 +205,7 @@ class MjxVectorEnv(CopiesVectorEnv[State]):
         super().__init__(PureTask(environment, flat=False), num_envs, autoreset_mode)
 
 
-class RobotVectorEnv(CopiesVectorEnv[Copy]):
+class RobotVectorEnv(CopiesVectorEnv):
     """Copies of a robot with its delays; see ``CopiesVectorEnv`` for seeds, resets and ends of episodes.
 
     At the end of an episode infos have its ``return`` and ``success``: the share of its second half in which the task

@@ -9,56 +9,51 @@ import pytest
 
 from sim2real.errors import UsageError
 from sim2real.graph.schedule import draw
+from sim2real.interop.environments import RobotEnvironment
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.stages.train.trained_bundle import contract_of
 from sim2real.training.environment.graph_environment import GraphEnvironment
-from sim2real.training.environment.policy_steps import PolicySteps
 
 VALUES = {"sensor_delay": 0.02, "actuator_delay": 0.025}
 
 
-def graph_at(rate_hz, episode_s=0.5):
+def robot_at(rate_hz, episode_s=0.5):
     """The pendulum, whose world ticks at 100 Hz, with a policy of another rate."""
     robot = load_pipeline("pendulum").load()
     nodes, task = robot.training({**robot.nominal(), **VALUES}, {}, {}, True)
     for name in ("sensor", "agent", "actuator"):
         nodes[name].rate = rate_hz
-    return GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, episode_s)), task)
+    env = GraphEnvironment(CompiledGraph(nodes, "agent", draw(nodes, episode_s)), task)
+    return RobotEnvironment(env, contract_of(robot, task, {}))
 
 
 @pytest.fixture(scope="module")
-def uneven():
-    """A policy at 40 Hz: two or three ticks of the world pass between its steps."""
-    return graph_at(40.0)
-
-
-@pytest.fixture(scope="module")
-def played(uneven):
-    """The same actions, row by row and policy step by policy step."""
-    env, key = PolicySteps(uneven), jax.random.key(3)
-    turns = uneven.graph.turns[0]
+def played():
+    """The same actions, row by row and policy step by policy step; at 40 Hz a step takes two or three ticks."""
+    robot, key = robot_at(40.0), jax.random.key(3)
+    env, turns = robot.env, robot.env.graph.turns[0]
     actions = jnp.linspace(-1.0, 1.0, int(turns.sum()))[:, None]
 
     def by_rows(state, action):
-        made = uneven.step(state, action, key)
-        return made.state, made._replace(state=made.state.step_state.seq)
-
-    def by_steps(state, action):
         made = env.step(state, action, key)
         return made.state, made._replace(state=made.state.step_state.seq)
 
-    of_row = actions[np.maximum(np.cumsum(turns) - 1, 0)][: uneven.length]
-    rows = jax.jit(lambda: jax.lax.scan(by_rows, uneven.reset(key)[0], of_row)[1])()
-    state, first = env.reset(key)
-    steps = jax.jit(lambda state: jax.lax.scan(by_steps, state, actions[: env.length])[1])(state)
+    def by_steps(state, action):
+        made = robot.step(state, action)
+        return made.state, made._replace(state=made.state.env.step_state.seq)
+
+    of_row = actions[np.maximum(np.cumsum(turns) - 1, 0)][: env.length]
+    rows = jax.jit(lambda: jax.lax.scan(by_rows, env.reset(jax.random.split(key)[0])[0], of_row)[1])()
+    first = robot.reset(key)
+    steps = jax.jit(lambda state: jax.lax.scan(by_steps, state, actions[: robot.length])[1])(first.state)
     as_numpy = lambda tree: jax.tree.map(np.asarray, tree)  # noqa: E731
-    return SimpleNamespace(env=env, turns=turns, rows=as_numpy(rows), steps=as_numpy(steps), first=first, state=state)
+    return SimpleNamespace(turns=turns, rows=as_numpy(rows), steps=as_numpy(steps), state=first.state)
 
 
-@pytest.mark.night
 def test_every_step_is_one_of_the_policy(played):
-    assert int(played.state.step_state.seq) == 0
-    assert played.steps.valid.all()
+    assert int(played.state.env.step_state.seq) == 0
+    assert np.flatnonzero(played.steps.truncated).tolist() == [played.turns.sum() - 2]
     assert played.steps.state.tolist() == list(range(1, played.turns.sum()))
 
 
@@ -74,17 +69,6 @@ def test_a_step_returns_what_the_policy_sees_next(played):
     np.testing.assert_allclose(played.steps.observation, played.rows.observation[before], rtol=1e-5, atol=1e-5)
 
 
-def test_where_every_row_has_a_step_nothing_is_changed():
-    env = graph_at(50.0, 0.2)
-    steps = PolicySteps(env)
-    assert env.graph.turns.all()
-    assert steps.length == env.length
-    key, act = jax.random.key(0), jnp.zeros(1)
-    state = jax.eval_shape(env.reset, key)[0]
-    sizes = [len(str(jax.make_jaxpr(e.step)(state, act, key)).splitlines()) for e in (env, steps)]
-    assert sizes[0] == sizes[1]
-
-
 def test_a_timeline_with_a_single_step_is_refused():
     with pytest.raises(UsageError, match="'agent' makes fewer than two steps in a timeline"):
-        PolicySteps(graph_at(50.0, 0.02))
+        robot_at(50.0, 0.02)
