@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -265,11 +265,10 @@ class Deployment(Shown):
             Output -> name of the file in the folder.
         """
         folder, advice = make_folder(folder), self.advice
-        arrays = ("simulated", "recordings", "probe", "summary")
         if advice is not None:
             advice = replace(advice, next=advice.next.replace(shown(folder.parent), _RUN))
-        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays}
-        write_json(folder / RESULT, values | {"advice": advice})
+        document = replace(self, advice=advice)
+        write_json(folder / RESULT, document, without=("simulated", "recordings", "probe", "summary"))
         if self.dry_run:
             return {"result": RESULT}
         columns = {f"{n}_{i}": v for i, episode in enumerate(self.simulated) for n, v in episode.items()}

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from sim2real.artifacts.files import check, malformed, read_arrays, read_versioned, write_arrays, write_json
+from sim2real.artifacts.files import check, malformed, read_grouped, read_versioned, write_grouped, write_json
 from sim2real.artifacts.identification import Noise
 from sim2real.artifacts.summary import ArtifactTable, Interval
 
@@ -91,8 +91,8 @@ class Episodes:
         Returns:
             Output -> name of the file in the folder.
         """
-        write_json(folder / EPISODES, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS})
-        write_arrays(folder / DRAWS, {f"{kind}/{n}": v for kind in _ARRAYS for n, v in getattr(self, kind).items()})
+        write_json(folder / EPISODES, self, without=_ARRAYS)
+        write_grouped(folder / DRAWS, self, _ARRAYS)
         return {"episodes": EPISODES, "episodes_draws": DRAWS}
 
     @staticmethod
@@ -104,10 +104,6 @@ class Episodes:
         """
         episodes = read_versioned(path / EPISODES, Episodes, _AGAIN, FORMAT)
         with malformed(path / DRAWS, _AGAIN):
-            kinds: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in _ARRAYS}
-            for name, values in read_arrays(path / DRAWS).items():
-                kind, _, owner = name.partition("/")
-                check(kind in kinds and values.ndim == 1 and values.dtype.kind == "f", f"{name} is no list of numbers")
-                kinds[kind][owner] = values
+            kinds = read_grouped(path / DRAWS, _ARRAYS)
             check(set(kinds["draws"]) == {p.name for p in episodes.parameters}, "draws of other parameters")
         return replace(episodes, **kinds)

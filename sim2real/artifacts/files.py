@@ -6,7 +6,7 @@ import dataclasses
 import math
 import os
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral, Real
 from pathlib import Path
@@ -90,17 +90,21 @@ def read_versioned(path: Path, kind: type[T], again: str, *formats: int) -> T:
     return document
 
 
-def write_json(path: Path, document: object) -> None:
+def write_json(path: Path, document: object, without: Collection[str] = ()) -> None:
     """Write a document as JSON; a reader finds the old file or the new one, never a part.
 
     Args:
         document: A dataclass, or a dict of its fields; infinite numbers and NaN, which JSON lacks, become null.
+        without: Names of fields of a dataclass that lie in other files.
 
     Raises:
         Sim2RealError: When a text has bytes that are no text, which names of files can have.
     """
+    if without:
+        document = {n: v for n, v in vars(document).items() if n not in without}
+    text = to_json(document)
     with replacing(path) as stream:
-        stream.write(to_json(document))
+        stream.write(text)
 
 
 @contextmanager
@@ -108,8 +112,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """Yield a stream whose bytes replace a file when the block ends, on the disk and at once; an error leaves it."""
     draft = path.with_name(f".{path.name}.tmp")
     try:
-        with draft.open("wb") as stream:
+        # Overwrite what is there, then cut the file to its length: reserved bytes need no new space on a full disk.
+        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT, 0o666), "wb") as stream:
             yield stream
+            stream.truncate()
             stream.flush()
             os.fsync(stream.fileno())
     except BaseException:
@@ -195,6 +201,25 @@ def _array(kind: type, value: Json) -> Json:
         return [flat(e) for e in entry] if isinstance(entry, list) else math.nan if entry is None else float(entry)
 
     return np.array(flat(value), np.float64)
+
+
+def write_grouped(path: Path, document: object, kinds: Sequence[str]) -> None:
+    """Write the fields of a dataclass that are dicts of arrays, as arrays ``FIELD/NAME`` of one npz file."""
+    write_arrays(path, {f"{kind}/{n}": v for kind in kinds for n, v in getattr(document, kind).items()})
+
+
+def read_grouped(path: Path, kinds: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+    """Return what ``write_grouped`` wrote: field -> name -> numbers ``(N,)``.
+
+    Raises:
+        ValueError: When it is no such file.
+    """
+    groups: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in kinds}
+    for name, values in read_arrays(path).items():
+        kind, _, owner = name.partition("/")
+        check(kind in groups and values.ndim == 1 and values.dtype.kind == "f", f"{name} is no list of numbers")
+        groups[kind][owner] = values
+    return groups
 
 
 def number(value: float | None, missing: float = math.nan) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -731,8 +731,7 @@ class Identification(Shown):
 
     def write(self, path: Path) -> None:
         """Write estimates and verdict as JSON, without samples and timing."""
-        arrays = ("samples", "free", "replays", "timing")
-        write_json(path, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in arrays})
+        write_json(path, self, without=("samples", "free", "replays", "timing"))
 
     @staticmethod
     def load(path: Path | str) -> Identification:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,9 @@ from sim2real.artifacts.files import (
     check,
     make_folder,
     malformed,
-    read_arrays,
+    read_grouped,
     read_versioned,
-    write_arrays,
+    write_grouped,
     write_json,
 )
 from sim2real.artifacts.summary import ArtifactTable, Shown
@@ -203,8 +203,8 @@ class Timing(Shown):
         """
         folder = make_folder(folder)
         document, samples = f"{name}.json", f"{name}.npz"
-        write_json(folder / document, {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS})
-        write_arrays(folder / samples, {f"{kind}/{n}": v for kind in _ARRAYS for n, v in getattr(self, kind).items()})
+        write_json(folder / document, self, without=_ARRAYS)
+        write_grouped(folder / samples, self, _ARRAYS)
         return {name: document, f"{name}_samples": samples}
 
     @staticmethod
@@ -223,11 +223,7 @@ class Timing(Shown):
         # Read the samples, and check that they belong to the nodes of the document.
         samples = file.with_suffix(".npz")
         with malformed(samples, _AGAIN):
-            kinds: dict[str, dict[str, np.ndarray]] = {kind: {} for kind in _ARRAYS}
-            for name, values in read_arrays(samples).items():
-                kind, _, owner = name.partition("/")
-                check(kind in kinds and values.ndim == 1 and values.dtype.kind == "f", f"{name} is no list of times")
-                kinds[kind][owner] = values
+            kinds = read_grouped(samples, _ARRAYS)
             check(set(kinds["steps_s"]) == set(timing.nodes), "its nodes differ from those of the JSON file")
             check(set(kinds["bus_s"]) <= set(timing.nodes), "the JSON file lacks a node that is on the bus")
         return replace(timing, format=FORMAT, **kinds)

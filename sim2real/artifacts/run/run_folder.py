@@ -7,6 +7,7 @@ overwritten, references to files stay valid, and a failed attempt does not hide 
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sys
@@ -22,7 +23,6 @@ from sim2real.artifacts.run.manifest import (
     RUNNING,
     git_state,
     read_manifest,
-    readable_error,
     reserve,
     sha256,
     versions,
@@ -36,6 +36,7 @@ DRY = "dry run"
 """Status of a finished stage that sent no commands: later stages do not use it."""
 INTERRUPTED = 130
 _NAME = re.compile(r"\w[\w.-]*")
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @dataclass(frozen=True)
@@ -166,8 +167,14 @@ def open_stage(
         UsageError: When the name of the stage or the pipeline is no valid folder name.
         Sim2RealError: When an input, or an output after the block, does not exist, or the disk is full.
     """
+    # Refuse names that are no folder in the folder of runs, as a pipeline's name can come from a file.
+    if not stage.isidentifier():
+        raise UsageError(f"{stage!r} is no name for a stage", hint="letters, digits and '_'; a letter first")
+    if not _NAME.fullmatch(pipeline):
+        raise UsageError(
+            f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"
+        )
     # Hash the inputs first, as the stage can take hours and files can change.
-    _check_names(pipeline, stage)
     hashes = {name: sha256(Path(path)) for name, path in (inputs or {}).items()}
     folder = _stage_folder(run_dir or new_run(root, pipeline), stage)
     hashed = {n: {"path": portable(Path(p), folder.parent), "sha256": hashes[n]} for n, p in (inputs or {}).items()}
@@ -181,7 +188,7 @@ def open_stage(
         yield running
         _close(running, manifest, start, DRY if dry_run else "finished", OK)
     except BaseException as error:
-        failure = readable_error(error, folder)
+        failure = _readable(error, folder)
         try:
             _close(running, manifest, start, *_failure(failure), failure)
         except OSError as other:
@@ -215,16 +222,6 @@ def _first_manifest(
         "versions": versions(),
         "git": git_state(),
     }
-
-
-def _check_names(pipeline: str, stage: str) -> None:
-    """Refuse names that are no folder in the folder of runs, as a pipeline's name can come from a file."""
-    if not stage.isidentifier():
-        raise UsageError(f"{stage!r} is no name for a stage", hint="letters, digits and '_'; a letter first")
-    if not _NAME.fullmatch(pipeline):
-        raise UsageError(
-            f"{pipeline!r} is no name for a pipeline", hint="letters, digits, '_', '-' and '.'; a letter or digit first"
-        )
 
 
 def portable(path: Path, run_dir: Path) -> str:
@@ -352,6 +349,17 @@ def _stage_folder(run_dir: Path, stage: str) -> Path:
 def _not_writable(folder: Path, error: OSError) -> Sim2RealError:
     return Sim2RealError(
         f"cannot write the run folder {folder}: {error.strerror}", hint="name a folder of your own with --runs DIR"
+    )
+
+
+def _readable(error: BaseException, folder: Path) -> BaseException:
+    """Return the exception to show the user: an error with a hint if the disk is full, else the same exception."""
+    if not isinstance(error, OSError) or error.errno not in _FULL:
+        return error
+    where = f" (writing {os.fsdecode(error.filename)})" if isinstance(error.filename, str | bytes) else ""
+    return Sim2RealError(
+        f"the disk is full: {error.strerror}{where}",
+        hint=f"free some space, or name a folder elsewhere with --runs DIR; the files written so far are in {folder}",
     )
 
 
