@@ -131,3 +131,24 @@ def test_what_an_observable_misses_is_named_itself():
 def test_of_a_number_there_is_nothing_to_aggregate():
     for name, aggregator in AGGREGATORS.items():
         assert (aggregator(np.float64(2.0)), aggregator(jnp.float32(2.0))) == (2.0, 2.0), name
+
+
+class Rod(composer.ModelWrapperEntity):
+    @composer.observable
+    def angle(robot, physics):  # noqa: N805 - any name will do
+        return physics.bind(robot.mjcf_model.find("joint", "j")).qpos
+
+    @composer.observable
+    def height(self, simulation, scale=2.0):
+        return scale * simulation.bind(self.mjcf_model.find("body", "b")).xpos[2]
+
+
+def test_the_first_argument_of_an_observable_may_have_any_name():
+    text = (
+        '<mujoco><worldbody><body name="b" pos="0 0 .5"><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    rod = Rod(mjcf.from_xml_string(text))
+    rod.observables.enable_all()
+    step = composer.Environment(composer.NullTask(rod)).reset()
+    assert {k: float(np.ravel(v)[0]) for k, v in step.observation.items()} == {"angle": 0.0, "height": 1.0}
+    assert composer.observable(lambda physics: physics.time()).takes_physics

@@ -18,15 +18,7 @@ IMPORTS = {
     "from dm_control.mjcf import parser": "from sim2real.composer import mjcf as parser",
 }
 FAILS = {
-    "element_test": {
-        "testActuatorReordering": "tree_surgery", "testAdd": "tree_surgery", "testAttach": "wording_of_errors",
-        "testAttachmentFrameChildReference": "joints_of_frames", "testAttachmentFrames": "free_joints",
-        "testAttributeError": "tree_surgery", "testAttributes": "tree_surgery", "testChildren": "tree_surgery",
-        "testDeletion": "tree_surgery", "testFindAllFrameJoints": "joints_of_frames",
-        "testGetAssetsFromDict": "wording_of_errors", "testInvalidAttr": "wording_of_errors",
-        "testProperties": "tree_surgery", "testSetAndGetAttributes": "wording_of_errors",
-        "testDefaultIdentifier": "tree_surgery", "testTendonSameness": "tree_surgery",
-    },
+    "element_test": {"testActuatorReordering": "tree_surgery", "testProperties": "tree_surgery"},
     "export_with_assets_test": {"test_model_with_separators": "names_with_slashes"},
 }  # fmt: skip
 """Module -> test that fails -> the row that says why."""

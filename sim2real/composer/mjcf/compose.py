@@ -35,21 +35,27 @@ def compile_model(model: RootElement) -> MjModel:
     return mj.MjModel.from_xml_string(text(model), assets(model))
 
 
-def text(model: RootElement) -> str:
+def text(model: RootElement, precision: int = 17) -> str:
     """Return a model as MJCF."""
-    return _Writer(model).document()
+    return _Writer(model, precision=precision).document()
 
 
-def element_text(element: Element, top: RootElement, self_only: bool, pretty: bool) -> str:
+def element_text(element: Element, top: RootElement, self_only: bool, pretty: bool, precision: int) -> str:
     """Return an element as MJCF, with names as seen from a model."""
-    writer = _Writer(top, element.root.root_model)
+    writer = _Writer(top, element.root.root_model, precision)
     if self_only:
         attributes = writer.attributes(element)
         if not element._given.get("name") and not element.is_frame:
-            attributes = {k: v for k, v in attributes.items() if k != "name"}
-        inner = "...</" + element.tag + ">" if element.all_children() else ""
+            attributes.pop("name", None)
+        inner = "...</" + element.tag + ">" if element._with_attached() else ""
         return _tag(element.tag, attributes, bool(inner)) + inner + "\n" * pretty
-    writer.element(element)
+    if element.tag == "default":
+        writer.defaults(element)
+    elif element._is_setting:
+        writer.setting(element._in(element.root.root_model), 0)
+        writer.lines = writer.lines or [_tag(element.tag, {})]
+    else:
+        writer.element(element)
     return "\n".join(writer.lines) + "\n" if pretty else "".join(line.strip() for line in writer.lines)
 
 
@@ -75,9 +81,10 @@ def _asset(element: Element, asset: files.Asset, top: RootElement) -> files.Asse
 class _Writer:
     """Writes elements line by line; names are as seen from the model at the top."""
 
-    def __init__(self, top: RootElement, world: RootElement | None = None) -> None:
-        self.top, self.world = top, world or top
+    def __init__(self, top: RootElement, world: RootElement | None = None, precision: int = 17) -> None:
+        self.top, self.world, self._number = top, world or top, f"%.{precision}g"
         self.lines: list[str] = []
+        self._is_whole = False
         self._unnamed: dict[RootElement, dict[Element, int]] = {}
         self._factors: dict[RootElement, float] = {}
 
@@ -85,19 +92,16 @@ class _Writer:
 
     def document(self) -> str:
         """Return the whole document."""
-        top = self.top
+        top, self._is_whole = self.top, True
         self.lines.append(f"<mujoco model={quoteattr(top.model)}>")
         for tag in ("compiler", "option", "size", "statistic", "visual"):
             section = top._present(tag)
             if section is not None:
                 self.setting(section, 1)
-        self.lines.append("  <default>")
-        for model in top.all_models():
-            self.default(model._child("default"), 2)
-        self.lines.append("  </default>")
+        self.defaults(top._child("default"), 1)
         for tag in top._spec.children:
             if tag not in ("compiler", "option", "size", "statistic", "visual", "default", "keyframe"):
-                children = top._child(tag).all_children()
+                children = top._child(tag)._with_attached()
                 if children:
                     self.lines.append(f"  <{tag}>")
                     for child in children:
@@ -122,6 +126,16 @@ class _Writer:
         if attributes or len(self.lines) > at:
             self._around(element.tag, attributes, at, depth)
 
+    def defaults(self, element: Element, depth: int = 0) -> None:
+        """Write a class of defaults; the classes of attached models stand beside those at the top."""
+        if element._parent is not element.root:
+            self.default(element, depth)
+            return
+        self.lines.append("  " * depth + "<default>")
+        for model in element.root.all_models():
+            self.default(model._child("default"), depth + 1)
+        self.lines.append("  " * depth + "</default>")
+
     def default(self, element: Element, depth: int) -> None:
         """Write a class of defaults."""
         at = len(self.lines)
@@ -144,10 +158,10 @@ class _Writer:
     def element(self, element: Element, depth: int = 0) -> None:
         """Write an element and all below it."""
         space, tag = "  " * depth, element.tag
-        children = element.all_children()
+        children = element._with_attached()
         attributes = self.attributes(element)
         attached = element._attached
-        if attached is not None and free_body(attached) is not None:
+        if self._is_whole and attached is not None and free_body(attached) is not None:
             parent = element._parent
             if children[: len(element._children)] or attached.parent_model is not self.top or not parent.is_worldbody:
                 raise UsageError(
@@ -168,23 +182,25 @@ class _Writer:
 
     def attributes(self, element: Element) -> dict[str, str]:
         """Return the attributes of an element as text."""
-        made, spec = {}, element._spec
-        if spec.kind and spec.kind != "default" and "name" in spec.attributes:
-            made["name"] = self._name(element)
-        for name, value in element._given.items():
-            if name == "name" and "name" in made:
-                continue
-            if name in _FOLDERS or (element.tag == "default" and name == "class"):
-                continue
-            if element.tag == "key" and name in element._key_order:
+        made, spec, given = {}, element._spec, element._given
+        named_by = spec.named_by
+        if spec.kind and named_by in spec.attributes and named_by != "class":
+            made[named_by] = self._name(element)
+            if not made[named_by]:  # a composite at the top, whose elements are called as MuJoCo calls them
+                del made[named_by]
+        if "class" in spec.attributes and "class" not in given and element.tag != "default":
+            by_model = self._class(element)
+            if by_model:
+                made["class"] = by_model
+        for name in sorted(given, key=spec.attributes.__getitem__):
+            value = given[name]
+            if name == named_by or name in _FOLDERS or (element.tag == "key" and name in element._key_order):
                 continue
             written = self._text(element, name, value)
             if written is not None:
                 made[name] = written
-        if "class" in spec.attributes and "class" not in made and element.tag != "default":
-            inherited = self._class(element)
-            if inherited:
-                made["class"] = inherited
+        if "name" in made and (element.is_frame or element._parent.is_frame):
+            made["name"] = made.pop("name")  # PyMJCF writes it last
         factor = self._factor(element.root)
         if factor != 1.0:
             made |= self._turned(element, factor)
@@ -192,8 +208,8 @@ class _Writer:
 
     def _name(self, element: Element) -> str:
         model = element.root
-        parent = element._parent
-        if element._given.get("name") or element.is_frame or (parent is not None and parent.is_frame):
+        parent: Any = element._parent
+        if element._given.get("name") or element.is_frame or parent.is_frame or element.tag == "composite":
             return model.identify(element, self.top) or ""
         numbers = self._unnamed.get(model)
         if numbers is None:
@@ -229,9 +245,14 @@ class _Writer:
             return model.prefix(self.top) + value
         if element.tag == "flex" and name in ("body", "node"):
             return " ".join(model.prefix(self.top) + word for word in str(value).split())
-        if isinstance(value, np.ndarray):
-            return " ".join(map(repr, value.tolist())) if value.dtype.kind != "U" else " ".join(value.tolist())
-        return value if isinstance(value, str) else repr(value)
+        return value if isinstance(value, str) else self._digits(value)
+
+    def _digits(self, value: Any) -> str:
+        """Return a number, or an array, as text."""
+        values = np.atleast_1d(value)
+        if values.dtype.kind != "f":
+            return " ".join(map(str, values.tolist()))
+        return " ".join([self._number] * values.size) % tuple(values.tolist())
 
     def _named(self, element: Element, name: str, target: Element) -> str | None:
         if target.is_removed:
@@ -258,15 +279,15 @@ class _Writer:
         """Return the attributes of an element that are angles, in the unit of the model at the top."""
         made, given = {}, element._given
         if "euler" in given and element.tag != "compiler":
-            made["euler"] = " ".join(map(repr, (factor * given["euler"]).tolist()))
+            made["euler"] = self._digits(factor * given["euler"])
         if "axisangle" in given:
-            made["axisangle"] = " ".join(map(repr, [*given["axisangle"][:3].tolist(), factor * given["axisangle"][3]]))
+            made["axisangle"] = self._digits(given["axisangle"] * [1.0, 1.0, 1.0, factor])
         if element.tag == "joint" and "range" in element._spec.attributes:
             scale = factor if turns(element) else 1.0
             for name in _ANGLES:  # those of its classes too: a class may be for hinges and for slides
                 value = inherited(element, name)
                 if value is not None:
-                    made[name] = " ".join(map(repr, np.atleast_1d(scale * value).tolist()))
+                    made[name] = self._digits(scale * np.asarray(value))
         if element.tag == "compiler":
             made.pop("angle", None)
         return made
@@ -278,7 +299,7 @@ class _Writer:
         alone = not self.top.frames
         names = key._key_order
         if alone and all(_same(order, key.root.keyed_elements(name)) for name, order in names.items()):
-            return {name: " ".join(map(repr, key._given[name].tolist())) for name in names}
+            return {name: self._digits(key._given[name]) for name in names}
         layout = self.top.layout
         if layout is None or layout[0] != body:
             layout = body, mj.MjModel.from_xml_string(f"{body}\n</mujoco>", assets(self.top))
@@ -307,7 +328,7 @@ class _Writer:
             if place is not None:
                 numbers[place : place + size] = values[at : at + size]
             at += size
-        return " ".join(map(repr, numbers.tolist()))
+        return self._digits(numbers)
 
     def _placed(self, order: list[Any], name: str, model: MjModel) -> list[tuple[int | None, int]]:
         """Return where the numbers of elements are in the world, and how many; None for those that are gone.

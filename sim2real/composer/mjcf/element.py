@@ -19,6 +19,10 @@ _POSE = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
 _UNITS = {unit: 1 << 10 * (i + 1) for i, unit in enumerate("kmgtpe")}
 
 
+class NoSuchChildError(UsageError, AttributeError):
+    """MJCF has no such element there."""
+
+
 class Element:
     """One element of a model; made by ``find``, ``find_all`` and ``add``.
 
@@ -46,15 +50,19 @@ class Element:
         return self.to_xml_string(self_only=True, pretty_print=False)
 
     def __dir__(self) -> list[str]:
-        names = {"dclass" if name == "class" else name for name in self._spec.attributes}
-        return sorted({*object.__dir__(self), *names, *self._spec.children})
+        return sorted({*object.__dir__(self), *map(_public, self._spec.attributes), *self._spec.children})
 
     # -- what it is
 
     @property
     def tag(self) -> str:
         """The tag in MJCF."""
-        return self._spec.tag
+        return self._spec.name
+
+    @property
+    def spec(self) -> schema.Spec:
+        """What MJCF says of such an element: its attributes and children."""
+        return self._spec
 
     @property
     def kind(self) -> str:
@@ -64,6 +72,11 @@ class Element:
     @property
     def root(self) -> RootElement:
         """The model."""
+        return self._root
+
+    @property
+    def namescope(self) -> RootElement:
+        """Whose names this element's are: the model's."""
         return self._root
 
     @property
@@ -116,13 +129,13 @@ class Element:
         holder = model if parent is self._root or parent is None else parent._in(model)
         return holder._child(self.tag)
 
-    def _checked(self, name: str) -> str:
+    def _checked(self, name: str, problem: str = "") -> str:
         if self.is_removed:
             raise UsageError(f"this {self.kind} was removed from model {self._root.model!r}")
         name = "class" if name == "dclass" else name
         if name not in self._spec.attributes:
-            available = ", ".join(sorted("dclass" if n == "class" else n for n in self._spec.attributes))
-            raise AttributeError(f"{name!r} is not a valid attribute for <{self.tag}>. Available: {available}")
+            available = ", ".join(sorted(map(_public, self._spec.attributes)))
+            raise AttributeError(f"{problem}{name!r} is not a valid attribute for <{self.tag}>. Available: {available}")
         return name
 
     def _get(self, name: str) -> Any:
@@ -132,21 +145,26 @@ class Element:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
+        if hasattr(type(self), name):  # a property of this class failed: let its own error be seen
+            return object.__getattribute__(self, name)
         spec = self._spec
         if name in spec.children and not self.is_removed:
             if spec.children[name].repeated:
                 return ElementList(self, name)
             return self._child(name) if spec.children[name].implicit else self._present(name)
-        if name == spec.tag and name in schema.GROUPS:
+        if name == spec.name and name in schema.GROUPS:
             return ElementList(self, name)
         if name not in spec.attributes and name != "dclass" and spec.children:
             children = f"; children: {', '.join(sorted(spec.children))}"
             attributes = ", ".join(sorted(spec.attributes))
-            raise AttributeError(f"<{self.tag}> has no attribute {name!r}. Available: {attributes}{children}")
-        return self._get(self._checked(name))
+            raise AttributeError(f"<{self.tag}> object has no attribute {name!r}. Available: {attributes}{children}")
+        return self._get(self._checked(name, "object has no attribute: "))
 
     def __setattr__(self, name: str, value: Any) -> None:
-        self._set(self._checked(name), value)
+        if name.startswith("_") or name == "is_removed":
+            object.__setattr__(self, name, value)
+        else:
+            self._set(self._checked(name, "can't set attribute: "), value)
 
     def __delattr__(self, name: str) -> None:
         if name in self._spec.children:
@@ -156,12 +174,12 @@ class Element:
             if child is not None:
                 child.remove()
             return
-        self._set(self._checked(name), None)
+        self._set(self._checked(name, "object has no attribute: "), None)
 
     def _set(self, name: str, value: Any) -> None:
         values = self._values(name)
         value = None if isinstance(value, str) and not value else value
-        if name == "name" or (name == "class" and self.tag == "default"):
+        if name == self._spec.named_by:
             self._root.rename(self, values.get(name), value)
         if value is None:
             values.pop(name, None)
@@ -188,6 +206,8 @@ class Element:
                 array = np.atleast_1d(np.array(numbers, dtype=float if form == "array" else int))
                 if array.ndim > 1:
                     raise ValueError("it has more than one dimension")
+                if array.size > schema.LENGTHS.get(name, array.size):
+                    raise ValueError(f"it should have no more than {schema.LENGTHS[name]} entries")
                 return array
             if form == "int":
                 if float(value) != int(float(value)):
@@ -230,7 +250,7 @@ class Element:
     def get_attributes(self) -> dict[str, Any]:
         """Return the explicit attributes: name -> value."""
         found = {name: self._get(name) for name in sorted(self._spec.attributes)}
-        return {"dclass" if name == "class" else name: v for name, v in found.items() if v is not None}
+        return {_public(name): v for name, v in found.items() if v is not None}
 
     def set_attributes(self, **attrs: Any) -> None:
         """Set several attributes, or none where one of them is not valid."""
@@ -256,13 +276,18 @@ class Element:
         child = self._present(tag)
         if child is None:
             child = Element(self._spec.children[tag], self)
-            self._children.append(child)
+            place = len(self._children)
+            if self.tag == "default":  # in MJCF's order, whenever it is first used: classes of actuators share values
+                order = list(self._spec.children)
+                later = order[order.index(tag) :]
+                place = next((i for i, c in enumerate(self._children) if c.tag in later), place)
+            self._children.insert(place, child)
         return child
 
     def get_children(self, tag: str) -> Any:
         """Return the children with a tag: a list, or the one child."""
         if tag not in self._spec.children:
-            raise AttributeError(f"<{tag}> is not a valid child of <{self.tag}>")
+            raise NoSuchChildError(f"<{tag}> is not a valid child of <{self.tag}>")
         return getattr(self, tag)
 
     def add(self, tag: str, **attrs: Any) -> Element:
@@ -279,12 +304,12 @@ class Element:
         if spec is None or (self.is_frame and tag not in schema.FRAME_CHILDREN):
             available = ", ".join(schema.FRAME_CHILDREN if self.is_frame else sorted(self._spec.children))
             where = f"the attachment frame {self.full_identifier!r}" if self.is_frame else f"<{self.tag}>"
-            raise UsageError(f"<{tag}> is not a valid child of {where}. Available: {available or 'nothing'}")
+            raise NoSuchChildError(f"<{tag}> is not a valid child of {where}. Available: {available or 'nothing'}")
         if not spec.repeated and (spec.implicit or self._present(tag) is not None):
             raise UsageError(f"A <{tag}> child already exists in <{self.tag}>, please access it directly.")
-        if tag == "freejoint" and not (self._parent is not None and self._parent.is_worldbody):
-            raise UsageError(
-                f"a free joint is only for bodies that stand in the world, {self.full_identifier!r} does not",
+        if tag == "freejoint" and not self._stands_in_the_world:
+            raise NoSuchChildError(
+                f"<freejoint> is not a valid child of {self.full_identifier!r}, which does not stand in the world",
                 hint="attach the model to the world, or use hinge and slide joints",
             )
         element = Element(spec, self)
@@ -297,21 +322,18 @@ class Element:
         try:
             for name in sorted(attrs, key=_types_first):
                 element._set(name, attrs[name])
-            if self.is_frame and element.kind == "joint":
-                self._check_frame_joint(element)
         except Exception:
-            self._root.rename(element, element._given.get("name"), None)
+            self._root.rename(element, element._given.get(spec.named_by), None)
             self._children.remove(element)
             raise
         return element
 
-    def _check_frame_joint(self, joint: Element) -> None:
-        same = [j for j in self._children if j is not joint and j.kind == "joint" and j.name == joint.name]
-        if same:
-            raise UsageError(
-                f"the attachment frame {self.full_identifier!r} has a joint {joint.full_identifier!r} already",
-                hint='give each of its joints a name: frame.add("joint", name="x", ...)',
-            )
+    @property
+    def _stands_in_the_world(self) -> bool:
+        above = self._parent
+        while above is not None and above.tag in ("frame", "replicate"):
+            above = above._parent
+        return above is not None and above.is_worldbody
 
     def remove(self, affect_attachments: bool = False) -> None:
         """Delete the element from its model, with its children.
@@ -320,37 +342,50 @@ class Element:
             affect_attachments: Whether models that are attached below it may be detached.
         """
         below = [e for e in self.walk(own=True) if e._attached is not None]
-        if below and not affect_attachments:
-            raise UsageError("please use remove(affect_attachments=True), as models are attached below this element")
+        others = [] if below or self.is_worldbody else self.attached_children()
+        shared = self._is_setting and (self._root.parent_model is not None or self._root.frames)
+        if (below or others or shared) and not affect_attachments:
+            raise UsageError(
+                "other models are attached here, or share this element",
+                hint="use remove(affect_attachments=True), which detaches them, or removes it for all",
+            )
         for frame in below:
             attached: Any = frame._attached
             attached.detach()
-        for child in list(self._children):
-            child.remove()
-        name = self._given.get("class" if self.tag == "default" else "name")
+        if shared and self._root is not self._root.root_model:
+            self._in(self._root.root_model).remove(affect_attachments=True)
+        for child in [*self._children, *others]:
+            child.remove(affect_attachments=affect_attachments)
+        name = self._given.get(self._spec.named_by)
         self._root.rename(self, name, None)
         self._given.clear()
         self._key_order["name"] = [name]  # for messages
         if self._parent is not None and (self._spec.repeated or not self._spec.implicit):
             self._parent._children.remove(self)
-            object.__setattr__(self, "is_removed", True)
+            self.is_removed = True
 
     def all_children(self) -> list[Element]:
         """Return the children, and those of the model that an attachment frame or a section holds too."""
+        for tag, spec in self._spec.children.items():
+            if spec.implicit:
+                self._child(tag)
+        return self._with_attached()
+
+    def _with_attached(self) -> list[Element]:
         return [*self._children, *self.attached_children()]
 
     def attached_children(self) -> list[Element]:
         """Return the children that belong to attached models."""
         if self._attached is not None:
-            return self._attached.worldbody.all_children()
+            return self._attached.worldbody._with_attached()
         if self._parent is self._root and self.tag not in ("worldbody", "default") and not self._is_setting:
-            return [c for m in self._root.attached_models() for c in m._child(self.tag).all_children()]
+            return [c for m in self._root.attached_models() for c in m._child(self.tag)._with_attached()]
         return []
 
     def walk(self, own: bool = False) -> Iterator[Element]:
         """Yield this element and all below it, in the order of the document; ``own``: without attached models."""
         yield self
-        for child in self._children if own else self.all_children():
+        for child in self._children if own else self._with_attached():
             yield from child.walk(own)
 
     def find(self, kind: str, identifier: str | None = None, *, name: str | None = None) -> Any:
@@ -369,7 +404,7 @@ class Element:
             raise UsageError(f"{kind!r} is not a valid namespace. Available: {', '.join(schema.KINDS)}")
         kind = KIND_OF_TAG.get(kind, kind)
         if immediate_children_only:
-            found: Iterable[Element] = self._children if exclude_attachments else self.all_children()
+            found: Iterable[Element] = self._children if exclude_attachments else self._with_attached()
         else:
             found = (e for e in self.walk(exclude_attachments) if e is not self)
         return [e for e in found if e._spec.kind == kind]
@@ -387,7 +422,7 @@ class Element:
         self._root.adopt(attachment)
         holder: Any = self if self.is_worldbody else self._parent
         frame = Element(schema.root().children["worldbody"].children["body"], holder)
-        object.__setattr__(frame, "_attached", attachment)
+        frame._attached = attachment
         self._root.frames[attachment] = frame
         frame._given.update({k: v for k, v in self._given.items() if k in _POSE})
         position = len(holder._children)
@@ -403,15 +438,16 @@ class Element:
         if other is None or other.tag != self.tag:
             return False
         mine, theirs = (
-            {k: v.full_identifier if isinstance(v, Element) else v for k, v in e.get_attributes().items()}
+            {k: v.full_identifier if isinstance(v, Element) else v for k, v in Element.get_attributes(e).items()}
             for e in (self, other)
         )
         if mine.keys() != theirs.keys() or not all(
             np.array_equal(np.asarray(mine[k]), np.asarray(theirs[k])) for k in mine
         ):
             return False
-        for tag in self._spec.children:
-            one, two = ([c for c in e.all_children() if c.tag == tag] for e in (self, other))
+        ordered = self.kind == "tendon"  # the order of a path counts
+        for tag in (None,) if ordered else self._spec.children:
+            one, two = ([c for c in e._with_attached() if tag in (None, c.tag)] for e in (self, other))
             if len(one) != len(two) or not all(a.is_same_as(b) for a, b in zip(one, two, strict=True)):
                 return False
         return True
@@ -421,22 +457,31 @@ class Element:
         for element in self.walk():
             for name, value in element._given.items():
                 target = schema.reference(element._path, element.tag, name) if isinstance(value, str) else None
-                if target in ("objtype", "reftype"):
-                    target = KIND_OF_TAG.get(element._given.get(target, ""), element._given.get(target))
+                target = element._given.get(target) if target in ("objtype", "reftype") else target
+                target = KIND_OF_TAG.get(target or "", target)
                 if target is not None and target in schema.KINDS:
                     element._given[name] = element._root.look_up(target, value) or value
 
     def to_xml_string(
-        self, prefix_root: RootElement | None = None, self_only: bool = False, pretty_print: bool = True
+        self,
+        prefix_root: RootElement | None = None,
+        self_only: bool = False,
+        pretty_print: bool = True,
+        precision: int = 17,
     ) -> str:
         """Return this element as MJCF.
 
         Args:
             prefix_root: The model that names are relative to; default: the element's own.
+            precision: Significant digits of numbers; with 17 they are exact.
         """
         from sim2real.composer.mjcf import compose  # which walks over elements
 
-        return compose.element_text(self, prefix_root or self._root, self_only, pretty_print)
+        return compose.element_text(self, prefix_root or self._root, self_only, pretty_print, precision)
+
+
+def _public(name: str) -> str:
+    return "dclass" if name == "class" else name
 
 
 def _types_first(name: str) -> bool:
@@ -466,7 +511,7 @@ class ElementList(Sequence[Element]):
             if self.tag != self._parent.tag or self.tag not in schema.GROUPS
             else self._parent._spec.children
         )
-        return [c for c in self._parent.all_children() if c.tag in wanted]
+        return [c for c in self._parent._with_attached() if c.tag in wanted]
 
     def __len__(self) -> int:
         return len(self._find())

@@ -24,6 +24,10 @@ NAMED_AFTER = ("mesh", "hfield", "texture")
 _NAME_BYTES = 40
 
 
+class NoSuchFileError(UsageError, OSError):
+    """A file that a model names is not there."""
+
+
 @dataclass(frozen=True)
 class Asset:
     """The contents of a file: ``asset.add('texture', file=mjcf.Asset(png, '.png'))``.
@@ -56,7 +60,7 @@ def read(element: Element, file: str) -> Asset:
             break
     else:
         if not path.is_file():
-            raise UsageError(
+            raise NoSuchFileError(
                 f"model {model.model!r} has no file {file!r}: it is neither among its assets nor at {path}"
             )
         contents = path.read_bytes()

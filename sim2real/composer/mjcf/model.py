@@ -13,6 +13,7 @@ import numpy as np
 
 from sim2real.composer.mjcf import compose, schema
 from sim2real.composer.mjcf.element import KEYED, Element, bytes_of
+from sim2real.composer.mjcf.files import NoSuchFileError
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ class RootElement(Element):
         """
         path = Path(path)
         if not path.is_file():
-            raise UsageError(f"there is no MJCF file {str(path)!r}", hint="give the path of a file that exists")
+            raise NoSuchFileError(f"there is no MJCF file {str(path)!r}", hint="give the path of a file that exists")
         node = _parsed(path.read_bytes(), str(path))
         return _from_node(node, path.parent, path.parent, assets or {}, resolve_references)
 
@@ -125,6 +126,10 @@ class RootElement(Element):
             for name, order in element._key_order.items():
                 element._key_order[name] = [(copies.get(e, e), *rest) for e, *rest in order]
         return copy
+
+    def get_attributes(self) -> dict[str, Any]:
+        """Return the explicit attributes: the model's name."""
+        return {"model": self.model}
 
     # -- names and models
 
@@ -181,7 +186,7 @@ class RootElement(Element):
             return prefix or "world"
         if element._attached is not None:
             return f"{prefix}{element._attached.model}/"
-        name = element._given.get("class" if element.tag == "default" else "name")
+        name = element._given.get(element._spec.named_by)
         if element.tag == "default":
             return prefix + ("" if element._parent is self else name or "") or "/"
         if not element._spec.kind:
@@ -189,8 +194,8 @@ class RootElement(Element):
         parent = element._parent
         if parent is not None and parent.is_frame:
             return f"{self.identify(parent, top)}{name}/" if name else self.identify(parent, top)
-        if name:
-            return prefix + name
+        if name or element.tag == "composite":  # its elements are called as MuJoCo calls them, below the model
+            return prefix + (name or "")
         peers = self.find_all(element.kind, exclude_attachments=True)
         number = next(i for i, peer in enumerate(peers) if peer is element)
         return f"{prefix or '/'}/unnamed_{element.kind}_{number}"
@@ -211,6 +216,13 @@ class RootElement(Element):
             del names[old]
         if new is not None:
             names[new] = element
+
+    def get(self, kind: str, identifier: str) -> Any:
+        """Return the element of a kind with a name; KeyError when there is none."""
+        found = self.look_up(kind, identifier)
+        if found is None:
+            raise KeyError(f"there is no {kind} {identifier!r}")
+        return found
 
     def look_up(self, kind: str, identifier: str | None) -> Any:
         """Return the element of a kind with a name in this model or those attached, or None.
@@ -250,11 +262,11 @@ class RootElement(Element):
     def adopt(self, model: RootElement) -> None:
         """Make a model one of those attached, before it has a frame; UsageError when it cannot be."""
         if not isinstance(model, RootElement):
-            raise UsageError(f"Expected a model, got {type(model).__name__}: {model!r}")
+            raise UsageError(f"Expected a mjcf.RootElement: got {type(model).__name__}: {model!r}")
         if model.parent_model is not None:
             raise UsageError(f"The model {model.model!r} is already attached elsewhere", hint="detach it first")
         if model is self.root_model:
-            raise UsageError(f"Cannot attach model {model.model!r} to itself")
+            raise UsageError(f"Cannot merge a model to itself: {model.model!r}")
         for element, name, value in list(_merged(model, self.root_model)):
             element._given[name] = value
         taken = {m.model for m in self.frames}
@@ -268,7 +280,8 @@ class RootElement(Element):
         if self.is_degree or not model.is_document or model.compiler.angle is not None:
             return
         joints = model.find_all("joint", exclude_attachments=True)
-        if any({"range", "ref", "springref"} & j._given.keys() and compose.turns(j) for j in joints):
+        angles = ("range", "ref", "springref")
+        if any(compose.turns(j) and any(compose.inherited(j, a) is not None for a in angles) for j in joints):
             _log.warning(
                 "the document of model %r does not say in which unit its angles are: they are read in degrees, as "
                 "MuJoCo reads them, also below %r, whose unit is the radian. hint: set compiler.angle of the model to "
@@ -282,9 +295,13 @@ class RootElement(Element):
         parent = self.parent_model
         if parent is None:
             raise UsageError(f"Cannot detach model {self.model!r}: it is not attached")
+        for section in [c for c in self.root_model._children if c.tag in SETTINGS]:  # they stay as they were shared
+            for element in section.walk(own=True):
+                kept = {k: v for k, v in element._given.items() if k not in schema.OWN_SETTINGS}
+                element._in(self)._given.update(kept)
         frame = parent.frames.pop(self)
         object.__setattr__(self, "parent_model", None)
-        object.__setattr__(frame, "_attached", None)
+        frame._attached = None
         frame.remove()
 
     # -- keyframes
@@ -302,18 +319,17 @@ class RootElement(Element):
         """Return the ``mujoco.MjModel`` of this model with all attached models; ValueError with MuJoCo's message."""
         return compose.compile_model(self)
 
-    def to_xml_string(self, *args: Any, **kwargs: Any) -> str:
+    def to_xml_string(self, *args: Any, precision: int = 17, **kwargs: Any) -> str:
         """Return the composed model as MJCF; its files are called as ``get_assets`` calls them."""
         del args, kwargs
-        return compose.text(self)
+        return compose.text(self, precision)
 
     def get_assets(self) -> dict[str, bytes]:
         """Return the contents of the files that ``to_xml_string`` names: name -> bytes."""
         return compose.assets(self)
 
-    @property
-    def spec(self) -> MjSpec:
-        """A new ``mujoco.MjSpec`` of the composed model."""
+    def to_spec(self) -> MjSpec:
+        """Return a new ``mujoco.MjSpec`` of the composed model."""
         return schema.mj.MjSpec.from_string(self.to_xml_string(), assets=self.get_assets())
 
 
@@ -355,10 +371,10 @@ def _copied(model: RootElement, copies: dict[Element, Element]) -> RootElement:
             new._children.append(made)
             if child._attached is not None:
                 attached = _copied(child._attached, copies)
-                object.__setattr__(made, "_attached", attached)
+                made._attached = attached
                 object.__setattr__(attached, "parent_model", copy)
             fill(child, made)
-            copy.rename(made, None, made._given.get("class" if made.tag == "default" else "name"))
+            copy.rename(made, None, made._given.get(made._spec.named_by))
 
     fill(model, copy)
     for attached, frame in model.frames.items():
@@ -407,7 +423,7 @@ def _include(node: ElementTree.Element, folder: Path, beside: Path, assets: dict
         file = child.get("file", "")
         path = next((p for p in (folder / file, beside / file) if p.is_file()), None)
         if file not in assets and path is None:
-            raise UsageError(
+            raise NoSuchFileError(
                 f"the document includes {file!r}, which is not there",
                 hint=f"looked for {folder / file}; from_xml_string takes model_dir and assets",
             )
@@ -419,7 +435,7 @@ def _include(node: ElementTree.Element, folder: Path, beside: Path, assets: dict
 def _fill(element: Element, node: ElementTree.Element) -> None:
     """Give an element the attributes and children of a node."""
     for name in sorted(node.attrib, key=lambda n: not n.endswith("type")):
-        if element._spec.tag != "mujoco" or name != "model":
+        if element.tag != "mujoco" or name != "model":
             element._set(element._checked(name), node.attrib[name])
     for child in node:
         spec = element._spec.children.get(child.tag)
@@ -427,7 +443,11 @@ def _fill(element: Element, node: ElementTree.Element) -> None:
             available = ", ".join(sorted(element._spec.children)) or "nothing"
             raise UsageError(f"<{child.tag}> is not a valid child of <{element.tag}>. Available: {available}")
         if spec.implicit:
-            _fill(element._child(child.tag), child)
+            part = element._child(child.tag)
+            if element.tag == "default":  # as MuJoCo reads a document
+                element._children.remove(part)
+                element._children.append(part)
+            _fill(part, child)
             continue
         made = element.add(child.tag, **child.attrib)
         child.attrib.clear()

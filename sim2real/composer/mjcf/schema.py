@@ -23,29 +23,51 @@ class Spec:
     """What an element with a tag may have.
 
     Attributes:
-        attributes: Names in MJCF.
+        name: The tag.
+        attributes: Names in MJCF -> their places in its own table.
         children: Tag -> what that may have.
         repeated: Whether there may be several in one parent.
         implicit: Whether the element is there without being added, such as ``option`` or ``default.geom``.
         kind: What ``find`` and ``find_all`` call it: its tag, or ``actuator``, ``sensor`` and so on; '' has no kind.
     """
 
-    tag: str
-    attributes: frozenset[str]
+    name: str
+    attributes: dict[str, int]
     repeated: bool
     implicit: bool = False
     kind: str = ""
     children: dict[str, Spec] = field(default_factory=dict)
 
+    @property
+    def on_demand(self) -> bool:
+        """Whether there may be one in a parent, once it is added."""
+        return not self.repeated and not self.implicit
+
+    @property
+    def named_by(self) -> str:
+        """The attribute that holds the name; '' where elements have no names."""
+        return _NAMES.get(self.name, "name" if self.kind else "")
+
+
+_NAMES = {"default": "class", "composite": "prefix"}
 
 GROUPS = ("actuator", "sensor", "tendon", "equality")
 """Sections whose elements have one kind."""
 _KINDS = {
-    "asset": ("mesh", "hfield", "skin", "texture", "material", "model"), "contact": ("pair", "exclude"),
-    "custom": ("numeric", "text", "tuple"), "keyframe": ("key",), "deformable": ("flex", "skin"),
+    "asset": ("mesh", "hfield", "skin", "texture", "material", "model"),
+    "custom": ("numeric", "text", "tuple"), "keyframe": ("key",),
 }  # fmt: skip
-_TREE = ("body", "geom", "joint", "site", "camera", "light", "frame")
-KINDS = (*_TREE, *GROUPS, *(kind for kinds in _KINDS.values() for kind in kinds), "default", "attachment_frame")
+_TREE = ("body", "geom", "joint", "site", "camera", "light", "frame", "composite", "flexcomp")
+KINDS = (
+    *_TREE,
+    *GROUPS,
+    "contact",
+    "deformable",
+    "plugin",
+    *(kind for kinds in _KINDS.values() for kind in kinds),
+    "default",
+    "attachment_frame",
+)
 """What ``find_all`` takes."""
 FRAME_CHILDREN = ("joint", "freejoint", "inertial")
 """What an attachment frame may hold."""
@@ -55,16 +77,14 @@ FRAME_CHILDREN = ("joint", "freejoint", "inertial")
 def root() -> Spec:
     """Return what ``<mujoco>`` may have."""
     stack: list[Spec] = []
-    names: dict[int, set[str]] = {}
     for line in mj.mj_printSchema(False, False).splitlines():
         entry = _ENTRY.match(line)
         if entry is None:
-            names[id(stack[-1])].update(line.split())
-            stack[-1].attributes = frozenset(names[id(stack[-1])])
+            _add_attributes(stack[-1], line.split())
             continue
         depth, tag = len(entry[1]) // _INDENT, entry[2]
-        spec = Spec(tag, frozenset(entry[4].split()), entry[3] in "*R")
-        names[id(spec)] = set(entry[4].split())
+        spec = Spec(tag, {}, entry[3] in "*R")
+        _add_attributes(spec, entry[4].split())
         del stack[depth:]
         if stack:
             stack[-1].children[tag] = spec
@@ -73,27 +93,27 @@ def root() -> Spec:
     # Bodies hold bodies; the world is the body at the top. MuJoCo's table leaves out frames and copies.
     body = top.children.pop("body")
     body.kind, body.children["body"] = "body", body
-    pose = {"pos", "quat", "axisangle", "xyaxes", "zaxis", "euler"}
-    frame = Spec("frame", frozenset({"name", "childclass", *pose}), True, kind="frame")
-    replicate = Spec("replicate", frozenset({"count", "offset", "euler", "sep", "childclass"}), True)
+    frame, replicate = Spec("frame", {}, True, kind="frame"), Spec("replicate", {}, True)
+    _add_attributes(frame, ["name", "childclass", "pos", "quat", "axisangle", "xyaxes", "zaxis", "euler"])
+    _add_attributes(replicate, ["count", "offset", "euler", "sep", "childclass"])
     body.children |= {"frame": frame, "replicate": replicate}
     frame.children = replicate.children = body.children
     body.children["freejoint"].repeated = False
-    for tag in ("geom", "joint", "site", "camera", "light"):
+    for tag in ("geom", "joint", "site", "camera", "light", "composite", "flexcomp"):
         body.children[tag].kind = tag
     body.children["freejoint"].kind = "joint"
     world_children = {k: v for k, v in body.children.items() if k not in ("inertial", "joint", "freejoint")}
-    top.children["worldbody"] = Spec("worldbody", frozenset(), False, True, children=world_children)
+    top.children["worldbody"] = Spec("worldbody", {}, False, True, children=world_children)
     for name, section in top.children.items():
         section.repeated, section.implicit = False, True
         for tag, child in section.children.items():
-            if name in GROUPS:
+            if name in (*GROUPS, "contact", "deformable"):
                 child.kind = name
             elif tag in _KINDS.get(name, ()):
                 child.kind = tag
             elif name in ("compiler", "option", "visual"):
                 child.implicit = True
-    top.children["extension"].children["plugin"].children["instance"].kind = "instance"
+    top.children["extension"].children["plugin"].children["instance"].kind = "plugin"
     default = top.children["default"]
     nested = Spec("default", default.attributes, True, False, "default", default.children)
     for child in default.children.values():
@@ -101,6 +121,15 @@ def root() -> Spec:
     default.kind = "default"
     default.children["default"] = nested
     return top
+
+
+def _add_attributes(spec: Spec, names: list[str]) -> None:
+    for name in names:
+        spec.attributes.setdefault(name, _FIRST.get(name, len(_FIRST) + len(spec.attributes)))
+
+
+_FIRST = {"name": 0, "prefix": 0, "class": 1, "objtype": 2, "objname": 3, "reftype": 4, "refname": 5, "type": 6}
+"""Where PyMJCF writes some attributes."""
 
 
 ARRAYS = _words(
@@ -114,6 +143,14 @@ ARRAYS = _words(
     "vertex vertweight wind xyaxes zaxis "
 )
 """Attributes that read as arrays of floats."""
+LENGTHS = {
+    **dict.fromkeys(("pos", "euler", "zaxis", "axis", "dir", "gravity", "wind", "anchor"), 3),
+    **dict.fromkeys(("quat", "axisangle", "rgba", "refquat"), 4), "xyaxes": 6, "fromto": 6, "gear": 6,
+    **dict.fromkeys(("solref", "ctrlrange", "forcerange", "solreflimit", "solreffriction", "springlength",
+                     "springdamper"), 2),
+    **dict.fromkeys(("solimp", "solimplimit", "solimpfriction"), 5),
+}  # fmt: skip
+"""How many numbers an attribute has at most, where that is the same for all tags."""
 INTEGER_ARRAYS = _words(
     "actuatorgroupdisable cellcount count elemtexcoord face gridsize inertiagrouprange resolution vertid "
 )
@@ -185,7 +222,7 @@ KIND_OF_TAG = {
     **{tag: "actuator" for tag in ("general", "motor", "position", "velocity", "intvelocity", "damper", "cylinder",
                                    "muscle", "adhesion")},
     **dict.fromkeys(("connect", "weld"), "equality"), **dict.fromkeys(("fixed", "spatial"), "tendon"),
-    "xbody": "body",
+    "xbody": "body", "pair": "contact", "exclude": "contact", "flex": "deformable", "instance": "plugin",
 }  # fmt: skip
 """Other names of kinds."""
 SMALLER = _words("timestep tolerance ls_tolerance noslip_tolerance ccd_tolerance znear ")

@@ -1,0 +1,291 @@
+"""Models: random ones against PyMJCF, and what PyMJCF has no answer to, or another one."""
+
+import copy
+import zipfile
+
+import mujoco
+import numpy as np
+import pytest
+import random_models
+from mujoco import mjx
+from test_oracle import names
+
+from sim2real import composer
+from sim2real.composer import mjcf
+from sim2real.errors import UsageError
+
+
+@pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.night) for part in range(1, 50))])
+def test_random_models_are_those_of_dm_control(oracle, part):
+    found = {seed: random_models.compare(seed) for seed in range(20 * part, 20 * part + 20)}
+    assert not any(found.values()), found
+
+
+# -- what a model names
+
+ROBOT = """
+<mujoco model="r"><asset><material name="skin" rgba="1 0 0 1"/></asset>
+  <worldbody><body name="b"><joint name="j"/><geom name="g" size=".1" material="skin"/><site name="s"/></body>
+    <body name="c" pos="0 0 1"><joint name="k"/><geom name="h" size=".1"/><site name="z"/></body>{inside}</worldbody>
+  {beside}</mujoco>"""
+NAMING = {
+    "second joint": ("joint k", '<equality><joint joint1="j" joint2="k"/></equality>'),
+    "second body": ("body c", '<equality><weld body1="b" body2="c"/></equality>'),
+    "second site": ("site z", '<equality><connect site1="s" site2="z"/></equality>'),
+    "reference site": ("site z", '<actuator><general site="s" refsite="z" gear="1 0 0 0 0 0"/></actuator>'),
+    "side site": (
+        "site z",
+        '<tendon><spatial><site site="s"/><geom geom="g" sidesite="z"/><site site="s"/></spatial></tendon>',
+    ),
+    "joint of a tendon": (
+        "joint k",
+        '<tendon><fixed><joint joint="j" coef="1"/><joint joint="k" coef="1"/></fixed></tendon>',
+    ),
+    "frame of a sensor": (
+        "site z",
+        '<sensor><framepos objtype="site" objname="s" reftype="site" refname="z"/></sensor>',
+    ),
+    "transmission": ("joint k", '<actuator><motor joint="k"/></actuator>'),
+    "pair": ("geom h", '<contact><pair geom1="g" geom2="h"/></contact>'),
+    "tuple": ("body c", '<custom><tuple name="t"><element objtype="body" objname="c"/></tuple></custom>'),
+    "target": ("body c", '<camera mode="targetbody" target="c"/>'),
+}
+
+
+@pytest.mark.parametrize("attached", [True, False])
+@pytest.mark.parametrize("reference", NAMING)
+def test_what_names_a_removed_element_stays_and_is_refused(reference, attached):
+    """Without its second element, an equality would hold the first one in place."""
+    removed, text = NAMING[reference]
+    kind, name = removed.split()
+    parts = {"inside": text, "beside": ""} if kind in text[:8] or text.startswith("<camera") else {"beside": text}
+    robot = mjcf.from_xml_string(ROBOT.format(**({"inside": "", "beside": ""} | parts)))
+    if attached:
+        mjcf.RootElement(model="w").attach(robot)
+    robot.find(kind, name).remove()
+    with pytest.raises(UsageError, match=f"names the {kind} '{name}', which was removed"):
+        robot.root_model.compile()
+
+
+def test_a_removed_material_is_forgotten():
+    robot = mjcf.from_xml_string(ROBOT.format(inside="", beside=""))
+    robot.find("material", "skin").remove()
+    assert robot.find("geom", "g").material is None
+    assert robot.compile().geom_matid.tolist() == [-1, -1]
+
+
+def test_a_model_that_others_name_may_be_detached_and_come_back():
+    top, left, right = (mjcf.from_xml_string(ROBOT.format(inside="", beside="")) for _ in range(3))
+    top.model = "top"
+    for model in (left, right):
+        top.attach(model)
+    left.actuator.add("motor", name="m", joint=right.find("joint", "k"))
+    right.detach()
+    with pytest.raises(UsageError, match="refers to model 'r_1', which is not attached below it"):
+        top.compile()
+    right.model = "again"
+    top.attach(right)
+    model = top.compile()
+    assert model.actuator("r/m").trnid[0] == model.joint("again/k").id
+    twin = copy.copy(left)  # it names the same element of another model
+    top.attach(twin)
+    assert top.compile().actuator_trnid[:, 0].tolist() == [model.joint("again/k").id] * 2
+    with pytest.raises(UsageError, match="not attached below"):
+        left.compile()
+
+
+def test_text_names_what_is_there_when_the_world_is_compiled():
+    top = mjcf.from_xml_string('<mujoco><actuator><motor name="m" joint="r/k"/></actuator></mujoco>')
+    with pytest.raises(ValueError, match="r/k"):
+        top.compile()
+    top.attach(mjcf.from_xml_string(ROBOT.format(inside="", beside="")))
+    model = top.compile()
+    assert model.actuator("m").trnid[0] == model.joint("r/k").id
+
+
+def test_a_derived_attribute_is_refused_and_a_misspelt_one_names_those_that_exist():
+    site = mjcf.from_xml_string(ROBOT.format(inside="", beside="")).find("site", "s")
+    with pytest.raises(AttributeError, match="pos"):
+        site.xpos = [0, 0, 1]
+    with pytest.raises(AttributeError, match="rgba"):
+        _ = site.rgbaa
+
+
+# -- settings of several models
+
+
+def test_settings_are_those_of_the_whole_world(oracle):
+    """The top's, those that it takes over, those set later by any model; a model that is detached keeps them."""
+    found = []
+    for lib in (mjcf, oracle.mjcf):
+        top, part, other = (lib.RootElement(model=name) for name in ("top", "part", "other"))
+        top.option.density, part.option.viscosity, part.option.timestep = 3.0, 2.0, 0.01
+        part.option.iterations, top.option.flag.gravity = 7, "enable"
+        top.attach(part)
+        seen = [top.option.viscosity, part.option.density, top.option.timestep]
+        part.option.gravity = [0, 0, -3]
+        top.option.flag.contact = "disable"
+        seen += [top.option.gravity[2], part.option.flag.contact, top.to_xml_string().count("gravity=")]
+        other.option.flag.gravity = "disable"
+        with pytest.raises(ValueError, match="Conflicting values for attribute `gravity`"):
+            top.attach(other)
+        part.detach()
+        seen += [top.option.gravity[2], part.option.gravity[2], part.option.density]
+        part.option.density = 5.0
+        seen += [top.option.density, len(top.find_all("attachment_frame"))]
+        found.append(seen)
+    assert found[0][:-1] == found[1][:-1]
+
+
+def test_units_travel_with_the_model(caplog):
+    part = """<mujoco model="p"><!-- <compiler angle="radian"/> -->
+      <default><joint range="-9 9" limited="true"/></default>
+      <worldbody><body euler="0 90 0"><joint name="h"/><joint name="s" type="slide"/><geom size=".1"/></body>
+      </worldbody></mujoco>"""
+    world = composer.Arena().mjcf_model
+    world.attach(mjcf.from_xml_string(part))
+    model = world.compile()
+    assert model.jnt_range[:, 1].tolist() == pytest.approx([np.radians(9), 9.0])
+    np.testing.assert_allclose(model.body_quat[model.jnt_bodyid[0]], [0.5**0.5, 0, 0.5**0.5, 0], atol=1e-12)
+    assert "unit" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("when", "physics", "steps"), [("before", 0.0005, 40), ("only control", 0.0005, 40), ("after", 0.002, 10)]
+)
+def test_a_task_knows_the_timestep_of_the_world(oracle, ours, when, physics, steps):
+    """The smallest timestep holds, unless one is set once all models are attached; as in dm_control."""
+    for kit in (oracle, ours):
+        arena = kit.composer.Arena()
+        task = kit.composer.NullTask(arena)
+        if when == "before":
+            task.set_timesteps(0.02, 0.002)
+        part = kit.mjcf.from_xml_string('<mujoco><option timestep="0.0005"/></mujoco>')
+        arena.attach(kit.composer.ModelWrapperEntity(part))
+        if when == "after":
+            task.set_timesteps(0.02, 0.002)
+        task.control_timestep = 0.02
+        env = kit.composer.Environment(task)
+        env.reset()
+        env.step([])
+        assert task.physics_timestep == env.physics.timestep() == physics
+        assert task.physics_steps_per_control_step == steps
+        assert env.physics.time() == pytest.approx(0.02)
+
+
+# -- keyframes
+
+
+def keyed(attach_first, **values):
+    world = mjcf.from_xml_string("""<mujoco model="w"><worldbody><body name="o" mocap="true"><geom size=".1"/></body>
+      <body pos="0 0 3"><joint name="oj"/><geom size=".1"/></body></worldbody></mujoco>""")
+    robot = mjcf.from_xml_string(ROBOT.format(inside="", beside='<actuator><motor joint="k"/></actuator>'))
+    if attach_first:
+        world.attach(robot)
+    world.keyframe.add("key", name="home", **values)
+    if not attach_first:
+        world.attach(robot)
+    return mjcf.Physics.from_mjcf_model(world).model
+
+
+@pytest.mark.parametrize("attach_first", [True, False])
+def test_a_keyframe_of_the_whole_world_sets_all_models(attach_first):
+    model = keyed(attach_first, qpos=[0.5, 0.1, 0.2], ctrl=[0.7], mpos=[1, 2, 3])
+    assert (model.key_qpos.tolist(), model.key_ctrl.tolist()) == ([[0.5, 0.1, 0.2]], [[0.7]])
+    assert model.key_mpos.ravel().tolist() == [1, 2, 3]
+    assert keyed(attach_first, qpos=[0.5]).key_qpos.tolist() == [[0.5, 0, 0]]
+    with pytest.raises(UsageError, match="has 2 values for qpos, its model has 1, and 3 with the attached ones"):
+        keyed(attach_first, qpos=[0.5, 0.1])
+
+
+@pytest.mark.parametrize("attached", [False, True])
+def test_numbers_of_a_keyframe_stay_with_elements_that_move(attached):
+    rest = '<actuator><motor name="u" joint="j"/><motor name="v" joint="k"/></actuator>'
+    rest += '<keyframe><key name="home" ctrl="1 2" qpos=".5 -.3"/></keyframe>'
+    robot = mjcf.from_xml_string(ROBOT.format(inside="", beside=rest))
+    robot.find("actuator", "u").remove()
+    robot.actuator.add("motor", name="u", joint="j")
+    if attached:
+        composer.Arena().mjcf_model.attach(robot).add("joint", type="slide", name="rail")
+    model = robot.root_model.compile()
+    called = [model.actuator(i).name.removeprefix("r/") for i in range(2)]
+    assert dict(zip(called, model.key_ctrl[0].tolist(), strict=True)) == {"u": 1.0, "v": 2.0}
+    assert model.key_qpos[0].tolist() == [0.0] * attached + [0.5, -0.3]
+
+
+# -- what only documents can hold, and files
+
+
+@pytest.mark.parametrize(
+    ("text", "count"),
+    [
+        ('<worldbody><replicate count="3" offset="1 0 0"><body name="n"><joint/><geom size=".1"/></body></replicate>'
+         "</worldbody>", 3),
+        ('<worldbody><frame pos="0 0 1"><body name="m"><geom size=".1"/></body></frame></worldbody>', 1),
+        ('<deformable><flex name="f" dim="1" body="b b" vertex="0 0 0 0 0 1" element="0 1"/></deformable>', 0),
+        ('<worldbody><body><composite type="cable" curve="s" count="4 1 1" size="1" initial="none"><geom '
+         'type="capsule" size=".01"/><joint kind="main"/></composite></body></worldbody>', 4),
+    ],
+)  # fmt: skip
+def test_what_only_documents_can_hold_is_attached_with_them(text, count):
+    robot, top = ROBOT.format(inside="", beside=text), mjcf.RootElement(model="w")
+    for _ in range(2):
+        top.attach(mjcf.from_xml_string(robot))
+    assert mjcf.from_xml_string(robot).compile().nbody == 3 + count
+    model = top.compile()
+    assert model.nbody == 1 + 2 * (3 + count)
+    assert all(name.startswith(("r/", "r_1/")) for name in names(model)["body"][1:])
+    assert model.nflex in (0, 2)
+
+
+def test_references_across_models_are_there_on_mjx():
+    top, left, right = (mjcf.from_xml_string(ROBOT.format(inside="", beside="")) for _ in range(3))
+    top.attach(left)
+    left.attach(right)
+    tendon = top.tendon.add("spatial", name="t")
+    for model in (left, right):
+        tendon.add("site", site=model.find("site", "s"))
+    top.actuator.add("motor", tendon=tendon)
+    left.equality.add("joint", joint1=right.find("joint", "j"), joint2=left.find("joint", "k"))
+    model = mjx.put_model(top.compile())
+    assert (model.ntendon, model.nu, model.neq, model.nv) == (1, 1, 1, 6)
+
+
+def test_a_model_with_a_free_joint_of_its_own_keeps_it():
+    text = '<mujoco model="drone"><worldbody><body name="hull" pos="0 0 1"><freejoint/><geom size=".1"/></body>'
+    drone, arena = mjcf.from_xml_string(f"{text}</worldbody></mujoco>"), composer.Arena()
+    entity = composer.ModelWrapperEntity(drone)
+    arena.attach(entity)
+    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
+    entity.set_pose(physics, position=[1.0, 0, 2])
+    np.testing.assert_array_equal(physics.bind(drone.find("body", "hull")).xpos, [1, 0, 2])
+    entity.detach()
+    arena.mjcf_model.worldbody.add("body").add("site", name="s").attach(drone)
+    with pytest.raises(UsageError, match="only be attached to the world"):
+        arena.mjcf_model.compile()
+
+
+def test_files_are_collected_and_written(tmp_path):
+    mesh = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "tip.obj").write_text(mesh)
+    (tmp_path / "part.xml").write_text('<mujoco><asset><mesh file="tip.obj"/></asset></mujoco>')
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco model="arm"><compiler meshdir="meshes"/><include file="part.xml"/>'
+        '<worldbody><geom name="tip" type="mesh" mesh="tip"/></worldbody></mujoco>'
+    )
+    root, arm = mjcf.RootElement(model="root"), mjcf.from_path(tmp_path / "arm.xml")
+    root.attach(arm)
+    arm.asset.add("mesh", name="twin", file=mjcf.Asset(arm.find("mesh", "tip").file.contents, ".obj"))
+    assets = root.get_assets()
+    assert [a.decode() for a in assets.values()] == [mesh] * 2
+    assert mujoco.MjModel.from_xml_string(root.to_xml_string(), assets).nmesh == 2
+    mjcf.export_with_assets(root, tmp_path / "out")
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "root.xml")).nmesh == 2
+    with zipfile.ZipFile(mjcf.export_with_assets_as_zip(root, tmp_path / "new")) as archive:
+        archive.extractall(tmp_path)
+    found = {file.name: file.read_bytes() for file in (tmp_path / "root").iterdir()}
+    assert found == {file.name: file.read_bytes() for file in (tmp_path / "out").iterdir()}
+    (tmp_path / "part.xml").unlink()
+    with pytest.raises(UsageError, match=r"includes 'part\.xml', which is not there"):
+        mjcf.from_path(tmp_path / "arm.xml")
