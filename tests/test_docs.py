@@ -21,7 +21,7 @@ from sim2real.commands.table import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-NIGHT, PROCESS = pytest.mark.night, pytest.mark.process
+NIGHT = pytest.mark.night
 OPTIONAL = {"stable_baselines3"}
 """Packages that no extra brings: their blocks are left out where they are not installed."""
 GROUPS = {"sim2real.pipelines", "sim2real.devices", "sim2real.worlds"}
@@ -40,17 +40,16 @@ def python_of(page: str) -> list[str]:
 
 MARKS = {
     "README.md": [NIGHT],
-    "docs/graph.md": [PROCESS],
     "docs/guides/compose.md": [NIGHT],
     "docs/guides/identify.md": [NIGHT],
     "docs/guides/interop.md": [NIGHT],
-    "docs/guides/notebook.md": [NIGHT, PROCESS],
+    "docs/guides/notebook.md": [NIGHT],
     "docs/guides/record.md": [NIGHT],
     "docs/reference/identification.md": [NIGHT],
     "docs/reference/runs.md": [NIGHT],
-    "docs/tutorial.md": [NIGHT, PROCESS],
+    "docs/tutorial.md": [NIGHT],
     "sim2real.identify": [NIGHT],
-    "sim2real.runtime": [NIGHT, PROCESS],
+    "sim2real.runtime": [NIGHT],
 }
 TINY_FIT = '{"generations": 2, "population": 8, "refine_steps": 3, "folds": 0, "free_run_s": 0.0}'
 TINY_PPO = '{"episode_s": 2.0, "timelines": 4, "ppo": {"total_steps": 512, "num_envs": 16, "minibatches": 2}}'
@@ -110,7 +109,7 @@ def optional(block: str) -> set[str]:
         if python_of(page)
     ],
 )
-def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request):
+def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request, virtual_robots):
     blocks = [(i, block) for i, block in enumerate(python_of(page), start=1) if not optional(block)]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(jax, "device_put_replicated", None, raising=False)  # interop.md defines it, for all of JAX

@@ -32,6 +32,7 @@ from sim2real.emulation.bus import BusEmulation, PlannedBus, truth_header
 from sim2real.emulation.plant import load_plant
 from sim2real.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError
+from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
 from sim2real.hardware.registry import load_named
 
 if TYPE_CHECKING:
@@ -77,6 +78,9 @@ class EmbeddedRobot:
     The stages get only the port. The emulator logs true states and latencies to the truth file; `truth` and `reveal`
     read it.
 
+    Attributes:
+        clock: The clock that the host shares with the robot.
+
     Args:
         plant: `package.module:Name` or `path/to/file.py:Name`; see `load_plant`.
         plant_args: Keyword arguments for the plant: JSON-able.
@@ -85,6 +89,8 @@ class EmbeddedRobot:
     Raises:
         HardwareLost: The emulator did not start; its own message is included.
     """
+
+    clock: Clock = SYSTEM_CLOCK
 
     def __init__(
         self,

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from sim2real.emulation.bus import BusEmulation, truth_header
 from sim2real.emulation.plant import Plant, load_plant
@@ -50,6 +50,14 @@ class VirtualTime(ABC):
         self._watchers: dict[threading.Event, list[Any]] = {}  # what is called, its period [ns], when it is due [ns]
         self._calling = False
         self._guard: Guard | None = None
+
+    def __enter__(self) -> Self:
+        """Return the running robot."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Stop it."""
+        self.stop()
 
     @abstractmethod
     def _next_ns(self) -> int | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ import numpy as np
 from sim2real.errors import SafetyStop, Sim2RealError
 
 if TYPE_CHECKING:
+    from sim2real.hardware.clock import Clock
     from sim2real.hardware.device import Reading
     from sim2real.hardware.safety.rig import Rig
 
@@ -74,7 +74,8 @@ class Witness:
 
     Attributes:
         rig: The robot.
-        measured: Times of the request and of the answer, CLOCK_MONOTONIC [ns], and the reading, of each measurement.
+        measured: Times of the request and of the answer on the device's clock [ns], and the reading, of each
+            measurement.
         sent: Start and end of sending [ns], and the command after the gate ``(n,)``, of each command.
     """
 
@@ -82,17 +83,22 @@ class Witness:
     measured: list[tuple[int, int, Reading]] = field(default_factory=list)
     sent: list[tuple[int, int, np.ndarray]] = field(default_factory=list)
 
+    @property
+    def clock(self) -> Clock:
+        """The device's clock."""
+        return self.rig.clock
+
     def measure(self) -> Reading:
         """Measure all joints; see `Rig.measure`."""
         reading = self.rig.measure()
-        self.measured.append((reading.transaction.t_sent_ns, time.monotonic_ns(), reading))
+        self.measured.append((reading.transaction.t_sent_ns, self.clock.now_ns(), reading))
         return reading
 
     def command(self, command: np.ndarray) -> None:
         """Send a command through the gate; see `Rig.command`."""
-        begin_ns = time.monotonic_ns()
+        begin_ns = self.clock.now_ns()
         allowed = self.rig.command(command, 0.0, 1e-9 * begin_ns)
-        self.sent.append((begin_ns, time.monotonic_ns(), allowed))
+        self.sent.append((begin_ns, self.clock.now_ns(), allowed))
 
 
 def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
@@ -177,16 +183,16 @@ def _steps(rig: Rig, probe: Probe) -> list[tuple[np.ndarray, np.ndarray]]:
 def _answer(witness: Witness, joint: int, before: np.ndarray, goal: np.ndarray) -> np.ndarray | None:
     """Return the answer to a step: times since the command [s], and motion in its direction [rad]; None: too few."""
     _settle(witness, before)
-    begin, rows = witness.measure().position_rad[joint], []
-    left_s = time.monotonic()
+    clock, begin, rows = witness.clock, witness.measure().position_rad[joint], []
+    left_ns = clock.now_ns()
     witness.command(goal)
-    sent_s = time.monotonic() - left_s
-    while (now := time.monotonic()) < left_s + _WATCHED_S:
+    sent_s = 1e-9 * (clock.now_ns() - left_ns)
+    while (now_ns := clock.now_ns()) < left_ns + round(1e9 * _WATCHED_S):
         reading = witness.measure()
-        rows.append((1e-9 * reading.transaction.t_sent_ns - left_s, reading.position_rad[joint] - begin))
+        rows.append((1e-9 * (reading.transaction.t_sent_ns - left_ns), reading.position_rad[joint] - begin))
         if len(rows) % _AGAIN == 0:
             witness.command(goal)
-        time.sleep(max(0.0, now + _PERIOD_S - time.monotonic()))
+        clock.sleep(max(0.0, _PERIOD_S - 1e-9 * (clock.now_ns() - now_ns)))
     if witness.rig.gate.config.stale == "zero":
         witness.command(before)
     longest_s = max(sent_s, *np.diff([0.0, *(t_s for t_s, _ in rows)]))
@@ -194,12 +200,12 @@ def _answer(witness: Witness, joint: int, before: np.ndarray, goal: np.ndarray) 
 
 
 def _settle(witness: Witness, command: np.ndarray) -> None:
-    begin = still = time.monotonic()
-    while (now := time.monotonic()) - still < _STILL_S and now - begin < _REST_S:
+    begin_ns = still_ns = witness.clock.now_ns()
+    while (now_ns := witness.clock.now_ns()) - still_ns < 1e9 * _STILL_S and now_ns - begin_ns < 1e9 * _REST_S:
         if np.max(np.abs(witness.measure().velocity_rad_s)) > _STILL_RAD_S:
-            still = time.monotonic()
+            still_ns = witness.clock.now_ns()
         witness.command(command)
-        time.sleep(0.01)
+        witness.clock.sleep(0.01)
 
 
 def _powers(t_s: np.ndarray, delay_s: float) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
@@ -91,7 +90,8 @@ class Session:
                 )
                 port = self.embedded.port
                 # Wait until the last command, torque off, has taken effect, so that it is in the truth file.
-                opening.callback(time.sleep, config.actuation_latency_s + config.actuation_jitter_s + 0.01)
+                lasts_s = config.actuation_latency_s + config.actuation_jitter_s + 0.01
+                opening.callback(self.embedded.clock.sleep, lasts_s)
             self.rig = opening.enter_context(Rig(device(port), gate, joints))
             self._stack = opening.pop_all()
 

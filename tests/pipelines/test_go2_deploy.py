@@ -14,6 +14,7 @@ from sim2real.artifacts.deployment import Deployment
 from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.errors import SafetyStop, UsageError
+from sim2real.hardware.clock import SYSTEM_CLOCK
 from sim2real.robots.gate_limits import GateLimits
 from sim2real.robots.walking.drive import StandUp
 from sim2real.robots.walking.plain.episodes import twin_of
@@ -23,9 +24,8 @@ pytest.importorskip("cyclonedds")
 GUIDE = Path(__file__).parents[2] / "docs/guides/walk.md"
 
 
-@pytest.mark.process
 @pytest.mark.night  # `make test` drives the device in test_unitree_device.py, and walks in test_rough_ground.py
-def test_the_shipped_policy_walks_over_dds_and_lies_down(tmp_path, capsys):
+def test_the_shipped_policy_walks_and_lies_down(tmp_path, capsys, virtual_robots):
     (command,) = re.findall(r"^    sim2real (deploy .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
     output = capsys.readouterr()
@@ -78,9 +78,8 @@ def test_a_robot_that_does_not_walk_refuses_a_velocity(tmp_path, capsys):
     assert "follows no velocity" in capsys.readouterr().err
 
 
-@pytest.mark.night  # `make test` records a deployment of it, above
-@pytest.mark.process
-def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
+@pytest.mark.night  # its legs move in test_unitree_device.py
+def test_a_recording_moves_the_legs_in_a_stand(tmp_path, virtual_robots):
     command, *_ = re.findall(r"^    sim2real (record .*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
     (folder,) = (tmp_path / "go2").glob("*/record")
@@ -97,8 +96,7 @@ def test_a_recording_moves_the_legs_in_a_stand(tmp_path):
 
 
 @pytest.mark.night
-@pytest.mark.process
-def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsys):
+def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsys, virtual_robots):
     """The smaller tests are those of the model in a stand, of the run's stages, and of the deployment above."""
     (command,) = re.findall(r"^    sim2real (run go2.*)$", GUIDE.read_text(), re.MULTILINE)
     assert cli.main([*shlex.split(command), "--runs", str(tmp_path)]) == 0
@@ -120,8 +118,7 @@ def test_a_run_records_identifies_and_deploys_the_shipped_policy(tmp_path, capsy
 
 
 @pytest.mark.night  # test_weighing.py has the load from a log of the emulator's clock
-@pytest.mark.process
-def test_the_load_of_a_robot_on_its_feet_over_dds(tmp_path, capsys):
+def test_the_load_of_a_robot_on_its_feet(tmp_path, capsys, virtual_robots):
     logs = []
     for number, excitation in enumerate(("multisine", "standing")):
         line = ["record", "go2", "--excitation", excitation, "--runs", str(tmp_path / str(number))]
@@ -173,7 +170,7 @@ def test_the_start_motion_folds_the_legs_and_rises():
 
 def test_a_robot_that_tips_over_is_stopped_while_it_stands_up():
     class Rig:
-        torque_withheld = False
+        torque_withheld, clock = False, SYSTEM_CLOCK
 
         def measure(self):
             from types import SimpleNamespace

@@ -7,13 +7,12 @@ import pytest
 
 from sim2real.commands.new_like import calibrate
 from sim2real.emulation.feetech import StsEmulation
-from sim2real.emulation.process import EmbeddedRobot
 from sim2real.emulation.truth import Kind
+from sim2real.emulation.virtual import VirtualRobot
 from sim2real.errors import HardwareLost, Sim2RealError
 from sim2real.hardware.device import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
-pytestmark = [pytest.mark.process, pytest.mark.night]
 SO101 = load_pipeline("so101")
 GUIDE, PERSON = SO101.load("guide"), SO101.load("person")
 PLANT = f"{Path(__file__).with_name('wrong_arms.py')}:WrongArm"
@@ -32,7 +31,7 @@ def arm(tmp_path, monkeypatch):
         monkeypatch.setenv("SO101_CALIBRATION", str(file))
         settings = {"homing_offset": 85, "plant_step_s": 0.001} | (emulation or {})
         truth = tmp_path / "truth.bin"
-        arms.append(EmbeddedRobot(PLANT, StsEmulation(**settings), {"hand": str(hand)} | plant, truth))
+        arms.append(VirtualRobot(PLANT, StsEmulation(**settings), {"hand": str(hand)} | plant, truth))
         return arms[-1]
 
     yield start

@@ -1,13 +1,13 @@
-"""`sim2real new --like so101` on the port of an embedded arm that a person moves: one question, then the twin."""
+"""`sim2real new --like so101` on the port of an emulated arm that a person moves: one question, then the twin."""
 
+import io
 import json
-import subprocess
-import sys
 
 import pytest
 
-from sim2real.emulation.process import EmbeddedRobot
+from sim2real import cli
 from sim2real.emulation.truth import Kind
+from sim2real.emulation.virtual import VirtualRobot
 from sim2real.hardware.device import OperatingMode
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -16,27 +16,28 @@ QUESTION = "press Enter"
 
 
 @pytest.fixture
-def arm(tmp_path, monkeypatch):
-    """An embedded arm, whose person begins 60 s after its start."""
+def arm(tmp_path, monkeypatch, virtual_robots):
+    """An arm whose person begins 60 s after its start."""
     hand = tmp_path / "hand.npz"
     SO101.load("person").write_motion(hand, begin_s=60.0)
     embedded = SO101.load("robot").embedded()
     monkeypatch.setenv("SO101_CALIBRATION", str(SO101.folder / "calibration.json"))
-    with EmbeddedRobot(embedded.plant, embedded.emulator, {"hand": str(hand)}, tmp_path / "truth.bin") as robot:
-        yield robot
+    monkeypatch.chdir(tmp_path)
+    virtual_robots.append(VirtualRobot(embedded.plant, embedded.emulator, {"hand": str(hand)}, tmp_path / "truth.bin"))
+    return virtual_robots[-1]
 
 
-def new(arm, folder, answer):
-    """Run the command with an answer on stdin; return its exit code and stderr."""
-    command = [sys.executable, "-m", "sim2real.cli", "new", "my_arm", "--like", "so101", "--port", arm.port]
-    done = subprocess.run(command, input=answer, capture_output=True, text=True, cwd=folder, timeout=900)
-    return done.returncode, done.stderr
+def new(arm, answer, capsys, monkeypatch):
+    """Run the command with an answer on stdin; return its exit code and what it said."""
+    monkeypatch.setattr("sys.stdin", io.StringIO(answer))
+    code = cli.main(["new", "my_arm", "--like", "so101", "--port", arm.port])
+    captured = capsys.readouterr()
+    return code, captured.out + captured.err
 
 
-@pytest.mark.night  # `make test` calibrates by hand in test_so101_calibration.py, without the minute of waiting
-@pytest.mark.process
-def test_without_an_answer_nothing_moves_and_the_pipeline_is_there(arm, tmp_path):
-    code, told = new(arm, tmp_path, "")
+@pytest.mark.night  # `make test` calibrates by hand in test_so101_calibration.py
+def test_without_an_answer_nothing_moves_and_the_pipeline_is_there(arm, tmp_path, capsys, monkeypatch):
+    code, told = new(arm, "", capsys, monkeypatch)
     assert (code, told.count(QUESTION)) == (2, 1), told
     assert "there was no answer, so the arm was not recorded" in told
     made = tmp_path / "pipelines" / "my_arm"
@@ -44,18 +45,15 @@ def test_without_an_answer_nothing_moves_and_the_pipeline_is_there(arm, tmp_path
         (SO101.folder / "calibration.json").read_text()
     )
     # The new pipeline is an arm of the same name on the same port, with the new file.
-    command = [sys.executable, "-m", "sim2real.cli", "record", "my_arm", "--duration-s", "1", "--dry-run"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert f"on {arm.port}" in done.stderr
-    arm.stop()
+    assert cli.main(["record", "my_arm", "--duration-s", "1", "--dry-run"]) == 0
+    assert f"on {arm.port}" in capsys.readouterr().err
     assert set(arm.truth().of(Kind.EFFECT)["values"][:, 0].tolist()) <= {OperatingMode.OFF}
 
 
 @pytest.mark.night
-@pytest.mark.process
-def test_an_answer_gives_an_accepted_twin(arm, tmp_path):
-    code, told = new(arm, tmp_path, "\n")
+@pytest.mark.timeout(900)
+def test_an_answer_gives_an_accepted_twin(arm, tmp_path, capsys, monkeypatch):
+    code, told = new(arm, "\n", capsys, monkeypatch)
     assert (code, told.count(QUESTION)) == (0, 1), told
     (page,) = tmp_path.glob("runs/my_arm/*/report.html")
     assert "accepted" in page.read_text()

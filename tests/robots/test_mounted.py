@@ -78,9 +78,7 @@ def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
     assert one.truth() == pytest.approx({n: v * factors[n.split("_")[0]] for n, v in pair.nominal().items()}, rel=1e-5)
 
 
-@pytest.mark.night
-@pytest.mark.process
-def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
+def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path, virtual_robots):
     """The servos turn up to twice as far, some of them the other way; the true joints go where they are told."""
     robot = arm.load()
     joints = (Joint("pan", 0.5, -1, 1.5), Joint("shoulder", -0.2, 1, 2.0), Joint("elbow", 0.1, -1, 0.8))
@@ -103,9 +101,8 @@ def test_goals_and_limits_are_the_joints_on_the_bus_too(arm, tmp_path):
         assert sent == pytest.approx(joint.encoder(goal[i]), abs=0.001)
 
 
-@pytest.mark.process
-@pytest.mark.night  # test_mounting.py has each reading and command, the test below goals and limits
-def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path):
+@pytest.mark.night  # test_mounting.py has each reading and command, the test above goals and limits
+def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path, virtual_robots):
     """The log of a pendulum whose motor turns twice the other way gives the parameters of the pendulum's plant."""
     pipeline = load_pipeline("pendulum")
     robot = type(pipeline.load())((Joint("hinge", 0.7, -1, 2.0),))
@@ -121,7 +118,7 @@ def test_what_is_identified_does_not_depend_on_how_the_joint_is_mounted(tmp_path
     how = replace(pipeline.identify, generations=0, initial_state="measured")
     spans = [Span(0, begin_s) for begin_s in (0.3, 2.0, 3.7, 5.4)]
     found = fit(robot.identifiable(0.06), [episode], spans, 1.5, how).values
-    # On a busy machine the friction of 8 s was off by 3.4 %; a wrong mounting is a factor of 2 or 4.
+    # A wrong mounting is a factor of 2 or 4.
     known = {"damping": 0.1, "friction": 0.08}
     for name, value in true.parameters.items():
         assert found[name] == pytest.approx(value, rel=known.get(name, 0.03)), name

@@ -32,10 +32,10 @@ class VirtualClock(MonotonicClock):
         """Wait until a predicate is true; return whether it became so before the timeout."""
         me = threading.current_thread()
         with self._gate:
-            deadline = float("inf") if timeout_s is None else self._ns + round(1e9 * max(0.0, timeout_s))
+            deadline = float("inf") if timeout_s is None else self.monotonic_ns() + round(1e9 * max(0.0, timeout_s))
             self._waiting[me] = predicate, deadline
             try:
-                while not (found := predicate()) and self._ns < deadline:
+                while not (found := predicate()) and self.monotonic_ns() < deadline:
                     self._jump()
                     self._gate.wait(0.001)  # a thread that ends wakes nobody
                 return bool(found)
@@ -60,11 +60,14 @@ class VirtualClock(MonotonicClock):
         if not taking_part <= self._waiting.keys():
             return
         deadline = min(deadline for _, deadline in self._waiting.values())
-        if deadline <= self._ns or any(predicate() for predicate, _ in self._waiting.values()):
+        if deadline <= self.monotonic_ns() or any(predicate() for predicate, _ in self._waiting.values()):
             return
         assert deadline < float("inf"), f"all wait for ever: {[t.name for t in taking_part]}"
-        self._ns = deadline
+        self._go_to(deadline)
         self._gate.notify_all()
+
+    def _go_to(self, deadline):
+        self._ns = deadline
 
 
 class _Condition:

@@ -1,7 +1,6 @@
 """Follows a motion by hand on the bus, and makes a calibration of it, in LeRobot's format."""
 
 import json
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -26,15 +25,16 @@ def follow(servos: StsServos, motion: HandMotion, show: Callable[[str], None]) -
     Raises:
         HardwareLost: The motion contradicts the calibration, or is not complete after 10 minutes.
     """
-    begun_s, printed = time.monotonic(), ""
-    while (now_s := time.monotonic() - begun_s) < _LONGEST_S:
+    clock, printed = servos.clock, ""
+    begun_ns = clock.now_ns()
+    while (now_s := 1e-9 * (clock.now_ns() - begun_ns)) < _LONGEST_S:
         if motion.instruction != printed:
             printed = motion.instruction
             show(printed)
         counts, _ = servos.link.read_counts(servos.ids, (reg.PRESENT_POSITION,), "read of the position")
         if motion.feed(now_s, counts[:, 0]):
             return
-        time.sleep(_PERIOD_S)
+        clock.sleep(_PERIOD_S)
     raise HardwareLost(f"the arm was not moved as asked within {_LONGEST_S:.0f} s: {printed}")
 
 

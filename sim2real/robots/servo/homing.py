@@ -1,7 +1,5 @@
 """The slow motion of a robot of servos to its rest pose; torque is off before and afterwards."""
 
-import time
-
 import numpy as np
 
 from sim2real.errors import SafetyStop
@@ -45,8 +43,8 @@ def _move(session: Session, position: np.ndarray, rest: np.ndarray, rate_hz: flo
     try:
         for step in range(1, steps + round(_HOLD_S * rate_hz)):
             rig.measure()
-            rig.command(position + min(1.0, step / steps) * way, 0.0, time.monotonic())
-            time.sleep(1 / rate_hz)
+            rig.command(position + min(1.0, step / steps) * way, 0.0, 1e-9 * rig.clock.now_ns())
+            rig.clock.sleep(1 / rate_hz)
     except BaseException:
         rig.stop_quietly()  # a failure here must not replace the reason
         raise

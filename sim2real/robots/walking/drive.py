@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -188,10 +187,11 @@ class WalkingDrive(RobotDrive):
         rig, motion = session.rig, self._stand_up
         if rig.torque_withheld:
             return
-        reading, begin_s = rig.measure(), time.monotonic()
+        reading, now_ns = rig.measure(), rig.clock.now_ns
+        begin_ns = now_ns()
         start = reading.position_rad
         folded = np.asarray(start if self._motors is None else self._motors.folded)
-        while (t_s := time.monotonic() - begin_s) < motion.duration_s:
+        while (t_s := 1e-9 * (now_ns() - begin_ns)) < motion.duration_s:
             reading = rig.measure()
             if gravity_of(reading.parts["quaternion"])[2] > -0.5:
                 raise SafetyStop("the robot tipped over while it stood up", hint="lay it on even ground, legs folded")

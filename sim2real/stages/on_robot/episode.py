@@ -1,7 +1,6 @@
 """One episode on the robot: the graph on the wall clock, its log, and how well it kept its times."""
 
 import math
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,6 +14,7 @@ from sim2real.errors import ERROR, OK, DeadlineExceeded, SafetyStop, Sim2RealErr
 from sim2real.graph.base import GraphState
 from sim2real.graph.episode import MessageRecord, Recorder, StepRecord, named_leaves
 from sim2real.graph.node import BaseNode
+from sim2real.hardware.clock import Clock
 from sim2real.hardware.safety.rig import Rig
 from sim2real.installation import has_jax
 from sim2real.later import jax
@@ -112,7 +112,7 @@ def run_episode(
     graph.recorder = watch
     try:
         try:
-            _drive(graph, state, duration_s, label, recorder)
+            _drive(graph, state, duration_s, label, recorder, session.rig.clock)
         except (KeyboardInterrupt, SystemExit):
             with interruptible():  # a second signal stops at once
                 come_to_rest(graph, session.rig, hold)
@@ -168,14 +168,16 @@ def timing_rows(summary: Mapping[str, Any]) -> tuple[list[list[Any]], list[str]]
     return [*rows, *answer_rows(summary)], [*headers, "overruns"]
 
 
-def _drive(graph: AsyncGraph, state: GraphState, duration_s: float, label: str, recorder: McapRecorder) -> None:
+def _drive(
+    graph: AsyncGraph, state: GraphState, duration_s: float, label: str, recorder: McapRecorder, clock: Clock
+) -> None:
     """Run the graph; print one warning if the log's writer falls behind."""
     graph.start(state)
     with progress(round(duration_s, 1), label) as bar:
-        begin, warned = time.monotonic(), False
-        while (left := duration_s - (time.monotonic() - begin)) > 0:
+        begin_ns, warned = clock.now_ns(), False
+        while (left := duration_s - 1e-9 * (clock.now_ns() - begin_ns)) > 0:
             graph.run_for(min(_POLL_S, left))
-            bar.n = round(min(duration_s, time.monotonic() - begin), 1)
+            bar.n = round(min(duration_s, 1e-9 * (clock.now_ns() - begin_ns)), 1)
             bar.refresh()
             if recorder.behind_s > WARN_BEHIND_S and not warned:
                 note(f"warning: the disk is slow: the log is {recorder.behind_s:.0f} s behind, kept in memory")

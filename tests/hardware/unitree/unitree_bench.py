@@ -1,18 +1,10 @@
-"""An emulated Go2 whose motors go on when their host dies, and how its first motor was driven."""
+"""How the first motor of an emulated Go2 was driven."""
 
 import numpy as np
 
-from sim2real.emulation.legs import UnitreeEmulation
-from sim2real.emulation.process import EmbeddedRobot
 from sim2real.emulation.truth import Kind
 
 OFF, CONTROLS, DAMPS = "off", "controls", "damps"
-
-
-def emulated(truth_path, place="floor", **settings):
-    """Return a running robot. Its worst reaction is the one that the guardian must cope with."""
-    config = UnitreeEmulation(alone_after_s=None, **settings)
-    return EmbeddedRobot("pipelines.go2.plant:Go2Body", config, {"place": place}, truth_path)
 
 
 def ways(robot):

@@ -1,0 +1,93 @@
+"""The guardian: what it is told over its connection, what it needs, and when it says nothing.
+
+When it acts is in test_ways_out.py, and its process in tests/process/test_guardian.py.
+"""
+
+import os
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from sim2real.emulation import process as emulator
+from sim2real.emulation.dynamixel import EmulatorConfig
+from sim2real.emulation.truth import Kind
+from sim2real.hardware.device import OperatingMode
+from sim2real.hardware.dynamixel import registers as reg
+from sim2real.hardware.safety import guardian_process
+from sim2real.hardware.safety.guardian_process import BEAT, REST, Guard
+from sim2real.runtime import clock
+
+
+def test_it_never_waits_for_the_threads_that_it_watches():
+    """An emulated servo comes between: a real one waits for nobody. Where its priority is not allowed none is taken."""
+    assert clock._PRIORITY < emulator._REAL_TIME_PRIORITY < guardian_process._PRIORITY == clock._GUARDIAN_PRIORITY
+
+
+def test_it_needs_little_and_so_starts_soon():
+    code = "import sys; sys.path.insert(0, sys.argv[1]); import guardian_process; print(*sys.modules)"
+    command = [sys.executable, "-I", "-S", "-c", code, os.path.dirname(guardian_process.__file__)]
+    loaded = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    assert not {"numpy", "sim2real", "re", "typing", "dataclasses", "subprocess", "socket"} & set(loaded)
+
+
+@pytest.mark.parametrize(("last", "acts"), [(BEAT, ["the control process is gone"]), (REST, [])])
+def test_a_robot_whose_torque_was_off_may_have_another_master(last, acts):
+    """The death of the control process counts for legs only while their torque is on."""
+
+    class Watch(Guard):
+        at_rest = False
+        acted = ()
+
+        def make_safe(self, reason):
+            self.acted = [*self.acted, reason]
+            return True
+
+    link, other = socket.socketpair()
+    with link, other:
+        guard = Watch()
+        other.send(BEAT)
+        other.send(last)
+        other.shutdown(socket.SHUT_WR)
+        guard.watch(link.fileno(), 0.0)
+        assert list(guard.acted) == acts
+
+
+def test_silence_is_allowed_while_torque_is_off_and_the_port_is_free_afterwards(start_robot, open_bus):
+    robot = start_robot()
+    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.1)
+    bus.torque(False)
+    robot.stall(0.3)
+    bus.torque(True)
+    bus.write_goal_pwm({1: 0.5})
+    bus.close()
+    assert robot.reports == []
+    assert open_bus(robot, mode=OperatingMode.PWM).read(1, reg.TORQUE_ENABLE) == 1
+
+
+def test_it_says_nothing_on_the_bus_while_all_is_well(start_robot, open_bus):
+    robot = start_robot()
+    bus = open_bus(robot, mode=OperatingMode.PWM)
+    opened_ns, before = robot.now_ns(), bus.counters.transactions
+    for _ in range(50):
+        bus.read_state()
+        robot.sleep(0.005)
+    done_ns, asked = robot.now_ns(), bus.counters.transactions - before
+    bus.close()
+    rows = robot.truth().rows
+    inside = (rows["t_ns"] > opened_ns) & (rows["t_ns"] < done_ns)
+    assert np.count_nonzero(np.isin(rows["kind"][inside], (Kind.SAMPLE, Kind.REPLY))) == asked == 50
+
+
+def test_without_it_a_servo_that_only_notices_goes_on_when_its_host_dies(start_robot, open_bus):
+    """An XL330: docs/guides/safety.md says so."""
+    robot = start_robot(config=EmulatorConfig(model_number=1200))
+    bus = open_bus(robot, mode=OperatingMode.PWM, silence_s=0.2, guardian=False)
+    bus.write_goal_pwm({1: 0.7})
+    robot.kill_host()
+    robot.sleep(1.0)
+    truth = robot.truth()
+    assert truth.of(Kind.WATCHDOG).size == 1
+    assert truth.of(Kind.EFFECT)["values"][-1, :2].tolist() == [OperatingMode.PWM, pytest.approx(0.7, abs=1e-3)]
