@@ -6,7 +6,7 @@ _BASELINES = (
     "Ends with code 1 if an error exceeds the expected one, a baseline predicts as well, or a log is not scored."
 )
 
-OTHERS = ("compare", "latency", "view", "demo", "play")
+OTHERS = ("compare", "view", "demo", "play")
 """Commands that ``sim2real --help`` lists last: other views of a run, and examples."""
 # fmt: off
 COMMANDS: dict[str, Command] = {
@@ -58,9 +58,6 @@ COMMANDS: dict[str, Command] = {
         "parameters with intervals, errors and success of several runs side by side",
         "stages.compare", "stages.compare.CompareConfig",
         examples=("compare runs/NAME/MONDAY runs/NAME/FRIDAY",),
-    ),
-    "latency": PipelineStage(
-        "measure the delay from motion to motion: the shares of host, bus and device", "latency.LatencyConfig"
     ),
     "view": FunctionCommand("open a run in the Rerun viewer, or save a file for it", "commands.run_commands.view"),
     "demo": FunctionCommand("run on the embedded pendulum, with its defaults", "commands.run_commands.demo"),

@@ -25,9 +25,8 @@ from sim2real.artifacts.run.run_folder import Source
 from sim2real.artifacts.sensitivity import Sensitivity
 from sim2real.artifacts.timing import NONE, ConnectionTiming, NodeTiming, Spread, Timing
 from sim2real.errors import Sim2RealError
-from sim2real.stages.latency.result import Latency
 
-FILES = (Deployment, Episodes, History, Identification, Iterations, Latency, Sensitivity, Timing)
+FILES = (Deployment, Episodes, History, Identification, Iterations, Sensitivity, Timing)
 ODD = [
     "\U0001f600",
     "\x7f",

@@ -1,4 +1,4 @@
-"""``record``, ``deploy`` and ``latency`` on robots in virtual time: what moves, how it ends, what is written."""
+"""``record`` and ``deploy`` on robots in virtual time: what moves, how it ends, what is written."""
 
 import contextlib
 import io
@@ -17,10 +17,9 @@ from sim2real.hardware.device import OperatingMode
 from sim2real.log.reader import read_log
 from sim2real.robots.nodes import Excitation
 from sim2real.stages.excitation.played import played
-from sim2real.stages.identify.true_values import true_values
-from sim2real.stages.latency.result import Latency
 from sim2real.stages.on_robot import come_to_rest
 from sim2real.stages.pipeline.pipeline import load_pipeline
+from sim2real.view.page.delay_parts import parts_of
 
 
 def call(root, command, pipeline, *flags):
@@ -135,27 +134,12 @@ def test_what_this_robot_cannot_do_is_refused(tmp_path, virtual_robots):
     assert manifest_of(folder)["status"] == "failed"
 
 
-@pytest.mark.night
-def test_steps_tell_what_the_device_takes(tmp_path, virtual_robots):
-    _, said, folder = call(tmp_path, "latency", "pendulum", "--duration-s", 10, "--identify.generations", 0)
-    found = Latency.load(folder)
-    truth = true_values(Recording.load(folder / "session.mcap"))
-    assert found.hidden.estimate == pytest.approx(truth["round_trip_delay"], abs=0.002)
-    assert {p.where for p in found.parts} == {"host", "bus"}
-    assert found.transactions > 500
-    assert "from the motion" in said
-
-
-def test_a_dry_test_of_latency_moves_nothing_and_knows_the_host_and_the_bus(tmp_path, virtual_robots):
-    code, said, folder = call(tmp_path, "latency", "pendulum", "--duration-s", 2, "--dry-run")
-    found = Latency.load(folder)
-    assert (code, found.hidden, manifest_of(folder)["status"]) == (0, None, "dry run")
-    assert [p.name for p in found.parts if p.where == "bus"] == [
-        "sensor on the bus, question and answer",
-        "actuator on the bus",
-    ]
-    assert "from the motion" not in said
-    assert (folder / "latency.png").read_bytes().startswith(b"\x89PNG")
+def test_a_recording_knows_the_shares_of_host_and_bus_in_the_delay(tmp_path, virtual_robots):
+    _, _, folder = call(tmp_path, "record", "pendulum", "--duration-s", 2)
+    parts = {name: (where, counted) for name, where, _, counted in parts_of(Recording.load(folder / "session.mcap"))}
+    assert parts["sensor on the bus, question and answer"] == ("bus", False)
+    assert parts["actuator on the bus"] == ("bus", True)
+    assert {where for where, _ in parts.values()} == {"host", "bus"}
 
 
 def test_a_recording_by_hand_has_no_command_and_no_torque(tmp_path, virtual_robots):

@@ -125,8 +125,8 @@ def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config
         if not config.force:
             raise DelayChanged(
                 message,
-                hint="record, identify and train again, or see where the delay is: sim2real latency; to deploy all "
-                "the same: --force",
+                hint="record, identify and train again, or see where the delay is in the report of a recording; to "
+                "deploy all the same: --force",
             )
         note(f"warning: {message}")
     return {"measured delay": measured}

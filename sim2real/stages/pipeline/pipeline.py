@@ -17,7 +17,6 @@ from weakref import WeakKeyDictionary
 from sim2real.errors import UsageError, did_you_mean
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.latency.config import LatencyConfig
 from sim2real.stages.record.config import RecordConfig
 from sim2real.stages.train.config import TrainConfig
 
@@ -75,11 +74,6 @@ class Pipeline:
         """Defaults of the stages of a run, in which a policy is trained on the run's identification."""
         train = replace(self.train, model="identified")
         return {"record": self.record, "identify": self.identify, "train": train, "deploy": self.deploy}
-
-    @property
-    def latency(self) -> LatencyConfig:
-        """Defaults of the test of latency."""
-        return LatencyConfig.of(self.record, self.identify)
 
     @property
     def words(self) -> tuple[str, ...]:

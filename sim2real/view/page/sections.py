@@ -4,11 +4,13 @@ import numpy as np
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.episodes import Episodes
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
-from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.artifacts.run.run_folder import StageFolder, finished
 from sim2real.view.blocks import Block, FigureBlock, NoteBlock, PageSection, TableBlock, Tile, number
 from sim2real.view.identification.section import identify_section
 from sim2real.view.page import figures
+from sim2real.view.page.delay_parts import delay_blocks
 from sim2real.view.page.deployment import deploy_section
 from sim2real.view.page.episodes import episodes_svg
 from sim2real.view.page.sensitivity import sensitivity_blocks
@@ -21,7 +23,8 @@ from sim2real.view.signals import signals_of
 
 def record_section(artifact: StageFolder) -> PageSection:
     """Return the recorded signals, and the timing of the nodes."""
-    log = signals_of(Recording.load(artifact.folder))
+    recording = Recording.load(artifact.folder)
+    log = signals_of(recording)
     blocks: list[Block] = [NoteBlock(text) for text in log.warnings]
     commanded = "the commands that were not sent" if log.dry else "the commands"
     truth = " The true state comes from the embedded robot." if log.truth else ""
@@ -31,6 +34,8 @@ def record_section(artifact: StageFolder) -> PageSection:
             f"Measurements, at the time of each sample, and {commanded}.{truth} Right: a part of the left plots.",
         )
     )
+    identified = finished(artifact.run_dir, "identify")
+    blocks += delay_blocks(recording, None if identified is None else Identification.load(identified.folder))
     blocks += [*timing_blocks(log.episode, "record"), *servo_blocks([log.episode])]
     steps = max((len(s) for s in log.episode.steps.values()), default=0)
     tiles = [Tile("length", f"{log.episode.duration_s:.1f} s", f"{steps} steps"), *timing_tiles([log.episode])]

@@ -1,17 +1,13 @@
-"""Where the milliseconds go: what is on the way and what is beside it; the file gives back what it was given."""
-
-import json
+"""Where the milliseconds go: what is on the way, and what is beside it."""
 
 import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.recording import Recording
-from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode, Messages, Steps
-from sim2real.stages.latency.result import Latency, measured
+from sim2real.view.page.delay_parts import delay_blocks, parts_of
 
-CHAIN = ("sensor", "agent", "actuator")
 COUNT = 50
 
 
@@ -61,42 +57,35 @@ def identification():
     )
 
 
+def times(blocks):
+    """Return part -> where, and its median [us]."""
+    (table,) = blocks
+    return {part: (where, round(1e3 * float(p50))) for part, where, p50, *_ in table.rows}
+
+
 def test_the_way_begins_at_the_sample_and_counts_nothing_twice(recording, identification):
-    found = Latency.of(recording, CHAIN, identification)
-    took = {p.name: (p.where, p.counted, round(1e6 * p.took.p50)) for p in found.parts}
-    assert took == {
-        "sensor, from the sample to its message": ("host", True, 300),
-        "sensor on the bus, question and answer": ("bus", False, 800),
-        "message from sensor to agent": ("host", True, 10),
-        "agent wakes and computes": ("host", True, 200),
-        "message from agent to actuator": ("host", True, 30),
-        "actuator wakes and computes": ("host", True, 300),
-        "actuator on the bus": ("bus", True, 600),
+    assert times(delay_blocks(recording, identification)) == {
+        "sensor, from the sample to its message": ("host", 300),
+        "sensor on the bus, question and answer": ("(bus)", 800),
+        "message from sensor to agent": ("host", 10),
+        "agent wakes and computes": ("host", 200),
+        "message from agent to actuator": ("host", 30),
+        "actuator wakes and computes": ("host", 300),
+        "actuator on the bus": ("bus", 600),
+        "late + early, from the motion": ("device", 25_000),
+        # From the sample at 700 us to the end of the actuator's step at 2140 us, and what the motion says.
+        "sum of the medians, without parts in ()": ("", 26_440),
     }
-    # From the sample at 700 us to the end of the actuator's step at 2140 us, and what the motion says.
-    assert found.total_s == pytest.approx(1440e-6 + 0.025)
-    assert (found.hidden.about, found.hidden.verdict) == ("late + early", "accepted")
-    assert (found.transactions, found.lost, found.late) == (100, 2, 1)
 
 
-def test_without_motion_the_devices_share_is_not_known(recording):
-    found = Latency.of(recording, CHAIN, None)
-    assert found.hidden is None
-    assert found.total_s == pytest.approx(1440e-6)
+def test_without_an_identification_the_devices_share_is_not_in_the_sum(recording):
+    *_, (whole, (_, total)) = times(delay_blocks(recording, None)).items()
+    assert "without the device" in whole
+    assert total == 1440
 
 
 def test_several_transactions_a_step_stay_together(recording):
     recording.timing.bus_s["actuator"] = np.full(2 * COUNT, 3e-4)
-    names = [name for name, *_ in measured(recording, CHAIN)]
+    names = [name for name, *_ in parts_of(recording)]
     assert "actuator, its transactions included" in names
     assert "actuator on the bus" not in names
-
-
-def test_it_comes_back_from_its_file(recording, identification, tmp_path):
-    found = Latency.of(recording, CHAIN, identification)
-    assert found.save(tmp_path) == {"latency": "latency.json"}
-    assert Latency.load(tmp_path) == found
-    document = json.loads((tmp_path / "latency.json").read_text())
-    (tmp_path / "latency.json").write_text(json.dumps(document | {"format": 9}))
-    with pytest.raises(Sim2RealError, match="has format 9, this version reads 1"):
-        Latency.load(tmp_path)
