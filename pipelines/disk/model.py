@@ -5,29 +5,29 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-from flax import struct
 
+from sim2real import pytree
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.worlds import friction
 from sim2real.worlds.friction import FrictionParams
 from sim2real.worlds.joint import Forces, JointWorld
 
 
-@struct.dataclass
+@pytree.dataclass
 class Command(Base):
     """Voltage, shape ``(1,)`` [V]."""
 
     action: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class Measurement(Base):
     """Angle by the encoder [rad]."""
 
     th: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class DiskParams(Base):
     """A DC motor that turns an eccentric mass, per unit of inertia.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-from flax import struct
 
+from sim2real import pytree
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.worlds import friction
@@ -18,21 +18,21 @@ from sim2real.worlds.servo import saturated
 JOINTS = ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll", "jaw")
 
 
-@struct.dataclass
+@pytree.dataclass
 class Goal(Base):
     """Goals of the joints, shape ``(6,)`` [rad]."""
 
     goal: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class Positions(Base):
     """Where the encoders say that they are, shape ``(6,)`` [rad]."""
 
     position: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class Gravity(Base):
     """By how much weight pushes joints off, over the stiffness of their servos [rad].
 
@@ -47,7 +47,7 @@ class Gravity(Base):
     hand: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class Table(Base):
     """What the hand comes to rest on: it pushes back once elbow + ``ratio`` * pitch exceeds ``height``.
 
@@ -62,7 +62,7 @@ class Table(Base):
     stiffness: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class ArmParams(Base):
     """Servos and their links; every leaf of the servos has shape ``(6,)``.
 

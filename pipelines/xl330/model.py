@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-from flax import struct
 
+from sim2real import pytree
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.worlds.joint import Forces, JointWorld
 from sim2real.worlds.servo import motor_torque, position_duty
@@ -20,7 +20,7 @@ _OPEN = 0.05
 """Share of the back-EMF's brake that is left when torque is off: the winding is nearly open."""
 
 
-@struct.dataclass
+@pytree.dataclass
 class Command(Base):
     """The servo's command.
 
@@ -35,14 +35,14 @@ class Command(Base):
     enabled: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class Measurement(Base):
     """Angle by the encoder [rad]."""
 
     position: Any
 
 
-@struct.dataclass
+@pytree.dataclass
 class ServoParams(Base):
     """Motor, gears and load.
 
@@ -72,7 +72,7 @@ class ServoParams(Base):
     stribeck_rad_s: Any = 0.1
     released: Any = 0.5
     offset: Any = 0.0
-    start: Any = struct.field(default_factory=lambda: jnp.zeros(2))
+    start: Any = pytree.field(default_factory=lambda: jnp.zeros(2))
 
 
 class ServoWorld(JointWorld):

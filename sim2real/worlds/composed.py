@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
+from sim2real import pytree
 from sim2real.composer.physics.mjx import constants, open_loop, stepping
 from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.physics.mjx.physics import MjxPhysics
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree
 
 
-@struct.dataclass
+@pytree.dataclass
 class Observations(Base):
     """The observation of a task.
 

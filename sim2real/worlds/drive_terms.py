@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.graph.base import Base
 from sim2real.types import Array, PyTree, Scalar
 
@@ -31,7 +31,7 @@ _FOLLOW = (
 """Terms that follow the state unless they are 0."""
 
 
-@struct.dataclass
+@pytree.dataclass
 class DriveTerms(Base):
     """Coefficients, each of shape ``(joints,)``; with 0 a term adds nothing.
 

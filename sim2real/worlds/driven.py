@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.types import MjModel, PyTree, Scalar
 from sim2real.worlds.closing import Closing
@@ -27,7 +27,7 @@ OF_PAYLOAD = {"payload": "kg", "payload_reach": "m"}
 """Fields of commands that name it, with their units."""
 
 
-@struct.dataclass
+@pytree.dataclass
 class DriveCommand(Base):
     """Command of the drives; each entry has shape ``(joints,)`` or ``(1,)``, and is None where the log has none.
 
@@ -56,7 +56,7 @@ class DriveCommand(Base):
     payload_reach: Value | None = None
 
 
-@struct.dataclass
+@pytree.dataclass
 class DriveParams(MjxParams):
     """Parameters of drives, each of shape ``(joints,)``, beside those of the model.
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from flax import struct
 from jax.core import Tracer
 
+from sim2real import pytree
 from sim2real.composer.physics.mjx import gate, stepping
 from sim2real.composer.physics.mjx.import_mjx import mjx
 from sim2real.composer.physics.mjx.warp import warp
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sim2real.composer.physics.mjx.warp.warp import WarpEngine
 
 
-@struct.dataclass
+@pytree.dataclass
 class MjxParams(Base):
     """Parameters of an MJX world; each copy of a graph may have its own.
 
@@ -41,7 +41,7 @@ class MjxParams(Base):
     qvel: jax.Array
 
 
-@struct.dataclass
+@pytree.dataclass
 class MjxState(Base):
     """The world's output.
 

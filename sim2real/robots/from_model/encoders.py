@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from flax import struct
 
+from sim2real import pytree
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.types import Array, Key
@@ -12,7 +12,7 @@ from sim2real.worlds.drive_terms import DriveTerms
 from sim2real.worlds.driven import DrivenWorld
 
 
-@struct.dataclass
+@pytree.dataclass
 class Measured(Base):
     """Readings of the encoders, each of shape ``(joints,)`` [rad, rad/s]; None without a velocity."""
 
@@ -51,7 +51,7 @@ class Encoders(BaseNode):
         return step_state, Measured(angle + params.zero, speed if self._velocity else None)
 
 
-@struct.dataclass
+@pytree.dataclass
 class EncoderParams(Base):
     """Parameters of the encoders.
 

@@ -8,8 +8,8 @@ from typing import Unpack
 
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.arrays import namespace
 from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode, NodeOptions
@@ -23,7 +23,7 @@ from sim2real.robots.walking.messages import BodyReading, WalkDecision, gravity_
 from sim2real.types import Array, Key, PyTree
 
 
-@struct.dataclass
+@pytree.dataclass
 class WalkingState(Base):
     """The agent's state.
 

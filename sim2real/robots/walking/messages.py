@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from flax import struct
-
+from sim2real import pytree
 from sim2real.arrays import namespace
 from sim2real.graph.base import Base
 from sim2real.types import Array
 
 
-@struct.dataclass
+@pytree.dataclass
 class BodyReading(Base):
     """A measurement of encoders and IMU.
 
@@ -28,7 +27,7 @@ class BodyReading(Base):
     gyro: Array
 
 
-@struct.dataclass
+@pytree.dataclass
 class WalkDecision(Base):
     """The agent's message.
 
@@ -41,7 +40,7 @@ class WalkDecision(Base):
     aim: Array
 
 
-@struct.dataclass
+@pytree.dataclass
 class LegCommand(Base):
     """The command of the motors, each ``(joints,)``: its torque is ``tau + kp (q - position) + kd (dq - velocity)``.
 

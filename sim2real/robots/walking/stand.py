@@ -8,8 +8,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.errors import OtherMotion
 from sim2real.graph.base import GraphState, Value
 from sim2real.graph.episode import Episode
@@ -138,7 +138,7 @@ class _World(DrivenWorld):
         return super().message(state, qpos, qvel + 0.5 * (STEP_S - FINE_S) * qacc, qacc)
 
 
-@struct.dataclass
+@pytree.dataclass
 class _SensorParams(EncoderParams):
     delay: Scalar | None = None
 

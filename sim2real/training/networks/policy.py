@@ -12,8 +12,8 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
+from sim2real import pytree
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import Base
 from sim2real.policy.contract import BUILT_IN, NetworkSpec
@@ -45,7 +45,7 @@ def entropy(log_std: jax.Array) -> jax.Array:
     return jnp.sum(log_std + 0.5 * math.log(2.0 * math.pi * math.e))
 
 
-@struct.dataclass
+@pytree.dataclass
 class Policy(Base):
     """A Gaussian policy: the observation is normalised, the network gives the mean, which is bounded and scaled.
 
@@ -68,8 +68,8 @@ class Policy(Base):
     std: jax.Array
     low: jax.Array
     high: jax.Array
-    network: Network = struct.field(pytree_node=False)
-    spec: NetworkSpec = struct.field(pytree_node=False, default=NetworkSpec())
+    network: Network = pytree.field(pytree_node=False)
+    spec: NetworkSpec = pytree.field(pytree_node=False, default=NetworkSpec())
 
     def initial_carry(self) -> PyTree:
         """Return the carry into an episode's first step; ``()`` if the network is stateless."""

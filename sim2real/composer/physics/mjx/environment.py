@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from mujoco import mjx
 
+from sim2real import pytree
 from sim2real.composer.environment import ObservationPadding
 from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.c.physics import Physics
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from sim2real.types import PyTree
 
 
-@struct.dataclass
+@pytree.dataclass
 class State:
     """One copy of the environment.
 

@@ -1,14 +1,29 @@
-"""Trees of arrays without JAX: the same leaves in the same order as JAX's."""
+"""Trees of arrays: JAX's and flax's, and the same leaves in the same order without JAX."""
 
 import dataclasses
 from collections import OrderedDict
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from flax import struct
 
-from sim2real import plain_pytree as plain
+from sim2real import pytree
+
+plain = SimpleNamespace(
+    dataclass=pytree.dataclass,
+    field=pytree.field,
+    flatten=pytree.plain_flatten,
+    flatten_with_path=pytree.plain_flatten_with_path,
+    map=pytree.plain_map,
+    leaves=lambda tree: pytree.plain_flatten(tree)[0],
+    structure=lambda tree: pytree.plain_flatten(tree)[1],
+    unflatten=lambda shape, values: shape.unflatten(values),
+)
+"""What the module offers on a computer without JAX."""
 
 
 class Pair(NamedTuple):
@@ -72,3 +87,13 @@ def test_constants_belong_to_the_structure():
     assert plain.leaves(kind(1, 2).replace(first=5)) == [1, 5]
     with pytest.raises(dataclasses.FrozenInstanceError):
         kind(1, 2).first = 3
+
+
+def test_with_jax_its_classes_are_those_of_flax():
+    ours, theirs = message(pytree), message(struct)
+    kind, other = (make(first=[1, jnp.zeros(2)], second={"q": 3.0}, name="n") for make in (ours, theirs))
+    assert jax.tree.leaves(jax.tree.map(np.shape, kind)) == jax.tree.leaves(jax.tree.map(np.shape, other))
+    paths = [[jax.tree_util.keystr(p) for p, _ in pytree.flatten_with_path(tree)[0]] for tree in (kind, other)]
+    assert paths[0] == paths[1]
+    assert jax.jit(lambda tree: tree.replace(second=tree.first))(kind).second[0] == 1
+    assert jax.tree.structure(kind) != jax.tree.structure(kind.replace(name="m"))
