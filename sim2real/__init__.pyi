@@ -6,9 +6,8 @@ from sim2real.artifacts.deployment import Deployment as Deployment
 from sim2real.artifacts.identification import Identification as Identification
 from sim2real.artifacts.recording import Recording as Recording
 from sim2real.artifacts.timing import Timing as Timing
-from sim2real.commands.export.identified import export as export
-from sim2real.commands.functions import report as report
-from sim2real.commands.functions import run as run
+from sim2real.commands.loop import run as run
+from sim2real.commands.report import report as report
 from sim2real.errors import DeadlineExceeded as DeadlineExceeded
 from sim2real.errors import HardwareLost as HardwareLost
 from sim2real.errors import SafetyStop as SafetyStop
@@ -38,6 +37,7 @@ from sim2real.runtime.clock import Clock as Clock
 from sim2real.runtime.compiled.graph import CompiledGraph as CompiledGraph
 from sim2real.stages.check.stage import check as check
 from sim2real.stages.deploy.stage import deploy as deploy
+from sim2real.stages.export import export as export
 from sim2real.stages.identify.stage import identify as identify
 from sim2real.stages.pipeline.pipeline import Pipeline as Pipeline
 from sim2real.stages.pipeline.pipeline import load_pipeline as load_pipeline

@@ -11,6 +11,13 @@ USAGE = 2
 SAFETY_STOP = 3
 HARDWARE_LOST = 4
 DEADLINE = 5
+EXIT_CODES = """\
+exit codes
+  0  finished                    4  hardware lost: a port or a device does not answer
+  1  error                       5  deadlines missed (with --strict-timing)
+  2  wrong command or flag       130, 143  ended by Ctrl-C, by SIGTERM; the robot is switched off first
+  3  safety stop"""
+"""The codes as the help of each command lists them."""
 
 
 class Sim2RealError(ValueError):

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from sim2real import cli
-from sim2real.commands.table import COMMANDS
+from sim2real.cli import COMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -162,10 +162,9 @@ def help_of(*words: str) -> str:
 def unknown_flags(line: str) -> list[str]:
     """Return the flags in a command line that the help of its command does not list."""
     words = shlex.split(re.split(r"&&|;|\|", line)[0], comments=True)
-    flags = [word.split("=")[0] for word in words if word.startswith("--") and word not in ("--help", "--mjcf")]
+    flags = [word.split("=")[0] for word in words if word.startswith("--") and word not in ("--help", "--help-all")]
     command, *names = itertools.takewhile(lambda word: not word.startswith("-"), words[1:])
-    names = [*names[:1], *(["--mjcf", "robot.xml"] if "--mjcf" in words else [])]
-    text = help_of(command) + help_of(command, *names) if flags else ""
+    text = help_of(command) + help_of(command, *names[:1]) if flags else ""
     return [flag for flag in flags if not re.search(rf"{flag}(?![\w-])", text)]
 
 

@@ -1,276 +1,313 @@
-"""Command-line flags from typed configurations: a field is a flag, its docstring the help, its value the default."""
+"""Command-line flags from configurations: a field is a flag, its docstring the help, its value the default."""
 
-import contextlib
+import argparse
+import ast
 import difflib
-import io
-import math
-import os
-import re
-import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+import inspect
+import shutil
+import textwrap
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar, get_type_hints
+from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import tyro
-
-from sim2real.errors import Sim2RealError, UsageError
-from sim2real.stages.deploy.config import DeployConfig
-from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.live.config import WINDOW
-from sim2real.stages.record.config import RecordConfig
-from sim2real.stages.train.config import TrainConfig
+from sim2real.errors import UsageError
+from sim2real.stages.flag import Flag
 
 Config = TypeVar("Config")
-Folder = Annotated[Path, tyro.conf.arg(metavar="DIR")]
-_OF_LOGS = re.compile(r"[-.](log|hold-out)$")
-OptionalFolder = Annotated[Path | None, tyro.conf.arg(metavar="DIR")]
+_SHOWN: Mapping[str, str] = {
+    "StageFlags": "config runs run",
+    "RunFlags.record": "port duration_s excitation amplitude dry_run",
+    "RunFlags.identify": "log terms max_delay_s",
+    "RunFlags.train": "episode_s ppo",
+    "RunFlags.deploy": "port episodes duration_s blend_s dry_run",
+    "RunFlags": "seed runs resume verbose iterations until record identify train deploy",
+    "RecordConfig": "port duration_s excitation amplitude low_hz high_hz seed dry_run view",
+    "IdentifyConfig": "log hold_out terms bounds fix max_delay_s seed view",
+    "TrainConfig": "model parameters episode_s resume seed view ppo",
+    "PPOConfig": "total_steps num_envs minutes",
+    "DeployConfig": "port bundle episodes duration_s command blend_s hold dry_run force seed view",
+    "NewConfig": "name robot log drive like port",
+    "RobotFlags": "mjcf joints parameter mapping unit rate_hz fix_base hold",
+    "CheckConfig": "log plan bounds fix json runs",
+    "ImportConfig": "files mapping pipeline mjcf joints unit calibration rate_hz out",
+}
+"""Configuration, or a field that holds it -> the fields that ``--help`` shows, where ``--help-all`` shows more."""
+_WIDTH, _COLUMN = 110, 28
+"""Largest width of the help, and the column where its texts begin."""
+_MAX_LISTED_FLAGS = 20
+"""A refusal lists at most this many flags."""
 
 
 @dataclass(frozen=True)
-class StageFlags(Generic[Config]):
-    """Flags of one stage."""
+class _Option:
+    """A flag, or a value without a flag.
 
-    config: Annotated[Config, tyro.conf.arg(name="")]
-    runs: Folder = Path("runs")
-    """Folder of all runs."""
-    run: OptionalFolder = None
-    """Run folder to add to; default: a new one for record, for the others the newest one with their inputs."""
-    cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
-    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
+    Attributes:
+        name: ``--record.duration-s``.
+        path: Names of the nested fields: ``("record", "duration_s")``.
+    """
 
-
-@dataclass(frozen=True)
-class DemoFlags:
-    """Flags of the demo."""
-
-    seed: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Seed of every stage."""
-    runs: Folder = Path("runs")
-    """Folder of all runs."""
-    resume: OptionalFolder = None
-    """Run folder to go on with: stages that are finished there, from the newest inputs, are skipped."""
-    cache: Annotated[str | None, tyro.conf.arg(metavar="DIR|off")] = None
-    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
-    verbose: bool = False
-    """Print everything that the stages print; default: a few lines for each stage."""
-
-
-@dataclass(frozen=True)
-class RunFlags(DemoFlags):
-    """Flags of all four stages."""
-
-    iterations: int = 1
-    """Largest number of iterations of a run; the verdict on a deployment chooses the stages that run again."""
-    until: Annotated[str | None, tyro.conf.arg(metavar="QUANTITY=VALUE")] = None
-    """Go around until a quantity of the gap report is at least so large on the robot, such as success=0.95; default:
-    until the verdict is 'fine'."""
-    record: RecordConfig = field(default_factory=RecordConfig)
-    identify: IdentifyConfig = field(default_factory=IdentifyConfig)
-    train: TrainConfig = field(default_factory=TrainConfig)
-    deploy: DeployConfig = field(default_factory=DeployConfig)
-
-    def __post_init__(self) -> None:
-        """Check what can be checked before anything moves."""
-        if self.train.hosts.several:
-            raise UsageError(
-                "only training is divided among processes: each of them would record and deploy",
-                hint="record and identify in one, then `sim2real train PIPELINE --hosts...` in all",
-            )
-        if self.iterations < 1 or (self.until and self.iterations == 1):
-            raise UsageError(
-                f"a run goes around at least once, and more often to reach a goal; got {self.iterations}",
-                hint="--iterations 5 --until success=0.95",
-            )
-        _ = self.goal
+    name: str
+    path: tuple[str, ...]
+    kind: Any
+    default: Any
+    text: str
+    mark: Flag
+    shown: bool
 
     @property
-    def goal(self) -> tuple[str, float] | None:
-        """The quantity to reach, and its least value; None: no goal."""
-        if self.until is None:
-            return None
-        name, _, value = self.until.partition("=")
-        try:
-            least = float(value)
-        except ValueError:
-            least = math.nan
-        if not name or not math.isfinite(least):
-            raise UsageError(f"until must be QUANTITY=VALUE, got {self.until!r}", hint="--until success=0.95")
-        return name, least
+    def off(self) -> str:
+        """The flag that switches it off: ``--record.no-dry-run``."""
+        prefix, dot, last = self.name[2:].rpartition(".")
+        return f"--{prefix}{dot}no-{last}"
 
 
-@dataclass(frozen=True)
-class TargetFlags:
-    """Flags of the commands that look at a run."""
-
-    runs: Folder = Path("runs")
-    """Folder of all runs."""
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(message.removeprefix("argument "), hint=f"see `{self.prog} --help`")
 
 
-@dataclass(frozen=True)
-class InfoFlags(TargetFlags):
-    """Flags of info."""
-
-    verbose: bool = False
-    """Print the default of every flag of a pipeline's stages."""
-
-
-@dataclass(frozen=True)
-class ViewFlags(TargetFlags):
-    """Flags of view."""
-
-    save: Annotated[Path | None, tyro.conf.arg(metavar="FILE.rrd")] = None
-    """Write a recording for the Rerun viewer instead of opening the viewer."""
-    web: bool = False
-    """Serve a page for browsers, until Ctrl-C, instead of opening the viewer."""
-    follow: bool = False
-    """Join a run whose stages are still running, and show their new rows, until Ctrl-C."""
-
-
-def parse(
-    default: Config, arguments: Sequence[str], prog: str, description: str, epilog: str = "", kind: Any = None
-) -> Config:
+def parse(default: Config, arguments: Sequence[str], prog: str, description: str, epilog: str = "") -> Config:
     """Return a configuration with the fields that the arguments name replaced.
 
     Args:
         default: A dataclass; its values are the defaults.
-        kind: Type to parse into where it is more than the default's class (a generic class with its argument).
 
     Raises:
-        UsageError: When a flag is unknown or a value does not fit.
+        UsageError: A flag is unknown, or a value does not fit.
         SystemExit: With code 0 after ``--help``.
     """
-    # Hide tyro's own messages: an error here has a hint.
-    talk = io.StringIO()
-    try:
-        with _plain_if_requested(), contextlib.redirect_stderr(talk):
-            parsed, unknown = tyro.cli(
-                kind or type(default),
-                default=_without_tables(default),
-                args=_completed(arguments, default),
-                prog=prog,
-                description=description,
-                return_unknown_args=True,
-            )
-    except SystemExit as end:
-        if not end.code:
-            print(f"\n{epilog}" if epilog else "", flush=True)
-            raise
-        raise _usage_error(end, talk.getvalue(), prog, default, arguments) from None
+    options = list(_options(default))
+    if {"-h", "--help", "--help-all"} & set(arguments):
+        print(_help(options, prog, description, epilog, "--help-all" in arguments), flush=True)
+        raise SystemExit(0)
+    # Let argparse assign the words to the flags.
+    parser = _Parser(prog=prog, add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
+    for option in options:
+        _add(parser, option)
+    given, unknown = parser.parse_known_intermixed_args([_with_hyphens(word) for word in arguments])
     if unknown:
-        raise _unknown(unknown, default, prog)
-    return _with_tables(parsed, default)
+        raise _unknown(unknown, options, prog)
+    # Convert the words, and put the values into the configuration.
+    values: dict[tuple[str, ...], Any] = {}
+    for option in options:
+        words = vars(given).get(".".join(option.path))
+        if isinstance(words, bool):
+            values[option.path] = words
+        elif words:
+            values[option.path] = _value(option, words, prog)
+    return _replaced(default, values, ())
 
 
-def _without_tables(config: Any) -> Any:
-    """Return a configuration with empty tables, such as ranges: the parser adds no names to tables with entries."""
+def flags_of(config: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the flags of a configuration and their values."""
+    yield from ((option.name, option.default) for option in _options(config))
+
+
+def _options(
+    config: Any, prefix: str = "", path: tuple[str, ...] = (), shown: bool = True, place: str = ""
+) -> Iterator[_Option]:
+    """Yield the flags of a configuration, nested ones with their prefix.
+
+    Args:
+        place: Class and field that hold it: ``RunFlags.record``.
+    """
+    kind = type(config)
+    hints, texts = get_type_hints(kind, include_extras=True), _docstrings(kind)
+    listed = next((_SHOWN[n] for n in (place, *(c.__name__ for c in kind.__mro__)) if n in _SHOWN), None)
+    for item in fields(config):
+        marks = [m for m in getattr(hints[item.name], "__metadata__", ()) if isinstance(m, Flag)]
+        mark, value = next(iter(marks), Flag()), getattr(config, item.name)
+        visible = shown and (listed is None or item.name in listed.split())
+        name = f"{prefix}{item.name.replace('_', '-')}"
+        if is_dataclass(value):
+            inner = prefix if mark.flat else f"{name}."
+            yield from _options(value, inner, (*path, item.name), visible, f"{kind.__name__}.{item.name}")
+        else:
+            text = texts.get(item.name, "")
+            yield _Option(f"--{name}", (*path, item.name), hints[item.name], value, text, mark, visible)
+
+
+@cache
+def _docstrings(kind: type) -> dict[str, str]:
+    """Return field -> the text below it in the source of its class."""
+    texts: dict[str, str] = {}
+    for base in reversed(kind.__mro__[:-1]):
+        if not is_dataclass(base):
+            continue
+        (tree,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        body = tree.body if isinstance(tree, ast.ClassDef) else []
+        for before, after in pairwise(body):
+            if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name):
+                text = after.value if isinstance(after, ast.Expr) else None
+                if isinstance(text, ast.Constant):
+                    texts[before.target.id] = " ".join(str(text.value).split())
+    return texts
+
+
+def _add(parser: argparse.ArgumentParser, option: _Option) -> None:
+    names, dest = [option.name, *filter(None, [option.mark.also])], ".".join(option.path)
+    kind = _bare(option.kind)
+    if option.mark.positional:
+        parser.add_argument(dest, nargs="*" if get_origin(kind) is tuple else "?", default=[])
+    elif kind is bool:
+        parser.add_argument(*names, dest=dest, action="store_const", const=True)
+        parser.add_argument(option.off, dest=dest, action="store_const", const=False)
+    elif get_origin(kind) is dict:
+        _, value = get_args(kind)
+        parser.add_argument(*names, dest=dest, action="append", nargs=1 + max(1, len(get_args(value))))
+    elif get_origin(kind) is tuple and get_args(kind)[-1] is not Ellipsis:
+        parser.add_argument(*names, dest=dest, nargs=len(get_args(kind)))
+    elif get_origin(kind) is tuple:
+        parser.add_argument(*names, dest=dest, nargs="+", action="extend")
+    elif option.mark.alone is not None:
+        parser.add_argument(*names, dest=dest, nargs="?", const=option.mark.alone)
+    else:
+        parser.add_argument(*names, dest=dest)
+
+
+def _value(option: _Option, words: Any, prog: str) -> Any:
+    """Return the value that the words of a flag stand for."""
+    kind = _bare(option.kind)
+    try:
+        if get_origin(kind) is dict:
+            _, value = get_args(kind)
+            entries = {name: _converted(value, rest if get_args(value) else rest[0]) for name, *rest in words}
+            return {**option.default, **entries}
+        return _converted(option.kind, words)
+    except ValueError as error:
+        written = " ".join(words) if isinstance(words, list) else words
+        raise UsageError(
+            f"{option.name} needs {_placeholder(option)}, got {written}", hint=f"see `{prog} --help`"
+        ) from error
+
+
+def _converted(kind: Any, words: Any) -> Any:
+    optional, kind = types.NoneType in get_args(_unmarked(kind)), _bare(kind)
+    if optional and words == "None":
+        return None
+    if get_origin(kind) is Literal:
+        return next(value for value in get_args(kind) if str(value) == words) if words in _choices(kind) else _refuse()
+    if get_origin(kind) is tuple:
+        inner = get_args(kind)
+        kinds = [inner[0]] * len(words) if inner[-1] is Ellipsis else inner
+        return tuple(_converted(k, word) for k, word in zip(kinds, words, strict=True))
+    return kind(words)
+
+
+def _refuse() -> NoReturn:
+    raise ValueError
+
+
+def _replaced(config: Any, values: Mapping[tuple[str, ...], Any], path: tuple[str, ...]) -> Any:
+    """Return the configuration with new values of the fields at or below a path; its own checks run."""
     changed = {}
     for item in fields(config):
-        value = getattr(config, item.name)
-        if is_dataclass(value):
-            changed[item.name] = _without_tables(value)
-        elif isinstance(value, dict):
-            changed[item.name] = {}
+        here = (*path, item.name)
+        if here in values:
+            changed[item.name] = values[here]
+        elif is_dataclass(inner := getattr(config, item.name)) and any(p[: len(here)] == here for p in values):
+            changed[item.name] = _replaced(inner, values, here)
     return replace(config, **changed) if changed else config
 
 
-def _with_tables(parsed: Any, default: Any) -> Any:
-    """Return the parsed configuration with the default's tables, in which the parsed names replace or add entries."""
-    changed = {}
-    for item in fields(parsed):
-        value, before = getattr(parsed, item.name), getattr(default, item.name)
-        if is_dataclass(value) and type(value) is type(before):
-            changed[item.name] = _with_tables(value, before)
-        elif isinstance(value, dict) and isinstance(before, dict):
-            changed[item.name] = {**before, **value}
-    return replace(parsed, **changed) if changed else parsed
-
-
-def _completed(arguments: Sequence[str], default: Any) -> list[str]:
-    """Return the arguments with a window for each ``--view`` that has no value, and a flag for each of several logs."""
-    logs = {name for name, value in flags_of(default) if _OF_LOGS.search(name) and isinstance(value, tuple)}
-    words, flag = list[str](), ""
-    for word, following in zip(arguments, [*arguments[1:], "-"], strict=False):
-        # A shell makes several files of `--log *.csv`: those of one kind follow the flag.
-        last = Path(words[-1]) if flag and words[-1] != flag else None
-        if last and not word.startswith("-") and _is_log(Path(word), last):
-            words.append(flag)
-        elif last or word.startswith("-"):
-            flag = word if word.replace("_", "-") in logs else ""
-        words.append(word)
-        if re.fullmatch(r"--(\w+\.)?view", word) and following.startswith("-"):
-            words.append(WINDOW)
-    return words
-
-
-def _is_log(path: Path, last: Path) -> bool:
-    """Return whether an argument after a log is one, too, and not an identification."""
-    return path.suffix == last.suffix and path.name != "parameters.json" and not path.is_dir()
-
-
-def flags_of(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the flags of a configuration and their values, nested ones with their prefix."""
-    for item in fields(config):
-        value = getattr(config, item.name)
-        if is_dataclass(value):
-            # The flags of StageFlags.config and of a robot have no prefix.
-            yield from flags_of(value, prefix if item.name in ("config", "robot") else f"{prefix}{item.name}.")
-        else:
-            yield f"--{prefix}{item.name}".replace("_", "-"), value
-
-
-_MAX_LISTED_FLAGS = 20
-"""A refusal lists at most this many flags; ``run`` has 120."""
-
-
-def _unknown(unknown: Sequence[str], default: Any, prog: str) -> UsageError:
-    """Return the error for arguments that no flag took."""
-    names, alone = _names(default)
-    flags = [word.split("=")[0] for word in unknown if word.startswith("-")]
-    if not flags:
+def _unknown(unknown: Sequence[str], options: Sequence[_Option], prog: str) -> UsageError:
+    """Return the error for words that no flag took."""
+    written = [word.split("=")[0] for word in unknown if word.startswith("-")]
+    if not written:
         return UsageError(f"unexpected argument {unknown[0]!r}", hint=f"see `{prog} --help`")
-    first = flags[0].replace("_", "-")
-    close = difflib.get_close_matches(first, names, n=1)
+    names = [option.name for option in options if not option.mark.positional]
     available = f". Available: {', '.join(names)}" if len(names) <= _MAX_LISTED_FLAGS else ""
+    close = difflib.get_close_matches(written[0], names, n=1)
     guess = f"did you mean {close[0]}? " if close else ""
-    guess = f"write its value without {first}. " if first in alone else guess
-    return UsageError(f"unknown flag {', '.join(flags)}{available}", hint=f"{guess}`{prog} --help` lists all flags")
+    if written[0] in [option.name for option in options if option.mark.positional]:
+        guess = f"write its value without {written[0]}. "
+    hint = f"{guess}`{prog} --help-all` lists all flags"
+    return UsageError(f"unknown flag {', '.join(written)}{available}", hint=hint)
 
 
-def _names(default: Any) -> tuple[list[str], list[str]]:
-    """Return the names of all flags, and of the arguments whose value stands without a flag."""
-    hints = get_type_hints(type(default), include_extras=True)
-    marks = {f"--{name}".replace("_", "-"): getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-    alone = [name for name, _ in flags_of(default) if tyro.conf.Positional in marks.get(name, ())]
-    return [name for name, _ in flags_of(default) if name not in alone], alone
+def _help(options: Sequence[_Option], prog: str, description: str, epilog: str, everything: bool) -> str:
+    """Return the help: one block of flags for each nested configuration."""
+    values = [o for o in options if o.mark.positional]
+    listed = [o for o in options if o not in values and (o.shown or everything)]
+    usage = " ".join([prog, *(_placeholder(o) for o in values), "[FLAGS]"])
+    lines = [f"usage: {usage}", "", *textwrap.wrap(description, _width()), ""]
+    for value in values:
+        lines += _entry(_placeholder(value), value.text)
+    block = ""
+    for option in listed:
+        prefix = option.name[2:].partition(".")[0] if "." in option.name else ""
+        if prefix != block:
+            lines, block = [*lines, "", prefix], prefix
+        text, default = option.text, _text(option.default)
+        lines += _entry(f"{option.name} {_placeholder(option)}".rstrip(), f"{text} [{default}]" if default else text)
+    if hidden := len(options) - len(values) - len(listed):
+        lines += ["", f"--help-all lists {hidden} more flags."]
+    return "\n".join([*lines, *(["", epilog] if epilog else [])])
 
 
-def _usage_error(end: BaseException, talk: str, prog: str, default: Any, arguments: Sequence[str]) -> Sim2RealError:
-    """Return why the parser gave up: the configuration's own error, or the text that the parser printed in a box."""
-    cause: BaseException | None = end
-    while cause is not None:
-        if isinstance(cause, Sim2RealError):
-            return cause
-        cause = cause.__context__
-    # The reason stands between the first two rules of the box, which has other characters where the output is ASCII.
-    lines = [line.strip("│| ") for line in talk.splitlines()]
-    rules = [i for i, line in enumerate(lines) if re.match("╭|╰|[─-]{4}", line)]
-    body = " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else talk.strip()
-    # With an unknown flag, the parser calls a missing value that stands without a flag a list.
-    taken = [*(names := _names(default)[0]), *(f"--no-{name[2:]}" for name in names)]
-    flags = [word for word in arguments if word.startswith("--") and word.split("=")[0].replace("_", "-") not in taken]
-    if flags and body.endswith("not list"):
-        return _unknown(flags, default, prog)
-    return UsageError(body, hint=f"see `{prog} --help`")
+def _entry(head: str, text: str) -> list[str]:
+    """Return a flag and its text as lines."""
+    body = textwrap.wrap(text, _width() - _COLUMN) or [""]
+    head = f"  {head}"
+    if len(head) > _COLUMN - 2:
+        return [head, *(" " * _COLUMN + line for line in body)]
+    return [head.ljust(_COLUMN) + body[0], *(" " * _COLUMN + line for line in body[1:])]
 
 
-@contextlib.contextmanager
-def _plain_if_requested() -> Iterator[None]:
-    """Print the help without colour where NO_COLOR is set, which the parser itself ignores."""
-    options = tyro._experimental_options
-    before = options["ansi_codes"]
-    options["ansi_codes"] = before and not os.environ.get("NO_COLOR") and sys.stdout.isatty()
-    try:
-        yield
-    finally:
-        options["ansi_codes"] = before
+def _width() -> int:
+    return min(_WIDTH, shutil.get_terminal_size((_WIDTH, 24)).columns)
+
+
+def _placeholder(option: _Option) -> str:
+    return option.mark.metavar or _placeholder_of(_bare(option.kind))
+
+
+def _placeholder_of(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return "|".join(_choices(kind))
+    if get_origin(kind) is dict:
+        (_, value) = get_args(kind)
+        return "NAME LOW HIGH" if get_args(value) else "NAME VALUE"
+    if get_origin(kind) is tuple:
+        inner = get_args(kind)
+        return f"{_placeholder_of(inner[0])} ..." if inner[-1] is Ellipsis else " ".join(map(_placeholder_of, inner))
+    return {bool: "", int: "INT", float: "NUMBER", Path: "PATH"}.get(kind, "TEXT")
+
+
+def _text(value: Any) -> str:
+    """Return a default as text; "" for one that says nothing."""
+    if value is None or value is False or value in ("", (), {}):
+        return ""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_text(v)}" for name, v in value.items())
+    if isinstance(value, tuple):
+        return " ".join(map(_text, value))
+    return "yes" if value is True else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _unmarked(kind: Any) -> Any:
+    """Return a type without its marks."""
+    return get_args(kind)[0] if hasattr(kind, "__metadata__") else kind
+
+
+def _bare(kind: Any) -> Any:
+    """Return a type without marks and without None."""
+    kind = _unmarked(kind)
+    if get_origin(kind) in (Union, types.UnionType):
+        return next(inner for inner in get_args(kind) if inner is not types.NoneType)
+    return kind
+
+
+def _choices(kind: Any) -> list[str]:
+    return [str(value) for value in get_args(kind)]
+
+
+def _with_hyphens(word: str) -> str:
+    """Return a flag with hyphens for underscores; its value is unchanged."""
+    name, equals, value = word.partition("=")
+    return f"{name.replace('_', '-')}{equals}{value}" if name.startswith("--") else word

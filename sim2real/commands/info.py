@@ -1,20 +1,52 @@
-"""What ``sim2real info`` prints about the installation, a pipeline, a log or a run."""
+"""``sim2real info``: about the installation, a pipeline, a log or a run."""
 
 import json
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from sim2real.artifacts.files import plain
 from sim2real.artifacts.run.manifest import versions
 from sim2real.artifacts.run.run_folder import STAGES, attempts, run_folders
 from sim2real.artifacts.run.stage_status import stage_status
-from sim2real.commands.flags import flags_of
+from sim2real.commands import flags
+from sim2real.commands.stages import DEMO_PIPELINE, examples_of, summary_of
+from sim2real.errors import Sim2RealError
 from sim2real.hardware import entries
 from sim2real.installation import has_jax
 from sim2real.runtime import compilation_cache
-from sim2real.stages.pipeline.pipeline import available, load_pipeline
+from sim2real.stages.flag import Flag
+from sim2real.stages.pipeline.find_run import find_run
+from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline
 from sim2real.stages.terminal.console import pairs, shown, table
+
+
+@dataclass(frozen=True)
+class InfoConfig:
+    """About the installation; or about a pipeline, a log, a run folder."""
+
+    target: Annotated[str | None, Flag("PIPELINE|LOG|RUN", positional=True)] = None
+    """A pipeline, an MCAP log, or a run folder; default: the installation."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+    verbose: bool = False
+    """Print the default of every flag of a pipeline's stages."""
+
+
+def info(command: str, arguments: list[str]) -> None:
+    """``sim2real info [PIPELINE|LOG|RUN]``."""
+    default = InfoConfig()
+    examples = examples_of("info", f"info {DEMO_PIPELINE}", f"info runs/{DEMO_PIPELINE}/TIME")
+    config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
+    if config.target is None:
+        print(installation())
+    elif Path(config.target).is_file():
+        print(log(Path(config.target)))
+    elif config.target in available():
+        print(pipeline(config.target, config.runs, config.verbose))
+    else:
+        print(run(find_run(config.runs, config.target)))
 
 
 def installation() -> str:
@@ -60,15 +92,29 @@ def pipeline(name: str, root: Path, verbose: bool) -> str:
         stages = {stage: "out of date" if s.stale else "finished" for stage, s in stage_status(runs[-1]).items()}
         states = [f"{stage} {stages.get(stage, 'not finished')}" for stage in STAGES]
         head |= {"newest run": runs[-1].name, "its stages": ", ".join(states)}
-    head["all four stages"] = f"sim2real run {name}"
+    head["commands"] = _commands(definition)
     if not verbose:
         return pairs(head | {"defaults of flags": f"sim2real info {name} --verbose"})
     # The default of each flag, one table for each stage.
     blocks = [pairs(head)]
     for stage in STAGES:
         config = getattr(definition, stage)
-        blocks.append(table(flags_of(config), [stage, "default"]))
+        blocks.append(table(flags.flags_of(config), [stage, "default"]))
     return "\n\n".join(blocks)
+
+
+def _commands(definition: Pipeline) -> str:
+    """Return the commands that work for a pipeline: a recorded robot has no hardware, task and policy."""
+    name = definition.name
+    try:
+        robot = definition.load()
+    except Sim2RealError as error:  # such as a package that is not installed
+        return f"none: {error.args[0]}"
+    from sim2real.robots.robot import Robot  # imports JAX
+
+    if isinstance(robot, Robot):
+        return f"sim2real run {name}; record, identify, train, deploy one by one"
+    return f"sim2real check {name} --log FILE; identify, validate, export (a robot without a task is not trained)"
 
 
 def run(run_dir: Path) -> str:

@@ -1,19 +1,26 @@
-"""Write the files of a pipeline for a robot that was recorded."""
+"""``sim2real new``: the files of a pipeline for a robot that has a model, or for an arm like a shipped one."""
 
+import os
 import re
-from dataclasses import replace
+import shutil
+import sys
+import tempfile
+import webbrowser
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-import msgspec
+from sim2real.commands import flags
+from sim2real.commands.stages import examples_of, run_stage, summary_of
+from sim2real.errors import ERROR, UsageError
+from sim2real.runtime import compilation_cache
+from sim2real.stages.flag import Flag
+from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline
+from sim2real.stages.pipeline.robot_flags import RobotFlags
 
-from sim2real.commands.config import NewConfig
-from sim2real.errors import UsageError
-from sim2real.log.importing.mapping import to_toml
-from sim2real.robots.from_model.mjcf import joints_of, read_model
-from sim2real.robots.from_model.mjcf_parameters import expand
-from sim2real.robots.from_model.mjcf_robot import RobotConfig
-from sim2real.stages.pipeline import from_model
-from sim2real.stages.terminal.console import wrote
+if TYPE_CHECKING:
+    from sim2real.log.importing.mapping import ImportMapping
+    from sim2real.robots.from_model.mjcf_robot import RobotConfig
 
 _COMMANDS = {
     "position": ("goal",),
@@ -26,7 +33,7 @@ _INIT = '''"""{summary}."""
 
 from dataclasses import replace
 
-from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY
+from sim2real.stages.config import MODEL_IDENTIFY
 from sim2real.stages.pipeline.pipeline import Pipeline
 
 PIPELINE = Pipeline(
@@ -45,6 +52,64 @@ from sim2real.robots.from_model.mjcf_robot import ROBOT_FILE, MjcfRobot, RobotCo
 
 ROBOT = MjcfRobot(RobotConfig.load(Path(__file__).with_name(ROBOT_FILE)))
 '''
+_CALIBRATION: Final = "calibration.json"
+_SILENCE_S: Final = 1.0  # torque is off, so a lost answer is no danger
+_LIKE_INIT = '''"""A robot like {like}, with its own calibration."""
+
+from dataclasses import replace
+
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+LIKE = load_pipeline("{like}")
+PIPELINE = replace(
+    LIKE,
+    name="{name}",
+    summary="a {like} of its own calibration",
+    package=__name__,
+    record=replace(LIKE.record, port={port!r}),
+    deploy=replace(LIKE.deploy, port={port!r}),
+)
+'''
+_LIKE_ROBOT = '''"""The robot, with the calibration beside this file."""
+
+from pathlib import Path
+
+from sim2real.stages.pipeline.pipeline import load_pipeline
+
+ROBOT = load_pipeline("{like}").load("guide").robot(Path(__file__).with_name("calibration.json"))
+'''
+
+
+@dataclass(frozen=True)
+class NewConfig:
+    """Write the files of a pipeline for a robot that has a model."""
+
+    name: Annotated[str, Flag("NAME", positional=True)] = ""
+    """Name of the pipeline: small letters, digits and underscores."""
+    robot: Annotated[RobotFlags, Flag(flat=True)] = field(default_factory=RobotFlags)
+    log: Annotated[str | None, Flag("FILE")] = None
+    """Log of the robot; its commands, measurements and rate are taken over."""
+    drive: Literal["position", "velocity", "torque", "duty", "mit"] = "position"
+    """Command of the drives, if there is no log."""
+    like: Annotated[str | None, Flag("PIPELINE")] = None
+    """Instead of a model: the pipeline of a robot like this one. Checks or makes the calibration of the robot on
+    --port, then records and identifies it."""
+    port: Annotated[str | None, Flag("PORT")] = None
+    """Serial port of the robot, for --like."""
+    folder: Path = Path("pipelines")
+    """Folder of pipelines."""
+    runs: Path = Path("runs")
+    """Folder of all runs, for --like."""
+
+
+def new(command: str, arguments: list[str]) -> None:
+    """``sim2real new NAME --mjcf ROBOT.xml [--log FILE]``, or ``sim2real new NAME --like PIPELINE --port PORT``."""
+    default = NewConfig()
+    examples = examples_of("new go2 --mjcf go2.xml --log run.csv", "new my_arm --like so101 --port /dev/ttyACM0")
+    config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
+    compilation_cache.enable()
+    if not run(config):
+        sys.exit(ERROR)
 
 
 def run(config: NewConfig) -> bool:
@@ -54,59 +119,177 @@ def run(config: NewConfig) -> bool:
         False if the identification was not accepted.
 
     Raises:
-        UsageError: When the name is none, the folder exists, or the model cannot be driven.
+        UsageError: The name is none, the folder exists, or the model cannot be driven.
     """
     if config.like is not None:
-        from sim2real.commands.new_like import run as run_like
+        return _run_like(config)
+    from sim2real.log.importing.mapping import MAPPING, to_toml
+    from sim2real.robots.from_model.mjcf import read_model
+    from sim2real.robots.from_model.mjcf_parameters import expand
+    from sim2real.stages.config import MODEL_IDENTIFY
+    from sim2real.stages.pipeline.from_model import files_of, note_held
+    from sim2real.stages.terminal.console import note, wrote
 
-        return run_like(config)
-    # Check name, model and folder.
-    if config.model is None or not re.fullmatch(r"[a-z]\w*", config.name):
-        raise UsageError(
-            f"new needs a name of small letters, digits and underscores, and a model, got {config.name!r} and "
-            f"{str(config.model) if config.model else 'no model'}",
-            hint="sim2real new go2 go2.xml --log run.csv",
-        )
+    example = "sim2real new go2 --mjcf go2.xml --log run.csv"
+    _check_name(config.name, example)
+    if config.robot.mjcf is None:
+        raise UsageError("new needs a model of the robot: --mjcf", hint=example)
     folder = config.folder / config.name
     if folder.exists():
         raise UsageError(f"{folder} exists", hint="choose another name, or delete it")
-    description, mapping = _described(config)
+    robot, mapping = _described(config)
     # Refuse a robot that cannot run before a file is written.
-    expand(description.terms, description.joints, description.driven(), read_model(description.model))
+    expand(robot.terms, robot.joints, robot.driven(), read_model(robot.model))
     if config.log is None:
-        from_model.note_held(description)
-    # Write the files of the pipeline.
-    default = from_model.MODEL_IDENTIFY
-    summary = f"recorded robot of {len(description.joints)} joints, identified from its model"
+        note_held(robot)
+    summary = f"recorded robot of {len(robot.joints)} joints, identified from its model"
+    lengths = {"horizon_s": MODEL_IDENTIFY.horizon_s, "max_delay_s": MODEL_IDENTIFY.max_delay_s}
     texts = {
-        "__init__.py": _INIT.format(
-            name=config.name, summary=summary, horizon_s=default.horizon_s, max_delay_s=default.max_delay_s
-        ),
+        "__init__.py": _INIT.format(name=config.name, summary=summary, **lengths),
         "robot.py": _ROBOT,
-        **from_model.files_of(description),
-        **({"import.toml": mapping} if mapping else {}),
+        **files_of(robot),
+        **({} if mapping is None else {MAPPING: to_toml(mapping)}),
     }
     folder.mkdir(parents=True)
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
         wrote(folder / name)
+    if config.log:
+        note(
+            f"next: sim2real check {config.name} --log {config.log}; sim2real identify {config.name} --log {config.log}"
+        )
     return True
 
 
-def _described(config: NewConfig) -> tuple[RobotConfig, str]:
-    """Return the robot's description, and the text of its mapping; without a log, by the flags alone."""
-    # With a log, describe the robot by the log and its mapping.
-    flags = replace(config.robot, mjcf=config.model)
+def _described(config: NewConfig) -> "tuple[RobotConfig, ImportMapping | None]":
+    """Return the robot's description and the mapping of its log; without a log, by the flags alone."""
+    import msgspec
+
+    from sim2real.robots.from_model.mjcf import joints_of, read_model
+    from sim2real.robots.from_model.mjcf_robot import RobotConfig
+    from sim2real.stages.pipeline.from_model import describe, describe_robot
+
     if config.log is not None:
-        model_robot = from_model.from_flags(flags, [config.log])
-        mapping = (
-            ""
-            if model_robot.mapping is None
-            else to_toml(msgspec.structs.replace(model_robot.mapping, pipeline=config.name))
+        found = describe_robot(config.robot, [config.log])
+        if found.mapping is None:
+            return found.robot, None
+        return found.robot, msgspec.structs.replace(found.mapping, pipeline=config.name)
+    joints = config.robot.joints or joints_of(read_model(Path(str(config.robot.mjcf))))
+    rate_hz, step_s = config.robot.rate_hz or RobotConfig.rate_hz, config.robot.step_s or RobotConfig.step_s
+    return describe(config.robot, joints, _COMMANDS[config.drive], rate_hz, step_s, config.drive == "mit"), None
+
+
+def _check_name(name: str, example: str) -> None:
+    if not re.fullmatch(r"[a-z]\w*", name):
+        raise UsageError(f"new needs a name of small letters, digits and underscores, got {name!r}", hint=example)
+
+
+# -- a robot like a shipped one
+
+
+def _run_like(config: NewConfig) -> bool:
+    """Check or make the calibration, write the pipeline, record, identify, and open the page.
+
+    Returns:
+        Whether the identification was accepted.
+
+    Raises:
+        UsageError: The flags do not fit, or the calibration file is refused.
+        HardwareLost: The arm contradicts its calibration. No motor has moved.
+    """
+    from sim2real.artifacts.identification import Identification
+    from sim2real.stages.terminal.console import wrote
+
+    like, port, folder = _checked(config)
+    guide = like.load("guide")
+    with tempfile.TemporaryDirectory() as temporary:
+        # Find faults of the arm before a motor moves.
+        calibration = Path(temporary) / _CALIBRATION
+        calibrate(port, guide, calibration)
+        folder.mkdir(parents=True)
+        shutil.copy(calibration, folder / _CALIBRATION)
+    wrote(folder / _CALIBRATION)
+    for name, text in (("__init__.py", _LIKE_INIT), ("robot.py", _LIKE_ROBOT)):
+        (folder / name).write_text(text.format(name=config.name, like=like.name, port=port), encoding="utf-8")
+        wrote(folder / name)
+    # The only question: from here on the arm moves.
+    pipeline = load_pipeline(config.name)
+    _ask(f"The arm moves next, for {pipeline.record.duration_s:g} s: let go of it, clear its table, and press Enter. ")
+    recorded = run_stage("record", pipeline, pipeline.record, config.runs, None, page=False)
+    run_dir = None if recorded is None else recorded.run_dir
+    identified = run_stage("identify", pipeline, pipeline.identify, config.runs, run_dir)
+    if identified is None:
+        raise UsageError("identify has written no folder")
+    # Open the page if there is a screen.
+    page = identified.run_dir / "report.html"
+    if sys.stdout.isatty() and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        webbrowser.open(page.resolve().as_uri())
+    return Identification.load(identified.output("parameters")).verdict.status == "accepted"
+
+
+def calibrate(port: str, guide: Any, path: Path) -> None:
+    """Write the checked calibration of the arm on a port into a file.
+
+    With a calibration of LeRobot's, a person's motion checks it; without one, the motion makes it.
+
+    Args:
+        guide: The module ``guide`` of the robot's pipeline.
+
+    Raises:
+        UsageError: LeRobot's file is refused.
+        HardwareLost: A servo or the motion contradicts the calibration. No motor has moved.
+    """
+    from sim2real.hardware.feetech.calibrate import follow, write_calibration
+    from sim2real.hardware.feetech.device import StsConfig, StsServos
+    from sim2real.hardware.feetech.find_servos import find_servos
+    from sim2real.hardware.feetech.hand_motion import HandMotion
+    from sim2real.stages.terminal.console import note
+
+    # Find the servos, and the file that belongs to them.
+    present = find_servos(port, guide.IDS, guide.BAUD_RATE)
+    note(f"{len(present)} servos answer on {port}", urgent=True)
+    source: Path | None = guide.calibration_of(present)
+    joints = present if source is None else guide.read(source)
+    note(f"calibration: {source or 'none of LeRobot, so it is made now'}", urgent=True)
+    # Opening compares models, homing offsets and limits with the calibration, and takes the torque off.
+    with StsServos(StsConfig(port, guide.BAUD_RATE, max_silence_s=_SILENCE_S), joints) as servos:
+        motion = HandMotion(joints, guide.NUDGES, calibrated=source is not None)
+        note(f"torque is off. Move the arm by hand. Its middle pose: {guide.MIDDLE}", urgent=True)
+        follow(servos, motion, lambda words: note(f"- {words}", urgent=True))
+        if source is None:
+            write_calibration(servos, motion, path)
+        else:
+            shutil.copy(source, path)
+    guide.read(path)
+    note("the calibration fits the arm", urgent=True)
+
+
+def _checked(config: NewConfig) -> tuple[Pipeline, str, Path]:
+    """Return the pipeline of the like robot, the port and the new folder; refuse flags that do not fit."""
+    sources = available()
+    able = sorted(n for n, s in sources.items() if isinstance(s, Path) and (s / "guide.py").is_file())
+    if config.like not in able:
+        raise UsageError(f"--like {config.like}: no such robot. Available: {', '.join(able)}")
+    example = f"sim2real new my_arm --like {config.like} --port /dev/ttyACM0"
+    _check_name(config.name, example)
+    if config.port is None or config.robot.mjcf is not None or config.log is not None:
+        raise UsageError("--like needs the --port of the robot, and neither a model nor a log", hint=example)
+    if config.folder.resolve() != Path("pipelines").resolve() or config.name in sources:
+        raise UsageError(
+            f"the pipeline {config.name!r} exists already, or --folder is not ./pipelines",
+            hint="choose another name, or delete it",
         )
-        return model_robot.description, mapping
-    # Without a log, describe it by the kind of drive.
-    joints = flags.joints or joints_of(read_model(Path(str(config.model))))
-    rate_hz, step_s = flags.rate_hz or RobotConfig.rate_hz, flags.step_s or RobotConfig.step_s
-    commands, physical = _COMMANDS[config.drive], config.drive == "mit"
-    return from_model.describe(flags, joints, commands, rate_hz, step_s, physical), ""
+    return load_pipeline(config.like), config.port, config.folder / config.name
+
+
+def _ask(question: str) -> None:
+    """Print a question on stderr, and wait for Enter.
+
+    Raises:
+        UsageError: stdin has ended before an answer.
+    """
+    print(question, end="", file=sys.stderr, flush=True)
+    if not sys.stdin.readline():
+        raise UsageError(
+            "there was no answer, so the arm was not recorded", hint="sim2real record NAME records it later"
+        )

@@ -52,11 +52,11 @@ def test_a_log_that_is_open_when_a_command_ends_is_aborted(tmp_path):
     path = tmp_path / "session.mcap"
     program = textwrap.dedent("""
         import sys
-        from sim2real.commands.exit_code import leave
+        from sim2real.cli import _leave
         from sim2real.log import McapRecorder
         log = McapRecorder(sys.argv[1], {}, {}, {"a": {"x": 0.0}}, [])
         log.start(10**18, 0)
-        leave(3)
+        _leave(3)
     """)
     assert subprocess.run([sys.executable, "-c", program, str(path)], check=False).returncode == 3
     assert read_log(path).metadata["log"]["session_end"]["status"] == "aborted"

@@ -33,7 +33,7 @@ def test_the_shipped_policy_walks_and_lies_down(tmp_path, capsys, virtual_robots
     assert "verdict: fine" in output.err
     (deployed,) = (tmp_path / "go2").glob("*/deploy")
     # The report has the gap to the twin, and draws what was measured.
-    page = (deployed / "report.html").read_text()
+    page = (deployed.parent / "report.html").read_text()
     assert "velocity error" in page
     assert "yaw error" in page
     assert page.count("<svg") >= 4

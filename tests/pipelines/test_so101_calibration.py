@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sim2real.commands.new_like import calibrate
+from sim2real.commands.new import calibrate
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.truth import Kind
 from sim2real.emulation.virtual import VirtualRobot

@@ -14,7 +14,6 @@ import pytest
 from sim2real import cli, errors
 from sim2real.artifacts.identification import Estimate, Identification, Judgement, Link, Ranged
 from sim2real.artifacts.posterior import Posterior
-from sim2real.commands.export.identified import facts_of, write_model_card
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.problem.problem import Problem
@@ -27,6 +26,7 @@ from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.excitation.simulated_log import simulate
+from sim2real.stages.export import facts_of, write_model_card
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -182,7 +182,7 @@ def test_the_card_of_a_run(finished_run_dir, tmp_path, monkeypatch, capsys):
     """The command writes page, document, model, signals and script; the page is self-contained and has no own path."""
     monkeypatch.chdir(tmp_path)
     source = str(finished_run_dir / "identify" / "parameters.json")
-    assert cli.main(["export", "identified", source, "--to", "card"]) == 0
+    assert cli.main(["export", source, "--to", "card"]) == 0
     folder = tmp_path / "pendulum_card"
     assert {p.name for p in folder.iterdir()} == {"card.html", "card.json", "model.xml", "reproduce.py", "signals.npz"}
     code, lines = alone(folder)
@@ -194,10 +194,10 @@ def test_the_card_of_a_run(finished_run_dir, tmp_path, monkeypatch, capsys):
     assert not re.search(r'(src|href)="http', page)
     assert mujoco.MjModel.from_xml_path(str(folder / "model.xml")).nu == 1
     # A second card replaces the first; another folder with files is refused.
-    assert cli.main(["export", "identified", source, "--to", "card"]) == 0
+    assert cli.main(["export", source, "--to", "card"]) == 0
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
-    assert cli.main(["export", "identified", source, "--to", "card", "--out", "mine"]) == errors.USAGE
+    assert cli.main(["export", source, "--to", "card", "--out", "mine"]) == errors.USAGE
     assert "holds no model card" in capsys.readouterr().err
 
 

@@ -1,13 +1,8 @@
 """A robot with a floating base: commands, its twin in C MuJoCo, and the policy that comes with pipelines/go2."""
 
-import os
-import pty
 import re
 import shlex
 import shutil
-import struct
-import sys
-import termios
 from pathlib import Path
 
 import jax
@@ -16,14 +11,12 @@ import pytest
 
 from pipelines.go2.robot import ROBOT
 from sim2real import cli
-from sim2real.commands.config import PlayConfig
-from sim2real.commands.play import run
+from sim2real.commands.play import PlayConfig, run
 from sim2real.errors import UsageError
 from sim2real.policy.bundle import load_bundle
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.messages import gravity_of
 from sim2real.robots.walking.twin import HiddenTwin, Twin, walk
-from sim2real.stages.live.steering import gamepad, steer, terminal_keys
 
 ROOT = Path(__file__).parents[2]
 BUNDLE = ROOT / "pipelines/go2/walk"
@@ -86,9 +79,8 @@ def test_play_writes_a_picture(tmp_path, capsys):
 
 def test_a_film_without_ffmpeg_and_another_format_are_refused_before_the_walk(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(UsageError, match="needs FFmpeg"):
-        run(PlayConfig("no pipeline", video=tmp_path / "a.mp4"))
+        run(PlayConfig("go2", video=tmp_path / "a.mp4"))
     with pytest.raises(UsageError, match=r"a \.gif or a \.mp4"):
         PlayConfig("go2", video=tmp_path / "a.avi")
 
@@ -98,70 +90,6 @@ def test_play_refuses_a_robot_that_does_not_walk(tmp_path):
     shutil.copytree(BUNDLE, bundle)
     with pytest.raises(UsageError, match="does not walk"):
         run(PlayConfig(str(bundle)))
-
-
-def test_keys_steer_within_limits():
-    wanted = np.zeros(3)
-    for _ in range(20):
-        steer(wanted, 265)
-    steer(wanted, 262)
-    np.testing.assert_allclose(wanted, [1.0, 0.0, -0.1])
-    steer(wanted, 32)
-    np.testing.assert_array_equal(wanted, np.zeros(3))
-
-
-def event(value, kind, number):
-    """Return an event of Linux's joystick."""
-    return struct.pack("=IhBB", 0, value, kind, number)
-
-
-def test_the_sticks_of_a_gamepad_set_the_command(tmp_path, capsys):
-    device = tmp_path / "js0"
-    os.mkfifo(device)
-    follow, wanted = gamepad(device, (1.0, 0.6, 0.8)), np.array([0.3, 0.0, 0.0])
-    with open(device, "wb", buffering=0) as pad:
-        follow(wanted)
-        np.testing.assert_array_equal(wanted, [0.3, 0.0, 0.0])
-        # The state at the start: sticks at rest; a button is no stick.
-        pad.write(event(0, 0x82, 1) + event(1, 0x81, 1) + event(500, 0x82, 0))
-        follow(wanted)
-        np.testing.assert_array_equal(wanted, np.zeros(3))
-        # Up is forwards; to the left is positive.
-        pad.write(event(-32767, 2, 1) + event(16384, 2, 0) + event(-32767, 2, 3))
-        follow(wanted)
-        np.testing.assert_allclose(wanted, [1.0, -0.3, 0.8], atol=1e-4)
-    # A gamepad that is pulled out lets the robot stand.
-    follow(wanted)
-    np.testing.assert_array_equal(wanted, np.zeros(3))
-    assert "is gone" in capsys.readouterr().err
-    follow(wanted)
-    assert capsys.readouterr().err == ""
-    with pytest.raises(UsageError, match=r"no gamepad at .*No such file"):
-        gamepad(tmp_path / "js1", (1.0, 1.0, 1.0))
-
-
-def test_keys_of_a_terminal_steer_and_the_terminal_is_as_before(monkeypatch):
-    host, terminal = pty.openpty()
-    monkeypatch.setattr(sys, "stdin", os.fdopen(terminal, "r"))
-    before, wanted = termios.tcgetattr(terminal), np.zeros(3)
-    with terminal_keys() as follow:
-        follow(wanted)
-        os.write(host, b"\x1b[A\x1b[Ax,\x1b[D")
-        follow(wanted)
-        np.testing.assert_allclose(wanted, [0.2, 0.1, 0.1])
-        assert termios.tcgetattr(terminal) != before
-    assert termios.tcgetattr(terminal) == before
-
-
-def test_play_into_a_file_of_the_viewer(tmp_path):
-    from rerun.chunk import RrdReader
-
-    run(PlayConfig("go2", seconds=0.5, view=str(tmp_path / "walk.rrd")))
-    chunks = RrdReader(tmp_path / "walk.rrd").stream().to_chunks()
-    rows = sum(c.num_rows for c in chunks if c.entity_path == "/robot/body_1" and not c.is_static)
-    assert rows == 25
-    with pytest.raises(UsageError, match="one of them"):
-        PlayConfig("go2", window=True, view="web")
 
 
 @pytest.mark.night

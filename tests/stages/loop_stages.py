@@ -12,14 +12,15 @@ from sim2real.artifacts.deployment import Advice, Changed, Deployment, Drift, Ga
 from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification, Judgement
 from sim2real.artifacts.run.run_folder import STAGES, Source, attempts, newest, open_stage
 from sim2real.artifacts.run.stage_status import TAKES
-from sim2real.commands.flags import RunFlags
-from sim2real.commands.loop import run_loop
+from sim2real.commands.loop import run_all
+from sim2real.commands.run import RunFlags
 from sim2real.errors import Sim2RealError
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 TRIP = Estimate(ROUND_TRIP, "s", "derived", "", 0.0, 0.02, "ok")
 FRICTION = Changed("friction", "rad/s^2", 6.0, 12.0, 11.0, 13.0, 0.9, 1e-20)
-WIDER = "sim2real identify pendulum --bounds friction 0.1 80 --max-delay-s 0.1"
+AT_BOUND = Estimate("friction", "rad/s^2", "dynamics", "", 6.0, 19.9, "at a bound", lower=0.1, upper=20.0)
+LATE = Estimate("delay", "s", "delay", "", 0.0, 0.06, "at a bound", lower=0.0, upper=0.06)
 
 
 def verdict(status, success=0.5, reason="why", seconds=18.0, drift=False):
@@ -66,8 +67,10 @@ class Stages:
                 if status == "fails":
                     raise Sim2RealError("nothing could be simulated")
                 logs = tuple(Source.of(path, opened.run_dir) for path in inputs.values())
-                told = Judgement(status, (content,), WIDER if status == "change the model" else "")
-                Identification("pendulum", logs, told, (TRIP,)).write(opened.output("parameters", "parameters.json"))
+                rows = (TRIP, AT_BOUND, LATE) if status == "change the model" else (TRIP,)
+                Identification("pendulum", logs, Judgement(status, (content,)), rows).write(
+                    opened.output("parameters", "parameters.json")
+                )
             if stage == "train":
                 opened.output("bundle", "bundle").mkdir()
                 (opened.folder / "bundle" / "policy.json").write_text(content)
@@ -94,6 +97,6 @@ class Stages:
         stages = {stage: getattr(pipeline, stage) for stage in STAGES}
         stages["train"] = replace(pipeline.train, **(train or {}))
         flags = RunFlags(iterations=iterations, runs=self.root, resume=resume, **stages, **told)
-        run_loop.run_all(pipeline, flags, self)
+        run_all(pipeline, flags, self)
         (run_dir,) = (self.root / "pendulum").iterdir()
         return run_dir

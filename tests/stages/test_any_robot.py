@@ -52,9 +52,10 @@ def workplace(tmp_path, monkeypatch):
 
 @pytest.mark.night
 def test_a_model_and_a_log_give_parameters_that_hold_on_a_later_log(workplace, capsys):
-    assert cli.main(["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--folds", "0", "--free-run-s", "0"]) == 0
+    assert cli.main(["new", "rig", "--mjcf", "robot.xml", "--log", "run.npz"]) == 0
+    assert cli.main(["identify", "rig", "--log", "run.npz", "--folds", "0", "--free-run-s", "0"]) == 0
     assert "verdict: accepted" in capsys.readouterr().err
-    (folder,) = workplace.glob("runs/robot/*/identify")
+    (folder,) = workplace.glob("runs/rig/*/identify")
     found = json.loads((folder / "parameters.json").read_text())
     rows = {p["name"]: p["estimate"] for p in found["parameters"]}
     assert found["verdict"]["status"] == "accepted"
@@ -68,7 +69,7 @@ def test_a_model_and_a_log_give_parameters_that_hold_on_a_later_log(workplace, c
     assert (ahead["kind"], ahead["exceeded"]) == ("ahead", False)
     assert (free["kind"], free["expected"], free["ratio"]) == ("free run", None, None)
     assert ahead["ratio"] == pytest.approx(ahead["error"] / ahead["expected"])
-    assert cli.main(["export", "identified", str(folder / "parameters.json"), "--out", "exported.xml"]) == 0
+    assert cli.main(["export", str(folder / "parameters.json"), "--out", "exported.xml"]) == 0
     assert "not expressed" not in capsys.readouterr().err
     t, goal, q = simulated(1)
     assert np.abs(alone("exported.xml", t, goal) - q).max() < 0.02 * np.ptp(q)

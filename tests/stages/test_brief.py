@@ -54,15 +54,15 @@ def test_each_second_prints_a_dot(capsys, monkeypatch):
 def test_the_demo_prints_at_most_25_lines(verbose, monkeypatch, tmp_path, capsys, run_copy):
     """The stages' artifacts are those of a finished run; each stage prints 100 lines of details."""
     from sim2real.artifacts.run.run_folder import finished
-    from sim2real.commands import run_commands
+    from sim2real.commands import run
 
-    def call_stage(stage, pipeline, config, root, run_dir):
+    def call_stage(stage, pipeline, config, root, run_dir, page=True):
         for i in range(100):
             console.note(f"{stage}: detail {i}")
             print(f"row {i} of {stage}")
         return finished(run_copy, stage)
 
-    monkeypatch.setattr(run_commands, "run_stage", call_stage)
+    monkeypatch.setattr(run, "run_stage", call_stage)
     monkeypatch.chdir(tmp_path)
     assert cli.main(["demo", *(["--verbose"] if verbose else [])]) == 0
     out, err = capsys.readouterr()

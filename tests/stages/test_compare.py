@@ -1,4 +1,4 @@
-"""``sim2real compare``: runs side by side, and the parameters whose intervals do not overlap."""
+"""``sim2real report`` of several runs: runs side by side, and the parameters whose intervals do not overlap."""
 
 import json
 from dataclasses import replace
@@ -48,7 +48,7 @@ def test_runs_are_compared_from_the_command_line(finished_run_dir, run_copy, tmp
         gain[end] += 20 * gain["standard_error"]
     file.write_text(json.dumps(document))
     page = tmp_path / "page.html"
-    arguments = ["compare", str(finished_run_dir), str(run_copy / "identify"), "--out", str(page), "--json"]
+    arguments = ["report", str(finished_run_dir), str(run_copy / "identify"), "--out", str(page), "--json"]
     assert cli.main(arguments) == 0
     found = json.loads(capsys.readouterr().out)
     overlap = {row["parameter"]: row["intervals overlap"] for row in found["parameters"]}
@@ -58,10 +58,10 @@ def test_runs_are_compared_from_the_command_line(finished_run_dir, run_copy, tmp
     assert "gain" in page.read_text(encoding="utf-8")
 
 
-def test_one_run_and_runs_of_two_robots_are_refused(finished_run_dir, run_copy, capsys):
-    assert cli.main(["compare", str(finished_run_dir)]) == USAGE
+def test_json_of_one_run_and_runs_of_two_robots_are_refused(finished_run_dir, run_copy, capsys):
+    assert cli.main(["report", str(finished_run_dir), "--json"]) == USAGE
     assert "two runs" in capsys.readouterr().err
     for file in run_copy.glob("*/manifest.json"):
         file.write_text(json.dumps({**json.loads(file.read_text()), "pipeline": "head"}))
-    assert cli.main(["compare", str(finished_run_dir), str(run_copy)]) == USAGE
+    assert cli.main(["report", str(finished_run_dir), str(run_copy)]) == USAGE
     assert "different robots" in capsys.readouterr().err

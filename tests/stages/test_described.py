@@ -1,24 +1,19 @@
-"""Robots that are described on the command line: by a model and a log, and as a pipeline that is written for them."""
+"""``sim2real new``: a model and a log describe a robot, and become a pipeline."""
 
-import shlex
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sim2real import cli
-from sim2real.artifacts.identification import Identification, Judgement
-from sim2real.commands import model_flags
 from sim2real.errors import UsageError
 from sim2real.log import read_log
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import RobotConfig
-from sim2real.stages.pipeline import from_model
+from sim2real.stages.pipeline.from_model import describe_robot, files_of
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.pipeline.robot_flags import RobotFlags
-from sim2real.stages.shared.identification import command, continuing
 
 XML = """<mujoco>
   <option timestep="0.002"/>
@@ -29,6 +24,7 @@ XML = """<mujoco>
   </worldbody>
 </mujoco>"""
 RATE_HZ = 100.0
+NEW = ["new", "rig", "--mjcf", "robot.xml", "--log", "run.npz"]
 
 
 @pytest.fixture(scope="module")
@@ -50,49 +46,30 @@ def workplace(tmp_path, monkeypatch, recorded):
 
 
 def test_a_model_and_a_log_describe_a_robot(workplace):
-    found = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"])
+    found = describe_robot(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"])
     assert found.name == "robot"
-    own = found.description
+    own = found.robot
     assert (own.joints, own.commands, own.step_s) == (("pan_joint", "lift_joint"), ("goal",), 0.002)
     assert own.rate_hz == pytest.approx(RATE_HZ, rel=1e-3)
-    names = [p.name for p in found.load().dynamics()]
+    names = [p.name for p in found.pipeline.load().dynamics()]
     assert names == ["kp", "damping", "armature", "frictionloss_pan_joint", "frictionloss_lift_joint"]
-    assert found.words == ("--mjcf", "robot.xml")
 
 
-def test_a_later_log_is_read_by_the_mapping_of_the_identification(workplace, recorded):
-    found = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"])
-    folder = workplace / "identify"
-    folder.mkdir()
-    for name, text in found.texts().items():
-        (folder / name).write_text(text)
-    later = from_model.pipeline_beside(folder, Identification("robot", (), Judgement("", ()), ()))
+def test_a_later_log_is_read_by_the_mapping_of_the_pipeline(workplace, recorded):
+    assert cli.main(NEW) == 0
     t, goal, q = recorded
     np.savez("still.npz", t_s=t, q_rad=0 * q, goal_rad=0 * goal)  # at rest, from which no mapping can be proposed
-    log = open_recording(Path("still.npz"), later, later.load())
+    pipeline = load_pipeline("rig")
+    log = open_recording(Path("still.npz"), pipeline, pipeline.load())
     assert log.episode.outputs["sensor"]["position"].shape == q.shape
-
-
-def test_the_next_command_describes_the_robot_again(workplace):
-    told = RobotFlags(mjcf=Path("robot.xml"), joints=("lift_joint", "pan_joint"), parameter=("kp=20",), contacts=True)
-    found = from_model.from_flags(told, ["run.npz"])
-    asked = replace(found.identify, log=("run.npz",), fix={"delay": 0.0})
-    program, stage, *rest = shlex.split(command(found, asked, Path("runs")))
-    assert (program, stage) == ("sim2real", "identify")
-    again = model_flags.parse_identify(rest, "")
-    assert (again.robot, again.config) == (told, asked)
-    asked = replace(asked, refine_steps=3)
-    _, _, *rest = shlex.split(continuing(found, asked, Path("all runs"), Path("all runs/robot/partial.json")))
-    onward = model_flags.parse_identify(rest, "")
-    assert (onward.robot, onward.runs) == (told, Path("all runs"))
-    assert (onward.config.begin, onward.config.log) == ("all runs/robot/partial.json", ("run.npz",))
 
 
 def test_check_says_of_a_joint_that_stands_still_what_to_record(workplace, capsys, recorded):
     t, goal, q = recorded
     noise = 1e-3 * np.random.default_rng(0).standard_normal(q.shape)
     np.savez("run.npz", t_s=t, q_rad=np.stack([q[:, 0], 0 * t], 1) + noise, goal_rad=np.stack([goal[:, 0], 0 * t], 1))
-    assert cli.main(["check", "--mjcf", "robot.xml", "--log", "run.npz"]) == 1
+    assert cli.main(NEW) == 0
+    assert cli.main(["check", "rig", "--log", "run.npz"]) == 1
     out = capsys.readouterr().out
     assert "lift_joint does not move at all" in out
     assert "nothing in this data determines frictionloss_lift_joint" in out
@@ -103,7 +80,7 @@ def test_check_says_of_a_joint_that_stands_still_what_to_record(workplace, capsy
 def test_gains_and_torque_that_is_switched_make_inputs(workplace, recorded):
     t, goal, q = recorded
     np.savez("run.npz", t_s=t, q_rad=q, goal_rad=goal, kp=np.float64(32.0), torque_enable=np.ones(len(t)))
-    own = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).description
+    own = describe_robot(RobotFlags(mjcf=Path("robot.xml")), ["run.npz"]).robot
     assert (set(own.commands), set(own.shared)) == ({"goal", "kp", "enabled"}, {"kp", "enabled"})
     assert own.kp_unit == 32.0
     assert ParameterPattern("kd") in own.terms
@@ -115,15 +92,15 @@ def test_an_imported_log_is_taken_as_it_is(workplace, capsys):
     assert "positions follow their goals" in err
     assert "wrote run.import.toml" in out
     assert read_log("run.mcap").metadata["pipeline"] == "robot"
-    found = from_model.from_flags(RobotFlags(mjcf=Path("robot.xml")), ["run.mcap"])
+    found = describe_robot(RobotFlags(mjcf=Path("robot.xml")), ["run.mcap"])
     assert found.mapping is None
-    assert found.description.commands == ("goal",)
+    assert found.robot.commands == ("goal",)
     assert cli.main(["import", "run.npz", "--mapping", "run.import.toml", "--out", "again.mcap"]) == 0
 
 
 @pytest.mark.parametrize("flags", [(), ("--joints", "lift_joint", "pan_joint")])
 def test_new_writes_a_pipeline_that_loads(workplace, flags):
-    assert cli.main(["new", "rig", "robot.xml", "--log", "run.npz", *flags]) == 0
+    assert cli.main([*NEW, *flags]) == 0
     assert {p.name for p in Path("pipelines/rig").iterdir()} == {
         "__init__.py", "robot.py", "robot.toml", "robot.xml", "import.toml"
     }  # fmt: skip
@@ -143,7 +120,7 @@ def test_the_number_of_a_lone_joint_is_a_vector(workplace, recorded):
         '[nodes.sensor]\nstamps = "t"\nfields.position = { source = "q", unit = "rad" }\n'
     )
     flags = ["--joints", "pan_joint", "--hold", "lift_joint=0.1", "--mapping", "map.toml"]
-    assert cli.main(["new", "rig", "robot.xml", "--log", "lone.npz", *flags]) == 0
+    assert cli.main(["new", "rig", "--mjcf", "robot.xml", "--log", "lone.npz", *flags]) == 0
     pipeline = load_pipeline("rig")
     outputs = open_recording(Path("lone.npz"), pipeline, pipeline.load()).episode.outputs
     shapes = {name: values.shape for fields in outputs.values() for name, values in fields.items()}
@@ -151,12 +128,23 @@ def test_the_number_of_a_lone_joint_is_a_vector(workplace, recorded):
     # A log of ours keeps its shapes, and the error tells the remedy.
     assert cli.main(["import", "lone.npz", "--mapping", "map.toml", "--out", "lone.mcap"]) == 0
     with pytest.raises(UsageError, match="goal \\(\\)") as caught:
-        from_model.from_flags(RobotFlags(mjcf=Path("robot.xml"), joints=("pan_joint",)), ["lone.mcap"])
+        describe_robot(RobotFlags(mjcf=Path("robot.xml"), joints=("pan_joint",)), ["lone.mcap"])
     assert "shape = [-1]" in str(caught.value.hint)
 
 
 def test_new_without_a_log_goes_by_its_flags(workplace, capsys):
-    arguments = ["new", "rig", "robot.xml", "--drive", "mit", "--parameter", "damping:each", "--joints", "pan_joint"]
+    arguments = [
+        "new",
+        "rig",
+        "--mjcf",
+        "robot.xml",
+        "--drive",
+        "mit",
+        "--parameter",
+        "damping:each",
+        "--joints",
+        "pan_joint",
+    ]
     assert cli.main(arguments) == 0
     own = RobotConfig.load(Path("pipelines/rig/robot.toml"))
     assert own.commands == ("goal", "goal_velocity", "torque", "kp", "kd")
@@ -170,7 +158,7 @@ def test_a_model_with_files_of_its_own_stays_where_it_is(workplace):
     asset = '<asset><mesh name="m" file="meshes/m.obj"/></asset><worldbody>'
     Path("robot.xml").write_text(XML.replace("<worldbody>", asset))
     Path("meshes/m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    texts = from_model.files_of(RobotConfig(Path("robot.xml"), ("pan_joint",), ("goal",)))
+    texts = files_of(RobotConfig(Path("robot.xml"), ("pan_joint",), ("goal",)))
     assert list(texts) == ["robot.toml"]
     assert str(workplace / "robot.xml") in texts["robot.toml"]
 
@@ -178,21 +166,20 @@ def test_a_model_with_files_of_its_own_stays_where_it_is(workplace):
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["identify", "--mjcf", "robot.xml"], "--log"),
-        (["identify", "--mjcf", "none.xml", "--log", "run.npz"], "none.xml"),
-        (["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--joints", "toe"], "toe"),
-        (["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--joints", "pan_joint"], "not the robot's 1 joints"),
-        (["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--parameter", "kq"], "unknown parameter 'kq'"),
-        (["identify", "--mjcf", "robot.xml", "--log", "run.npz", "--velocity"], "no velocity"),
-        (["new", "Rig", "robot.xml"], "small letters"),
-        (["new", "rig"], "no model"),
+        ([*NEW, "--joints", "toe"], "toe"),
+        ([*NEW, "--joints", "pan_joint"], "not the robot's 1 joints"),
+        ([*NEW, "--parameter", "kq"], "unknown parameter 'kq'"),
+        ([*NEW, "--velocity"], "no velocity"),
+        (["new", "rig", "--mjcf", "none.xml", "--log", "run.npz"], "none.xml"),
+        (["new", "Rig", "--mjcf", "robot.xml"], "small letters"),
+        (["new", "rig"], "--mjcf"),
         (["validate"], "validate needs parameters"),
     ],
 )
 def test_wrong_commands_are_refused_before_anything_is_compiled(workplace, capsys, arguments, named):
     assert cli.main(arguments) == 2
     assert named in capsys.readouterr().err
-    assert not Path("runs").exists()
+    assert not Path("pipelines").exists()
 
 
 def test_a_mapping_that_the_data_contradicts_is_refused(workplace, capsys, recorded):
@@ -207,4 +194,4 @@ def test_a_mapping_that_the_data_contradicts_is_refused(workplace, capsys, recor
     assert not Path("wrong.mcap").exists()
     assert cli.main(["import", "run.npz", "--mapping", "wrong.toml", "--out", "wrong.mcap", "--as-told"]) == 0
     with pytest.raises(UsageError, match="contradict"):
-        from_model.from_flags(RobotFlags(mjcf=Path("robot.xml"), mapping=Path("wrong.toml")), ["run.npz"])
+        describe_robot(RobotFlags(mjcf=Path("robot.xml"), mapping=Path("wrong.toml")), ["run.npz"])

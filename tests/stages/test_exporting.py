@@ -1,7 +1,8 @@
-"""``sim2real export identified``: which identification it takes, what it writes, and what it refuses."""
+"""``sim2real export``: which identification it takes, what it writes, and what it refuses."""
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -11,8 +12,7 @@ from sim2real import cli, errors
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run import run_folder
-from sim2real.commands.config import ExportConfig
-from sim2real.commands.export import identified as export_model
+from sim2real.commands.export import find_parameters
 from sim2real.identify.export import terms
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
@@ -53,7 +53,7 @@ def save(found, folder):
 
 def test_mjcf_has_what_was_identified(arm, here, capsys):
     file = save(arm, here / "found")
-    assert cli.main(["export", "identified", str(file), "--to", "mjcf"]) == 0
+    assert cli.main(["export", str(file), "--to", "mjcf"]) == 0
     assert "wrote arm_identified.xml" in capsys.readouterr().out
     model = mujoco.MjModel.from_xml_path(str(here / "arm_identified.xml"))
     np.testing.assert_allclose(model.dof_damping, 0.3)
@@ -71,9 +71,9 @@ def test_a_run_folder_is_found_by_its_pipeline(arm, here, capsys):
         for name, path in arm.save(stage.folder).items():
             stage.output(name, path)
     for source in ("arm", str(stage.run_dir), str(stage.folder)):
-        assert export_model.find_parameters(ExportConfig(source)).samefile(stage.folder / "parameters.json")
+        assert find_parameters(source, Path("runs")).samefile(stage.folder / "parameters.json")
     out = here / "own.json"
-    assert cli.main(["export", "identified", "arm", "--to", "json", "--out", str(out)]) == 0
+    assert cli.main(["export", "arm", "--to", "json", "--out", str(out)]) == 0
     assert "own.json" in capsys.readouterr().out
     document = json.loads(out.read_text())
     assert document["format"] == 1
@@ -88,21 +88,21 @@ def test_python_files_are_python(arm, here, monkeypatch):
     monkeypatch.setattr(terms.find_terms, "__defaults__", (5,))
     file = save(arm, here / "found")
     for to in ("mjlab", "isaaclab"):
-        assert cli.main(["export", "identified", str(file), "--to", to]) == 0
+        assert cli.main(["export", str(file), "--to", to]) == 0
         compile((here / f"arm_{to}.py").read_text(), to, "exec")
 
 
 def test_a_world_that_is_not_mujocos_is_refused_but_for_json(here, capsys):
     file = save(identified("disk", "change the model"), here / "found")
     for to in ("mjcf", "mjlab", "isaaclab"):
-        assert cli.main(["export", "identified", str(file), "--to", to]) == errors.USAGE
+        assert cli.main(["export", str(file), "--to", to]) == errors.USAGE
         told = capsys.readouterr().err
         assert "the world of pipeline 'disk' is not MuJoCo's" in told
         for name in ("load", "swing", "cogging", "eccentricity"):
             assert name in told
         assert "damping" not in told.split("nothing for:")[1].split("hint")[0]
         assert "--to json" in told
-    assert cli.main(["export", "identified", str(file), "--to", "json"]) == 0
+    assert cli.main(["export", str(file), "--to", "json"]) == 0
     assert "verdict: change the model" in capsys.readouterr().err
     document = json.loads((here / "disk_identified.json").read_text())
     assert document["mujoco"] is None
@@ -113,7 +113,7 @@ def test_a_world_that_is_not_mujocos_is_refused_but_for_json(here, capsys):
 def test_an_identification_without_intervals_is_refused(arm, here, capsys, status, said):
     verdict = Judgement(status, ("why",), "sim2real identify arm --begin parameters.json")
     file = save(replace(arm, posterior=None, verdict=verdict), here / "found")
-    assert cli.main(["export", "identified", str(file)]) == errors.USAGE
+    assert cli.main(["export", str(file)]) == errors.USAGE
     told = capsys.readouterr().err
     assert said in told
     assert "hint: sim2real identify arm --begin parameters.json" in told
@@ -122,26 +122,20 @@ def test_an_identification_without_intervals_is_refused(arm, here, capsys, statu
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([], "export needs an action"),
-        (["weights"], "there is no `export weights`"),
-        (["identified"], "needs a run folder, a pipeline or a parameters.json"),
-        (["identified", "no_such"], "there is no file, pipeline or run 'no_such'"),
-        (["identified", "arm"], "no finished 'identify' of pipeline 'arm'"),
-        (["identified", "arm", "--to", "gazebo"], "gazebo"),
+        ([], "needs a run folder, a pipeline or a file"),
+        (["no_such"], "there is no file, pipeline or run 'no_such'"),
+        (["arm"], "no finished 'identify' of pipeline 'arm'"),
+        (["arm", "--to", "gazebo"], "gazebo"),
+        (["network.onnx", "--to", "policy"], "folder of a policy bundle"),
     ],
 )
 def test_what_is_not_there_is_said(here, capsys, arguments, words):
+    (here / "network.onnx").write_bytes(b"x")
     assert cli.main(["export", *arguments]) in (errors.USAGE, errors.ERROR)
     assert words in capsys.readouterr().err
 
 
-def test_help_lists_both_kinds_of_export(capsys):
-    assert cli.main(["export", "--help"]) == 0
-    said = capsys.readouterr().out
-    assert {"identified", "policy"} <= set(said.split())
-
-
 def test_parameters_of_a_world_that_is_not_installed_are_refused(arm, here, capsys):
     file = save(replace(arm, world="nowhere"), here / "found")
-    assert cli.main(["export", "identified", str(file)]) == errors.USAGE
+    assert cli.main(["export", str(file)]) == errors.USAGE
     assert "nowhere" in capsys.readouterr().err

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sim2real.stages.config import MODEL_IDENTIFY
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY
 from sim2real.stages.shared.identification import covering, long_spans, spans, split_of, usable, with_length
 
 CONFIG = IdentifyConfig(initial_state="measured", held_out=0.25, long_s=5.0)

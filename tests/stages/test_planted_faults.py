@@ -170,9 +170,9 @@ def identified(t: np.ndarray, goal: np.ndarray, q: np.ndarray) -> tuple[Path, di
     """Identify from a log in the working directory; return the stage's folder and its parameters.json."""
     Path("robot.xml").write_text(XML)
     np.savez("run.npz", t_s=t, q_rad=q, goal_rad=goal)
-    flags = ["--mjcf", "robot.xml", "--log", "run.npz", "--as-told", "--folds", "0", "--free-run-s", "0"]
-    assert cli.main(["identify", *flags]) == 0
-    (folder,) = Path.cwd().glob("runs/robot/*/identify")
+    assert cli.main(["new", "rig", "--mjcf", "robot.xml", "--log", "run.npz", "--as-told"]) == 0
+    assert cli.main(["identify", "rig", "--log", "run.npz", "--folds", "0", "--free-run-s", "0"]) == 0
+    (folder,) = Path.cwd().glob("runs/rig/*/identify")
     return folder, json.loads((folder / "parameters.json").read_text())
 
 
@@ -202,7 +202,7 @@ def test_the_first_figure_shows_the_fault(name, tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(measured[1, at], np.interp(measured[0, at], t, q[:, JOINTS.index(joint)]), atol=2e-3)
     # Page, console and JSON have the same joint, time and error.
     text = re.search(r"worst: (joint .*)", said)[1]
-    page = (folder / "report.html").read_text()
+    page = (folder.parent / "report.html").read_text()
     assert page.index("identify-worst-") == min(m.start() for m in re.finditer("identify-[a-z]+-figure_", page))
     assert text in page
     worst = result["worst"]
@@ -221,4 +221,4 @@ def test_a_fault_in_the_fitted_part_is_named_though_the_verdict_does_not_see_it(
     begin_s = float(re.search(r"not explain elbow in the second from (\d+\.\d) s on", said)[1])
     assert 4.0 <= begin_s <= 4.7
     assert result["verdict"]["reasons"][0].startswith("the model does not explain elbow")
-    assert "Accepted, but the model does not explain one second" in (folder / "report.html").read_text()
+    assert "Accepted, but the model does not explain one second" in (folder.parent / "report.html").read_text()

@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import jax
 import pytest
 
-from sim2real.commands.flags import RunFlags
-from sim2real.commands.loop.run_loop import run_all
-from sim2real.commands.loop.shipped import why_shipped
+from sim2real.commands.loop import run_all, why_shipped
+from sim2real.commands.run import RunFlags
 from sim2real.errors import UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
 

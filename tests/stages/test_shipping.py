@@ -1,4 +1,4 @@
-"""``sim2real export policy``: a bundle that runs where nothing but numpy is."""
+"""``sim2real export --to policy``: a bundle that runs where nothing but numpy is."""
 
 import hashlib
 import itertools
@@ -10,8 +10,8 @@ import venv
 import numpy as np
 import pytest
 
-from sim2real.commands.config import ShipConfig
-from sim2real.commands.export import policy as export_policy
+from sim2real.commands import export
+from sim2real.commands.export import ExportConfig
 from sim2real.errors import UsageError
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, load_bundle, save_bundle, standalone
 from sim2real.policy.bundle import sealed
@@ -67,7 +67,7 @@ def ask(python, code, *arguments, cwd):
 
 def test_the_policy_runs_on_a_bare_machine(trained, bare, tmp_path):
     bundle, observations = trained
-    out = export_policy.run(ShipConfig(str(bundle), tmp_path / "out"))
+    out = export.run(ExportConfig(str(bundle), "policy", tmp_path / "out"))
     for missing in ("jax", "sim2real", "safetensors"):
         assert ask(bare, f"import importlib.util as u; print(u.find_spec('{missing}'))", cwd=out) == ["None"]
     actions, imported = ask(bare, SAME, json.dumps(observations.tolist()), cwd=out)
@@ -83,7 +83,7 @@ def test_the_policy_runs_on_a_bare_machine(trained, bare, tmp_path):
     ("file", "named"), [("policy.json", "policy.json was changed"), ("policy.safetensors", "safetensors was changed")]
 )
 def test_the_example_refuses_a_changed_bundle(trained, tmp_path, file, named):
-    out = export_policy.run(ShipConfig(str(trained[0]), tmp_path / "out"))
+    out = export.run(ExportConfig(str(trained[0]), "policy", tmp_path / "out"))
     path = out / file
     content = path.read_bytes()
     # A digit of the rate, or the last byte of the weights.
@@ -94,7 +94,7 @@ def test_the_example_refuses_a_changed_bundle(trained, tmp_path, file, named):
 
 def test_what_is_written_is_a_bundle(trained, tmp_path):
     bundle, observations = trained
-    out = export_policy.run(ShipConfig(str(bundle.parent), tmp_path / "out"))
+    out = export.run(ExportConfig(str(bundle.parent), "policy", tmp_path / "out"))
     assert np.array_equal(load_bundle(out).act(observations[0]), load_bundle(bundle).act(observations[0]))
 
 
@@ -112,7 +112,7 @@ def test_the_runner_is_imported_where_there_is_no_jax():
 def test_a_policy_with_other_layers_is_not_run_as_if_it_had_none(trained, bare, tmp_path):
     import safetensors.numpy
 
-    out = export_policy.run(ShipConfig(str(trained[0]), tmp_path / "out"))
+    out = export.run(ExportConfig(str(trained[0]), "policy", tmp_path / "out"))
     weights = safetensors.numpy.load((out / "policy.safetensors").read_bytes())
     more = {**weights, "memory.kernel": np.zeros((2, 2), np.float32), "memory.bias": np.zeros(2, np.float32)}
     content = safetensors.numpy.save(more)
@@ -134,7 +134,7 @@ def test_an_example_that_would_run_another_policy_is_not_written(trained, tmp_pa
     squashed = save_bundle(
         tmp_path / "bundle", weights, load_bundle(trained[0]).contract, spec=NetworkSpec("mlp", True)
     )
-    out = export_policy.run(ShipConfig(str(squashed), tmp_path / "out"))
+    out = export.run(ExportConfig(str(squashed), "policy", tmp_path / "out"))
     assert sorted(path.name for path in out.iterdir()) == ["policy.json", "policy.onnx", "policy.safetensors"]
     assert "run policy.onnx with onnxruntime" in capsys.readouterr().err
     with pytest.raises(ValueError, match="clipped tanh layers"):
@@ -143,10 +143,10 @@ def test_an_example_that_would_run_another_policy_is_not_written(trained, tmp_pa
 
 def test_a_folder_that_holds_something_is_left_alone(trained, tmp_path):
     (tmp_path / "mine").write_text("x")
-    with pytest.raises(UsageError, match=r"(?s)not empty.*hint: .*--to"):
-        export_policy.run(ShipConfig(str(trained[0]), tmp_path))
+    with pytest.raises(UsageError, match=r"(?s)not empty.*hint: .*--out"):
+        export.run(ExportConfig(str(trained[0]), "policy", tmp_path))
 
 
 def test_a_policy_must_be_named():
-    with pytest.raises(UsageError, match=r"(?s)Pipelines: .*pendulum.*hint: sim2real export policy"):
-        export_policy.run(ShipConfig())
+    with pytest.raises(UsageError, match=r"(?s)Pipelines: .*pendulum.*hint: sim2real export"):
+        export.run(ExportConfig(to="policy"))

@@ -53,7 +53,7 @@ def test_an_error_above_the_expected_one_is_named_and_fails(rows, changes, holds
     assert found.holds == holds
     assert named in found.verdict
     monkeypatch.setattr(stage.Identification, "load", lambda path: Identification("arm", (), Judgement("", ()), ()))
-    monkeypatch.setattr(stage.from_model, "pipeline_beside", lambda *given: None)
+    monkeypatch.setattr(stage, "load_pipeline", lambda name: None)
     monkeypatch.setattr(stage, "open_recording", lambda *given: None)
     monkeypatch.setattr(stage, "score", lambda *given: found)
     for as_json in (False, True):

@@ -151,7 +151,7 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
         logs, model = _written(fold.fitted, Path(folder), gains), _model(fold.fitted, Path(folder))
         with contextlib.redirect_stderr(io.StringIO()):  # drops the messages on columns, which repeat for each fold
             flags = RobotFlags(mjcf=model, **{**constants.get("flags", {}), "as_told": True})
-            pipeline = from_model.from_flags(flags, [str(p) for p in logs])
+            pipeline = from_model.describe_robot(flags, [str(p) for p in logs]).pipeline
         wanted = "auto" if name in CHOOSES else constants.get("terms", "own")
         robot = shared.offering(pipeline.load(), wanted)
         fitted = {str(p): open_recording(p, pipeline, robot).episode for p in logs}

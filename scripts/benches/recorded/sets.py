@@ -349,7 +349,7 @@ def described(about: dict[str, Any], folder: str, data: Path) -> list[Fold]:
     chosen: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in words.items() if n != "mapping"}
     mapping = where / words["mapping"] if "mapping" in words else None
     flags = RobotFlags(mjcf=where / about["mjcf"], mapping=mapping, **chosen)
-    pipeline = from_model.from_flags(flags, [str(where / parts["fit"][0][0])])
+    pipeline = from_model.describe_robot(flags, [str(where / parts["fit"][0][0])]).pipeline
     constants = {"mjcf": str(flags.mjcf), "flags": chosen, "terms": about.get("terms", "own")}
 
     def read(name: str, low: float, high: float, ahead: bool) -> Recording:

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import UseAppendAction
-
 from sim2real.errors import UsageError
+from sim2real.stages.flag import Flag
 from sim2real.stages.record.config import RecordConfig
 
 
@@ -16,14 +15,14 @@ from sim2real.stages.record.config import RecordConfig
 class CheckConfig:
     """Predict which parameters a recording, or a planned one, can determine, before a search."""
 
-    log: Annotated[tuple[str, ...], UseAppendAction] = ()
+    log: Annotated[tuple[str, ...], Flag("FILE ...")] = ()
     """Logs to judge; default: the newest recording, and without one the planned excitation."""
     plan: bool = False
     """Judge the planned excitation even if there is a recording."""
-    bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
-    """Bounds of a parameter instead of the pipeline's: NAME LOW HIGH, one flag a parameter."""
-    fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
-    """Value at which a parameter is fixed: NAME VALUE, one flag a parameter."""
+    bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Bounds of a parameter instead of the pipeline's: one flag a parameter."""
+    fix: dict[str, float] = field(default_factory=dict)
+    """Value at which a parameter is fixed: one flag a parameter."""
     world: str | None = None
     """World of an installed package whose parameters are judged; default: the robot's own."""
     json: bool = False

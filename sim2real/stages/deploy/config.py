@@ -2,10 +2,11 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from sim2real.errors import UsageError
 from sim2real.robots.gate_limits import GateLimits
+from sim2real.stages.flag import Flag
 from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed
 
@@ -14,9 +15,9 @@ from sim2real.stages.seed import check_seed
 class DeployConfig:
     """Run the policy on the robot and compare with the simulation."""
 
-    port: str = "embedded"
+    port: Annotated[str, Flag("PORT")] = "embedded"
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
-    bundle: str | None = None
+    bundle: Annotated[str | None, Flag("DIR")] = None
     """Folder of the policy bundle; default: the newest training of the pipeline, or the bundle that it ships."""
     episodes: int = 2
     """Number of episodes."""
@@ -44,7 +45,7 @@ class DeployConfig:
     """End with code 5 when more than 1 % of the steps miss their deadline."""
     view: ViewFlag = None
     """Show the robot live in the Rerun viewer; 'web': on a page for browsers."""
-    command: tuple[float, float, float] | None = None
+    command: Annotated[tuple[float, float, float] | None, Flag("X Y YAW")] = None
     """Commanded velocity of a robot that walks: forwards, to the left [m/s], yaw rate [rad/s]; default: each episode
     has four of its own."""
     max_tilt_rad: float | None = None

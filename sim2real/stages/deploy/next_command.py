@@ -31,17 +31,17 @@ def with_command(
     if advice.status == "fine" or advice.joint:
         return advice
     run = ["--run", shown(folder.parent)] if (folder / MANIFEST).is_file() else []
-    train = shlex.join(["sim2real", "train", *pipeline.words, *run])
+    train = shlex.join(["sim2real", "train", pipeline.name, *run])
     if identification is None:
-        return replace(advice, next=shlex.join(["sim2real", "identify", *pipeline.words, *run]))
+        return replace(advice, next=shlex.join(["sim2real", "identify", pipeline.name, *run]))
     logs = logs_to_identify([r.path for r in deployment.logs], deployment.drift, identification, folder)
     terms = terms_to_identify(pipeline.identify.terms, pipeline, identification, deployment.drift)
     if advice.status == "not judged" and any(PAUSED in reason for reason in advice.reasons):
-        return replace(advice, next=shlex.join(["sim2real", "deploy", *pipeline.words, *run]))
+        return replace(advice, next=shlex.join(["sim2real", "deploy", pipeline.name, *run]))
     # Without logs that suffice the robot is recorded first.
     if advice.status == "not judged" or not logs:
-        record = shlex.join(["sim2real", "record", *pipeline.words])
-        identify = shlex.join(["sim2real", "identify", *pipeline.words, "--terms", terms])
+        record = shlex.join(["sim2real", "record", pipeline.name])
+        identify = shlex.join(["sim2real", "identify", pipeline.name, "--terms", terms])
         return replace(advice, next=record if terms == pipeline.identify.terms else f"{record} && {identify}")
     config = replace(pipeline.identify, log=logs, terms=terms)
     identify = command(pipeline, config, Path("runs"), shlex.join(run))

@@ -1,13 +1,11 @@
 """Output of deploy: timing and warnings of the sessions, the gap to simulation, the tests of the model, the verdict."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from sim2real.artifacts.deployment import Deployment
-from sim2real.installation import has_jax
 from sim2real.stages.on_robot.episode import timing_rows
 from sim2real.stages.on_robot.open_robot import show_withheld, warn
-from sim2real.stages.terminal.console import artifact_table, note, shown, table
+from sim2real.stages.terminal.console import artifact_table, note, table
 from sim2real.types import Json
 
 
@@ -19,16 +17,6 @@ def show_sessions(summaries: Sequence[Mapping[str, Json]], dry_run: bool) -> Non
     if dry_run:
         show_withheld(summaries)
         note("dry run: the robot did not move, so there is no gap report")
-
-
-def write_page(folder: Path) -> str | None:
-    """Write the page of a deployment and return its name; None, with a message, without the packages for pictures."""
-    if not has_jax():
-        note(f"no page: `sim2real report {shown(folder.parent)}` writes it on a computer with sim2real")
-        return None
-    from sim2real.view.page.page import deploy_page  # matplotlib and jinja2 take 0.5 s to import
-
-    return deploy_page(folder).name
 
 
 def show(deployment: Deployment) -> None:

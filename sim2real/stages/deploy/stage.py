@@ -16,7 +16,7 @@ from sim2real.robots.robot import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import check_timing, require_tilt, run_episodes
 from sim2real.stages.deploy.preflight import find_bundle, require_fit
-from sim2real.stages.deploy.show import show, show_sessions, summary_lines, write_page
+from sim2real.stages.deploy.show import show, show_sessions, summary_lines
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.load_robot import moving_robot
 from sim2real.stages.pipeline.open_parameters import check_parameters, open_identification
@@ -112,8 +112,6 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         for i, recording in enumerate(deployment.recordings):
             for name, file in recording.timing.save(stage.folder, f"timing_{i}").items():
                 stage.output(name, file)
-        if (page := write_page(stage.folder)) is not None:
-            stage.output("page", page)
         show(deployment)
         stage.summary(summary_lines(deployment, summaries))
         check_timing(summaries, config)

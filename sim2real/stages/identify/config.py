@@ -3,10 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from tyro.conf import UseAppendAction
-
 from sim2real.errors import UsageError
 from sim2real.identify.config import FitConfig
+from sim2real.stages.flag import Flag
 from sim2real.stages.live.config import ViewFlag, check_view
 
 
@@ -14,14 +13,14 @@ from sim2real.stages.live.config import ViewFlag, check_view
 class IdentifyConfig(FitConfig):
     """Identify dynamics, delays and initial states from logs."""
 
-    log: Annotated[tuple[str, ...], UseAppendAction] = ()
+    log: Annotated[tuple[str, ...], Flag("FILE ...")] = ()
     """Logs to identify from; default: the newest finished recording of the pipeline."""
-    begin: str | None = None
+    begin: Annotated[str | None, Flag("FILE")] = None
     """File at whose values the search begins: parameters.json or partial.json of an identification; default: data
     sheet."""
-    hold_out: Annotated[tuple[str, ...], UseAppendAction] = ()
+    hold_out: Annotated[tuple[str, ...], Flag("FILE ...")] = ()
     """Logs that are held out: predicted, not fitted."""
-    standing: str | None = None
+    standing: Annotated[str | None, Flag("FILE")] = None
     """Log of a robot on its feet (`record --excitation standing`), from which its load is estimated."""
     force: bool = False
     """Allow a log that is given twice: held out and fitted, or fitted two times."""
@@ -47,10 +46,10 @@ class IdentifyConfig(FitConfig):
     commas."""
     each: bool = True
     """Identify each of several logs alone, too, and report the spread between them."""
-    bounds: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
-    """Bounds of a parameter that replace the pipeline's: NAME LOW HIGH, one flag a parameter."""
-    fix: Annotated[dict[str, float], UseAppendAction] = field(default_factory=dict)
-    """Value at which a parameter is held: NAME VALUE, one flag a parameter."""
+    bounds: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Bounds of a parameter that replace the pipeline's: one flag a parameter."""
+    fix: dict[str, float] = field(default_factory=dict)
+    """Value at which a parameter is held: one flag a parameter."""
     world: str | None = None
     """World of an installed package in which to identify; default: the robot's."""
     links: bool = False

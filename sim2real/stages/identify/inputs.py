@@ -79,7 +79,7 @@ class Inputs:
             (replace(p, prior=None, begin=None), p.prior and [float(p.prior.log_prob(v)) for v in (p.low, p.high)])
             for p in self.table
         ]
-        whole = (config, rows, self.hashes[: self.fitted], sorted(self.pipeline.texts().items()), sim2real.__version__)
+        whole = (config, rows, self.hashes[: self.fitted], sim2real.__version__)
         return hashlib.sha256(repr(whole).encode()).hexdigest()
 
     def sources(self, run_dir: Path | None = None) -> tuple[Source, ...]:

@@ -25,7 +25,7 @@ from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
 from sim2real.stages.shared.identification import command, continuing
-from sim2real.stages.terminal.console import progress, shown
+from sim2real.stages.terminal.console import shown
 
 
 def identify(
@@ -113,28 +113,22 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
         verdict = replace(identification.verdict, next=again)
         identification = replace(identification, logs=inputs.sources(stage.run_dir), verdict=verdict)
         show(identification, _following(pipeline, robot, stage, identification))
-        with progress(None, "identify: write the files and the page"):
-            _write(identification, stage, pipeline, robot)
+        _write(identification, stage, robot)
         stage.summary(summary(identification))
     return stage.result
 
 
-def _write(identification: Identification, stage: OpenStage, pipeline: Pipeline, robot: RecordedRobot) -> None:
-    """Write the artifact, the pipeline's files, the model as MJCF, and the page."""
+def _write(identification: Identification, stage: OpenStage, robot: RecordedRobot) -> None:
+    """Write the artifact, and the model as MJCF."""
     for name, path in identification.save(stage.folder).items():
         stage.output(name, path)
-    for name, text in pipeline.texts().items():
-        stage.output(Path(name).stem + "_" + Path(name).suffix[1:], name).write_text(text, encoding="utf-8")
     if (mjcf := robot.identified_mjcf(identification.values)) is not None:
         stage.output("mjcf", "identified.xml").write_text(mjcf, encoding="utf-8")
-    from sim2real.view.page.page import identify_page  # matplotlib and jinja2 take 0.5 s to import
-
-    stage.output("page", identify_page(stage.folder).name)
 
 
 def _following(pipeline: Pipeline, robot: RecordedRobot, stage: OpenStage, identification: Identification) -> str:
     """Return what to do where the verdict has no next command."""
-    name, folder = shlex.join(pipeline.words), shlex.quote(shown(stage.folder))
+    name, folder = pipeline.name, shlex.quote(shown(stage.folder))
     if not pipeline.has_commands:
         return ""
     if identification.verdict.status == "record again":
@@ -143,7 +137,7 @@ def _following(pipeline: Pipeline, robot: RecordedRobot, stage: OpenStage, ident
         return ""
     if isinstance(robot, Robot):
         return f"sim2real train {name} --run {shlex.quote(shown(stage.run_dir))}"
-    return f"sim2real validate {folder} --log LATER_LOG, or sim2real export identified {folder}"
+    return f"sim2real validate {folder} --log LATER_LOG, or sim2real export {folder}"
 
 
 def _begin(path: str, pipeline: Pipeline) -> dict[str, float]:

@@ -5,20 +5,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
-
 from sim2real.errors import UsageError
+from sim2real.stages.flag import Flag
 
 
 @dataclass(frozen=True)
 class ImportConfig:
     """Turn files of other recorders into logs, one for each file."""
 
-    files: Annotated[Positional[tuple[Path, ...]], arg(metavar="FILE...")] = ()
+    files: Annotated[tuple[Path, ...], Flag("FILE...", positional=True)] = ()
     """Files of other recorders: npz, JSON, CSV, MCAP or the folder of a ROS 2 bag, or a LeRobot data set."""
     mapping: Path | None = None
     """TOML file that maps signals to fields; default: the pipeline's import.toml, or one is proposed."""
-    pipeline: Annotated[str | None, arg(aliases=("--like",))] = None
+    pipeline: Annotated[str | None, Flag(also="--like")] = None
     """Pipeline whose robot was recorded: its joints, and the pipeline of the logs; default: the mapping's, or the
     model's name."""
     mjcf: Path | None = None
@@ -38,7 +37,7 @@ class ImportConfig:
     """Keep order, signs and units of the file or the mapping, even if the data contradict them or fit others."""
     episode: int | None = None
     """Episode of a LeRobot data set; default: all."""
-    samples: Annotated[str | None, arg(metavar="A:B")] = None
+    samples: Annotated[str | None, Flag("A:B")] = None
     """Take the samples from A to just before B, counted from 0; default: all."""
     out: Path | None = None
     """Log to write; default: one in a run folder of its own, as record makes it."""

@@ -2,13 +2,12 @@
 
 from typing import Annotated
 
-import tyro
-
 from sim2real.errors import UsageError
+from sim2real.stages.flag import Flag
 
 WINDOW = "window"
 """The viewer that ``--view`` without a value opens."""
-ViewFlag = Annotated[str | None, tyro.conf.arg(metavar="[web|ADDRESS|FILE.rrd]")]
+ViewFlag = Annotated[str | None, Flag("[web|ADDRESS|FILE.rrd]", alone=WINDOW)]
 
 
 def check_view(view: str | None) -> None:

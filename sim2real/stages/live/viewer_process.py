@@ -14,11 +14,9 @@ from pathlib import Path
 from sim2real.errors import Sim2RealError
 from sim2real.stages.live.scene import drawn
 from sim2real.types import Json
-from sim2real.view.live.follower import Follower
+from sim2real.view.live.follower import PERIOD_S, Follower
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
 
-PERIOD_S = 0.2
-"""Time between two reads: two flushes of a log's writer."""
 NICENESS = 10
 
 

@@ -1,29 +1,28 @@
-"""A robot that is described on the command line, by its model and a recording, as a pipeline for the stages."""
+"""A robot that is described by its model and a log."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from sim2real.artifacts.identification import Identification
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log.importing.bags import is_ours
 from sim2real.log.importing.importer import import_table
-from sim2real.log.importing.mapping import MAPPING, ImportMapping, load_mapping, to_toml
+from sim2real.log.importing.mapping import ImportMapping, load_mapping
 from sim2real.log.importing.readers import Table, open_tables
 from sim2real.log.reader import read_log
 from sim2real.robots.from_model import model_file
 from sim2real.robots.from_model.mjcf import joints_of, read_model, read_spec
 from sim2real.robots.from_model.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig
 from sim2real.robots.from_model.usual_parameters import named_terms, usual_terms
+from sim2real.stages.config import MODEL_IDENTIFY
 from sim2real.stages.import_logs import stage as import_logs_stage
-from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline
-from sim2real.stages.pipeline.robot_flags import MODEL_IDENTIFY, RobotFlags
+from sim2real.stages.pipeline.pipeline import RobotPipeline
+from sim2real.stages.pipeline.robot_flags import RobotFlags
 from sim2real.stages.terminal import console
 from sim2real.stages.terminal.console import note
 from sim2real.types import MjModel
@@ -38,62 +37,35 @@ MODEL_FILE = "robot.xml"
 
 
 @dataclass(frozen=True)
-class DescribedPipeline(Pipeline):
-    """A pipeline without a folder.
+class Described:
+    """A robot, described by its model and a log.
 
     Attributes:
-        description: The robot's model, joints, commands and parameters.
-        mapping: Mapping of files of other recorders; None: there is none.
-        flag_words: The flags that describe it.
+        name: Name of its pipeline.
+        mapping: Mapping of its logs, which another recorder wrote; None: they are logs of this package.
     """
 
-    description: RobotConfig = field(default_factory=lambda: RobotConfig(Path(), (), ()))
-    mapping: ImportMapping | None = None
-    flag_words: tuple[str, ...] = ()
-
-    def load(self, module: str | None = None) -> Any:
-        """Return the robot; it has no other modules."""
-        if module:
-            raise UsageError(f"{self.name!r} is a model without a pipeline: it has no {module!r}")
-        return MjcfRobot(self.description)
+    name: str
+    robot: RobotConfig
+    mapping: ImportMapping | None
 
     @property
-    def words(self) -> tuple[str, ...]:
-        """How a command names it."""
-        return self.flag_words or (self.name,)
-
-    def mapping_of(self, path: Path) -> ImportMapping | None:
-        """Return the mapping of a file of another recorder; None of a log of ours."""
-        return None if is_ours(path) else self.mapping
-
-    def reading(self, logs: Sequence[str], mapping: ImportMapping | None = None) -> DescribedPipeline:
-        """Return the pipeline with the mapping that it needs to read logs of another recorder.
-
-        Args:
-            mapping: Their mapping; None: one is proposed.
-        """
-        first = Path(logs[0])
-        if mapping is None and not is_ours(first):
-            hints = import_logs_stage.hints_of_model(self.description.model, self.name, self.description.joints)
-            mapping, _ = import_logs_stage.proposed(_table(first), hints)
-        return replace(self, mapping=mapping)
-
-    def texts(self) -> Mapping[str, str]:
-        """Return the files that describe the robot and the columns of its logs: name -> text."""
-        mapping = {} if self.mapping is None else {MAPPING: to_toml(self.mapping)}
-        return {**files_of(self.description), **mapping}
+    def pipeline(self) -> RobotPipeline:
+        """A pipeline without a folder, for Python."""
+        summary = f"{len(self.robot.joints)} joints of {self.robot.model.name}"
+        robot = MjcfRobot(self.robot)
+        return RobotPipeline(self.name, summary, "", identify=MODEL_IDENTIFY, bare_robot=robot, mapping=self.mapping)
 
 
-def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
-    """Return the pipeline of a model and a log.
+def describe_robot(flags: RobotFlags, logs: Sequence[str]) -> Described:
+    """Describe a robot by its model and a log.
 
     Args:
         logs: The logs; the first one has the commands and their rate.
     """
     if flags.mjcf is None or not logs:
         raise UsageError(
-            "a robot without a pipeline is described by its model and by a log",
-            hint="sim2real identify --mjcf robot.xml --log run.csv",
+            "a robot is described by its model and a log", hint="sim2real new go2 --mjcf go2.xml --log run.csv"
         )
     # A log of this package needs no mapping; any other file has one, or one is proposed.
     model, first = read_model(flags.mjcf), Path(logs[0])
@@ -101,23 +73,20 @@ def from_flags(flags: RobotFlags, logs: Sequence[str]) -> DescribedPipeline:
     if is_ours(first):
         mapping, episode = None, read_log(first)
         name = str(episode.metadata.get("pipeline") or name)
+    elif flags.mapping is not None:
+        mapping = load_mapping(flags.mapping, name).of_joints()
+        episode = import_table(_table(first), mapping)
+        import_logs_stage.refuse_contradictions(first, episode, flags.as_told)
     else:
-        mapping = load_mapping(flags.mapping, name).of_joints() if flags.mapping else None
-        if mapping is None:
-            more = {"as_told": flags.as_told, "unit": flags.unit or ""}
-            hints = import_logs_stage.hints_of_model(flags.mjcf, name, flags.joints, flags.rate_hz, **more)
-            mapping, _ = import_logs_stage.proposed(_table(first), hints)
-            episode = import_table(_table(first), mapping)
-        else:
-            episode = import_table(_table(first), mapping)
-            import_logs_stage.refuse_contradictions(first, episode, flags.as_told)
+        hints = import_logs_stage.hints_of_model(
+            flags.mjcf, name, flags.joints, flags.rate_hz, as_told=flags.as_told, unit=flags.unit or ""
+        )
+        mapping, _ = import_logs_stage.proposed(_table(first), hints)
+        episode = import_table(_table(first), mapping)
     # Describe the robot by the first log.
     description = _description(flags, model, episode)
     note_held(description)
-    summary = f"{len(description.joints)} joints of {flags.mjcf.name}"
-    return DescribedPipeline(
-        name, summary, "", identify=MODEL_IDENTIFY, description=description, mapping=mapping, flag_words=_words(flags)
-    )
+    return Described(name, description, mapping)
 
 
 def _table(path: Path) -> Table:
@@ -136,38 +105,6 @@ def note_held(description: RobotConfig) -> None:
         console.note(f"not recorded, held: {held}")
     for number, name in holding.moved.items():
         console.note(f"not recorded, free: {model.joint(number).name or 'a joint without a name'}, which {name} moves")
-
-
-def _words(flags: RobotFlags) -> tuple[str, ...]:
-    """Return the flags that describe the robot, as a command line has them."""
-    words: list[str] = []
-    for f in fields(flags):
-        flag, value = f"--{f.name.replace('_', '-')}", getattr(flags, f.name)
-        if f.name in ("parameter", "hold"):
-            words += [word for one in value for word in (flag, one)]
-        elif value != f.default:
-            words += [flag, *([] if value is True else value if isinstance(value, tuple) else [str(value)])]
-    return tuple(map(str, words))
-
-
-def from_file(path: Path, name: str) -> DescribedPipeline:
-    """Return the pipeline of a ``robot.toml``, as an identification writes it beside its parameters."""
-    return DescribedPipeline(
-        name, f"described by {path}", "", identify=MODEL_IDENTIFY, description=RobotConfig.load(path)
-    )
-
-
-def pipeline_beside(parameters: Path, identification: Identification) -> Pipeline:
-    """Return the robot that parameters are of, with the mapping of its logs: described beside them, or a pipeline.
-
-    Args:
-        parameters: Their file, or its folder.
-    """
-    beside = (parameters if parameters.is_dir() else parameters.parent) / ROBOT_FILE
-    if not beside.is_file():
-        return load_pipeline(identification.pipeline)
-    described, file = from_file(beside, identification.pipeline), beside.with_name(MAPPING)
-    return replace(described, mapping=load_mapping(file, described.name)) if file.is_file() else described
 
 
 def files_of(description: RobotConfig) -> dict[str, str]:

@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 import reprlib
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -39,7 +38,7 @@ class Pipeline:
         summary: One line for ``sim2real info``.
         package: ``__name__`` of the pipeline's package.
         robot: Module in the package whose ``ROBOT`` is a ``sim2real.robots.robot.Robot``, or ``RecordedRobot``.
-        scene: Module in the package with ``log_scene``, which draws the robot for ``sim2real view``; None: not drawn.
+        scene: Module in the package with ``log_scene``, which draws the robot in the Rerun viewer; None: not drawn.
         record: Defaults of the stage; its fields become flags.
         identify: Defaults of the stage.
         train: Defaults of the stage.
@@ -76,13 +75,8 @@ class Pipeline:
         return {"record": self.record, "identify": self.identify, "train": train, "deploy": self.deploy}
 
     @property
-    def words(self) -> tuple[str, ...]:
-        """How a command names the robot."""
-        return (self.name,)
-
-    @property
     def has_commands(self) -> bool:
-        """Whether a command finds it by its words."""
+        """Whether a command finds it by its name."""
         return True
 
     def mapping_of(self, path: Path) -> ImportMapping | None:
@@ -94,10 +88,6 @@ class Pipeline:
             return None
         file = self.folder / "import.toml"
         return load_mapping(file) if file.is_file() else None
-
-    def texts(self) -> Mapping[str, str]:
-        """Return files that an identification keeps beside its parameters: name -> text; none for a pipeline."""
-        return {}
 
     @overload
     def load(self) -> RecordedRobot: ...
@@ -132,15 +122,25 @@ _LOADED: WeakKeyDictionary[RecordedRobot, Pipeline] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, repr=False)
-class _OfRobot(Pipeline):
-    """A robot without a pipeline, such as one made in a notebook, with the stages' defaults."""
+class RobotPipeline(Pipeline):
+    """A robot without a folder, such as one made in a notebook, with the stages' defaults.
+
+    Attributes:
+        mapping: Mapping of its logs of other recorders; None: there is none.
+    """
 
     bare_robot: Any = None
+    mapping: ImportMapping | None = None
 
     @property
     def has_commands(self) -> bool:
         """False: no command finds it by name."""
         return False
+
+    def mapping_of(self, path: Path) -> ImportMapping | None:
+        from sim2real.log.importing.bags import is_ours
+
+        return None if is_ours(path) else self.mapping
 
     def load(self, module: str | None = None) -> Any:
         return super().load(module) if module else self.bare_robot
@@ -160,7 +160,7 @@ def pipeline_of(robot: RecordedRobot | Pipeline | str) -> Pipeline:
             hint="sim2real.load_pipeline(NAME), or NAME alone, is a pipeline, and its load() a robot",
         )
     kind = type(robot)
-    return _LOADED.get(robot) or _OfRobot(
+    return _LOADED.get(robot) or RobotPipeline(
         kind.__name__, "", kind.__module__, bare_robot=checked(robot, kind.__module__)
     )
 

@@ -4,10 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-
 from sim2real.errors import UsageError
 from sim2real.robots.gate_limits import GateLimits
+from sim2real.stages.flag import Flag
 from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed
 
@@ -19,11 +18,11 @@ _FILES = (".mcap", ".csv", ".npz", ".json", ".parquet")
 class RecordConfig:
     """Record the robot under an excitation."""
 
-    port: str = "embedded"
+    port: Annotated[str, Flag("PORT")] = "embedded"
     """Serial port of the servo bus, or 'embedded' for the emulated robot."""
     duration_s: float = 40.0
     """Length of the recording [s]."""
-    excitation: Annotated[str, tyro.conf.arg(metavar="multisine|chirp|steps|hand|standing|FILE")] = "multisine"
+    excitation: Annotated[str, Flag("multisine|chirp|steps|hand|standing|FILE")] = "multisine"
     """Command signal; a file has a motion to play: a log, or csv, npz or parquet columns named by joint; 'hand': torque
     stays off, a person moves the robot; 'standing': a robot on legs stands up and bends them."""
     amplitude: float = 1.8
@@ -74,5 +73,5 @@ class RecordConfig:
         if self.excitation in GENERATED and not 0.0 < self.amplitude <= self.gate.limit:
             raise UsageError(
                 f"the amplitude must lie in (0, {self.gate.limit}], got {self.amplitude}",
-                hint="raise --gate.limit only if the robot bears it",
+                hint="the limit stands in the robot's file: gate.limit of its RecordConfig",
             )

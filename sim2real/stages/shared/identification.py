@@ -296,7 +296,7 @@ def command(pipeline: Pipeline, config: IdentifyConfig, root: Path, flags: str =
         call = "sim2real.identify(robot, recording, ...)"
         return f"{call} with the settings {flags}" if flags else call
     named = {name for flag, name in pairwise(further) if flag in ("--bounds", "--fix")}
-    words = ["sim2real", "identify", *pipeline.words]
+    words = ["sim2real", "identify", pipeline.name]
     # Add a flag for each setting that differs from the pipeline's default.
     for f in fields(config):
         flag, value = "--" + f.name.replace("_", "-"), getattr(config, f.name)

@@ -3,9 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from tyro.conf import UseAppendAction
-
 from sim2real.errors import UsageError
+from sim2real.stages.flag import Flag
 from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed
 from sim2real.training.config import PPOConfig
@@ -18,9 +17,9 @@ from sim2real.training.sweep import Sweep
 class LearningConfig:
     """Settings of learning."""
 
-    resume: str | None = None
+    resume: Annotated[str | None, Flag("RUN|newest")] = None
     """Interrupted training to continue: its folder, its run, or 'newest' for the pipeline's newest."""
-    sweep: Annotated[tuple[str, ...], UseAppendAction] = ()
+    sweep: tuple[str, ...] = ()
     """Settings of PPO to try side by side, such as learning_rate=1e-3,3e-3, one flag a setting; every combination with
     every seed, the best policy of all is saved."""
     checkpoint: bool = True
@@ -46,7 +45,7 @@ class TrainConfig(LearningConfig):
 
     model: Literal["identified", "nominal"] = "identified"
     """Parameters to train on: the estimates of identify, or the nominal ones without any delay."""
-    parameters: str | None = None
+    parameters: Annotated[str | None, Flag("FILE")] = None
     """parameters.json to train on; default: the newest identification of the pipeline."""
     force: bool = False
     """Train on an identification whose verdict is not 'accepted'."""

@@ -28,11 +28,10 @@ from sim2real.identify.problem.segments import Span, check_log, ranges
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.folds import moving
 from sim2real.identify.validation.verdict import ACCEPTED, Position, positions, scores
-from sim2real.log.importing.mapping import load_mapping
 from sim2real.stages.identify.config import IdentifyConfig
-from sim2real.stages.pipeline import from_model, python_arguments
+from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.open_log import open_recording
-from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
+from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyRecording, AnyRobot
 from sim2real.stages.shared.identification import identified_robot, require_new, side_by_side, usable
 from sim2real.stages.terminal.console import artifact_table, note, progress
@@ -128,10 +127,7 @@ def run(config: ValidateConfig) -> bool:
             "validate needs parameters and a log", hint="sim2real validate RUN/identify/parameters.json --log new.mcap"
         )
     identification = Identification.load(config.parameters)
-    pipeline = from_model.pipeline_beside(config.parameters, identification)
-    if isinstance(pipeline, from_model.DescribedPipeline) and (config.mapping or pipeline.mapping is None):
-        mapping = load_mapping(config.mapping, pipeline.name).of_joints() if config.mapping else None
-        pipeline = pipeline.reading(config.log, mapping)
+    pipeline = load_pipeline(identification.pipeline)
     # A log that cannot be read is named, and the others are scored.
     logs, refused = [], dict[str, str]()
     for path in config.log:

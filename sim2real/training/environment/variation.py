@@ -1,9 +1,6 @@
 """The differences between the episodes of a training; every field is a flag. Imports no JAX: ``--help`` is instant."""
 
 from dataclasses import dataclass, field
-from typing import Annotated
-
-from tyro.conf import UseAppendAction
 
 from sim2real.errors import UsageError
 
@@ -21,7 +18,7 @@ class VariationConfig:
     uniform: float = 0.0
     """Draw dynamics and delays uniformly instead, within this share of their value up and down: 0.3 is 30 %; 0: draw
     from the posterior."""
-    range: Annotated[dict[str, tuple[float, float]], UseAppendAction] = field(default_factory=dict)
+    range: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Draw a parameter uniformly from this range instead, for instance a payload: NAME LOW HIGH, one flag a
     parameter. The pipeline's own ranges of other parameters stay."""
     push: float = 0.0

@@ -13,6 +13,8 @@ from sim2real.view.live.stage_sources import FitSource, ProgressSource
 from sim2real.view.rerun_content import Tab
 from sim2real.view.rerun_recording import Scene, blueprint_of, send_style, send_values, time_column
 
+PERIOD_S = 0.2
+"""Time between two reads: two flushes of a log's writer [s]."""
 _PATIENCE_S = 0.5
 """The viewer is behind if it does not take the rows of one round within this time [s]; then rows are dropped."""
 

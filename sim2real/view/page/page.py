@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished_stages, open_folder
+from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished_stages
 from sim2real.artifacts.run.stage_status import stage_status
 from sim2real.view.blocks import NoteBlock, PageSection
 from sim2real.view.page.iterations import iterations_sections
@@ -17,11 +17,14 @@ _MOST_REASONS = 2
 """Number of reasons in a verdict's box; the others are folded, so that a telephone's first screen has the figure."""
 
 
-def report(run_dir: Path) -> Path:
+def report(run_dir: Path, out: Path | None = None) -> Path:
     """Write the report of a run: a section for each stage that is finished.
 
+    Args:
+        out: The page to write; None: ``report.html`` in the run's folder.
+
     Returns:
-        Path of the page, ``report.html`` in the run's folder.
+        Path of the page.
 
     Raises:
         Sim2RealError: When no stage is finished, or a file of the stage is missing or malformed.
@@ -29,49 +32,17 @@ def report(run_dir: Path) -> Path:
     run_dir = Path(run_dir)
     artifacts = finished_stages(run_dir)
     sections = [SECTIONS[stage](artifact) for stage, artifact in artifacts.items()] + iterations_sections(run_dir)
-    notes = _about_others(run_dir, artifacts)
-    return _write(run_dir / PAGE, list(artifacts.values()), sections, run_dir.resolve().name, notes)
-
-
-def identify_page(identify_folder: Path) -> Path:
-    """Write the page of an identification into its folder.
-
-    Raises:
-        Sim2RealError: When a file of the stage is missing or malformed.
-    """
-    return _stage_page(identify_folder, "identify")
-
-
-def deploy_page(deploy_folder: Path) -> Path:
-    """Write the page of a deployment into its folder.
-
-    Raises:
-        Sim2RealError: When a file of the stage is missing or malformed.
-    """
-    return _stage_page(deploy_folder, "deploy")
-
-
-def _stage_page(folder: Path, stage: str) -> Path:
-    artifact = open_folder(folder, stage)
-    section = SECTIONS[stage](artifact)
-    return _write(artifact.folder / PAGE, [artifact], [section], artifact.folder.resolve().parent.name, [])
-
-
-def _write(
-    path: Path, artifacts: Sequence[StageFolder], sections: Sequence[PageSection], run: str, notes: list[NoteBlock]
-) -> Path:
-    """Write the page of stages of one run."""
-    pipeline = next((str(a.manifest["pipeline"]) for a in artifacts if "pipeline" in a.manifest), "")
-    started = min((str(a.manifest["started"]) for a in artifacts if "started" in a.manifest), default="")
+    manifests = [artifact.manifest for artifact in artifacts.values()]
+    started = min((str(m["started"]) for m in manifests if "started" in m), default="")
     return write_page(
-        path,
-        pipeline or "run",
+        out or run_dir / PAGE,
+        next((str(m["pipeline"]) for m in manifests if "pipeline" in m), "run"),
         sections,
-        run=run,
+        run=run_dir.resolve().name,
         started=started.replace("T", " ")[:19] + (" UTC" if started.endswith("+00:00") else ""),
-        version=next((a.manifest["versions"].get("sim2real") for a in artifacts if "versions" in a.manifest), ""),
-        absent=[stage for stage in STAGES if stage not in {s.id for s in sections}],
-        notes=notes,
+        version=next((m["versions"].get("sim2real") for m in manifests if "versions" in m), ""),
+        absent=[stage for stage in STAGES if stage not in artifacts],
+        notes=_about_others(run_dir, artifacts),
     )
 
 

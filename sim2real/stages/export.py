@@ -1,4 +1,4 @@
-"""``sim2real export identified``: the estimates as a model of another simulator, as JSON, or as a model card."""
+"""An identification as a model of another simulator, as JSON, or as a model card."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from typing import Literal
 import numpy as np
 
 from sim2real.artifacts.files import write_json
-from sim2real.artifacts.identification import PARAMETERS, UNFINISHED, Identification
+from sim2real.artifacts.identification import UNFINISHED, Identification
 from sim2real.artifacts.run.manifest import sha256
-from sim2real.artifacts.run.run_folder import newest, pipeline_of
-from sim2real.commands.config import ExportConfig
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.export.card import differing, write_card
@@ -26,36 +24,17 @@ from sim2real.installation import version
 from sim2real.log.reader import read_log
 from sim2real.robots.loop import SENSOR
 from sim2real.robots.robot import RecordedRobot
-from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
-from sim2real.stages.pipeline.from_model import pipeline_beside
-from sim2real.stages.pipeline.pipeline import Pipeline, available
-from sim2real.stages.pipeline.pipeline import pipeline_of as pipeline_of_robot
+from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyPath, identification_of
 from sim2real.stages.shared.identification import identified_robot
-from sim2real.stages.terminal.console import note, wrote
+from sim2real.stages.terminal.console import note
 from sim2real.types import Json
 
-FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json",
-          "card": "card"}  # fmt: skip
+FORMATS = ("mjcf", "mjlab", "isaaclab", "json", "card")
 _PLAIN = {"gain", "stiffness", "damping", "viscous", "coulomb", "armature", "gravity", "delay"}
 """Leaves of parameters that have a counterpart in MuJoCo's joints and drives."""
 _SESSION: tuple[str, ...] = ("firmware", "voltage", "temperature")
 """Facts about the hardware that a log may hold, in its metadata or as a measurement."""
-
-
-def run(config: ExportConfig) -> Path:
-    """Write the file, print the parameters that it lacks, and return its path.
-
-    Raises:
-        UsageError: There is no identification, it was interrupted, or the target cannot hold the robot's model.
-    """
-    file = find_parameters(config)
-    identification = Identification.load(file)
-    out = config.out or Path(f"{identification.pipeline}_{FILES[config.to]}")
-    pipeline = pipeline_beside(file, identification)
-    _export(identification, pipeline, config.to, out, str(file), file.resolve().parent.parent)
-    wrote(out)
-    return out
 
 
 def export(
@@ -74,18 +53,18 @@ def export(
     Raises:
         UsageError: The identification was interrupted or is of another robot, or the target cannot hold the model.
     """
-    pipeline, document, out = pipeline_of_robot(robot), identification_of(identification), Path(out)
-    if to not in FILES:
-        raise UsageError(f"cannot export to {to!r}. Available: {', '.join(FILES)}")
+    pipeline, document, out = pipeline_of(robot), identification_of(identification), Path(out)
+    if to not in FORMATS:
+        raise UsageError(f"cannot export to {to!r}. Available: {', '.join(FORMATS)}")
     if document.pipeline != pipeline.name:
         raise UsageError(f"these are parameters of pipeline {document.pipeline!r}, not of {pipeline.name!r}")
     in_memory = isinstance(identification, Identification)
     where, run_dir = ("memory", None) if in_memory else (str(identification), Path(identification).resolve().parent)
-    _export(document, pipeline, to, out, where, run_dir)
+    write_export(document, pipeline, to, out, where, run_dir)
     return out
 
 
-def _export(
+def write_export(
     identification: Identification, pipeline: Pipeline, to: str, out: Path, where: str, run_dir: Path | None
 ) -> None:
     """Write one file, or the folder of a card.
@@ -213,23 +192,3 @@ def _no_model(identification: Identification, table: ParameterTable, to: str) ->
         f"{to}. Joints and drives of MuJoCo's have nothing for: {', '.join(lost) or 'its equations of motion'}",
         hint="--to json has all parameters, their intervals and the posterior",
     )
-
-
-def find_parameters(config: ExportConfig) -> Path:
-    """Return the file of the identification that the configuration names."""
-    source = config.source
-    if source is None:
-        raise UsageError(
-            f"export needs a run folder, a pipeline or a {PARAMETERS}. Pipelines: {', '.join(sorted(available()))}",
-            hint="sim2real export identified PIPELINE --to mjcf",
-        )
-    # A file or a stage folder, then a pipeline's name, then a run.
-    path = Path(source)
-    if path.is_file():
-        return path
-    if (path / PARAMETERS).is_file():
-        return path / PARAMETERS
-    if source in available():
-        return warn_of_stale(newest(config.runs, source, "identify")).output("parameters")
-    run_dir = find_run(config.runs, source)
-    return warn_of_stale(newest(config.runs, pipeline_of(run_dir), "identify", run_dir)).output("parameters")

@@ -1,0 +1,149 @@
+"""``sim2real export``: estimates for other simulators, as JSON or a model card; a policy for a machine with numpy."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from sim2real.commands import flags
+from sim2real.commands.stages import examples_of, summary_of
+from sim2real.errors import UsageError
+from sim2real.runtime import compilation_cache
+from sim2real.stages.flag import Flag
+from sim2real.stages.pipeline.pipeline import available, load_pipeline
+
+Format = Literal["mjcf", "mjlab", "isaaclab", "json", "card", "policy"]
+FILES = {"mjcf": "identified.xml", "mjlab": "mjlab.py", "isaaclab": "isaaclab.py", "json": "identified.json",
+          "card": "card", "policy": "policy"}  # fmt: skip
+EXAMPLE = "run_policy.py"
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """Write the estimates as a model of another simulator, or a policy for a machine that has numpy alone."""
+
+    source: Annotated[str | None, Flag("RUN|PIPELINE|FILE", positional=True)] = None
+    """A run folder, a pipeline, whose newest result is taken, a parameters.json, or the folder of a policy bundle."""
+    to: Format = "mjcf"
+    """Format: a model for MuJoCo, a Python file for mjlab or for Isaac Lab, everything as JSON; a model card: a folder
+    with a page and a script that computes each figure again; a policy: its bundle with a script that runs it."""
+    out: Annotated[Path | None, Flag("PATH")] = None
+    """The file or folder to write; default: one in the working directory that is called after the pipeline."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+
+
+def export_(command: str, arguments: list[str]) -> None:
+    """``sim2real export RUN|PIPELINE|FILE --to FORMAT``."""
+    examples = examples_of(
+        "export pendulum --to json", "export runs/arm/TIME --to mjcf --out arm.xml", "export go2 --to policy"
+    )
+    default = ExportConfig()
+    config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
+    compilation_cache.enable()
+    run(config)
+
+
+def run(config: ExportConfig) -> Path:
+    """Write the file, print the parameters that it lacks, and return its path.
+
+    Raises:
+        UsageError: There is no such result, it was interrupted, or the target cannot hold the robot's model.
+    """
+    from sim2real.artifacts.identification import Identification
+    from sim2real.stages.export import write_export  # imports JAX
+    from sim2real.stages.terminal.console import wrote
+
+    if config.source is None:
+        raise UsageError(
+            f"export needs a run folder, a pipeline or a file. Pipelines: {', '.join(sorted(available()))}",
+            hint="sim2real export PIPELINE --to mjcf",
+        )
+    if config.to == "policy":
+        return _export_policy(find_bundle(config.source, config.runs), config.out)
+    file = find_parameters(config.source, config.runs)
+    identification = Identification.load(file)
+    out = config.out or Path(f"{identification.pipeline}_{FILES[config.to]}")
+    pipeline = load_pipeline(identification.pipeline)
+    write_export(identification, pipeline, config.to, out, str(file), file.resolve().parent.parent)
+    wrote(out)
+    return out
+
+
+def find_parameters(source: str, runs: Path) -> Path:
+    """Return the file of the identification that a text names: a file, a stage folder, a pipeline or a run."""
+    from sim2real.artifacts.identification import PARAMETERS
+    from sim2real.artifacts.run.run_folder import newest, pipeline_of
+    from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
+
+    path = Path(source)
+    if path.is_file():
+        return path
+    if (path / PARAMETERS).is_file():
+        return path / PARAMETERS
+    if source in available():
+        return warn_of_stale(newest(runs, source, "identify")).output("parameters")
+    run_dir = find_run(runs, source)
+    return warn_of_stale(newest(runs, pipeline_of(run_dir), "identify", run_dir)).output("parameters")
+
+
+def find_bundle(source: str, runs: Path) -> Path:
+    """Return the folder of the policy bundle that a text names: a bundle, a stage folder, a pipeline or a run.
+
+    A pipeline without a training of its own gives the bundle that it ships.
+    """
+    from sim2real.artifacts.bundle import BUNDLE
+    from sim2real.artifacts.run.run_folder import newest, pipeline_of
+    from sim2real.errors import Sim2RealError
+    from sim2real.policy.bundle import CONTRACT
+    from sim2real.stages.pipeline.find_run import find_run, warn_of_stale
+
+    for folder in (Path(source), Path(source) / BUNDLE):
+        if (folder / CONTRACT).is_file():
+            return folder
+    if Path(source).is_file():
+        raise UsageError(
+            f"{source} is a file, where the folder of a policy bundle is expected: policy.json says what the network's "
+            "inputs and outputs mean, which a network alone does not",
+            hint="a policy of another library becomes a bundle with sim2real.policy.bundle.save_bundle",
+        )
+    if source in available():
+        try:
+            return warn_of_stale(newest(runs, source, "train")).output("bundle")
+        except Sim2RealError:
+            if (shipped := load_pipeline(source).shipped).is_dir():
+                return shipped
+            raise
+    run_dir = find_run(runs, source)
+    return warn_of_stale(newest(runs, pipeline_of(run_dir), "train", run_dir)).output("bundle")
+
+
+def _export_policy(bundle: Path, out: Path | None) -> Path:
+    """Copy a bundle, write the script that runs it beside it, and return the folder.
+
+    Raises:
+        UsageError: The folder is not empty.
+        Sim2RealError: The bundle is missing or damaged.
+    """
+    from sim2real.policy import standalone
+    from sim2real.policy.bundle import CONTRACT, GRAPH, WEIGHTS, load_bundle, read_contract
+    from sim2real.policy.contract import NetworkSpec
+    from sim2real.stages.terminal.console import note, wrote
+
+    contract = load_bundle(bundle).contract  # refuses a damaged bundle
+    out = out or Path(f"{bundle.resolve().parent.name}_policy")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out} is there and not empty", hint="name another folder with --out")
+    out.mkdir(parents=True, exist_ok=True)
+    for name in (WEIGHTS, GRAPH, CONTRACT):
+        shutil.copyfile(bundle / name, out / name)
+    note(f"{contract.observation_size} observations to {len(contract.action)} actions at {contract.rate_hz:g} Hz")
+    wrote(out / CONTRACT)
+    if read_contract(bundle)[1] != NetworkSpec():
+        note(f"{EXAMPLE} runs clipped perceptrons alone: run {GRAPH} with onnxruntime, or sim2real.policy.load_bundle")
+        return out
+    shutil.copyfile(Path(standalone.__file__), out / EXAMPLE)
+    wrote(out / EXAMPLE)
+    return out

@@ -1,0 +1,420 @@
+"""The loop of a run: the four stages, then iterations, in which each verdict decides which stages run again."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.artifacts.bundle import Bundle, History
+from sim2real.artifacts.deployment import Deployment, Drift
+from sim2real.artifacts.identification import ROUND_TRIP, Estimate, Identification
+from sim2real.artifacts.paths import shown
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run.iterations import Iteration, Iterations, Plan
+from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished, portable
+from sim2real.artifacts.run.stage_status import stage_status, why_stale
+from sim2real.artifacts.summary import Shown
+from sim2real.commands.run import RunFlags
+from sim2real.errors import DelayChanged, Sim2RealError, UsageError
+from sim2real.stages.config import DeployConfig, IdentifyConfig, RecordConfig, TrainConfig
+from sim2real.stages.deploy.next_command import logs_to_identify, needs_timing, terms_to_identify
+from sim2real.stages.pipeline.find_run import find_run
+from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
+from sim2real.stages.pipeline.python_arguments import AnyPath, AnyRobot, config_of, folder_of
+from sim2real.stages.terminal.console import artifact_table, note, wrote
+
+CallStage = Callable[[str, Any, Path | None], StageFolder]
+"""Runs a stage: its name, its configuration, the run folder; returns the stage's folder."""
+MIN_SUCCESS = 0.95
+"""Success in simulation below which an iteration trains for longer instead of deploying."""
+_MAX_RETRIES = 2
+"""Bounds that widen without limit would hide a wrong model."""
+_LONGEST_DELAY_S = 1.0
+_ALL = ", ".join(STAGES)
+
+
+def run_all(pipeline: Pipeline, flags: RunFlags, call: CallStage) -> Path | None:
+    """Run the four stages in one run folder, from the first stage without a current result; then the iterations.
+
+    Returns:
+        The run folder; None if there is none.
+    """
+    # Refuse a dry recording, and find an interrupted run.
+    if flags.record.dry_run:
+        raise UsageError(
+            "a dry recording holds no motion: a run cannot identify from it",
+            hint=f"`sim2real record {pipeline.name} --dry-run` records alone; of a run, only deploy can be dry",
+        )
+    run_dir = find_run(flags.runs, flags.resume, pipeline.name) if flags.resume else None
+    shipped = why_shipped(pipeline)
+    if flags.iterations > 1 and shipped:
+        raise UsageError(f"{shipped}, and iterations train another one", hint="run without --iterations")
+    if flags.iterations > 1:
+        return _Iterating(pipeline, flags, call).run(run_dir)
+    if run_dir is not None and (plan := Iterations.load(run_dir).plan) is not None:
+        note(f"an iteration of this run was interrupted ({plan.words}): --iterations N continues it")
+    # Skip the stages with a current result. After a stage that runs, the results of all later stages are out of date.
+    rerun = False
+    for number, stage in enumerate(STAGES, 1):
+        title = f"{stage} ({number}/{len(STAGES)})"
+        if stage == "train" and shipped:
+            note(f"{title}: skipped, as {shipped}")
+            continue
+        status = None if rerun or run_dir is None else stage_status(run_dir).get(stage)
+        if status is not None and not status.stale:
+            note(f"{title}: finished before, skipped")
+            continue
+        rerun = True
+        note(title if status is None else f"{title}: {status.stale}")
+        run_dir = call(stage, getattr(flags, stage), run_dir).run_dir
+    return run_dir
+
+
+def why_shipped(pipeline: Pipeline) -> str:
+    """Return why a run deploys the policy that its pipeline ships; "" if it trains one."""
+    if not pipeline.shipped.is_dir():
+        return ""
+    import jax
+
+    from sim2real.robots.robot import Robot
+
+    robot = pipeline.load()
+    if not isinstance(robot, Robot) or not robot.model.needs_gpu or jax.default_backend() == "gpu":
+        return ""
+    return (
+        f"a policy for {pipeline.name} takes hours to train without a GPU, and JAX has none here: the run deploys the "
+        "policy that the pipeline ships"
+    )
+
+
+@dataclass
+class _Iterating:
+    """The iterations of a run. Each plan is on disk before its first stage, so that an interrupted run goes on."""
+
+    pipeline: Pipeline
+    flags: RunFlags
+    call: CallStage
+
+    def run(self, run_dir: Path | None) -> Path:
+        """Run a plan, judge its deployment, write the next plan; until a plan has no stages.
+
+        Args:
+            run_dir: The run's folder; None: the first stage makes it.
+
+        Raises:
+            DelayChanged: The deployment of the last iteration was refused.
+        """
+        # In a run whose four stages are current, the newest deployment is judged first.
+        before = Iterations() if run_dir is None else Iterations.load(run_dir)
+        status = {} if run_dir is None else stage_status(run_dir)
+        current = set(status) == set(STAGES) and not any(s.stale for s in status.values())
+        rows, plan = before.rows, before.plan or Plan(() if current else STAGES, _ALL)
+        while True:
+            refusal = None
+            for stage in plan.stages:
+                note(f"{stage} (iteration {len(rows) + 1})")
+                try:
+                    run_dir = self._stage(stage, self._config(plan, stage, run_dir), run_dir, plan.before).run_dir
+                except DelayChanged as error:
+                    refusal = error
+                    break
+            if run_dir is None:
+                raise refusal or UsageError("this run has no folder, because no stage ran")
+            # The row of the iteration lists the attempts that no earlier row lists.
+            listed = {name for row in rows for name in row.stages}
+            made = [a for s in STAGES for a in attempts(run_dir, s) if a.finished]
+            done = [a.folder.name for a in sorted(made, key=lambda a: str(a.manifest["started"]))]
+            row = Iteration(len(rows) + 1, tuple(name for name in done if name not in listed))
+            if refusal is not None:
+                # The policy was refused before it moved the robot: no log shows the robot as it is now.
+                row = replace(row, verdict="re-identify", why=str(refusal.args[0]))
+                plan = self._all_stages(run_dir)
+            else:
+                deployment = _newest_deployment(run_dir)
+                if rows and rows[-1].deployment == deployment.folder.name:
+                    # It was judged before; the flags may differ now, so the last row is written again.
+                    row, rows = rows[-1], rows[:-1]
+                row, plan = self._judge(row, run_dir, deployment)
+            if plan.stages and row.number >= self.flags.iterations:
+                plan = Plan((), f"the last iteration: it would {plan.words}")
+            rows = (*rows, replace(row, then=plan.words))
+            plan = replace(plan, before=tuple(done))
+            wrote(Iterations(rows, plan if plan.stages else None).save(run_dir))
+            note(f"iteration {row.number}: {row.verdict}; {plan.words}")
+            if not plan.stages:
+                break
+        if refusal is not None:
+            raise refusal
+        print(artifact_table(Iterations(rows).table().without("why")))
+        return run_dir
+
+    def _config(self, plan: Plan, stage: str, run_dir: Path | None) -> Any:
+        """Return the configuration of a stage: that of the flags, with the changes of the plan."""
+        if stage == "identify" and plan.terms is not None:
+            log = tuple(shown(Path(run_dir or "") / path) for path in plan.log)
+            return replace(self.flags.identify, log=log, terms=plan.terms)
+        if stage == "train" and plan.seed is not None:
+            return replace(self.flags.train, seed=plan.seed)
+        return getattr(self.flags, stage)
+
+    def _stage(self, stage: str, config: Any, run_dir: Path | None, before: tuple[str, ...]) -> StageFolder:
+        """Run a stage, with retries; record first where the logs of a deployment do not suffice to identify from.
+
+        A policy that holds still excites no parameter; one that balances amplifies errors a hundredfold.
+
+        Args:
+            before: Stage folders that were finished when the iteration started.
+        """
+        if stage != "identify" or not config.log:
+            return self._with_retries(stage, config, run_dir, before)
+        try:
+            folder = self._with_retries(stage, config, run_dir, before)
+            reason = _why_insufficient(Identification.load(folder.output("parameters")))
+        except DelayChanged:
+            raise
+        except Sim2RealError as error:
+            folder, reason = None, str(error.args[0])
+        if folder is not None and not reason:
+            return folder
+        note(f"the deployment's own logs do not suffice ({reason}): record, identify from that")
+        recorded = self._once("record", self.flags.record, run_dir, before)
+        known = (*before, *(() if folder is None else (folder.folder.name,)))
+        return self._with_retries(stage, replace(config, log=()), recorded.run_dir, known)
+
+    def _with_retries(self, stage: str, config: Any, run_dir: Path | None, before: tuple[str, ...]) -> StageFolder:
+        """Run a stage; again while an estimate lies at a bound, or a policy fails in simulation.
+
+        A worn robot leaves the bounds of a data sheet; a policy for more friction takes more steps to train.
+        """
+        folder = self._once(stage, config, run_dir, before)
+        for _ in range(_MAX_RETRIES):
+            changed = _changed_config(config, folder)
+            if changed is None:
+                break
+            config, reason = changed
+            note(f"{stage} again: {reason}")
+            folder = self.call(stage, config, folder.run_dir)
+        return folder
+
+    def _once(self, stage: str, config: Any, run_dir: Path | None, before: tuple[str, ...]) -> StageFolder:
+        """Return the attempt that an interrupted iteration has finished, if it is current; otherwise run the stage."""
+        done = None if run_dir is None else finished(run_dir, stage)
+        if run_dir is not None and done is not None and done.folder.name not in before:
+            if not (reason := why_stale(done, stage_status(run_dir))):
+                note(f"{stage}: {done.folder.name} is finished, skipped")
+                return done
+            note(f"{stage}: {reason}")
+        return self.call(stage, config, run_dir)
+
+    def _judge(self, row: Iteration, run_dir: Path, folder: StageFolder) -> tuple[Iteration, Plan]:
+        """Return an iteration's row, completed with the results of its deployment, and the plan of the next one."""
+        deployment = Deployment.read(folder.folder)
+        if success := next((g for g in deployment.gap if g.quantity == "success"), None):
+            row = replace(row, real=success.real, simulation=success.simulation)
+        if advice := deployment.advice:
+            row = replace(row, verdict=advice.status, why=next(iter(advice.reasons), ""))
+        return row, self._next_plan(run_dir, folder, deployment)
+
+    def _next_plan(self, run_dir: Path, folder: StageFolder, deployment: Deployment) -> Plan:
+        """Return the plan that follows from a deployment; a plan without stages ends the run."""
+        # Stop at the goal, or if no stage can improve the result.
+        if self.flags.goal and _reached(deployment, *self.flags.goal):
+            return Plan((), "stop: {} is at least {:g}".format(*self.flags.goal))
+        advice = deployment.advice
+        if advice is None or advice.status in ("look at this joint", "not judged"):
+            reason = advice.reasons[0] if advice and advice.reasons else "the deployment was not judged"
+            return Plan((), f"stop: {reason}")
+        if advice.status == "fine" and not self.flags.goal:
+            return Plan((), "stop: the policy works on the robot")
+        # Train again if the model holds and the timing of the training does, too.
+        seed = self._next_seed(run_dir)
+        if advice.status != "re-identify" and not needs_timing(advice):
+            return Plan(("train", "deploy"), "train with another seed, deploy", seed=seed)
+        # Otherwise identify from the deployment's logs, or record first if they are too short.
+        identification = self._newest_identification(run_dir)
+        outputs = sorted(folder.outputs.items())
+        deployed = [path for name, path in outputs if name.startswith("log_") or name == "probe"]
+        logs = logs_to_identify(deployed, deployment.drift, identification, folder.folder)
+        if not logs:
+            return self._all_stages(run_dir, deployment.drift)
+        terms = terms_to_identify(self.flags.identify.terms, self.pipeline, identification, deployment.drift)
+        words = f"identify from {len(logs)} log{'s' * (len(logs) > 1)}, the deployment's among them, train, deploy"
+        log = tuple(portable(Path(path), run_dir) for path in logs)
+        return Plan(("identify", "train", "deploy"), words, log, terms, seed)
+
+    def _all_stages(self, run_dir: Path, drift: Drift | None = None) -> Plan:
+        """Return the plan for a robot that no log shows as it is now."""
+        known = self._newest_identification(run_dir)
+        terms = terms_to_identify(self.flags.identify.terms, self.pipeline, known, drift)
+        return Plan(STAGES, _ALL, terms=terms, seed=self._next_seed(run_dir))
+
+    def _newest_identification(self, run_dir: Path) -> Identification:
+        folder = finished(run_dir, "identify")
+        if folder is None:
+            raise Sim2RealError("this run has no identification", hint=f"sim2real identify {self.pipeline.name}")
+        return Identification.load(folder.output("parameters"))
+
+    def _next_seed(self, run_dir: Path) -> int:
+        """Return the seed after that of the newest training: the same seed would train the same policy."""
+        training = finished(run_dir, "train")
+        return 1 + (int(training.manifest["config"]["seed"]) if training is not None else self.flags.train.seed)
+
+
+def _newest_deployment(run_dir: Path) -> StageFolder:
+    if (deployment := finished(run_dir, "deploy")) is None:
+        raise UsageError(
+            "this run has no deployment to judge", hint="run without --deploy.dry-run: a dry deployment moves nothing"
+        )
+    return deployment
+
+
+def _reached(deployment: Deployment, quantity: str, minimum: float) -> bool:
+    """Return whether a quantity of the gap report is at least ``minimum`` on the robot."""
+    on_robot = {g.quantity: g.real for g in deployment.gap}
+    if quantity not in on_robot:
+        raise UsageError(f"there is no {quantity!r} in the gap report. Available: {', '.join(on_robot) or 'none'}")
+    real = on_robot[quantity]
+    return real is not None and real >= minimum
+
+
+# -- retries
+
+
+def _changed_config(config: Any, folder: StageFolder) -> tuple[Any, str] | None:
+    """Return the configuration of a stage's retry and the reason for it; None if it needs no retry."""
+    if folder.stage == "identify":
+        found = Identification.load(folder.output("parameters"))
+        wider = with_wider_bounds(config, found)
+        at_bound = ", ".join(p.name for p in found.parameters if p.verdict == "at a bound")
+        return None if wider is None else (wider, f"wider bounds, as {at_bound} lies at a bound")
+    if folder.stage == "train" and "history" in folder.outputs:
+        success = History.load(folder.output("history")).success
+        enough = MIN_SUCCESS if config.ppo.target is None else min(MIN_SUCCESS, config.ppo.target)
+        if np.nanmax(success, initial=0.0) < enough:
+            longer = replace(config, ppo=replace(config.ppo, total_steps=2 * config.ppo.total_steps))
+            return longer, f"the policy succeeds in less than {enough:g} of the episodes in simulation; twice the steps"
+    return None
+
+
+def with_wider_bounds(config: IdentifyConfig, identification: Identification) -> IdentifyConfig | None:
+    """Return a configuration with wider bounds for each estimate that lies at one; None if there is none."""
+    wider = config
+    for estimate in identification.parameters if identification.verdict.status == "change the model" else ():
+        if estimate.verdict != "at a bound" or estimate.lower is None or estimate.upper is None:
+            continue
+        if estimate.unit == "s" and estimate.kind in ("delay", "derived"):
+            wider = replace(wider, max_delay_s=min(2.0 * config.max_delay_s, _LONGEST_DELAY_S))
+        else:
+            wider = replace(wider, bounds={**wider.bounds, estimate.name: _wider(estimate)})
+    return None if wider == config else wider
+
+
+def _wider(estimate: Estimate) -> tuple[float, float]:
+    """Return bounds that are four times as far away, or twice as wide if they reach 0, on the estimate's side."""
+    low, high = estimate.lower or 0.0, estimate.upper or 0.0
+    upper = high - estimate.estimate < estimate.estimate - low
+    if upper and low > 0.0 and high < 1.0 and estimate.unit in ("", "1"):
+        return low, 1.0 - (1.0 - high) / 4.0  # a share stays below 1
+    if low > 0.0:
+        return (low, 4.0 * high) if upper else (low / 4.0, high)
+    return (low, high + (high - low)) if upper else (low - (high - low), high)
+
+
+def _why_insufficient(identification: Identification) -> str:
+    """Return why the logs of a deployment do not suffice to identify from; "" if they do.
+
+    The motion of a policy may not separate a delay from inertia, and a delay of 0 is accepted.
+    """
+    if identification.verdict.status != "accepted":
+        return identification.verdict.status
+    round_trip = next((p for p in identification.parameters if p.name == ROUND_TRIP), None)
+    if round_trip is None or round_trip.verdict in ("ok", "fixed"):
+        return ""
+    return f"the round trip delay is {round_trip.verdict}"
+
+
+# -- for Python
+
+
+@dataclass(frozen=True, repr=False)
+class Run(Shown):
+    """A run folder: the newest finished result of each stage, read when it is first asked for."""
+
+    folder: Path
+
+    @cached_property
+    def recording(self) -> Recording:
+        """The recording."""
+        return Recording.load(self._stage("record"))
+
+    @cached_property
+    def identification(self) -> Identification:
+        """The identification."""
+        return Identification.load(self._stage("identify"))
+
+    @cached_property
+    def bundle(self) -> Bundle:
+        """The policy."""
+        return Bundle.load(self._stage("train"))
+
+    @cached_property
+    def deployment(self) -> Deployment:
+        """The deployment."""
+        return Deployment.load(self._stage("deploy"))
+
+    def about(self) -> Mapping[str, Any]:
+        """Return the facts that a notebook shows: name -> value."""
+        done = [stage for stage in STAGES if finished(self.folder, stage) is not None]
+        return {"folder": shown(self.folder), "finished": ", ".join(done) or "nothing"}
+
+    def _stage(self, stage: str) -> Path:
+        if (result := finished(self.folder, stage)) is None:
+            raise UsageError(f"{stage} is not finished in {self.folder}", hint="sim2real.run(..., resume=FOLDER)")
+        return result.folder
+
+
+def run(
+    robot: AnyRobot,
+    runs: AnyPath = "runs",
+    record: RecordConfig | Mapping[str, Any] | None = None,
+    identify: IdentifyConfig | Mapping[str, Any] | None = None,
+    train: TrainConfig | Mapping[str, Any] | None = None,
+    deploy: DeployConfig | Mapping[str, Any] | None = None,
+    resume: AnyPath | None = None,
+    iterations: int = 1,
+    until: str | None = None,
+) -> Run:
+    """Record, identify, train and deploy, one after the other, in one run folder.
+
+    Args:
+        robot: The robot, its pipeline, or the pipeline's name.
+        record: Settings of record; default: the pipeline's. A dict has the settings that differ from these.
+        resume: A run folder to go on with, from the first stage that is not finished there.
+        iterations: Most iterations; see ``sim2real run --help``.
+        until: ``QUANTITY=VALUE`` that ends the iterations.
+
+    Returns:
+        The run, with the results of its stages.
+    """
+    # Turn names and dicts into objects; each stage then runs as from the command line.
+    pipeline, root = pipeline_of(robot), folder_of(runs, "runs")
+    settings = {"record": record, "identify": identify, "train": train, "deploy": deploy}
+    configs: dict[str, Any] = {n: config_of(settings[n], c, n) for n, c in pipeline.in_a_run.items()}
+    home = None if resume is None else find_run(root, folder_of(resume, "resume"), pipeline.name)
+
+    def call(stage: str, config: Any, run_dir: Path | None) -> StageFolder:
+        nonlocal home
+        done = importlib.import_module(f"sim2real.stages.{stage}.stage").run(pipeline, config, root, run_dir)
+        home = done.run_dir
+        return done
+
+    run_all(pipeline, RunFlags(runs=root, resume=home, iterations=iterations, until=until, **configs), call)
+    if home is None:
+        raise UsageError("no stage ran")
+    return Run(home)

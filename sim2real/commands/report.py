@@ -1,0 +1,184 @@
+"""``sim2real report``: a run as an HTML page, in the Rerun viewer, or beside other runs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from sim2real.commands import flags
+from sim2real.commands.stages import examples_of
+from sim2real.errors import UsageError
+from sim2real.stages.flag import Flag
+from sim2real.stages.live.config import WINDOW, check_view
+from sim2real.stages.pipeline.find_run import find_run
+from sim2real.stages.pipeline.pipeline import available
+
+if TYPE_CHECKING:
+    from sim2real.artifacts.comparison import Comparison
+    from sim2real.artifacts.run.run_folder import StageFolder
+    from sim2real.commands.loop import Run
+
+COMPARISON = "compare.html"
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """Write a run as one HTML page, show it in the Rerun viewer, or compare runs of one robot."""
+
+    targets: Annotated[tuple[str, ...], Flag("RUN|PIPELINE...", positional=True)] = ()
+    """A run folder, its name, a folder of a stage in it, or a pipeline, whose newest run is taken. Several: their
+    parameters, errors and success side by side."""
+    rerun: Annotated[str | None, Flag("[web|FILE.rrd]", alone=WINDOW)] = None
+    """Open the run in the Rerun viewer instead of writing a page; 'web': on a page for browsers, until Ctrl-C;
+    FILE.rrd: a recording for the viewer."""
+    follow: bool = False
+    """With --rerun: join a run whose stages are still running, until Ctrl-C."""
+    out: Annotated[Path | None, Flag("FILE")] = None
+    """The page to write; default: report.html in the run's folder, of several runs compare.html here."""
+    json: bool = False
+    """Print the comparison of several runs as JSON."""
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+
+    def __post_init__(self) -> None:
+        """Check the flags against each other."""
+        check_view(self.rerun)
+        if len(self.targets) > 1 and self.rerun:
+            raise UsageError("the viewer shows one run", hint="name one run, or leave out --rerun")
+        if self.follow and (self.rerun is None or self.rerun.endswith(".rrd")):
+            raise UsageError("--follow shows new rows in a viewer", hint="add --rerun, or --rerun web")
+        if self.json and len(self.targets) < 2:
+            raise UsageError("--json prints a comparison", hint="name two runs")
+
+
+def report_command(command: str, arguments: list[str]) -> None:
+    """``sim2real report RUN|PIPELINE... [FLAGS]``."""
+    examples = examples_of("report pendulum", "report pendulum --rerun", "report runs/NAME/MONDAY runs/NAME/FRIDAY")
+    text = "Write a run as one HTML page, show it in the Rerun viewer, or compare runs of one robot."
+    config = flags.parse(ReportConfig(), arguments, f"sim2real {command}", text, examples)
+    targets = config.targets
+    if not targets:
+        names = ", ".join(sorted(available())) or "none"
+        raise UsageError(
+            f"{command} needs a run folder or a pipeline. Pipelines: {names}", hint=f"see `sim2real {command} --help`"
+        )
+    if len(targets) > 1:
+        compare(config)
+        return
+    run_dir = find_run(config.runs, targets[0])
+    if config.rerun:
+        _show(run_dir, config.rerun, config.follow)
+        return
+    from sim2real.stages.terminal.console import progress, wrote
+
+    with progress(None, "report"):
+        from sim2real.view.page.page import report as write  # matplotlib and jinja2 take 0.5 s to import
+
+        page = write(run_dir, config.out)
+    wrote(page)
+
+
+def report(run: str | Path | Run, runs: str | Path = "runs") -> Path:
+    """Write a run's report as one HTML page.
+
+    Args:
+        run: A run, its folder or its name, or a pipeline's name, whose newest run is taken.
+
+    Returns:
+        The page.
+    """
+    from sim2real.stages.pipeline.python_arguments import folder_of
+    from sim2real.view.page.page import report as write
+
+    folder = getattr(run, "folder", None)
+    return write(folder if isinstance(folder, Path) else find_run(folder_of(runs, "runs"), folder_of(run, "run")))
+
+
+def _show(run_dir: Path, target: str, follow: bool) -> None:
+    """Show a run in the viewer, or write a file for it."""
+    from sim2real.artifacts.run.run_folder import pipeline_of
+    from sim2real.stages.live import scene as scenes
+    from sim2real.stages.pipeline.pipeline import load_pipeline
+    from sim2real.stages.terminal.console import wrote
+    from sim2real.view.rerun_recording import view
+
+    pipeline = load_pipeline(pipeline_of(run_dir))
+    scene = scenes.drawn(scenes.scene_of(pipeline, None if pipeline.scene else pipeline.load()))
+    if follow:
+        scenes.follow(run_dir, pipeline.name, target, scene)
+        return
+    save = Path(target) if target.endswith(".rrd") and "://" not in target else None
+    view(run_dir, save, scene, scenes.serve if target != WINDOW and save is None else None)
+    if save is not None:
+        wrote(save)
+
+
+def compare(config: ReportConfig) -> Comparison:
+    """Print parameters with intervals, errors and success of several runs, and write the page.
+
+    Raises:
+        UsageError: Runs of different robots, or runs with nothing in common.
+        Sim2RealError: An artifact is missing or malformed.
+    """
+    from sim2real.artifacts.comparison import ComparedRun, Comparison
+    from sim2real.artifacts.deployment import Deployment
+    from sim2real.artifacts.files import to_json
+    from sim2real.artifacts.identification import Identification
+    from sim2real.stages.terminal.console import artifact_table, note, wrote
+
+    # Find the runs, which must be of one robot.
+    all_stages = [_stages_of(target, config.runs) for target in config.targets]
+    robots = list(dict.fromkeys(str(next(iter(stages.values())).manifest["pipeline"]) for stages in all_stages))
+    if len(robots) > 1:
+        raise UsageError(f"these are runs of different robots: {', '.join(robots)}", hint="compare runs of one robot")
+    # Read the artifacts of each run, and compare them.
+    runs = []
+    for name, stages in zip(_names(all_stages), all_stages, strict=True):
+        started = min(str(stage.manifest.get("started", "")) for stage in stages.values())
+        identify, deploy = stages.get("identify"), stages.get("deploy")
+        identification = None if identify is None else Identification.load(identify.folder)
+        deployment = None if deploy is None else Deployment.read(deploy.folder)
+        runs.append(ComparedRun(name, started.replace("T", " ")[:16], identification, deployment))
+    comparison = Comparison.of(runs)
+    if not comparison.parameters and not all(r.deployment for r in comparison.runs):
+        raise UsageError(
+            f"nothing to compare: these runs of {robots[0]} share no identified parameter and no deployment",
+            hint="compare runs whose stage identify or deploy is finished",
+        )
+    # Print the tables, and write the page.
+    figures, parameters = comparison.figures(), comparison.rows()
+    if config.json:
+        print(to_json({"figures": figures.records(), "parameters": parameters.records()}).decode())
+    else:
+        print(artifact_table(figures))
+        if parameters.rows:
+            print(artifact_table(parameters))
+            note(f"intervals that do not overlap: {', '.join(comparison.different) or 'of no parameter'}")
+    from sim2real.view.page.comparison import comparison_page  # imports matplotlib
+
+    page = comparison_page(comparison, config.out or Path(COMPARISON))
+    if config.json:
+        note(f"wrote {page}")  # stdout holds JSON alone
+    else:
+        wrote(page)
+    return comparison
+
+
+def _stages_of(target: str, root: Path) -> dict[str, StageFolder]:
+    """Return the finished stages of a run; a stage folder selects its run, with that attempt of the stage."""
+    from sim2real.artifacts.run.manifest import read_manifest
+    from sim2real.artifacts.run.run_folder import finished_stages, open_folder
+
+    stages = finished_stages(find_run(root, target))
+    if (manifest := read_manifest(Path(target))) is not None:
+        attempt = open_folder(Path(target), str(manifest["stage"]))
+        stages |= {attempt.stage: attempt}
+    return stages
+
+
+def _names(all_stages: Sequence[dict[str, StageFolder]]) -> list[str]:
+    """Return a name for each run: its folder's, with a number where two are the same."""
+    names = [next(iter(stages.values())).run_dir.resolve().name for stages in all_stages]
+    return [name if names.count(name) == 1 else f"{name} ({i + 1})" for i, name in enumerate(names)]

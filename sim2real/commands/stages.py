@@ -1,0 +1,165 @@
+"""The commands that call one stage or one function: parse the flags, run, print what was written."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
+
+from sim2real.commands import flags
+from sim2real.errors import ERROR, EXIT_CODES, UsageError
+from sim2real.installation import has_jax
+from sim2real.runtime import compilation_cache
+from sim2real.stages.flag import Flag
+from sim2real.stages.pipeline.pipeline import Pipeline, available, load_pipeline
+
+if TYPE_CHECKING:
+    from sim2real.artifacts.run.run_folder import StageFolder
+
+DEMO_PIPELINE = "pendulum"
+Config = TypeVar("Config")
+
+
+@dataclass(frozen=True)
+class StageFlags(Generic[Config]):
+    """Flags of one stage."""
+
+    config: Annotated[Config, Flag(flat=True)]
+    runs: Path = Path("runs")
+    """Folder of all runs."""
+    run: Annotated[Path | None, Flag("DIR")] = None
+    """Run folder to add to; default: a new one for record, for the others the newest one with their inputs."""
+    cache: Annotated[str | None, Flag("DIR|off")] = None
+    """Folder of compiled programs, or 'off'; default: SIM2REAL_CACHE, otherwise the platform's cache folder."""
+
+
+def stage(command: str, arguments: list[str]) -> None:
+    """``sim2real record|identify|train|deploy PIPELINE [FLAGS]``."""
+    pipeline, rest = split_pipeline(command, arguments)
+    default, name = getattr(pipeline, command), pipeline.name
+    examples = examples_of(f"{command} {name} --runs /data/runs", f"report {name}")
+    parsed = flags.parse(StageFlags(default), rest, f"sim2real {command} {name}", summary_of(default), examples)
+    compilation_cache.enable(parsed.cache)
+    run_dir = None
+    if parsed.run:
+        from sim2real.stages.pipeline.find_run import find_run
+
+        run_dir = find_run(parsed.runs, parsed.run, name)
+    run_stage(command, pipeline, parsed.config, parsed.runs, run_dir, page=command in ("identify", "deploy"))
+
+
+def check(command: str, arguments: list[str]) -> None:
+    """``sim2real check PIPELINE [FLAGS]``."""
+    from sim2real.stages.check.config import CheckConfig
+
+    pipeline, rest = split_pipeline(command, arguments)
+    default, name = CheckConfig(record=pipeline.record), pipeline.name
+    description = f"{summary_of(default)} Ends with code 1 if a parameter is not determined."
+    examples = examples_of(f"check {name} --log session.mcap", f"check {name} --plan --record.duration-s 60")
+    config = flags.parse(default, rest, f"sim2real check {name}", description, examples)
+    compilation_cache.enable()
+    from sim2real.stages.check import stage as check_stage  # imports JAX
+
+    _end(check_stage.run(pipeline, config))
+
+
+def validate(command: str, arguments: list[str]) -> None:
+    """``sim2real validate PARAMETERS --log FILE [FLAGS]``."""
+    from sim2real.stages.validate.config import ValidateConfig
+
+    default = ValidateConfig()
+    description = (
+        f"{summary_of(default)} Ends with code 1 if an error exceeds the expected one, a baseline predicts as well, or "
+        "a log is not scored."
+    )
+    examples = examples_of("validate runs/NAME/TIME/identify --log b.mcap")
+    config = flags.parse(default, arguments, f"sim2real {command}", description, examples)
+    compilation_cache.enable()
+    from sim2real.stages.validate import stage as validate_stage  # imports JAX
+
+    _end(validate_stage.run(config))
+
+
+def import_files(command: str, arguments: list[str]) -> None:
+    """``sim2real import FILE... [FLAGS]``."""
+    from sim2real.stages.import_logs.config import ImportConfig
+
+    default = ImportConfig()
+    examples = examples_of("import run.csv --mjcf robot.xml", "import DATASET --like so101", "info LOG")
+    config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
+    from sim2real.stages.import_logs import stage as import_stage
+
+    import_stage.run(config)
+
+
+def run_stage(
+    name: str, pipeline: Pipeline, config: Any, runs: Path, run_dir: Path | None, page: bool = True
+) -> StageFolder | None:
+    """Run a stage, then print its summary and the names of its files, and write the run's page.
+
+    Args:
+        page: False: a later stage of the same command writes it.
+
+    Returns:
+        The stage's folder; None in a training of several processes, where another process writes it.
+    """
+    from sim2real.stages.terminal import console
+
+    module = importlib.import_module(f"sim2real.stages.{name}.stage")
+    folder: StageFolder | None = module.run(pipeline, config, runs, run_dir)
+    if folder is None:
+        return None
+    if folder.manifest["summary"]:
+        print(console.pairs(folder.manifest["summary"]))
+    for path in [*folder.outputs.values(), folder.folder / "manifest.json"]:
+        console.wrote(path)
+    if page:
+        write_report(folder.run_dir)
+    return folder
+
+
+def write_report(run_dir: Path) -> Path | None:
+    """Write the page of a run and print its name; None, with a note, on a robot's computer without JAX."""
+    from sim2real.stages.terminal import console
+
+    if not has_jax():
+        console.note(f"no page: `sim2real report {console.shown(run_dir)}` writes it on a computer with sim2real")
+        return None
+    with console.progress(None, "report"):
+        from sim2real.view.page.page import report  # matplotlib and jinja2 take 0.5 s to import
+
+        page = report(run_dir)
+    console.wrote(page)
+    return page
+
+
+def split_pipeline(command: str, arguments: list[str]) -> tuple[Pipeline, list[str]]:
+    """Return the pipeline, which the first argument names, and the other arguments.
+
+    ``--help`` without a pipeline shows the flags of the demo's pipeline.
+    """
+    if arguments and arguments[0] in ("-h", "--help", "--help-all"):
+        return load_pipeline(DEMO_PIPELINE), arguments
+    if not arguments or arguments[0].startswith("-"):
+        raise UsageError(
+            f"{command} needs a pipeline before its flags. Available: {', '.join(sorted(available())) or 'none'}",
+            hint=f"sim2real {command} PIPELINE [FLAGS]; `sim2real new` makes a pipeline of a model",
+        )
+    return load_pipeline(arguments[0]), arguments[1:]
+
+
+def summary_of(config: object) -> str:
+    """Return the first line of the docstring of a configuration's class."""
+    return (type(config).__doc__ or "").strip().splitlines()[0]
+
+
+def examples_of(*commands: str) -> str:
+    """Return the text below the flags in ``--help``: examples and exit codes."""
+    return "\n".join(["examples", *(f"  sim2real {command}" for command in commands), "", EXIT_CODES])
+
+
+def _end(good: bool) -> None:
+    if not good:
+        sys.exit(ERROR)
