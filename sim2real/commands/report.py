@@ -58,7 +58,7 @@ def report_command(command: str, arguments: list[str]) -> None:
     examples = examples_of("report pendulum", "report pendulum --rerun", "report runs/NAME/MONDAY runs/NAME/FRIDAY")
     text = "Write a run as one HTML page, show it in the Rerun viewer, or compare runs of one robot."
     config = flags.parse(ReportConfig(), arguments, f"sim2real {command}", text, examples)
-    targets = config.targets
+    targets: tuple[str, ...] = config.targets
     if not targets:
         names = ", ".join(sorted(available())) or "none"
         raise UsageError(
@@ -67,7 +67,7 @@ def report_command(command: str, arguments: list[str]) -> None:
     if len(targets) > 1:
         compare(config)
         return
-    run_dir = find_run(config.runs, targets[0])
+    run_dir = find_run(config.runs, *targets)
     if config.rerun:
         _show(run_dir, config.rerun, config.follow)
         return

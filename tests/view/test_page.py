@@ -18,7 +18,7 @@ from sim2real.artifacts.identification import Identification, Judgement, WorstSe
 from sim2real.errors import Sim2RealError
 from sim2real.view.blocks import MISSING, decimals_for, fixed, number
 from sim2real.view.identification.section import _banner
-from sim2real.view.page.page import deploy_page, identify_page, report
+from sim2real.view.page.page import report
 
 CHROMIUM = next((path for n in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(n))), None)
 FLAGS = (
@@ -166,19 +166,10 @@ def test_a_log_that_was_cut_is_shown_with_a_note(only):
     assert "actuator.action [V]" in text
 
 
-@pytest.mark.parametrize(("stage", "write"), [("identify", identify_page), ("deploy", deploy_page)])
-def test_a_stage_writes_its_page_before_its_manifest_lists_anything(run, stage, write):
-    path = run / stage / "manifest.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"status": "running", "outputs": {}}))
-    path = write(run / stage)
-    assert path == run / stage / "report.html"
-    assert f'<section id="{stage}"' in path.read_text(encoding="utf-8")
-
-
 def test_a_deployment_without_a_simulation_is_shown(run):
     (run / "deploy" / "result.json").write_text(json.dumps(synthetic_run.result(simulated=False)))
     np.savez(run / "deploy" / "simulation.npz")
-    words = Page(deploy_page(run / "deploy").read_text(encoding="utf-8")).words
+    words = Page(report(run).read_text(encoding="utf-8")).words
     assert {"first upright", "1.375"} <= set(words)
     assert "1.340" not in words
 
@@ -239,8 +230,6 @@ def test_what_is_malformed_is_named_with_a_hint(only, case):
 def test_no_finished_stage_and_no_folder_are_errors(tmp_path):
     with pytest.raises(Sim2RealError, match="no finished stage"):
         report(tmp_path)
-    with pytest.raises(Sim2RealError, match="there is no folder"):
-        identify_page(tmp_path / "identify")
 
 
 @pytest.mark.parametrize(
