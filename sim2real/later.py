@@ -1,7 +1,8 @@
 """JAX, imported when it is first used: the modules that a robot needs are imported without it.
 
 ``from sim2real.later import jax, jnp`` stands for ``import jax`` and ``import jax.numpy as jnp``. A robot's computer
-may have no JAX: there, the first use of ``jax`` is an error that names the package, and ``jnp`` is numpy.
+may have no JAX: there, the first use is an error that names the package. Code that runs on both takes the module of its
+numbers: ``sim2real.arrays.namespace``.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ ABSENT = ("distrax", "evosax", "flax", "jax", "jinja2", "matplotlib", "mujoco.mj
 
 
 class Later:
-    """A module that is imported when one of its attributes is first used, or another one instead where it is absent.
+    """A module that is imported when one of its attributes is first used.
 
     Raises:
         NotInstalled: At that use, if its package is not installed.
     """
 
-    def __init__(self, name: str, instead: str = "") -> None:
-        self._name, self._instead, self._module = name, instead, None
+    def __init__(self, name: str) -> None:
+        self._name, self._module = name, None
 
     def __getattr__(self, attribute: str) -> Any:
         if self._module is None:
@@ -36,9 +37,7 @@ class Later:
             try:
                 self._module = importlib.import_module(self._name)
             except ModuleNotFoundError as error:
-                if not self._instead:
-                    raise (not_installed(error.with_traceback(None)) or error) from None
-                self._module = importlib.import_module(self._instead)
+                raise (not_installed(error.with_traceback(None)) or error) from None
         return getattr(self._module, attribute)
 
 
@@ -73,4 +72,4 @@ if TYPE_CHECKING:
     from scipy import special as special
 else:
     special = Later("scipy.special")
-    jax, jnp = Later("jax"), Later("jax.numpy", instead="numpy")
+    jax, jnp = Later("jax"), Later("jax.numpy")

@@ -238,8 +238,7 @@ class TrainableDist(Base, DelayDistribution):
         that time: an integer may be a flag, a counter, or an encoder's ticks, which start again at 0 after a turn.
 
         Args:
-            inputs: The lengthened window, leaves ``(W, ...)``; its arrival times are those at the smallest delay. In
-                numpy the copies' axes come behind the first one, of ``age_s`` too.
+            inputs: The lengthened window, leaves ``(W, ...)``; its arrival times are those at the smallest delay.
             age_s: Shape ``(W,)``: step start minus sent time of each message [s]; large for empty slots.
             period_s: The reader's period [s]; for ``zoh_mean``.
             ts_s: The step's start [s from the episode's start]; for ``linear``.
@@ -256,14 +255,13 @@ class TrainableDist(Base, DelayDistribution):
         # exact ties are recognised.
         width = inputs.seq.shape[0]
         arrived = late > HALF_TICK_S if skip else late > -HALF_TICK_S
-        last = jnp.maximum(jnp.sum(arrived, axis=0) - 1, window - 1)
+        last = jnp.maximum(jnp.sum(arrived) - 1, window - 1)
         if self.interp == "zoh":
             return _part(inputs, last - window + 1, window)
 
         # Interpolate at the times of the last messages, moved so that the newest lies at the step's start.
         late = jnp.where(inputs.seq < 0, ts_s, late)
-        steps = jnp.arange(window - 1, -1, -1).reshape(-1, *[1] * last.ndim)
-        query = -(_take(late, jnp.clip(last - steps, 0, width - 1)) - _take(late, last[None]))
+        query = late[last] - late[jnp.clip(last - jnp.arange(window - 1, -1, -1), 0, width - 1)]
         return _interpolate(inputs, -late, query, -HALF_TICK_S if skip else HALF_TICK_S)
 
 
@@ -275,7 +273,7 @@ def _interpolate(inputs: InputState, knots: Array, query: Array, slack: float) -
     """
     held = jnp.maximum(jnp.sum(knots[None] < query[:, None] + slack, axis=1) - 1, 0)
     above = jnp.clip(held + 1, 1, knots.shape[0] - 1)
-    low, high = _take(knots, above - 1), _take(knots, above)
+    low, high = knots[above - 1], knots[above]
     # In a burst two messages may arrive at the same time: the value jumps, and that of the later one holds.
     span = jnp.where(high > low, high - low, 1.0)
     weight = jnp.where(held >= above, 1.0, jnp.clip((query - low) / span, 0.0, 1.0))
@@ -283,8 +281,8 @@ def _interpolate(inputs: InputState, knots: Array, query: Array, slack: float) -
     def between(leaf: Array) -> Array:
         leaf = jnp.asarray(leaf)
         if not _is_float(leaf):
-            return _take(leaf, held)
-        a, b = (_at_least_float32(_take(leaf, index)) for index in (above - 1, above))
+            return leaf[held]
+        a, b = (_at_least_float32(leaf[index]) for index in (above - 1, above))
         return (a + (b - a) * _beside(weight, leaf)).astype(leaf.dtype)
 
     seq, sent, received = (between(leaf) for leaf in (inputs.seq, inputs.ts_sent, inputs.ts_recv))
@@ -299,7 +297,7 @@ def _mean_over_period(inputs: InputState, late: Array, window: int, period_s: fl
     """
     # Fraction of the period in which each message, or a newer one, holds.
     share = jnp.clip(1.0 + late / period_s, 0.0, 1.0)
-    held = _part(inputs, jnp.maximum(jnp.sum(late > -HALF_TICK_S, axis=0) - window, 0), window)
+    held = _part(inputs, jnp.maximum(jnp.sum(late > -HALF_TICK_S) - window, 0), window)
 
     def mean(leaf: Array, now: jax.Array) -> jax.Array:
         """Return the window ``now (w, ...)``, its last value replaced by the mean over the messages."""
@@ -319,16 +317,8 @@ def _mean_over_period(inputs: InputState, late: Array, window: int, period_s: fl
 
 
 def _part(inputs: InputState, first: Array, window: int) -> InputState:
-    """Return ``window`` messages of each leaf ``(W, ...)`` from the message ``first`` on, one number for each copy."""
-    if jnp.ndim(first) == 0:
-        return jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, window), inputs)
-    index = first + jnp.arange(window).reshape(-1, *[1] * first.ndim)
-    return pytree.map(lambda leaf: _take(leaf, index), inputs)
-
-
-def _take(leaf: Array, index: Array) -> Array:
-    """Return messages ``(w, ...)`` of a window ``(W, ...)`` by an index ``(w, ...)`` for each copy."""
-    return jnp.take_along_axis(leaf, _beside(index, leaf), axis=0)
+    """Return ``window`` messages of each leaf ``(W, ...)`` from the message ``first`` on."""
+    return jax.tree_util.tree_map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, first, window), inputs)
 
 
 def _beside(numbers: Array, leaf: Array) -> Array:

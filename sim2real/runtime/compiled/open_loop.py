@@ -8,6 +8,8 @@ make their steps and look messages up by ``seq``. The program depends only on th
 import graphlib
 from collections.abc import Callable, Collection, Mapping
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2real import pytree
@@ -16,8 +18,6 @@ from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import TICKS_PER_S, BaseNode, BaseWorld
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import check_bursts, newest_message
-from sim2real.installation import has_jax
-from sim2real.later import jax, jnp
 from sim2real.runtime.compiled.wiring import check_fit, messages_read
 from sim2real.runtime.init import OUTPUTS, init_graph_state
 from sim2real.runtime.match import matched
@@ -90,7 +90,7 @@ class OpenLoopGraph:
             defaults: Default outputs that replace those of ``init_output``: node -> a message.
             eps: The episode's number, which steps receive.
         """
-        gs = init_graph_state(self.nodes, self.supervisor, jax.random.key(0) if has_jax() else None, params)
+        gs = init_graph_state(self.nodes, self.supervisor, jax.random.key(0), params)
         outputs = dict(gs.aux[OUTPUTS])
         for name, message in defaults.items():
             outputs[name] = pytree.map(lambda new, old: jnp.asarray(new, old.dtype), message, outputs[name])
@@ -153,16 +153,6 @@ class OpenLoopGraph:
             params = matched(name, "the params that step returns", new.params, "the ones it got", params)
             return (new.rng, state, params), output
 
-        if not has_jax():
-            # All steps and copies at once: the window's axis comes first, then steps and copies.
-            first = pytree.map(lambda leaf: np.swapaxes(leaf, 0, 1), table["inputs"])
-            inputs = self._inputs(name, gs, {**table, "inputs": first}, sent)
-            rows = {**table, "inputs": pytree.map(lambda leaf: np.swapaxes(leaf, 0, 1), inputs)}
-            carry, outputs, ahead = (None, gs.state[name], gs.params[name]), [], True
-            for k in range(len(table["ts"])):
-                carry, output = one(carry, pytree.map(lambda leaf, k=k: leaf[k], rows))
-                outputs.append(output)
-            return pytree.map(lambda *leaves: np.stack(leaves), *outputs)
         if ahead:
             table = {**table, "inputs": jax.vmap(lambda now: self._inputs(name, gs, now, sent))(table)}
         return jax.lax.scan(one, (gs.rng[name], gs.state[name], gs.params[name]), table)[1]
@@ -185,14 +175,13 @@ class OpenLoopGraph:
         node, inputs = self.nodes[name], {}
         for input_name, t in now["inputs"].items():
             connection = node.inputs[input_name]
-            places = (t["seq"] + 1, *(() if has_jax() else (np.arange(t["seq"].shape[-1]),)))  # of messages, and copies
-            data = pytree.map(lambda leaf, places=places: leaf[places], sent[connection.output_node.name])
+            data = pytree.map(lambda leaf, t=t: leaf[t["seq"] + 1], sent[connection.output_node.name])
             state = InputState(t["seq"], t["sent"], t["received"], data)
             dist = gs.delays.get(name, {}).get(input_name)
             if dist is not None:
                 period_s = 1.0 / node.rate
                 delayed = dist.apply(state, t["lead"], connection.window, period_s, now["ts"], connection.skip)
-                state = delayed.replace(delay_dist=dist) if has_jax() else delayed
+                state = delayed.replace(delay_dist=dist)
             inputs[input_name] = state
         return inputs
 
