@@ -14,7 +14,6 @@ from typing import Any, NoReturn
 from sim2real.errors import ERROR, EXIT_CODES, OK, Sim2RealError, UsageError, did_you_mean
 from sim2real.installation import require_one
 from sim2real.later import not_installed
-from sim2real.runtime import compilation_cache
 from sim2real.stages.terminal.console import clean
 from sim2real.stages.terminal.interruption import SignalHandling
 
@@ -75,7 +74,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     with SignalHandling() as signals:
         code = _run_command(list(sys.argv[1:] if argv is None else argv), signals)
-        compilation_cache.release()
         if argv is None and code != OK:
             _leave(code)
     return code

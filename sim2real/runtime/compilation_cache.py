@@ -4,12 +4,10 @@ Imports no JAX: the folder is set in the environment, which child processes inhe
 JAX was imported before.
 """
 
-import atexit
 import contextlib
 import hashlib
 import os
 import platform
-import socket
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -29,8 +27,6 @@ _SETTINGS = {
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.0",  # a run compiles a hundred small programs: 3 s together
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
 }
-_MARKS: list[Path] = []
-"""Notes that this process writes programs."""
 
 
 def location(place: str | None = None) -> Path | None:
@@ -66,9 +62,8 @@ def enable(place: str | None = None) -> Path | None:
     except OSError:  # a home directory that is read-only or full: compiling takes longer, and that is all
         return None
 
-    # Remove broken and old programs, then set the folder for child processes, and for JAX if it was imported before.
-    _remove_unfinished(folder)
-    _mark(folder)
+    # Remove old programs (JAX's own limit needs a further package, and a lock for each program), then set the folder
+    # for child processes, and for JAX if it was imported before.
     _cut(folder, _MAX_BYTES)
     os.environ[_JAX] = str(folder)
     for name, value in _SETTINGS.items():
@@ -117,44 +112,3 @@ def _cut(folder: Path, max_bytes: int) -> None:
         if total > max_bytes:
             with contextlib.suppress(OSError):
                 path.unlink()
-
-
-def release() -> None:
-    """Remove the note that this process writes programs."""
-    while _MARKS:
-        with contextlib.suppress(OSError):
-            _MARKS.pop().unlink(missing_ok=True)
-
-
-def _mark(folder: Path) -> None:
-    """Leave a note that this process writes programs into the folder."""
-    mark = folder / f"{socket.gethostname()}-{os.getpid()}.writing"
-    with contextlib.suppress(OSError):
-        mark.touch()
-        _MARKS.append(mark)
-        owner = os.getpid()
-        atexit.register(lambda: release() if os.getpid() == owner else None)
-
-
-def _remove_unfinished(folder: Path) -> None:
-    """Remove the programs of killed processes of this host: JAX writes in place, so a part of a program may be left."""
-    host = f"{socket.gethostname()}-"
-    for mark in folder.glob(f"{host}*.writing"):
-        with contextlib.suppress(OSError, ValueError):
-            if _runs(int(mark.name.removeprefix(host).removesuffix(".writing"))):
-                continue
-            since = mark.stat().st_mtime
-            for path in folder.glob("*-cache"):
-                if path.stat().st_mtime >= since:
-                    path.unlink(missing_ok=True)
-            mark.unlink(missing_ok=True)
-
-
-def _runs(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return True
