@@ -28,6 +28,7 @@ def alone(monkeypatch, tmp_path):
     for name in ("JAX_COMPILATION_CACHE_DIR", "SIM2REAL_CACHE", *cache._SETTINGS):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache.has_jax()  # remembered, before the next line
     monkeypatch.setitem(sys.modules, "jax", None)  # this process has a cache of its own
     yield tmp_path
     for name in ("JAX_COMPILATION_CACHE_DIR", *cache._SETTINGS):
