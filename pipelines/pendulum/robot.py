@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.dynamixel.device import DynamixelServos
     from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.gate import GateConfig
-    from sim2real.robots.gate_limits import GateLimits
+    from sim2real.hardware.safety.limits import GateLimits
 
 SERVO_ID = 1
 LIMIT_V = 2.0

@@ -17,6 +17,7 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.hardware.clock import SYSTEM_CLOCK, Clock
+from sim2real.hardware.safety.following import Following
 
 
 @dataclass(frozen=True)
@@ -280,6 +281,13 @@ class Device(ABC):
         A gate with wider limits is refused, as a motor may ignore such a command without an error. Infinite: there is
         no such limit, or `command` raises.
         """
+
+    def following(self) -> Following | None:
+        """Return how the motors follow their commands, by their own figures, read from the open device.
+
+        Default: None, it is not known, and nobody notices a motor that has let go.
+        """
+        return None
 
     @abstractmethod
     def withhold_torque(self) -> None:

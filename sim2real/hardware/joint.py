@@ -76,6 +76,9 @@ class Mounting:
     The unit of a command determines its conversion: angle, speed, torque, or drive of the motor (`V`, `A` or `1`),
     whose sign alone changes. Gears count as lossless.
 
+    Attributes:
+        gear: Turns of each motor for one of its joint, ``(n,)``.
+
     Args:
         joints: One per motor, in the device's order; none: each turns with its encoder.
         device: The device; it need not be open.
@@ -93,7 +96,7 @@ class Mounting:
         kind = device.commanded
         rows = np.array([(joint.zero_rad, joint.direction, joint.gear) for joint in mounted], np.float64)
         self._zero, direction, gear = rows.reshape(-1, 3).T
-        self._turns = direction * gear
+        self._turns, self.gear = direction * gear, gear
         # Plain joints need no conversion, so their units may be any.
         plain = all(joint.is_plain for joint in mounted)
 

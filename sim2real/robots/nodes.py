@@ -219,6 +219,7 @@ class ServoActuator(BaseNode):
         self._rig.start()
         if self._begin is not None:
             self._begin()
+            self._rig.hand_over()
         return True
 
     def stop(self, timeout: float | None = None) -> bool:

@@ -52,8 +52,8 @@ from sim2real.types import Array, Key, PyTree, Scalar
 if TYPE_CHECKING:
     from sim2real.artifacts.identification import Noise
     from sim2real.hardware.device import Reading
+    from sim2real.hardware.safety.limits import GateLimits
     from sim2real.hardware.safety.rig import GateConfig
-    from sim2real.robots.gate_limits import GateLimits
 
 AnyRobot = TypeVar("AnyRobot", bound="RecordedRobot")
 _NOTHING: Mapping[str, Any] = MappingProxyType({})

@@ -1,6 +1,6 @@
 """Configurations of the four stages, as pipelines import them. Imports no JAX, so that ``--help`` stays instant."""
 
-from sim2real.robots.gate_limits import GateLimits as GateLimits
+from sim2real.hardware.safety.limits import GateLimits as GateLimits
 from sim2real.stages.deploy.config import DeployConfig as DeployConfig
 from sim2real.stages.identify.config import IdentifyConfig as IdentifyConfig
 from sim2real.stages.record.config import RecordConfig as RecordConfig

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.safety.gate import GateConfig, SafetyGate
-from sim2real.robots.gate_limits import GateLimits
+from sim2real.hardware.safety.limits import GateLimits
 
 
 def test_commands_within_limits_pass_unchanged():

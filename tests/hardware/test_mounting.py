@@ -90,7 +90,7 @@ def as_joints(rows):
 
 def gate_of(kind, **limits):
     given = {"limit": ((-0.9, -1.4), (1.1, 0.7)), "slew_per_s": 13.7, "max_speed_rad_s": (2.0, 1.5)}
-    return GateConfig(**{**given, "command_timeout_s": 10.0, "stale": kind.stale, **limits})
+    return GateConfig(**{**given, "command_timeout_s": 10.0, "first_step_rad": np.inf, "stale": kind.stale, **limits})
 
 
 def timeline(device, rows, gate, wanted):

@@ -20,7 +20,7 @@ from sim2real.hardware.safety.rig import Rig
 IDS = (1, 2, 3)
 START_RAD = np.array([0.5, -0.8, 0.3])
 DRIVE = PositionDrive(p_gain=800, profile_velocity_rad_s=20.0)
-GATE = {"limit": 1.5, "stale": "hold", "command_timeout_s": 0.1}
+GATE = {"limit": 1.5, "stale": "hold", "command_timeout_s": 0.1, "first_step_rad": np.inf}
 COUNT_RAD = reg.RAD_PER_COUNT
 
 

@@ -12,7 +12,7 @@ from arm_conformance import ArmConformance, task_on_c
 from sim2real import composer
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers
-from sim2real.robots.gate_limits import GateLimits
+from sim2real.hardware.safety.limits import GateLimits
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.pipeline.pipeline import load_pipeline
 

@@ -7,6 +7,7 @@ import numpy as np
 from sim2real.hardware.device import CommandKind, Device, Reading, Transaction
 from sim2real.hardware.dynamixel.bus import BusConfig, ServoBus
 from sim2real.hardware.dynamixel.drive import Drive
+from sim2real.hardware.safety.following import Following
 
 
 class DynamixelServos(ServoBus, Device):
@@ -36,6 +37,10 @@ class DynamixelServos(ServoBus, Device):
     def reach(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest command that the servos follow, each ``(n,)``."""
         return self.drive.reach(self)
+
+    def following(self) -> Following | None:
+        """Return how joints follow their goals, by the position controller's gain; None for voltages."""
+        return self.drive.following
 
     def enable(self) -> None:
         """Write the settings, which a servo loses at a reboot, and switch the torque on, at rest."""

@@ -12,6 +12,7 @@ from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.device import POSITION, VOLTAGE, CommandKind, OperatingMode, Reading, Transaction
 from sim2real.hardware.dynamixel import registers as reg
 from sim2real.hardware.dynamixel.bus import ServoBus
+from sim2real.hardware.safety.following import MOST_SHARE, RESPONSE_S, SLOW_RAD_S, Following
 
 
 class Drive(ABC):
@@ -27,6 +28,11 @@ class Drive(ABC):
     def prepare(self, bus: ServoBus) -> None:
         """Write the servos' settings, with torque off; raise HardwareLost if a servo does not keep them."""
         del bus
+
+    @property
+    def following(self) -> Following | None:
+        """How joints follow their commands; here: not known."""
+        return None
 
     def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest command that the servos follow, each ``(n,)``; inf: `send` refuses more."""
@@ -115,6 +121,14 @@ class PositionDrive(Drive):
             for register, value in self._settings().items():
                 bus.write(servo_id, register, value)
                 bus.link.require(servo_id, register, value)
+
+    @property
+    def following(self) -> Following | None:
+        """How joints follow their goals: near the limit, a servo pushes with nearly all of its torque."""
+        if not self.p_gain:
+            return None
+        full_rad = reg.PWM_FULL_SCALE * reg.P_GAIN_PER_PWM / self.p_gain * reg.RAD_PER_COUNT
+        return Following(MOST_SHARE * full_rad, RESPONSE_S, min(SLOW_RAD_S, 0.5 * self.profile_velocity_rad_s))
 
     def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:
         """Return the servos' own position limits, and half a count, which a goal is rounded by [rad].

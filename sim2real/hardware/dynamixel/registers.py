@@ -13,6 +13,7 @@ COUNTS_PER_REVOLUTION: Final = 4096
 RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
 RAD_S_PER_COUNT: Final = 0.229 * 2.0 * math.pi / 60.0  # velocity registers count in units of 0.229 rpm
 PWM_FULL_SCALE: Final = 885  # counts at 100 % of the supply voltage
+P_GAIN_PER_PWM: Final = 256  # P gain that turns a count of error into a count of PWM: measured on XL330 (e-Manual: 128)
 LOAD_FULL_SCALE: Final = 1000  # load registers count in units of 0.1 %
 WATCHDOG_UNIT_S: Final = 0.020
 WATCHDOG_MAX_COUNT: Final = 127

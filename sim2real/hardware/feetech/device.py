@@ -18,6 +18,7 @@ from sim2real.hardware.feetech.calibration import CalibratedJoint
 from sim2real.hardware.feetech.drive import StsDrive
 from sim2real.hardware.feetech.models import MODELS
 from sim2real.hardware.feetech.protocol import PROTOCOL, describe_alarms
+from sim2real.hardware.safety.following import MOST_SHARE, RESPONSE_S, SLOW_RAD_S, Following
 
 _STATE: Final = (reg.PRESENT_POSITION, reg.PRESENT_SPEED, reg.PRESENT_LOAD)
 _SETTINGS: Final = (reg.TORQUE_ENABLE, reg.ACCELERATION, reg.GOAL_SPEED, reg.TORQUE_LIMIT)
@@ -99,6 +100,14 @@ class StsServos(GuardedServos[StsLink], Device):
         """Return the lowest and the highest angles of the joints [rad], each ``(n,)``."""
         low, high = np.array([joint.range_rad for joint in self.joints]).T
         return low, high
+
+    def following(self) -> Following | None:
+        """Return how joints follow their goals: near the limit, a servo pushes with nearly all of its torque."""
+        drive = self._drive
+        if not drive.p_gain:
+            return None
+        full_rad = 1.0 / (drive.p_gain * reg.DUTY_PER_RAD_AND_GAIN)
+        return Following(MOST_SHARE * full_rad, RESPONSE_S, min(SLOW_RAD_S, 0.5 * drive.speed_rad_s))
 
     def enable(self) -> None:
         """Write settings and goals, the present positions, and switch the torque on; see `Device.enable`."""

@@ -14,6 +14,7 @@ from sim2real.hardware.bus.registers import MemoryTable, Register, eeprom, ram
 COUNTS_PER_REVOLUTION: Final = 4096
 RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_REVOLUTION
 ACCELERATION_UNIT: Final = 100  # counts/s^2; 8.7 deg/s^2 in the table
+DUTY_PER_RAD_AND_GAIN: Final = 0.166  # duty for a radian of error and a P gain of 1: measured by Rhoban (BAM, STS3215)
 LOAD_FULL_SCALE: Final = 1000  # load and torque registers count in units of 0.1 %
 CURRENT_UNIT_A: Final = 0.0065
 FASTEST_COUNTS_PER_S: Final = 3400

@@ -9,44 +9,33 @@ import numpy as np
 
 from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.device import Stale
+from sim2real.hardware.safety.limits import POSITIVE, GateLimits
 
 _Limit: TypeAlias = "float | Sequence[float] | Sequence[Sequence[float]]"
 
 
 @dataclass(frozen=True)
-class GateConfig:
-    """The limits of commands and measurements.
+class GateConfig(GateLimits):
+    """The limits of one robot's commands and measurements; those of `GateLimits`, which may differ between joints.
 
     Args:
         limit: Largest magnitude of a command, or (low, high), each one value or one per actuator [the command's unit];
             for commands with columns one value per column, or of the shape (n, k).
         slew_per_s: Largest rate of change of a command [the command's unit per second]; one value, or one per column;
             None: no limit.
-        command_timeout_s: Age from which a command is stale [s].
-        max_speed_rad_s: Speed above which the robot is stopped, whether measured or computed from successive positions;
-            one value or one per joint [rad/s]; None: not checked.
+        max_speed_rad_s: One value or one per joint [rad/s]; None: not checked.
         stale: Replacement of a stale command: ``zero``, or ``hold``, the last command that was sent (for positions), or
             a number. A tuple with one for each column is for commands of the shape (n, k).
-        freeze_rad_s: A joint that is pushed, moved this fast between two readings, and then reads the same to the count
-            for ``freeze_s``, stops the robot: its encoder has frozen, or it hit an obstacle [rad/s].
-        envelope_rad: Measured positions beyond which the robot is stopped, (low, high), each one value or one per joint
-            [rad]; None: not checked.
-        max_sample_age_s: Age of the newest measurement above which the robot is stopped [s].
-        stop_s: Longest time in which a soft stop brings the robot to rest [s].
     """
 
     limit: float | tuple[_Limit, _Limit] = 1.0
     slew_per_s: float | Sequence[float] | None = None
-    command_timeout_s: float = 0.1
     max_speed_rad_s: float | Sequence[float] | None = None
+    envelope_rad: tuple[float | Sequence[float], float | Sequence[float]] | None = None
     node: str = "actuator"
     stale: Stale | tuple[Stale, ...] = "zero"
     joints: tuple[str, ...] = ()
-    freeze_rad_s: float = 2.0
     freeze_s: float = 0.05
-    envelope_rad: tuple[float | Sequence[float], float | Sequence[float]] | None = None
-    max_sample_age_s: float = 0.25
-    stop_s: float = 0.5
 
     def __post_init__(self) -> None:
         # A gate that refuses every command, or the one at rest, would stop the robot at once.
@@ -67,8 +56,7 @@ class GateConfig:
         if self.envelope_rad is not None and not np.all(np.less(*map(np.asarray, self.envelope_rad))):
             raise UsageError(f"gate of {self.node!r}: envelope_rad = {self.envelope_rad} holds no position")
         # All other limits are positive, each one value or one per joint.
-        positive = ("command_timeout_s", "max_speed_rad_s", "max_sample_age_s", "stop_s")
-        for name in ("slew_per_s", "freeze_rad_s", "freeze_s", *positive):
+        for name in ("slew_per_s", "freeze_s", *POSITIVE):
             value = getattr(self, name)
             if value is not None and not np.all(np.asarray(value) > 0.0):
                 raise UsageError(f"gate of {self.node!r}: {name} = {value} must be larger than 0")

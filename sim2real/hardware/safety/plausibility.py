@@ -70,8 +70,9 @@ class Plausibility:
         Raises:
             SafetyStop: A position is not a number, jumped, lies outside of the envelope, or has frozen.
         """
-        self._require_finite(position_rad)
+        # A joint outside of its envelope is named first: the angle of another may be no number.
         self._require_inside(position_rad)
+        self._require_finite(position_rad)
         if self._t_s is None or len(position_rad) != len(self._position):
             self._begin(position_rad, t_s, unsure_s)
             return
@@ -111,7 +112,7 @@ class Plausibility:
         if self._config.envelope_rad is None:
             return
         low, high = (np.broadcast_to(np.asarray(e, np.float64), position_rad.shape) for e in self._config.envelope_rad)
-        beyond = np.maximum(low - position_rad, position_rad - high)
+        beyond = np.nan_to_num(np.maximum(low - position_rad, position_rad - high), nan=-np.inf)
         worst = int(np.argmax(beyond))
         if beyond[worst] > 0.0:
             raise SafetyStop(

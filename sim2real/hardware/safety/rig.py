@@ -6,7 +6,7 @@ import logging
 import threading
 from array import array
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Self
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy as np
 from sim2real.errors import HardwareLost, SafetyStop, Sim2RealError, UsageError
 from sim2real.hardware.device import Device, Reading, Transaction
 from sim2real.hardware.joint import Joint, Mounting
+from sim2real.hardware.safety.following import Following, FollowingCheck
 from sim2real.hardware.safety.gate import GateConfig, SafetyGate
 from sim2real.hardware.safety.plausibility import Plausibility, require_parts
 
@@ -66,6 +67,7 @@ class Rig:
     Attributes:
         measuring: The bus's use by `measure` since `start`.
         commanding: The bus's use by `command` since `start`.
+        following: How the joints follow their commands, which `measure` checks; None: not known, or not checked.
         repeats: Readings since `start` that were the sample before once again, by the device's tick.
 
     Raises:
@@ -80,8 +82,12 @@ class Rig:
         self.device = device
         self.gate = SafetyGate(gate)
         self._plausibility = Plausibility(gate)
+        self.following: Following | None = None
+        self._follow_check: FollowingCheck | None = None
         self._sent: np.ndarray | None = None
         self._speed_rad_s: np.ndarray | None = None
+        self._position_rad: np.ndarray | None = None
+        self._is_first = False  # whether the next command is the first of its sender
         self._checked_s = 0.0
         self._sampled_s: float | None = None
         self._eased_s: float | None = None
@@ -99,6 +105,7 @@ class Rig:
         self.clock = device.clock
         try:
             self._require_reach()
+            self.following = self._follows()
         except BaseException:
             device.close()
             raise
@@ -141,7 +148,10 @@ class Rig:
                 self.device.enable()
                 self.gate.reset(self._mounting.to_joints(self.device.rest()))
                 self._plausibility.reset()
+                self._position_rad = None
                 self._sent = self.gate.fallback
+                self._begin_following()
+                self._is_first = True
                 self._on = True
                 self._start_watchdog(self._done)
             except BaseException as error:
@@ -213,7 +223,18 @@ class Rig:
         sampled_s = 1e-9 * transaction.t_sent_ns
         self._plausibility.check(reading.position_rad, sampled_s, 1e-9 * transaction.late_ns, pushed)
         self._speed_rad_s, self._sampled_s = reading.velocity_rad_s, sampled_s
+        self._position_rad = reading.position_rad
+        if self._follow_check is not None and self._on:
+            self._follow_check.check(reading.position_rad, reading.velocity_rad_s, reading.load, sampled_s)
         return reading
+
+    def follow(self, following: Following) -> None:
+        """Check from the next `start` on whether the joints follow as an identified model says; see `following`."""
+        self.following = self._limited(following)
+
+    def hand_over(self) -> None:
+        """Treat the next command as the first of its sender: it must be near the measured pose, see `command`."""
+        self._is_first = True
 
     def command(self, command: np.ndarray, age_s: float, now_s: float) -> np.ndarray:
         """Send a command through the gate and return the gate's output.
@@ -224,14 +245,18 @@ class Rig:
             now_s: A monotonic time, for the slew limit [s].
 
         Raises:
-            SafetyStop: The gate stopped the robot, or a motor has stopped itself.
+            SafetyStop: The gate stopped the robot, a motor has stopped itself, or the first goals since `start` or
+                `hand_over` are farther than ``first_step_rad`` away from the measured pose.
             HardwareLost: The device is silent.
         """
         with self._lock:
             self._check()
             if not self._on:
                 raise SafetyStop("no command is sent: the torque is off", hint="start the rig first")
+            self._require_near(np.asarray(command, np.float64))
             allowed = self.gate.apply(self._softened(command), age_s, now_s, self._speed_rad_s)
+            if self._follow_check is not None:
+                self._follow_check.sent(allowed, self._now_s())
             self.commanding.add(self.device.command(self._mounting.to_motors(allowed)))
             self._sent = allowed
             self._commanded_s = self._now_s()
@@ -247,7 +272,7 @@ class Rig:
             raise SafetyStop(
                 f"node {self.gate.config.node!r} stopped: the newest measurement is {age_s:.3g} s old, "
                 f"{max_age_s:g} s are allowed",
-                hint="does another process hold up the sensor? max_sample_age_s sets the limit",
+                hint="is this computer too busy, or the sensor held up? max_sample_age_s sets the limit",
             )
 
     def ease(self) -> None:
@@ -306,6 +331,51 @@ class Rig:
                     hint="hold it still, or allow longer with --settle-s",
                 )
             self.clock.sleep(0.02)
+
+    def _follows(self) -> Following | None:
+        """Return how the joints follow their commands, by the device's own figures."""
+        following = self.device.following()
+        if following is None:
+            return None
+        if following.most_nm is None:
+            gear = self._mounting.gear
+            following = replace(following, limit=following.limit / gear, speed_rad_s=following.speed_rad_s / gear)
+        return self._limited(following)
+
+    def _limited(self, following: Following) -> Following | None:
+        """Return how the joints follow their commands, with the limit that the user has set."""
+        limit = self.gate.config.following_rad
+        if limit is None:
+            return following
+        if np.all(np.isinf(limit)):
+            return None
+        return following if following.most_nm is not None else replace(following, limit=limit, source="following_rad")
+
+    def _begin_following(self) -> None:
+        self._follow_check = None
+        if self.following is not None and self._sent is not None and not self.torque_withheld:
+            self._follow_check = FollowingCheck(self.following, self._sent, self._now_s(), self.gate.config.joint)
+
+    def _require_near(self, command: np.ndarray) -> None:
+        """Refuse a sender whose first goals are far away from the measured pose."""
+        if not self._is_first:
+            return
+        self._is_first = False
+        kinds = self.device.commanded.columns or (self.device.commanded,)
+        goals = [i for i, kind in enumerate(kinds) if kind.unit == "rad" and kind.stale == "hold"]
+        position = self._sent if self._position_rad is None else self._position_rad
+        if not goals or position is None or self.torque_withheld:
+            return
+        wanted, here = (values[:, goals[0]] if values.ndim > 1 else values for values in (command, position))
+        away = np.abs(wanted - here)
+        most = np.broadcast_to(np.asarray(self.gate.config.first_step_rad), away.shape)
+        if np.any(away > most):  # the gate refuses a command that is no number
+            worst = int(np.nanargmax(away - most))
+            raise SafetyStop(
+                f"the first command puts {self.gate.config.joint(worst)} at {wanted[worst]:.3g} rad, measured are "
+                f"{here[worst]:.3g} rad: {away[worst]:.2g} rad away, {most[worst]:.2g} rad are allowed",
+                hint="bring the robot to the pose in which the policy starts; first_step_rad sets the limit",
+            )
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -370,6 +440,8 @@ class Rig:
             fallback = self.gate.fallback
             self.device.command(self._mounting.to_motors(fallback))
             self._sent = fallback
+            if self._follow_check is not None:
+                self._follow_check.sent(fallback, self._now_s())
         if late:
             self.timeouts += 1
             self._commanded_s = self._now_s()

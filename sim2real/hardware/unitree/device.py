@@ -18,9 +18,10 @@ from sim2real.hardware.device import (
     Transaction,
     WithoutHost,
 )
+from sim2real.hardware.safety.following import Following
 from sim2real.hardware.unitree.dds import Address
 from sim2real.hardware.unitree.guarded import GuardedLegs
-from sim2real.hardware.unitree.legs import NAMES, LegDrive, command
+from sim2real.hardware.unitree.legs import NAMES, TORQUE_NM, LegDrive, command
 from sim2real.hardware.unitree.messages import MOTORS, LowCmd, LowState
 from sim2real.hardware.unitree.sit_down import motors_on
 
@@ -37,6 +38,8 @@ PARTS: Final[Mapping[str, ReadingPart]] = MappingProxyType(
 )
 """Parts of a reading. The quaternion is (w, x, y, z). Gyro and accelerometer of this kind reach 35 rad/s and 157 m/s^2.
 The force on a foot is the count of its sensor, in the order FR, FL, RR, RL: Unitree documents no unit."""
+_WEAK_NM, _WEAK_S = 8.0, 0.1
+"""By how much a motor's torque may be weaker than its law [N m], on average over a time [s]."""
 _SOURCE: Final = (
     "Unitree documents no reaction of a Go2; a motor of its GO family goes on (unitree_actuator_sdk, issue 29); "
     "not measured by us"
@@ -148,6 +151,10 @@ class UnitreeLegs(GuardedLegs, Device):
         self._rest[:, 0] = np.clip(self.measure().position_rad, low[:, 0], high[:, 0])
         self._rest[:, 3] = self.drive.damping
         self.switch_on(self._message(self._rest))
+
+    def following(self) -> Following:
+        """Return by how much a motor's torque may be weaker than its law."""
+        return Following(_WEAK_NM, _WEAK_S, source="the motors' own torques", most_nm=TORQUE_NM[self._places])
 
     def rest(self) -> np.ndarray:
         """Return the command since `enable`, ``(12, 5)``: the positions of that time without a gain, and damping."""

@@ -22,7 +22,7 @@ from sim2real.robots.session import Embedded, Session
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
     from sim2real.hardware.safety.gate import GateConfig
-    from sim2real.robots.gate_limits import GateLimits
+    from sim2real.hardware.safety.limits import GateLimits
 
 _HOLD_S = 1.0
 """How long an excitation's last goals are repeated [s]."""

@@ -22,7 +22,7 @@ from sim2real.robots.walking.messages import BodyReading, LegCommand, gravity_of
 if TYPE_CHECKING:
     from sim2real.hardware.device import Device, Reading
     from sim2real.hardware.safety.gate import GateConfig
-    from sim2real.robots.gate_limits import GateLimits
+    from sim2real.hardware.safety.limits import GateLimits
 
 Place = Literal["floor", "stand"]
 _STILL_RAD_S = 0.3

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from sim2real.errors import UsageError
-from sim2real.robots.gate_limits import GateLimits
+from sim2real.hardware.safety.limits import GateLimits
 from sim2real.stages.flag import Flag
 from sim2real.stages.live.config import ViewFlag, check_view
 from sim2real.stages.seed import check_seed

@@ -34,7 +34,8 @@ def opened(robot: Robot, config: RecordConfig | DeployConfig, truth_path: Path) 
     if config.dry_run:
         note("dry run: torque stays off and no goal is sent; what would have been sent is logged")
     hanging = isinstance(config, RecordConfig) and not config.standing
-    with robot.drive.connect(config.port, config.gate, truth_path, config.seed, hanging) as session, realtime():
+    limits = config.gate.on(config.port)
+    with robot.drive.connect(config.port, limits, truth_path, config.seed, hanging) as session, realtime():
         _require_rig(session.rig)
         if config.dry_run:
             session.rig.withhold_torque()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from sim2real.errors import UsageError
@@ -12,6 +12,21 @@ if TYPE_CHECKING:
     from sim2real.hardware.safety.gate import GateConfig
 
 GateLimit: TypeAlias = float | tuple[float | Sequence[float], float | Sequence[float]]
+
+EMBEDDED = "embedded"
+"""The port of a robot's emulated twin."""
+POSITIVE = (
+    "command_timeout_s",
+    "max_speed_rad_s",
+    "freeze_rad_s",
+    "first_step_rad",
+    "following_rad",
+    "max_sample_age_s",
+    "stop_s",
+)
+"""Limits that must be above 0."""
+_PATIENCE_S = 2.0
+"""Longest silence and oldest measurement of an emulated robot [s]."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +45,11 @@ class GateLimits:
     """A joint that moved this fast and then reads the same for 0.05 s stops the robot: its encoder froze [rad/s]."""
     envelope_rad: tuple[float, float] | None = None
     """Range of joint angles, lowest and highest; outside of it the robot is stopped; default: not checked [rad]."""
+    first_step_rad: float = 0.5
+    """Largest distance of the first goal from the measured pose; a policy that starts farther away is refused [rad]."""
+    following_rad: float | None = None
+    """Largest distance of a joint from where its goals put it: beyond it the robot is stopped, as the joint let go, is
+    blocked or slips; default: by the identified model, or by the servo's own figures; inf: not checked [rad]."""
     max_sample_age_s: float = 0.25
     """Age of the newest measurement above which the robot is stopped instead of commanded [s]."""
     stop_s: float = 0.5
@@ -38,20 +58,21 @@ class GateLimits:
     """Longest silence on the bus; after it the guardian takes the torque off, and the servos' watchdogs trip [s]."""
 
     def __post_init__(self) -> None:
-        positive = (
-            "command_timeout_s",
-            "max_speed_rad_s",
-            "max_sample_age_s",
-            "stop_s",
-            "freeze_rad_s",
-        )
-        for name in ("limit", "slew_per_s", *positive):
-            if not getattr(self, name) > 0.0:
-                raise UsageError(f"gate.{name} must be above 0, got {getattr(self, name)}")
+        for name in ("limit", "slew_per_s", *POSITIVE):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise UsageError(f"gate.{name} must be above 0, got {value}")
         if not 0.02 <= self.servo_watchdog_s <= 2.54:
             raise UsageError(f"gate.servo_watchdog_s must lie in [0.02, 2.54] s, got {self.servo_watchdog_s}")
         if self.envelope_rad is not None and not self.envelope_rad[0] < self.envelope_rad[1]:
             raise UsageError(f"gate.envelope_rad must be the lowest and the highest angle, got {self.envelope_rad}")
+
+    def on(self, port: str) -> GateLimits:
+        """Return the limits for a port: an emulated robot waits for its host, which may be busy."""
+        if port != EMBEDDED:
+            return self
+        age_s, silence_s = max(_PATIENCE_S, self.max_sample_age_s), max(_PATIENCE_S, self.servo_watchdog_s)
+        return replace(self, max_sample_age_s=age_s, servo_watchdog_s=silence_s)
 
     def gate(self, limit: GateLimit, **settings: Any) -> GateConfig:
         """Return the gate of a robot with these limits.

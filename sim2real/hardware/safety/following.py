@@ -1,0 +1,145 @@
+"""Following error: a joint that does not do what its commands say has let go, is blocked, slips, or reads wrongly."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from sim2real.errors import SafetyStop
+
+RESPONSE_S: Final = 0.2
+"""Time in which every servo answers a small step [s]."""
+SLOW_RAD_S: Final = 0.5
+"""Speed that every servo reaches on a longer way, also under load [rad/s]."""
+MOST_SHARE: Final = 0.9
+"""Share of its torque beyond which a servo that still does not reach its goal is stopped."""
+_BEYOND_S: Final = 0.04
+"""Time for which a joint must be beyond its limit before the robot is stopped [s]."""
+_SAMPLES: Final = 3
+"""Number of samples in a row that must be beyond the limit."""
+
+
+@dataclass(frozen=True)
+class Following:
+    """How the joints of a robot follow their commands, as far as that is certain.
+
+    Goals: ``response_s`` after a goal was sent, the joint is there, or travels there at ``speed_rad_s`` or faster. So
+    it lies between the goals of the last ``response_s``, or on the way to them, moved by ``weight``; it is away from
+    there by at most ``limit``.
+
+    Torques, if ``most_nm`` is given: the load that a motor reports is weaker than the torque of its law
+    ``tau + kp (q - position) + kd (dq - velocity)`` by at most ``limit``, on average over ``response_s``.
+
+    Attributes:
+        limit: Largest deviation, one value or one per joint [rad, or N m].
+        speed_rad_s: One value or one per joint.
+        source: Where the figures come from, for messages.
+        weight: Returns for positions ``(n,)`` by how much weight and dry friction move each joint off its goal, the
+            lowest and the highest value [rad]; None: ``limit`` includes that.
+        most_nm: Torque that each motor reaches, one value or one per joint; None: goals are compared.
+    """
+
+    limit: float | Sequence[float] | np.ndarray
+    response_s: float
+    speed_rad_s: float | Sequence[float] | np.ndarray = 0.5
+    source: str = "the servos' own figures"
+    weight: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
+    most_nm: float | Sequence[float] | np.ndarray | None = None
+
+
+class FollowingCheck:
+    """Compares measurements with commands; see `Following`. Both may come from different threads.
+
+    Args:
+        start: Command that the joints follow at the start, ``(n,)`` [rad], or ``(n, 5)`` as in `Following`.
+        t_s: Time of the start [s].
+        name: Returns a joint's name for errors.
+    """
+
+    def __init__(self, following: Following, start: np.ndarray, t_s: float, name: Callable[[int], str]) -> None:
+        self._following, self._name, n = following, name, len(start)
+        self._limit = np.broadcast_to(np.asarray(following.limit, np.float64), n)
+        self._speed = np.broadcast_to(np.asarray(following.speed_rad_s, np.float64), n)
+        self._lock = threading.Lock()
+        self._commands: list[tuple[float, np.ndarray]] = [(t_s, np.array(start, np.float64))]
+        self._low = self._high = self._commands[0][1]
+        self._place = self._low, self._high
+        self._t_s = t_s
+        self._weak, self._law = np.zeros(n), np.zeros(n)
+        # Since when each joint is beyond its limit, and for how many samples.
+        self._since_s, self._count = np.zeros(n), np.zeros(n, np.int64)
+
+    def sent(self, command: np.ndarray, t_s: float) -> None:
+        """Note a command that is sent at a time [s]."""
+        with self._lock:
+            self._commands.append((t_s, np.array(command, np.float64)))
+
+    def check(self, position_rad: np.ndarray, velocity_rad_s: np.ndarray, load: np.ndarray, t_s: float) -> None:
+        """Check a measurement that was taken at a time [s]; arrays ``(n,)``.
+
+        Raises:
+            SafetyStop: A joint does not follow its commands.
+        """
+        with self._lock:
+            # Keep the commands of the response's time, and the one before.
+            commands = self._commands
+            while len(commands) > 1 and commands[1][0] <= t_s - self._following.response_s:
+                commands.pop(0)
+            recent = np.array([command for _, command in commands])
+        elapsed_s, self._t_s = max(0.0, t_s - self._t_s), t_s
+        if self._following.most_nm is None:
+            off = self._distance(recent, position_rad, elapsed_s)
+        else:
+            off = self._weakness(recent[-1], position_rad, velocity_rad_s, load, elapsed_s)
+        # A joint must be beyond its limit for a while: single readings may be wrong.
+        beyond = off > self._limit
+        self._since_s = np.where(beyond & (self._count == 0), t_s, self._since_s)
+        self._count = np.where(beyond, self._count + 1, 0)
+        lasting = beyond & (self._count >= _SAMPLES) & (t_s - self._since_s >= _BEYOND_S)
+        if lasting.any():
+            raise self._stop(int(np.argmax(np.where(lasting, off - self._limit, -np.inf))), position_rad, load, off)
+
+    def _distance(self, goals: np.ndarray, position_rad: np.ndarray, elapsed_s: float) -> np.ndarray:
+        """Return the distance of each joint from where its goals put it [rad]."""
+        way = self._speed * elapsed_s
+        self._low = np.minimum(goals.min(axis=0), self._low + way)
+        self._high = np.maximum(goals.max(axis=0), self._high - way)
+        low, high = self._low, self._high
+        if self._following.weight is not None:
+            down, up = self._following.weight(position_rad)
+            low, high = low + np.minimum(down, 0.0), high + np.maximum(up, 0.0)
+        self._place = low, high
+        return np.maximum(np.maximum(low - position_rad, position_rad - high), 0.0)
+
+    def _weakness(
+        self, law: np.ndarray, position_rad: np.ndarray, velocity_rad_s: np.ndarray, load: np.ndarray, elapsed_s: float
+    ) -> np.ndarray:
+        """Return by how much the load of each motor is weaker than its law, on average [N m]."""
+        q, dq, kp, kd, tau = law.T
+        most = np.asarray(self._following.most_nm, np.float64)
+        torque = np.clip(tau + kp * (q - position_rad) + kd * (dq - velocity_rad_s), -most, most)
+        share = min(1.0, elapsed_s / self._following.response_s)
+        self._law = self._law + share * (torque - self._law)
+        self._weak = self._weak + share * (np.abs(torque) - np.sign(torque) * load - self._weak)
+        return np.maximum(self._weak, 0.0)
+
+    def _stop(self, joint: int, position_rad: np.ndarray, load: np.ndarray, off: np.ndarray) -> SafetyStop:
+        name, limit, source = self._name(joint), self._limit[joint], self._following.source
+        if self._following.most_nm is None:
+            low, high = self._place[0][joint], self._place[1][joint]
+            place = f"{low:.3g} rad" if high - low < 5e-3 else f"{low:.3g} to {high:.3g} rad"
+            fault = (
+                f"{name} is at {position_rad[joint]:.3g} rad, its commands put it at {place}: it is "
+                f"{off[joint]:.2g} rad away, {limit:.2g} rad are allowed ({source})"
+            )
+        else:
+            fault = (
+                f"{name} pushes with {load[joint]:.2g} N m, its command is {self._law[joint]:.2g} N m: "
+                f"{off[joint]:.2g} N m are missing, {limit:.2g} N m are allowed ({source})"
+            )
+        cause = "has its motor let go, is it blocked, does its belt slip, or is its encoder stuck?"
+        return SafetyStop(fault, hint=f"{cause} following_rad sets the limit")
