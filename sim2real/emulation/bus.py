@@ -50,6 +50,9 @@ class Emulation:
         frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
         unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
         ill_after_s: Time from which answers are late or wild [s].
+        lets_go_after_s: Time from which the motor of the servo `lets_go` has no torque, though it reports torque on,
+            such as one whose gear broke [s]; None: never.
+        lets_go: That servo's id.
         on_signal: Whether these times, except the overload's, count from SIGUSR1 to the process.
     """
 
@@ -72,6 +75,8 @@ class Emulation:
     frozen_after_s: float | None = None
     unplugged_after_s: float | None = None
     ill_after_s: float = 0.0
+    lets_go_after_s: float | None = None
+    lets_go: int = 1
     on_signal: bool = False
 
     def __post_init__(self) -> None:
@@ -172,9 +177,11 @@ class PlannedBus(ABC):
         self._last_bytes_ns = start_ns
         self._delivered_ns = start_ns
         self._frozen: dict[int, tuple[float, float, float]] = {}
-        self._fault_ns = None if config.on_signal else start_ns
+        self._fault_ns: int | None = None
         self._events: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._sequence = 0
+        if not config.on_signal:
+            self.begin_faults(start_ns)
         if config.overload_after_s is not None:
             overload_ns = start_ns + round(config.overload_after_s * 1e9)
             self._at(overload_ns, self._overload, overload_ns)
@@ -232,6 +239,9 @@ class PlannedBus(ABC):
     def begin_faults(self, t_ns: int) -> None:
         """Count the times of faults from ``t_ns``."""
         self._fault_ns = t_ns
+        if self._config.lets_go_after_s is not None:
+            ns = t_ns + round(1e9 * self._config.lets_go_after_s)
+            self._at(ns, self._stop_motor, self._firmware[self._config.lets_go], ns, OperatingMode.OFF)
 
     def unplugged(self, t_ns: int) -> bool:
         """Return whether the port is gone at a time [ns]."""
@@ -261,7 +271,10 @@ class PlannedBus(ABC):
         # Commands take effect in the order in which they were sent.
         planned_ns = max(planned_ns, self._last_effect_ns[servo.servo_id])
         self._last_effect_ns[servo.servo_id] = planned_ns
-        self._clock.schedule(planned_ns, request.t_host_ns, servo.servo_id, *servo.command())
+        mode, goal = servo.command()
+        if servo.servo_id == config.lets_go and self._passed(config.lets_go_after_s, request.t_ns):
+            mode, goal = OperatingMode.OFF, 0.0
+        self._clock.schedule(planned_ns, request.t_host_ns, servo.servo_id, mode, goal)
 
     def measure(self, servo: Firmware, t_ns: int) -> Sample:
         """Set a servo's present values to those of one sensing latency before `t_ns`, and return the true ones."""

@@ -70,7 +70,9 @@ class UnitreeEmulation:
         late: Probability that a state is held up; later states wait for it.
         late_s: Time for which it is held up [s].
         silent_after_s: Time from which no state is sent and no command received, as with an unplugged cable [s].
-        on_signal: Whether this time counts from SIGUSR1 to the process.
+        lets_go_after_s: Time from which the motor `lets_go` has no torque, though it reports that it is on [s].
+        lets_go: That motor's number.
+        on_signal: Whether these times count from SIGUSR1 to the process.
         seed: Seed of jitter and noise.
     """
 
@@ -91,6 +93,8 @@ class UnitreeEmulation:
     late: float = 0.0
     late_s: float = 0.009
     silent_after_s: float | None = None
+    lets_go_after_s: float | None = None
+    lets_go: int = 0
     on_signal: bool = False
     seed: int = 0
 
@@ -112,6 +116,7 @@ class EmulatedLegs:
 
     Attributes:
         ignored: Commands whose CRC or head was wrong.
+        faulty_ns: Time from which the times of faults count [ns]; None: they have not begun.
     """
 
     def __init__(self, body: Body, config: UnitreeEmulation, truth: TruthLog, start_ns: int) -> None:
@@ -124,12 +129,17 @@ class EmulatedLegs:
         self._heard_ns: int | None = None
         self._damps = False
         self.ignored = 0
+        self.faulty_ns = None if config.on_signal else start_ns
         # Measurements on the grid of the physics, the newest last, as far back as a state reaches.
         self._dtype = body.measure().dtype
         depth = int(1e9 * config.sensing_latency_s) // self._step_ns + 3
         self._history: deque[np.ndarray] = deque(maxlen=depth)
         self._stride = max(1, round(STATE_PERIOD_S / body.step_s))
         self._remember()
+
+    def has(self, after_s: float | None, t_ns: int) -> bool:
+        """Return whether a fault has begun at a time [ns] that begins ``after_s`` [s]; None: it never does."""
+        return after_s is not None and self.faulty_ns is not None and t_ns - self.faulty_ns > 1e9 * after_s
 
     def receive(self, command: LowCmd, t_ns: int) -> None:
         """Schedule a command that was written at ``t_ns``; one with a wrong CRC or head is ignored, as by the robot."""
@@ -194,7 +204,10 @@ class EmulatedLegs:
         law[~np.isfinite(law).all(axis=1)] = 0.0
         changed = modes != self._modes
         self._modes, self._law, self._heard_ns, self._damps = modes, law, t_ns, False
-        self._body.drive(law)
+        driven = law.copy()
+        if self.has(self._config.lets_go_after_s, self._now_ns()):
+            driven[self._config.lets_go] = 0.0
+        self._body.drive(driven)
         # Mode, goal and position gain: of the first motor for each command, of the others if their mode changes.
         acts_ns, changed[0] = self._now_ns() - self._step_ns // 2, True
         for i in np.flatnonzero(changed).tolist():
@@ -329,7 +342,6 @@ def _serve(
     parent_fd: int | None,
 ) -> None:
     """Send states and obey commands until ``stop`` is set; with ``parent_fd``, also until that pipe is closed."""
-    faulty_ns = None if config.on_signal else start_ns
     due_ns, inputs = start_ns + _PERIOD_NS, [] if parent_fd is None else [parent_fd]
     while not stop.is_set:
         # Sleep until the next millisecond.
@@ -338,9 +350,8 @@ def _serve(
         if select.select(inputs, [], [], wait_s)[0] and not os.read(inputs[0], 1024):
             return
         now_ns = time.monotonic_ns()
-        faulty_ns = stop.faulty_ns or faulty_ns
-        late_s = config.silent_after_s
-        silent = late_s is not None and faulty_ns is not None and now_ns - faulty_ns > 1e9 * late_s
+        legs.faulty_ns = stop.faulty_ns or legs.faulty_ns
+        silent = legs.has(config.silent_after_s, now_ns)
         # Commands count from the time at which they were written.
         for message in reader.take(16):
             if isinstance(message, LowCmd) and not silent:

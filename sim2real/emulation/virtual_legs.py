@@ -40,8 +40,7 @@ class VirtualLegs(VirtualTime):
     @property
     def silent(self) -> bool:
         """Whether the cable is unplugged."""
-        after_s = self._config.silent_after_s
-        return after_s is not None and self._now_ns > 1e9 * after_s
+        return self.legs.has(self._config.silent_after_s, self._now_ns)
 
     def stop(self) -> None:
         """End the robot, after which its truth is complete. May be called twice."""

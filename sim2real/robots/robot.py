@@ -52,6 +52,7 @@ from sim2real.types import Array, Key, PyTree, Scalar
 if TYPE_CHECKING:
     from sim2real.artifacts.identification import Noise
     from sim2real.hardware.device import Reading
+    from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.limits import GateLimits
     from sim2real.hardware.safety.rig import GateConfig
 
@@ -292,6 +293,10 @@ class RobotModel(ABC):
 
     def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation | None:
         """Return the robot with identified values as a simulation in plain MuJoCo; None: there is none."""
+        return None
+
+    def following(self, values: Mapping[str, float]) -> Following | None:
+        """Return how joints with identified values follow their commands; None: as the device says."""
         return None
 
 

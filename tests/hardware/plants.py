@@ -61,8 +61,9 @@ class Joints:
     CENTRE_RAD = math.pi
     RATE_PER_GAIN = 0.025
 
-    def __init__(self, ids=(1, 2, 3), start_rad=(0.5, -0.8, 0.3)):
+    def __init__(self, ids=(1, 2, 3), start_rad=(0.5, -0.8, 0.3), rate_per_gain=RATE_PER_GAIN):
         self.servo_ids = tuple(ids)
+        self._rate_per_gain = rate_per_gain
         self._steps = 0
         self._q = dict(zip(ids, start_rad, strict=True))
         self._dq = dict.fromkeys(ids, 0.0)
@@ -90,7 +91,7 @@ class Joints:
         p_gain, profile_rad_s = self._controller[i]
         error = goal - self.CENTRE_RAD - self._setpoint[i]
         self._setpoint[i] += math.copysign(min(abs(error), STEP_S * profile_rad_s), error)
-        return self.RATE_PER_GAIN * p_gain * (self._setpoint[i] - self._q[i])
+        return self._rate_per_gain * p_gain * (self._setpoint[i] - self._q[i])
 
     def command(self, servo_id, mode, goal):
         self._command[servo_id] = (mode, goal)
@@ -167,3 +168,11 @@ def lateness_s(truth):
     from sim2real.emulation.truth import Kind
 
     return 1e-9 * truth.rows["late_ns"][[kind in (Kind.SAMPLE, Kind.REPLY) for kind in truth.rows["kind"]]]
+
+
+class Sinking(Joints):
+    """Joints that sink at 0.6 rad/s without torque, from 0.9 s on, to -1.4 rad."""
+
+    def _speed(self, i):
+        speed = super()._speed(i)
+        return -0.6 if self._command[i][0] != POSITION and self._steps * STEP_S > 0.9 and self._q[i] > -1.4 else speed

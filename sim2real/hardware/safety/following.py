@@ -68,6 +68,7 @@ class FollowingCheck:
         self._commands: list[tuple[float, np.ndarray]] = [(t_s, np.array(start, np.float64))]
         self._low = self._high = self._commands[0][1]
         self._place = self._low, self._high
+        self._position = np.array(self._low if following.most_nm is None else self._low[:, 0])
         self._t_s = t_s
         self._weak, self._law = np.zeros(n), np.zeros(n)
         # Since when each joint is beyond its limit, and for how many samples.
@@ -105,9 +106,11 @@ class FollowingCheck:
 
     def _distance(self, goals: np.ndarray, position_rad: np.ndarray, elapsed_s: float) -> np.ndarray:
         """Return the distance of each joint from where its goals put it [rad]."""
+        # A joint that is on its way to its goals goes on from where it was measured last.
         way = self._speed * elapsed_s
-        self._low = np.minimum(goals.min(axis=0), self._low + way)
-        self._high = np.maximum(goals.max(axis=0), self._high - way)
+        self._low = np.minimum(goals.min(axis=0), np.maximum(self._low, self._position) + way)
+        self._high = np.maximum(goals.max(axis=0), np.minimum(self._high, self._position) - way)
+        self._position = position_rad
         low, high = self._low, self._high
         if self._following.weight is not None:
             down, up = self._following.weight(position_rad)

@@ -19,6 +19,7 @@ from sim2real.robots.loop import ACTUATOR, WORLD
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotModel
 from sim2real.robots.servo import parameters
+from sim2real.robots.servo.following import identified_following
 from sim2real.robots.servo.parts import REFERENCE, GoalTask
 from sim2real.robots.servo.payload import PAYLOAD, Hand
 from sim2real.robots.servo.servos import Servos, gear_of
@@ -28,6 +29,7 @@ from sim2real.types import Array, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.emulation.bus import BusEmulation
+    from sim2real.hardware.safety.following import Following
     from sim2real.worlds.rollouts import WorldParams
 
 mj: Any = mujoco
@@ -160,6 +162,12 @@ class ComposedModel(RobotModel):
             lead_s=self.lead_s,
             velocity_lead_s=self.lead_s,
         )
+
+    def following(self, values: Mapping[str, float]) -> Following:
+        """Return how the joints follow their goals, with every payload that the hand can bear."""
+        hand, joints = self.hand, tuple(joint.full_identifier for joint in self.task.joints)
+        loads = [{}] if hand is None else [{PAYLOAD: hand.least_kg}, {PAYLOAD: hand.most_kg}]
+        return identified_following([self.identified_mjcf({**values, **load}) for load in loads], joints)
 
     def twin(self, emulator: BusEmulation, **factors: float) -> Embedded:
         """Return an emulated robot with this model's physics.

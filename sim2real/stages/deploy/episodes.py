@@ -7,6 +7,7 @@ from pathlib import Path
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.recording import TRUTH
 from sim2real.errors import UsageError
+from sim2real.hardware.safety.following import Following
 from sim2real.policy.runner import BlendedRunner, UprightRunner
 from sim2real.robots.probe import Witness
 from sim2real.robots.robot import Robot, Session
@@ -16,7 +17,7 @@ from sim2real.stages.deploy.probe_log import write_probe
 from sim2real.stages.live.scene import scene_of
 from sim2real.stages.live.viewer import live_view
 from sim2real.stages.on_robot.episode import check_deadlines, run_episode
-from sim2real.stages.on_robot.open_robot import opened
+from sim2real.stages.on_robot.open_robot import announce_following, opened
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note
 from sim2real.types import Json
@@ -25,12 +26,18 @@ PolicyRunner = BlendedRunner | UprightRunner
 
 
 def run_episodes(
-    pipeline: Pipeline, robot: Robot, bundle: Bundle, config: DeployConfig, logs: Sequence[Path]
+    pipeline: Pipeline,
+    robot: Robot,
+    bundle: Bundle,
+    config: DeployConfig,
+    logs: Sequence[Path],
+    following: Following | None = None,
 ) -> list[dict[str, Json]]:
     """Run the policy for one episode a log; return the summary of each session.
 
     Args:
         logs: The files to write, all in the folder of the deployment.
+        following: How the joints follow their commands, by the identified model; None: as the device says.
 
     Raises:
         Sim2RealError: The cause that stopped the robot.
@@ -40,6 +47,9 @@ def run_episodes(
     with live_view(config.view, folder, pipeline.name, scene), opened(robot, config, folder / TRUTH) as session:
         if config.hold and session.rig.gate.config.stale != "hold":
             raise UsageError("this robot's motors hold no position", hint="run without --hold")
+        if following is not None:
+            session.rig.follow(following)
+        announce_following(session.rig)
         # Measure the delay before the policy moves the robot: a policy trained for another delay may oscillate.
         delay = _measure_delay(pipeline, robot, session, bundle, config, folder)
         summaries = [_run_one(pipeline, robot, session, policy, i, log, config) for i, log in enumerate(logs)]

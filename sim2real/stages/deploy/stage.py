@@ -12,6 +12,7 @@ from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, finished, open_stage
 from sim2real.errors import UsageError
+from sim2real.installation import has_jax
 from sim2real.robots.robot import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.deploy.episodes import check_timing, require_tilt, run_episodes
@@ -61,7 +62,8 @@ def deploy(
 
     # Run the episodes on the robot.
     logs = [log_of(folder, i) for i in range(config.episodes)]
-    summaries = run_episodes(pipeline, robot, bundle, config, logs)
+    following = robot.model.following(identification.values) if identification is not None and has_jax() else None
+    summaries = run_episodes(pipeline, robot, bundle, config, logs, following)
     recordings = [Recording.load(log, folder / TRUTH) for log in logs]
     if config.dry_run:
         # The robot did not move: there are no scores and no gap.

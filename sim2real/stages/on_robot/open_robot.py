@@ -58,6 +58,16 @@ def announce(session: Session, urgent: bool) -> None:
         note(f"if this process dies: {line}; the guardian takes the torque off", urgent)
 
 
+def announce_following(rig: Rig) -> None:
+    """Print by which figures joints are watched that do not follow their commands; or that none are."""
+    following = rig.following
+    if following is None:
+        note("no motor is watched for letting go: how it follows its commands is not known, or following_rad is inf")
+        return
+    unit, limit = "rad" if following.most_nm is None else "N m", np.max(following.limit)
+    note(f"a joint more than {limit:.2g} {unit} off its commands stops the robot, by {following.source}")
+
+
 def rig_summary(rig: Rig) -> dict[str, Any]:
     """Return what the rig adds to an episode's summary.
 

@@ -1,0 +1,159 @@
+"""A joint that does not do what its commands say stops the robot and is named; a sound one never does."""
+
+import math
+
+import numpy as np
+import pytest
+from families import ANGLES, STS, VOLTS
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim2real.errors import SafetyStop
+from sim2real.hardware.safety.following import Following, FollowingCheck
+from sim2real.hardware.safety.gate import GateConfig
+from sim2real.hardware.safety.plausibility import Plausibility
+
+GATE = {"limit": 1.5, "slew_per_s": 20.0}
+START = np.array([0.5, -0.8, 0.3])
+FAULT_S = 1.0
+RATES = {ANGLES.name: 0.025, STS.name: 1.25}  # 1 / 50 ms at the gains of both
+LETS_GO = {"lets_go_after_s": FAULT_S, "lets_go": 2}
+
+
+def swing(t_s):
+    return START + 0.3 * np.sin(4.0 * t_s) * np.array([1.0, 1.0, 1.0])
+
+
+def drive(rig, goals, seconds):
+    """Command and measure at 50 Hz; return the time of the stop since the robot's start [s] and its message."""
+    rig.start()
+    begin_s = 1e-9 * rig.clock.now_ns()
+    while (t_s := 1e-9 * rig.clock.now_ns() - begin_s) < seconds:
+        try:
+            rig.measure()
+        except SafetyStop as error:
+            return 1e-9 * rig.clock.now_ns(), str(error)
+        rig.command(goals(t_s), 0.0, 1e-9 * rig.clock.now_ns())
+        rig.clock.sleep(0.02)
+    return None
+
+
+@pytest.mark.parametrize("family", [ANGLES, STS], ids=lambda family: family.name)
+@pytest.mark.parametrize(
+    ("plant", "fault", "within_s"),
+    [("Sinking", LETS_GO, 0.65), ("Joints", LETS_GO, 0.65), ("Joints", {"frozen_after_s": FAULT_S}, 0.65)],
+    ids=["sinks", "stays", "encoder freezes"],
+)
+def test_a_motor_that_lets_go_stops_the_robot_and_is_named(family, plant, fault, within_s):
+    robot = family.robot(plant, fault, rate_per_gain=RATES[family.name])
+    with family.rig(robot, {**GATE, "joints": ("pan", "lift", "tip"), "following_rad": 0.1}) as rig:
+        stopped_s, message = drive(rig, swing, 3.0)
+    assert FAULT_S < stopped_s < FAULT_S + within_s
+    assert "lift" in message or "frozen_after_s" in fault
+    assert "rad" in message
+    robot.stop()
+
+
+@pytest.mark.parametrize("family", [ANGLES, STS], ids=lambda family: family.name)
+@pytest.mark.parametrize("gate", [{}, {"following_rad": 0.1}], ids=["by the servos' figures", "by a limit"])
+def test_sound_joints_go_on(family, gate):
+    robot = family.robot("Joints", rate_per_gain=RATES[family.name])
+    with family.rig(robot, {**GATE, **gate}) as rig:
+        assert rig.following is not None
+        assert drive(rig, swing, 3.0) is None
+    robot.stop()
+
+
+def test_a_joint_at_rest_may_be_moved_off_its_goal_by_less_than_nearly_all_of_the_torque():
+    robot = ANGLES.robot("Joints")
+    with ANGLES.rig(robot) as rig:
+        # 885 counts of PWM at a P gain of 800: 283 counts of error, 0.434 rad.
+        assert float(rig.following.limit[0]) == pytest.approx(0.9 * 0.4344, abs=1e-4)
+    robot.stop()
+
+
+def test_what_is_not_watched_says_so():
+    robot = VOLTS.robot()
+    with VOLTS.rig(robot) as rig:
+        assert rig.following is None
+    robot = ANGLES.robot("Joints", LETS_GO)
+    with ANGLES.rig(robot, {**GATE, "following_rad": math.inf}) as rig:
+        assert rig.following is None
+        assert drive(rig, swing, 3.0) is None
+
+
+@given(
+    delay=st.floats(0.0, 0.05),
+    time_constant=st.floats(0.005, 0.05),
+    weight=st.floats(-0.09, 0.09),
+    goals=st.lists(st.floats(-1.5, 1.5), min_size=5, max_size=60),
+)
+def test_no_joint_of_first_order_is_stopped(delay, time_constant, weight, goals):
+    """Steps of the goal of any size and at any rate, with a weight that the limit contains."""
+    check = FollowingCheck(Following(0.1, 0.35, 0.5), np.zeros(1), 0.0, str)
+    position, sent = 0.0, [(-1.0, 0.0)]
+    for k in range(20 * len(goals)):
+        t_s = 0.005 * k
+        if k % 20 == 0:
+            sent.append((t_s, goals[k // 20]))
+            check.sent(np.array([goals[k // 20]]), t_s)
+        goal = next(value for since_s, value in reversed(sent) if since_s <= t_s - delay)
+        position += (1.0 - math.exp(-0.005 / time_constant)) * (goal + weight - position)
+        if k % 4 == 0:
+            check.check(np.array([position]), np.zeros(1), np.zeros(1), t_s)
+
+
+def let_go(check, still, since_s, until_s):
+    for t_s in np.arange(since_s, until_s, 0.002):
+        check.check(still, still, still, t_s)
+
+
+def test_a_weak_motor_is_named_by_its_missing_torque():
+    following = Following(8.0, 0.1, most_nm=np.array([23.7, 45.4]))
+    law = np.array([[0.0, 0.0, 60.0, 2.0, 0.0], [0.5, 0.0, 60.0, 2.0, 1.0]])
+    check = FollowingCheck(following, law, 0.0, lambda i: ("hip", "calf")[i])
+    still, zero = np.zeros(2), np.zeros(2)
+    for k in range(1, 50):  # the calf's law is 31 N m
+        check.check(zero, still, np.array([0.0, 30.0]), 0.002 * k)
+    with pytest.raises(SafetyStop, match=r"calf .* N m"):
+        let_go(check, still, 0.1, 0.2)
+
+
+FIRST = np.array([-0.8, 0.5, -1.0])
+
+
+@pytest.mark.parametrize("family", [ANGLES, STS], ids=lambda family: family.name)
+def test_a_first_command_far_from_the_measured_pose_is_refused(family):
+    robot = family.robot("Joints")
+    with family.rig(robot, {**GATE, "joints": ("pan", "lift", "tip")}) as rig:
+        rig.start()
+        rig.measure()
+        with pytest.raises(SafetyStop, match=r"'(pan|lift|tip)'.* -?[\d.]+ rad, measured are -?[\d.]+ rad"):
+            rig.command(FIRST, 0.0, 0.0)
+    with family.rig(robot, {**GATE, "first_step_rad": math.inf}) as rig:
+        rig.start()
+        rig.command(FIRST, 0.0, 0.0)
+    robot.stop()
+    modes = robot.truth().of(2)["values"]  # nothing but the goals at rest took effect before the refusal
+    assert modes.size
+
+
+def test_each_sender_begins_near_the_measured_pose():
+    robot = ANGLES.robot("Joints")
+    with ANGLES.rig(robot, GATE) as rig:
+        rig.start()
+        rig.command(START + 0.4, 0.0, 0.0)
+        rig.command(START - 0.4, 0.0, 0.02)  # the second command is the gate's to limit
+        rig.measure()
+        rig.hand_over()
+        with pytest.raises(SafetyStop):
+            rig.command(START - 0.6, 0.0, 0.04)
+    robot.stop()
+
+
+def test_nan_of_one_joint_hides_no_other_joint():
+    check = Plausibility(GateConfig(envelope_rad=(-1.0, 1.0), joints=("pan", "lift")))
+    with pytest.raises(SafetyStop, match=r"'lift'.*envelope"):
+        check.check(np.array([np.nan, 5.0]), 0.0, 0.0, np.zeros(2, bool))
+    with pytest.raises(SafetyStop, match="'pan'"):
+        check.check(np.array([np.nan, 0.5]), 0.0, 0.0, np.zeros(2, bool))
