@@ -82,14 +82,9 @@ class Recording(Shown):
         return {**self.episode.metadata.get("units", {}), **unique}  # older logs: units are the session's
 
     @property
-    def end(self) -> Mapping[str, Json]:
-        """The metadata that the session wrote at its end; empty after a crash."""
-        return self.episode.metadata.get("log", {}).get("session_end") or {}
-
-    @property
     def summary(self) -> Mapping[str, Json]:
-        """Timing by node, losses and the gate's counts of the session; empty after a crash."""
-        return self.end
+        """What the session wrote at its end: timing by node, losses, the gate's counts; empty after a crash."""
+        return self.episode.metadata.get("log", {}).get("session_end") or {}
 
     def about(self) -> Mapping[str, Json]:
         """Return pipeline, log, duration, steps and warnings, by name."""
@@ -122,9 +117,9 @@ class Recording(Shown):
 
         None for a robot that is not embedded, and for a log without the start of its clock.
         """
-        if self.truth is None or "monotonic_ns" not in self.end:
+        if self.truth is None or "monotonic_ns" not in self.summary:
             return None
         t_ns, states = self.truth.states()
-        t_s = (t_ns - self.end["monotonic_ns"]) / 1e9
+        t_s = (t_ns - self.summary["monotonic_ns"]) / 1e9
         inside = (t_s >= 0) & (t_s <= self.episode.duration_s)
         return t_s[inside], {n: s[inside] for n, s in states.items()}

@@ -30,7 +30,6 @@ from sim2real.log.session import input_ages
 from sim2real.types import Json
 
 FORMAT = 2
-_READ = (1, FORMAT)  # 1: without the times of the bus
 TIMING, SAMPLES = "timing.json", "timing.npz"
 _ARRAYS = ("steps_s", "bus_s", "transport_s")
 _AGAIN = "record again, or run `sim2real identify` again on the log"
@@ -219,14 +218,14 @@ class Timing(Shown):
         """
         path = Path(path)
         file = path / TIMING if path.is_dir() else path
-        timing = read_versioned(file, Timing, _AGAIN, *_READ)
+        timing = read_versioned(file, Timing, _AGAIN, FORMAT)
         # Read the samples, and check that they belong to the nodes of the document.
         samples = file.with_suffix(".npz")
         with malformed(samples, _AGAIN):
             kinds = read_grouped(samples, _ARRAYS)
             check(set(kinds["steps_s"]) == set(timing.nodes), "its nodes differ from those of the JSON file")
             check(set(kinds["bus_s"]) <= set(timing.nodes), "the JSON file lacks a node that is on the bus")
-        return replace(timing, format=FORMAT, **kinds)
+        return replace(timing, **kinds)
 
 
 def _node(episode: Episode, name: str, overruns: int | None, bus: Mapping[str, np.ndarray]) -> NodeTiming:

@@ -1,7 +1,5 @@
 """The timing of a session: what it says, and what training draws from it."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -65,18 +63,3 @@ def test_hiccups_are_left_out_and_counted(episode):
     assert np.unique(delays["agent"].sample(rng, (1000,))).tolist() == [0.001]
     with pytest.raises(Sim2RealError, match="only 0 of 100 steps of node 'sensor' took less"):
         Timing.of(episode).computation(0.0001)
-
-
-def test_what_was_written_before_the_bus_was_timed_is_read(episode, tmp_path):
-    del episode.metadata["log"]["session_end"]["bus"]
-    timing = Timing.of(episode)
-    timing.save(tmp_path)
-    document = json.loads((tmp_path / "timing.json").read_text())
-    document["format"] = 1
-    for node in document["nodes"].values():
-        del node["bus"], node["bus_wait"]
-    (tmp_path / "timing.json").write_text(json.dumps(document))
-    assert Timing.load(tmp_path).nodes == timing.nodes
-    (tmp_path / "timing.json").write_text(json.dumps(document | {"format": 3}))
-    with pytest.raises(Sim2RealError, match="has format 3, this version reads 2"):
-        Timing.load(tmp_path)

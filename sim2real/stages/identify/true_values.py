@@ -28,7 +28,7 @@ def true_values(recording: Recording) -> dict[str, float]:
     except (ValueError, KeyError) as error:  # the true values fill one column of a table
         note(f"warning: {recording.truth_path} is damaged, so estimates are not compared with it: {error}")
         return {}
-    episode, origin_ns = recording.episode, recording.end.get("monotonic_ns")
+    episode, origin_ns = recording.episode, recording.summary.get("monotonic_ns")
     if origin_ns is None:  # the session crashed before it wrote its start
         return values
     sensing = sensing_delay_s(truth, episode.steps[SENSOR], origin_ns)
