@@ -84,7 +84,7 @@ def test_an_estimate_that_stays_at_a_bound_leads_to_a_recording_and_then_to_an_e
     """The model may be wrong: bounds are not moved for ever."""
     world.judgements = ["change the model"] * 6
     again, _ = world.go(verdict("re-identify", drift=True), verdict("fine", 1.0))
-    assert again == ["identify"] * 2 + ["record"] + ["identify"] * 2 + ["train", "deploy"]
+    assert again == ["identify"] * 3 + ["record"] + ["identify"] * 3 + ["train", "deploy"]
 
 
 @pytest.mark.parametrize(
