@@ -1,23 +1,18 @@
-"""Figures as data: instead of a picture, whose layout takes 0.4 s, a page holds a sketch with the figure's texts.
-
-Instead of the robot's picture, which a process of its own draws in 1.5 s, it holds a few bytes.
-"""
+"""Figures as data: instead of a picture, whose layout takes 0.4 s, a page holds a sketch with the figure's texts."""
 
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from sim2real.view import style
-from sim2real.view.page import robot_picture
 
-DRAW, DRAW_ROBOT = style.render, robot_picture.drawn
+DRAW = style.render
 
 
 def texts(figure: Figure) -> list[str]:
@@ -40,14 +35,9 @@ def sketched(pictures: int = 0) -> Iterator[list[Figure]]:
     """Sketch the figures that are made in the block; yields the list of these figures, which grows.
 
     Args:
-        pictures: The number of figures that are drawn nevertheless, the first ones, and of robots.
+        pictures: The number of figures that are drawn nevertheless, the first ones.
     """
     figures: list[Figure] = []
-    robots: list[Path] = []
-
-    def drawn(model: Path, pose: Mapping[str, float]) -> robot_picture.Drawing:
-        robots.append(model)
-        return DRAW_ROBOT(model, pose) if len(robots) <= pictures else robot_picture.Drawing(b"PNG", tuple(pose))
 
     def render(figure: Figure) -> str:
         figures.append(figure)
@@ -55,5 +45,4 @@ def sketched(pictures: int = 0) -> Iterator[list[Figure]]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "render", render)
-        patch.setattr(robot_picture, "drawn", drawn)
         yield figures

@@ -236,7 +236,7 @@ def test_resume_runs_everything_after_the_first_unfinished_stage(calls):
 def test_report_finds_the_newest_run(monkeypatch, calls, capsys, tmp_path):
     seen = []
     monkeypatch.setattr("sim2real.view.rerun_recording.view", lambda run_dir, save, *_: seen.append((run_dir, save)))
-    monkeypatch.setattr("sim2real.view.page.page.report", lambda run_dir, out: run_dir / "report.html")
+    monkeypatch.setattr("sim2real.view.page.report", lambda run_dir, out: run_dir / "report.html")
     cli.main(["record", "pendulum"])
     cli.main(["record", "pendulum"])
     capsys.readouterr()

@@ -74,7 +74,7 @@ def report_command(command: str, arguments: list[str]) -> None:
     from sim2real.stages.terminal.console import progress, wrote
 
     with progress(None, "report"):
-        from sim2real.view.page.page import report as write  # matplotlib and jinja2 take 0.5 s to import
+        from sim2real.view.page import report as write  # matplotlib and jinja2 take 0.5 s to import
 
         page = write(run_dir, config.out)
     wrote(page)
@@ -90,7 +90,7 @@ def report(run: str | Path | Run, runs: str | Path = "runs") -> Path:
         The page.
     """
     from sim2real.stages.pipeline.python_arguments import folder_of
-    from sim2real.view.page.page import report as write
+    from sim2real.view.page import report as write
 
     folder = getattr(run, "folder", None)
     return write(folder if isinstance(folder, Path) else find_run(folder_of(runs, "runs"), folder_of(run, "run")))
@@ -156,7 +156,7 @@ def compare(config: ReportConfig) -> Comparison:
         if parameters.rows:
             print(artifact_table(parameters))
             note(f"intervals that do not overlap: {', '.join(comparison.different) or 'of no parameter'}")
-    from sim2real.view.page.comparison import comparison_page  # imports matplotlib
+    from sim2real.view.comparison import comparison_page  # imports matplotlib
 
     page = comparison_page(comparison, config.out or Path(COMPARISON))
     if config.json:

@@ -128,7 +128,7 @@ def write_report(run_dir: Path) -> Path | None:
         console.note(f"no page: `sim2real report {console.shown(run_dir)}` writes it on a computer with sim2real")
         return None
     with console.progress(None, "report"):
-        from sim2real.view.page.page import report  # matplotlib and jinja2 take 0.5 s to import
+        from sim2real.view.page import report  # matplotlib and jinja2 take 0.5 s to import
 
         page = report(run_dir)
     console.wrote(page)

@@ -135,7 +135,7 @@ def write_model_card(
     card, signals = write_card(folder, identification, model, plain, terms, delays, about, session)
     for sentence in [*card["notes"], *differing(folder)]:
         note(sentence)
-    from sim2real.view.page.model_card import model_card_page  # matplotlib and jinja2 take 0.5 s to import
+    from sim2real.view.model_card import model_card_page  # matplotlib and jinja2 take 0.5 s to import
 
     model_card_page(card, signals, folder, identification.links)
 

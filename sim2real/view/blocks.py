@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from sim2real.artifacts.run.run_folder import StageFolder
 from sim2real.artifacts.summary import ArtifactTable, Cell, Interval
 
 MISSING = "–"  # noqa: RUF001 - a dash, as is usual in tables
@@ -25,23 +26,18 @@ class FigureBlock:
     """A figure.
 
     Attributes:
-        narrow: Whether two such figures fit side by side.
-        phone: The same panels in one column, as SVG, which a telephone shows instead; "" for none.
         kind: Kind of block, for the template.
     """
 
     svg: str
     caption: str
-    narrow: bool = False
-    phone: str = ""
     kind: str = "figure"
 
     @property
     def layout(self) -> str:
         """Class for the style: on a telephone a ``wide`` figure scrolls, and any other one is scaled to fit."""
         drawn = _SVG_WIDTH.search(self.svg)
-        wide = drawn is not None and float(drawn[1]) > _WIDE_PT
-        return "narrow" if self.narrow else "twice" if self.phone else "wide" if wide else ""
+        return "wide" if drawn is not None and float(drawn[1]) > _WIDE_PT else "small"
 
 
 @dataclass(frozen=True)
@@ -110,21 +106,7 @@ class ListBlock:
     kind: str = "list"
 
 
-@dataclass(frozen=True)
-class PictureBlock:
-    """A picture as PNG.
-
-    Attributes:
-        data: The PNG in base64.
-        kind: Kind of block, for the template.
-    """
-
-    data: str
-    caption: str
-    kind: str = "picture"
-
-
-Block = FigureBlock | TableBlock | NoteBlock | FoldBlock | ListBlock | PictureBlock
+Block = FigureBlock | TableBlock | NoteBlock | FoldBlock | ListBlock
 
 
 @dataclass(frozen=True)
@@ -280,3 +262,20 @@ def flat(tree: object, prefix: str = "") -> Iterable[tuple[str, str]]:
 def pairs_table(caption: str, tree: object) -> TableBlock:
     """Return a table of names and values."""
     return TableBlock(caption, ("name", "value"), list(flat(tree)), text_columns=(1,))
+
+
+def about(artifact: StageFolder) -> list[Block]:
+    """Return configuration, files and versions of a stage as a folded block."""
+    m = artifact.manifest
+    when = {k: m[k] for k in ("started", "duration_s", "command", "git") if m.get(k) is not None}
+    files = {n: e.get("sha256", "") for n, e in m.get("outputs", {}).items()}
+    tables = {
+        "Summary": m.get("summary"),
+        "Configuration": m.get("config"),
+        "Run": when,
+        "Inputs": m.get("inputs"),
+        "Outputs, by SHA-256": files,
+        "Versions": m.get("versions"),
+    }
+    blocks = [pairs_table(caption, tree) for caption, tree in tables.items() if tree]
+    return [FoldBlock("Configuration, files and versions", blocks)] if blocks else []

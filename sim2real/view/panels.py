@@ -14,9 +14,6 @@ from sim2real.log.schema import unit_of
 from sim2real.view import style
 from sim2real.view.style import GRID, MUTED, ROLES, SHADE, new_figure, styled, to_svg
 
-_SMALL_IN = 5.0
-"""Width of a figure beside a verdict; at 360 pixels its text is 8 pixels high."""
-
 
 @dataclass(frozen=True)
 class Line:
@@ -110,7 +107,7 @@ def compared(lines: Sequence[Line], difference: Line, label: str, span: tuple[fl
         span: Shaded interval [s].
     """
     with styled():
-        figure = new_figure(3.6, _SMALL_IN)
+        figure = new_figure(3.6, style.PHONE_IN)
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.7, 1])
         framed = [role for role in ("measured", "identified") if any(line.role == role for line in lines)]
         _fill(upper, Panel(label, lines, spans=[span], framed=framed))

@@ -27,6 +27,8 @@ CYCLE = (BLUE, ORANGE, GREEN, PURPLE)
 DASHES = ("-", (0, (5, 1.6)), (0, (1.2, 1.4)), (0, (6, 1.5, 1.2, 1.5)))
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 WIDTH_IN = 10.5
+PHONE_IN = 5.5
+"""Width of a figure that a telephone shows without scrolling, with letters of at least 7 pixels [in]."""
 
 _RC: dict[str, Any] = {
     "svg.fonttype": "none",  # as text, not as outlines: can be searched, read aloud and copied

@@ -1,18 +1,21 @@
-"""Figures and numbers on timing: periods, lateness, and the schedule."""
+"""Timing of a log on a page: the schedule as a figure, and a row of numbers for each node."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
 
+from sim2real.artifacts.timing import Timing
 from sim2real.graph.episode import Episode, Steps
-from sim2real.log.session import oldest_input
+from sim2real.log.session import is_imported, oldest_input
+from sim2real.types import Json
 from sim2real.view import style
+from sim2real.view.blocks import MISSING, Block, FigureBlock, TableBlock, Tile, fixed, number
 from sim2real.view.node_looks import color_of, in_order, slowest_period_s
-from sim2real.view.style import BLUE, INK, MUTED, ORANGE, new_figure, styled, to_svg
+from sim2real.view.style import BLUE, MUTED, ORANGE, new_figure, styled, to_svg
 
 _PERIODS_SHOWN = 4.5
 
@@ -37,39 +40,56 @@ def times(steps: Steps) -> Times:
     return Times(np.diff(steps.woken) / 1e3, (steps.woken - steps.start) / 1e3, (steps.end - steps.woken) / 1e3)
 
 
-def histograms(episode: Episode, name: str) -> str:
-    """Draw histograms of period, lateness, computation and age of inputs, one row per node."""
-    nodes = [n for n in in_order(episode) if len(episode.steps[n]) > 1]
-    ages = {n: 1e3 * oldest_input(episode, n) for n in nodes}
-    oldest = max((float(a.max()) for a in ages.values() if a.size), default=0.0)
-    with styled():
-        figure = new_figure(0.6 + 1.35 * len(nodes))
-        grid = figure.subplots(len(nodes), 4, squeeze=False, sharex="col", sharey="row")
-        # Use common limits in each column, so that nodes can be compared.
-        limits = []
-        for column, quantity in enumerate(("period", "lateness", "computation")):
-            values = np.concatenate([getattr(times(episode.steps[n]), quantity) for n in nodes])
-            limits.append((min(0.0, values.min()) if column else values.min(), max(values.max(), 1e-3)))
-        # Draw a row of histograms for each node.
-        for node, row in zip(nodes, grid, strict=True):
-            measured = times(episode.steps[node])
-            row[0].set_ylabel(f"{node}\nsteps")
-            columns = (measured.period, measured.lateness, measured.computation)
-            color = color_of(episode, node, BLUE)
-            for axes, values, span in zip(row, columns, limits, strict=False):
-                _histogram(axes, values, span, color)
-            if ages[node].size:
-                _histogram(row[3], ages[node], (0.0, max(oldest, 1e-3)), color)
-            else:
-                row[3].annotate("no inputs", (0.03, 0.8), xycoords="axes fraction", color=MUTED)
-        for axes, title in zip(
-            grid[0], ("Period", "Lateness of the wake-up", "Computation", "Age of inputs"), strict=True
-        ):
-            axes.annotate(title, (0, 1.22), xycoords="axes fraction", fontweight="bold", fontsize=9, color=INK)
-        for axes in grid[-1]:
-            axes.set_xlabel("[ms]")
-        what = "period, lateness, computation and age of inputs"
-        return to_svg(figure, name, f"Histograms of {what} of {', '.join(nodes)}")
+def timing_tiles(episodes: Sequence[Episode]) -> Iterator[Tile]:
+    """Yield the worst lateness, the oldest input and the overruns of some episodes; nothing of an imported log."""
+    if any(map(is_imported, episodes)):
+        return
+    late = {n: np.concatenate([times(e.steps[n]).lateness for e in episodes]) for n in episodes[0].steps}
+    p99 = {n: float(np.quantile(values, 0.99)) for n, values in late.items() if len(values)}
+    worst = max(p99, key=lambda n: p99[n])
+    yield Tile("lateness, p99", f"{p99[worst]:.2f} ms", f"of {worst}, the worst node")
+    # Lateness does not show old messages, so show the oldest input, too.
+    old = {n: np.concatenate([oldest_input(e, n) for e in episodes]) for n in episodes[0].steps}
+    oldest = {n: 1e3 * float(ages.max()) for n, ages in old.items() if ages.size}
+    if oldest:
+        reader = max(oldest, key=lambda n: oldest[n])
+        yield Tile("oldest input of a step", f"{oldest[reader]:.1f} ms", f"of {reader}")
+    ends: list[Mapping[str, Json]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
+    overruns = [t.get("overruns", 0) for end in ends for t in end.get("timing", {}).values()]
+    if overruns:
+        lost = ends[-1].get("lost_replies")  # the count covers all episodes of a session
+        yield Tile("overruns", str(sum(overruns)), f"{lost} lost replies" if lost is not None else "")
+
+
+def timing_blocks(episode: Episode, name: str, which: str = "", folded: bool = False) -> list[Block]:
+    """Return schedule and table of an episode's timing; nothing of an imported log, whose steps have stamps alone."""
+    if is_imported(episode):
+        return []
+    end: Mapping[str, Json] = episode.metadata.get("log", {}).get("session_end") or {}
+    rows, measured = [], Timing.of(episode)
+    # Make a row for each node: quantiles of period, lateness, computation, bus and age of the oldest input.
+    for node in in_order(episode):
+        steps = episode.steps[node]
+        if len(steps) < 2:
+            continue
+        row = [node, str(len(steps))]
+        taken = times(steps)
+        for values in (taken.period, taken.lateness, taken.computation):
+            row += [fixed(float(v), 2) for v in (*np.quantile(values, [0.5, 0.99]), values.max())]
+        row += [MISSING if t is None else fixed(1e3 * t, 2) for t in astuple(measured.nodes[node].bus)]
+        ages = 1e3 * oldest_input(episode, node)
+        row += [fixed(float(q), 2) for q in np.quantile(ages, [0.5, 0.99, 1.0])] if ages.size else [MISSING] * 3
+        rows.append([*row, number(end.get("timing", {}).get(node, {}).get("overruns"))])
+    heads = [f"{q} {k}" for q in ("period", "late", "comp.", "bus", "age") for k in ("p50", "p99", "max")]
+    caption = f"Timing of each node [ms]{which and ',' + which.lower().rstrip('.')}"
+    table = TableBlock(caption, ("node", "steps", *heads, "overruns"), rows, folded=folded)
+    if folded or not rows:
+        return [table]
+    caption = (
+        f"Computation of each node over time.{which} An arrow is a message, from the end of the sender's step to the "
+        "start of the reader's step."
+    )
+    return [FigureBlock(schedule(episode, f"{name}-schedule"), caption), table]
 
 
 def schedule(episode: Episode, name: str) -> str:
@@ -82,9 +102,9 @@ def schedule(episode: Episode, name: str) -> str:
     moment = int(episode.steps[worst].start[late[worst].argmax()])
     middle = int(1e6 * episode.duration_s / 2)
     with styled():
-        figure = new_figure(1.15 + 0.42 * len(nodes))
+        figure = new_figure(1.5 + 0.75 * len(nodes), style.PHONE_IN)
         titles = (f"At {middle / 1e6:.1f} s", f"Around the latest wake-up: {worst}, {late[worst].max() / 1e3:.1f} ms")
-        grid = figure.subplots(1, 2, sharey=True)
+        grid = figure.subplots(2, 1, sharey=True)
         # Draw steps as bars and messages as arrows, in the middle and around the latest wake-up.
         for axes, begin, title in zip(grid, (middle, max(0, moment - int(0.4 * length))), titles, strict=True):
             for row, node in enumerate(nodes):
@@ -104,18 +124,6 @@ def schedule(episode: Episode, name: str) -> str:
         ]
         style.legend_above(figure, entries)
         return to_svg(figure, name, "Excerpts of the schedule: when each node waited and computed, and its messages")
-
-
-def _histogram(axes: Axes, values: np.ndarray, span: tuple[float, float], color: str) -> None:
-    axes.hist(values, bins=60, range=span, histtype="stepfilled", facecolor=color, alpha=0.35)
-    axes.hist(values, bins=60, range=span, histtype="step", color=color, lw=1.0)
-    axes.set_yscale("log")
-    axes.set_ylim(0.6, 2 * len(values))
-    style.plain_log(axes.yaxis)
-    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-    p50, p99 = np.quantile(values, [0.5, 0.99])
-    axes.axvline(p99, color=INK, lw=0.9, ls=style.DASHES[1])
-    axes.set_title(f"p50 {p50:.2f} · p99 {p99:.2f} · max {values.max():.2f}", fontweight="normal", fontsize=8)
 
 
 def _bars(axes: Axes, steps: Steps, row: int, begin: float, end: float, color: str) -> None:

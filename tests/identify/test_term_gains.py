@@ -9,7 +9,7 @@ from sim2real.artifacts.identification import TriedTerm, tried_table
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.identify.validation.optional_terms import Trial
 from sim2real.identify.validation.term_gains import gains
-from sim2real.view.identification.tried import tried_blocks
+from sim2real.view.identification import alternative_blocks
 
 TABLE = ParameterTable(
     [
@@ -50,6 +50,6 @@ def test_a_term_that_was_not_chosen_but_helps_mends():
 
 def test_the_page_has_a_table_of_the_tried_terms():
     rows = (TriedTerm("load", 8.0, 4.0, "chosen"), TriedTerm("torque_limit", 4.0, 4.0, "not reached"))
-    (block,) = tried_blocks(SimpleNamespace(tried=rows))
+    (block,) = alternative_blocks(SimpleNamespace(tried=rows, posterior=None))
     assert [row[0] for row in block.rows] == ["load", "torque_limit"]
-    assert tried_blocks(SimpleNamespace(tried=())) == []
+    assert alternative_blocks(SimpleNamespace(tried=(), posterior=None)) == []

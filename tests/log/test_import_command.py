@@ -13,9 +13,9 @@ import pytest
 from sim2real import cli
 from sim2real.artifacts.run.run_folder import newest
 from sim2real.log import import_file, read_log
-from sim2real.view.page.stage_verdicts import record_banner
-from sim2real.view.page.timing_blocks import timing_blocks, timing_tiles
+from sim2real.view.sections import record_banner
 from sim2real.view.signals import Signals
+from sim2real.view.timing import timing_blocks, timing_tiles
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("SIM2REAL_DATA", REPOSITORY.parent / "shared" / "data"))
@@ -104,7 +104,7 @@ def test_wrong_commands_exit_2_and_leave_no_run(workplace, capsys, arguments, na
 
 
 def test_help_says_all_flags_and_imports_nothing_heavy():
-    code = "import sys; from sim2real import cli; cli.main(['import', '--help'])"
+    code = "import sys; from sim2real import cli; cli.main(['import', '--help-all'])"
     heavy = "print(sorted({'jax', 'numpy', 'mujoco'} & set(sys.modules)))"
     command = [sys.executable, "-c", f"{code}; {heavy}"]
     lines = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout.splitlines()

@@ -33,7 +33,7 @@ def killed(stages, call, when, **options):
 @pytest.fixture(autouse=True)
 def quick(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sim2real.view.page.page.report", lambda run_dir: run_dir / "report.html")
+    monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
 
 
 def ran(run_dir):

@@ -19,7 +19,7 @@ from sim2real.robots.nodes import Excitation
 from sim2real.stages.excitation.played import played
 from sim2real.stages.on_robot import come_to_rest
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.view.page.delay_parts import parts_of
+from sim2real.view.delay_parts import parts_of
 
 
 def call(root, command, pipeline, *flags):

@@ -10,14 +10,14 @@ from sim2real.artifacts.run.run_folder import STAGES
 from sim2real.commands.run import RunFlags
 from sim2real.errors import DelayChanged, UsageError
 from sim2real.stages.pipeline.pipeline import load_pipeline
-from sim2real.view.page.iterations import iterations_sections
+from sim2real.view.sections import iterations_sections
 
 
 @pytest.fixture
 def world(tmp_path, monkeypatch):
     """Stages; ``go`` plays a run with these verdicts, and returns the stages after the first four and its rows."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sim2real.view.page.page.report", lambda run_dir: run_dir / "report.html")
+    monkeypatch.setattr("sim2real.view.page.report", lambda run_dir: run_dir / "report.html")
     stages = Stages(tmp_path / "runs")
 
     def go(*verdicts, **options):

@@ -5,7 +5,7 @@ import pytest
 
 from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.identification import Noise
-from sim2real.view.page.episodes import picture
+from sim2real.view.episodes import picture
 
 
 @pytest.fixture

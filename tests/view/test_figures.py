@@ -15,21 +15,13 @@ from sketches import sketched, texts
 
 from sim2real.artifacts.bundle import History
 from sim2real.artifacts.deployment import Deployment
-from sim2real.artifacts.identification import Identification, Quantity
+from sim2real.artifacts.identification import Identification
 from sim2real.artifacts.recording import Recording
 from sim2real.artifacts.run.run_folder import finished_stages
-from sim2real.view import style, timing
-from sim2real.view.identification import figures as identify_figures
-from sim2real.view.identification import intervals, residuals
-from sim2real.view.identification.worst import worst_figure
-from sim2real.view.page import figures
+from sim2real.view import identification, sections, style, timing
 from sim2real.view.signals import ComparedSeries, Series, pairs_of, signals_of, simulated_series
 
 SVG = "{http://www.w3.org/2000/svg}"
-QUANTITIES = [
-    Quantity(**{**row, **{n: np.array(row[n]) for n in ("estimates", "standard_errors")}})
-    for row in synthetic_run.aggregate()
-]
 
 
 @pytest.fixture(scope="module")
@@ -55,20 +47,14 @@ def calls(artifacts, found, log):
     pairs = pairs_of(episode, simulation, deployed.units, {})
     training = History.load(artifacts["train"].folder)
     return {
-        "record": (figures.recording, log),
-        "intervals": (intervals.intervals, found.parameters),
-        "predictions": (identify_figures.predictions, found),
-        "errors": (identify_figures.prediction_errors, found),
-        "free": (identify_figures.free_runs, found),
-        "residuals": (residuals.figure, found),
-        "search": (identify_figures.search, found),
-        "correlation": (identify_figures.correlation, found.correlation.names, found.correlation.matrix),
-        "aggregate": (intervals.aggregate, QUANTITIES),
-        "training": (figures.training, training),
-        "deployment": (figures.deployment, pairs, episode.units, 1),
-        "difference": (svg_of(figures.largest_difference), [pairs], ["th"], episode.units),
-        "worst": (svg_of(worst_figure), found),
-        "histograms": (timing.histograms, log.episode),
+        "record": (sections.recording_svg, log),
+        "intervals": (identification.intervals_svg, found.parameters),
+        "predictions": (identification.segments_svg, found),
+        "free": (identification.free_runs_svg, found),
+        "training": (sections.training_svg, training),
+        "deployment": (sections.deployment_svg, pairs, episode.units, 1),
+        "difference": (svg_of(sections.largest_difference), [pairs], ["th"], episode.units),
+        "worst": (svg_of(identification.worst_figure), found),
         "schedule": (timing.schedule, log.episode),
     }
 
@@ -122,7 +108,7 @@ def test_every_figure_has_a_label_and_no_pixels(calls, drawn):
 
 
 def test_ids_differ_between_the_figures_of_a_page(drawn):
-    svgs = [style.to_svg(drawn["search"], name, name) for name in ("one", "two")]
+    svgs = [style.to_svg(drawn["training"], name, name) for name in ("one", "two")]
     ids = [element.get("id") for svg in svgs for element in ET.fromstring(svg).iter() if element.get("id")]
     assert len(ids) == len(set(ids)) > 10
 
@@ -138,18 +124,16 @@ def test_every_reference_in_a_figure_leads_somewhere(picture):
 
 
 def test_measured_and_predicted_are_drawn_as_they_are(drawn, found):
-    (axes, closer), rows = drawn["predictions"].axes[:2], found.disjoint()
-    lines, whole = lines_of(axes), found.samples["recording"] == 0
+    axes, rows = drawn["predictions"].axes[0], found.disjoint()
+    lines = lines_of(axes)
     for color, model, own in (
-        (style.INK, "measured", whole), (style.BLUE, "identified", rows), (style.ORANGE, "nominal", rows)
+        (style.INK, "measured", rows), (style.BLUE, "identified", rows), (style.ORANGE, "nominal", rows)
     ):  # fmt: skip
         ((_, dash),) = [look for look in lines if look[0] == color]
         t_s, values = (values[np.isfinite(values)] for values in lines[color, dash])
         at = np.unique(found.samples["t"][own], return_index=True)
         np.testing.assert_allclose(t_s, at[0])
         np.testing.assert_allclose(values, found.samples[f"th_{model}"][own][at[1]])
-    assert lines_of(closer).keys() == lines.keys()
-    assert closer.get_xlim() == (3.0, 5.1)
 
 
 def test_a_recording_is_drawn_with_its_truth_and_its_command(drawn, log):
@@ -174,26 +158,9 @@ def test_a_parameter_without_truth_nominal_or_bounds_can_be_drawn(found):
         replace(e, truth=None, nominal=None, lower=None, upper=None, low95=None, high95=None, standard_error=None)
         for e in found.parameters
     ]
-    labels = texts(figure_of(intervals.intervals, bare))
+    labels = texts(figure_of(identification.intervals_svg, bare))
     assert "truth" not in labels
-    assert labels.count("no standard error") == len(bare)
-
-
-def test_residuals_are_white_or_not():
-    rng = np.random.default_rng(0)
-    segment = np.repeat(np.arange(20), 60)
-    white = residuals.autocorrelation(rng.normal(size=1200), segment)
-    assert white[0] == pytest.approx(1.0)
-    assert np.abs(white[1:20]).max() < 0.15
-    slow = residuals.autocorrelation(np.sin(np.arange(1200) / 15), segment)
-    assert slow[5] > 0.8
-    np.testing.assert_array_equal(residuals.autocorrelation(np.zeros(10), np.zeros(10)), [1.0])
-
-
-def test_only_what_lies_behind_the_fitted_start_counts_as_residual(found):
-    rest = residuals.residuals(replace(found, settle_s=0.5), "th")
-    assert len(rest.every) == 3 * 24
-    np.testing.assert_allclose(rest.every, -0.01, atol=1e-9)
+    assert bare[0].name in labels
 
 
 def test_a_sample_is_shown_when_it_was_taken_and_a_command_when_it_was_sent(log):
@@ -215,7 +182,7 @@ def test_the_second_with_the_largest_difference_is_given_with_its_root_mean_squa
     t_s = np.arange(400) / 100
     wave = np.where((t_s >= 1) & (t_s <= 2), 0.3 * np.sin(2 * np.pi * t_s), 0.0)
     robot, simulation = (Series("th", "sensor", t_s, np.cos(t_s) + off) for off in (wave, 0.0))
-    block = figures.largest_difference([[ComparedSeries("th", robot, simulation)]], ["th"], {"th": "rad"}, "name")
+    block = sections.largest_difference([[ComparedSeries("th", robot, simulation)]], ["th"], {"th": "rad"}, "name")
     # A sine of 0.3 rad, over its period.
     assert "th in episode 0, from 1.0 s, root mean square 2" in block.caption
     assert float(block.caption.split()[-2]) == pytest.approx(300 / 2**0.5, rel=0.01)

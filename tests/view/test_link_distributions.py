@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Link, Ranged
-from sim2real.view.identification.links import link_blocks
+from sim2real.view.identification import link_blocks
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from sketches import sketched
 from sim2real.artifacts.identification import Identification, Judgement, WorstSecond
 from sim2real.errors import Sim2RealError
 from sim2real.view.blocks import MISSING, decimals_for, fixed, number
-from sim2real.view.identification.section import _banner
-from sim2real.view.page.page import report
+from sim2real.view.identification import identify_banner
+from sim2real.view.page import report
 
 CHROMIUM = next((path for n in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(n))), None)
 FLAGS = (
@@ -71,7 +71,7 @@ def path(finished_run):
     """The report of a run, whose first figure is drawn."""
     with sketched(pictures=1) as figures:
         written = report(finished_run)
-    assert len(figures) > 10
+    assert len(figures) >= 8
     return written
 
 
@@ -93,7 +93,7 @@ def test_the_numbers_are_there(page):
 def test_an_unexplained_second_makes_an_accepted_identification_doubtful():
     worst = WorstSecond("elbow", "q", "rad", 0, 3, 5.1, 6.1, 0.8, 400.0, 0.49)
     found = Identification("robot", (), Judgement("accepted", ()), (), worst=worst)
-    banners = [_banner(replace(found, worst=replace(worst, of_motion=share))) for share in (0.49, 0.5, None)]
+    banners = [identify_banner(replace(found, worst=replace(worst, of_motion=share))) for share in (0.49, 0.5, None)]
     assert [banner.tone for banner in banners] == ["good", "doubt", "doubt"]
     assert banners[1].title == "Accepted, but the model does not explain one second"
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sim2real.artifacts.summary import ArtifactTable
 from sim2real.view.blocks import NoteBlock, PageSection, TableBlock
-from sim2real.view.page.page import write_page
+from sim2real.view.page import write_page
 
 TEXT = st.text(st.characters(codec=None, exclude_categories=()), max_size=20)
 

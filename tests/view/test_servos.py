@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from sim2real.view.page.servos import servo_blocks
+from sim2real.view.sections import servo_blocks
 
 
 def episode(end, dry=False):

@@ -169,7 +169,7 @@ def _explain(
         episodes = prepare(pipeline, config, identification).episodes
         for name, file in episodes.save(stage.folder).items():
             stage.output(name, file)
-        from sim2real.view.page.episodes import picture  # matplotlib takes 0.5 s to import
+        from sim2real.view.episodes import picture  # matplotlib takes 0.5 s to import
 
         picture(stage.output("picture", "episodes.png"), episodes)
         show_episodes(episodes)

@@ -9,8 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from sim2real.artifacts.run.run_folder import STAGES, StageFolder, attempts, finished_stages
 from sim2real.artifacts.run.stage_status import stage_status
 from sim2real.view.blocks import NoteBlock, PageSection
-from sim2real.view.page.iterations import iterations_sections
-from sim2real.view.page.sections import SECTIONS
+from sim2real.view.sections import SECTIONS, iterations_sections
 
 PAGE = "report.html"
 _MOST_REASONS = 2

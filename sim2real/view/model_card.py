@@ -4,19 +4,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
 from sim2real.artifacts.identification import Link
 from sim2real.artifacts.summary import ArtifactTable, Interval
 from sim2real.types import Json
-from sim2real.view import style
-from sim2real.view.blocks import Banner, Block, FigureBlock, ListBlock, NoteBlock, PageSection, TableBlock, sentence
-from sim2real.view.identification.links import link_blocks
-from sim2real.view.page.page import write_page
-from sim2real.view.style import BLUE, new_figure, styled, to_svg
+from sim2real.view.blocks import Banner, Block, ListBlock, NoteBlock, PageSection, TableBlock, sentence
+from sim2real.view.identification import link_blocks
+from sim2real.view.page import write_page
 
 PAGE = "card.html"
-_COLUMNS = 3
 _RECIPES = {
     "error": "{measure} of simulation less measurement of {field}, segments {run}, settle_s to {horizon_s:g} s later",
     "quantile": "quantile {q:g} of {signal}",
@@ -50,8 +46,11 @@ def model_card_page(
     blocks += link_blocks(links)
     times = {n.removeprefix("times/"): v for n, v in signals.items() if n.startswith("times/")}
     if times:
-        wide, phone = (times_figure(times, columns) for columns in (_COLUMNS, 1))
-        blocks.append(FigureBlock(wide, "Distribution of the recorded times in the log.", phone=phone))
+        quantiles: list[list[Json]] = [
+            [n, *(1e3 * np.quantile(v, [0.5, 0.95, 0.99, 1.0])).tolist()] for n, v in times.items()
+        ]
+        table = ArtifactTable(("times [ms]", "p50", "p95", "p99", "max"), quantiles)
+        blocks.append(TableBlock.of("Recorded times in the log", table))
     blocks.append(ListBlock("Not known", card["unknown"] or ["every parameter of the model was identified"]))
     blocks.append(ListBlock("Firmware, supply and temperature", [f"{n}: {v}" for n, v in card["session"].items()]))
     if card["simulation"]:
@@ -74,24 +73,6 @@ def recipe_text(recipe: Mapping[str, Json]) -> str:
     """Return a recipe of ``card.json`` as text."""
     texts = {name: ", ".join(value) if isinstance(value, list) else value for name, value in recipe.items()}
     return _RECIPES[recipe["kind"]].format(**texts)
-
-
-def times_figure(times: Mapping[str, np.ndarray], columns: int) -> str:
-    """Draw a histogram of each series of times, as SVG."""
-    names, columns = list(times), min(columns, len(times))
-    rows = -(-len(names) // columns)
-    with styled():
-        figure = new_figure(0.4 + 1.2 * rows, style.WIDTH_IN * columns / _COLUMNS)
-        grid = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axes in grid[len(names) :]:
-            axes.set_visible(False)
-        for name, axes in zip(names, grid, strict=False):
-            axes.hist(1e3 * times[name], bins=40, color=BLUE)
-            axes.set_title(name)
-            axes.set_xlabel("ms")
-            axes.set_yticks([])
-            axes.xaxis.set_major_locator(MaxNLocator(4))
-        return to_svg(figure, f"card-times-{columns}", f"Histograms of {', '.join(names)}")
 
 
 def _numbers(simulation: Mapping[str, Json]) -> ArtifactTable:

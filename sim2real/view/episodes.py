@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 
 from sim2real.artifacts.episodes import Episodes, Varied
 from sim2real.artifacts.identification import Noise
+from sim2real.view import style
 from sim2real.view.style import BLUE, INK, MUTED, ORANGE, new_figure, styled, to_svg
 
-_COLUMNS, _BINS = 3, 40
+_COLUMNS, _BINS = 2, 40
 _ROW_IN = 1.7
 _TAIL = 0.999
 
@@ -34,7 +35,7 @@ def _figure(episodes: Episodes) -> Figure:
     grows = episodes.curriculum != (1.0, 1.0) and not episodes.follow
     count = max(1, len(episodes.parameters) + len(nodes) + len(noise) + grows)
     rows = math.ceil(count / _COLUMNS)
-    figure = new_figure(0.3 + _ROW_IN * rows)
+    figure = new_figure(0.3 + _ROW_IN * rows, style.PHONE_IN)
     axes = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
     for ax in axes:
         ax.set_yticks([])

@@ -1,0 +1,526 @@
+"""The section of an identification: verdict and worst second, parameters, errors, predictions."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+
+from sim2real.artifacts.files import number as as_number
+from sim2real.artifacts.identification import (
+    MAX_ERROR_RATIO,
+    Estimate,
+    Identification,
+    Link,
+    links_table,
+    tried_table,
+)
+from sim2real.artifacts.run.run_folder import StageFolder
+from sim2real.log.schema import unit_of
+from sim2real.view import style
+from sim2real.view.blocks import (
+    MISSING,
+    Banner,
+    Block,
+    FigureBlock,
+    ListBlock,
+    PageSection,
+    TableBlock,
+    Tile,
+    Tone,
+    about,
+    decimals_for,
+    fixed,
+    interval,
+    number,
+    pretty_unit,
+    sentence,
+)
+from sim2real.view.panels import Line, Panel, compared, over_time, with_gaps, with_unit
+from sim2real.view.style import BLUE, GREEN, GRID, INK, MUTED, ORANGE, new_figure, styled, to_svg
+
+_TITLES: dict[str, tuple[Tone, str]] = {
+    "accepted": ("good", "Accepted"),
+    "record again": ("doubt", "Record again: the data does not determine every parameter"),
+    "change the model": ("bad", "Change the model: do not use these parameters yet"),
+    "not finished": ("doubt", "Not finished: these values are no estimates yet"),
+}
+_MOST_COMPARED = 12
+"""Rows of errors beside the expected ones that are not folded."""
+_STRONG = 0.9
+"""Correlations above this are listed."""
+_MAX_PANELS = 6
+_NUMBERS = ("estimate", "nominal", "standard_error", "low95", "high95", "lower", "upper", "truth")
+_KINDS = ("relative to nominal", "position between the bounds [%]", "time [ms]")
+_AROUND_S = 1.0
+"""Time that is drawn before and after the worst second [s]."""
+_GOAL = "told"
+"""Baseline whose predictions are the goals of joints."""
+_LABELS = {"no delay": "model fitted without delays", "identified": "identified model", "measured": "measured"}
+_MIN_SHARE = 1e-4
+"""Delays with a smaller share of the largest share are not drawn."""
+
+
+def identify_section(artifact: StageFolder) -> PageSection:
+    """Return the section of an identify stage, from the results to the details."""
+    result = Identification.load(artifact.folder)
+    blocks = [
+        *_expected(result),
+        *_parameters(result),
+        *_recordings(result),
+        *_held_out_parts(result),
+        *alternative_blocks(result),
+        *link_blocks(result.links),
+        *_predictions(result),
+        *_correlation(result),
+        *about(artifact),
+    ]
+    lead = "Dynamics and delays from the log, each with its 95 % interval."
+    figure = worst_figure(result, "identify-worst")
+    return PageSection("identify", "Identify", lead, list(_tiles(result)), blocks, identify_banner(result), figure)
+
+
+def identify_banner(result: Identification) -> Banner | None:
+    """Return the verdict, its deciding reason and the next command; None before it is judged."""
+    status = result.verdict.status
+    if not status:
+        return None
+    tone, title = _TITLES.get(status, ("doubt", status[:1].upper() + status[1:]))
+    if status == "accepted" and result.worst is not None and result.worst.unexplained:
+        tone, title = "doubt", "Accepted, but the model does not explain one second"
+    reasons = [sentence(r, [h.name for h in result.held_out]) for r in result.verdict.reasons]
+    reasons[1:1] = [f"next: {result.verdict.next}"] if result.verdict.next else []
+    return Banner(tone, title, reasons)
+
+
+def _tiles(result: Identification) -> Iterator[Tile]:
+    """Yield the worst position, the delays, the residuals and the search."""
+    for row in result.held_out[:1]:
+        which = f"{row.name}, the worst of {len(result.held_out)}," if len(result.held_out) > 1 else row.name
+        note = ", ".join(f"{m} {number(e, 3)}" for m, e in row.rmse.items() if m != "identified")
+        error = f"{number(row.rmse['identified'], 3)} {pretty_unit(row.unit)}".strip()
+        yield Tile(f"held-out RMSE of {which} after {row.horizon_s:g} s", error, note)
+    for e in result.parameters:
+        if e.kind == "derived" and e.unit == "s":
+            error = "" if e.standard_error is None else f" ± {1e3 * e.standard_error:.1f}"
+            truth = "" if e.truth is None else f"truth {1e3 * e.truth:.1f} ms"
+            yield Tile(e.name.replace("_", " "), f"{1e3 * e.estimate:.1f}{error} ms", truth)
+    if result.misfit is not None:
+        yield Tile("residuals of the fit", f"{number(result.misfit, 2)} times", "the assumed noise of a measurement")
+    seconds, evaluations = result.search.seconds, result.search.evaluations
+    if seconds is not None:
+        simulated = [f"{number(evaluations)} evaluations" if evaluations else "", result.search.engine]
+        yield Tile("search", f"{float(seconds):.0f} s", "; ".join(filter(None, simulated)))
+
+
+# -- the worst second
+
+
+def worst_figure(result: Identification, name: str) -> FigureBlock | None:
+    """Draw the worst joint in its worst second: command if it is a position, measurement, prediction, and residual.
+
+    None if the worst second or the samples are missing.
+    """
+    worst, s = result.worst, result.samples
+    if worst is None or f"{worst.column}_identified" not in s:
+        return None
+    # The segment of the worst second comes first, then those around it that do not overlap it.
+    begin_s, end_s = worst.begin_s - _AROUND_S, worst.end_s + _AROUND_S
+    inside = s["segment"] == worst.segment
+    first_s, last_s = float(s["t"][inside].min()), float(s["t"][inside].max())
+    apart = (s["recording"] == worst.recording) & ((s["t"] < first_s) | (s["t"] > last_s))
+    rows = np.flatnonzero((inside | (result.disjoint() & ~inside & apart)) & (s["t"] >= begin_s) & (s["t"] <= end_s))
+    rows = rows[np.argsort(s["t"][rows], kind="stable")]
+    t_s, pieces = s["t"][rows], s["segment"][rows]
+    lines = [
+        Line(*with_gaps(t_s, s[f"{worst.column}_{column}"][rows], pieces), role, role)
+        for column, role in ((_GOAL, "command"), ("measured", "measured"), ("identified", "identified"))
+        if f"{worst.column}_{column}" in s
+    ]
+    unit, scale = unit_of(worst.column, result.units) or worst.unit, 1.0
+    label = f"{worst.name} [{unit}]" if unit else worst.name
+    if unit in ("rad", "m") and worst.rmse is not None and worst.rmse < 0.1:
+        unit, scale = f"m{unit}", 1e3
+    rest = s[f"{worst.column}_measured"][rows].astype(float) - s[f"{worst.column}_identified"][rows]
+    residual = f"residual [{unit}]" if unit else "residual"
+    difference = Line(*with_gaps(t_s, scale * rest, pieces), residual, "residual")
+    svg = compared(lines, difference, label, (worst.begin_s, worst.end_s), name)
+    size = ""
+    if worst.of_motion is not None and worst.times_noise is not None:
+        size = f", {worst.of_motion:.0%} of the joint's motion and {worst.times_noise:.0f} times the noise"
+    meaning = "Residual: measured \u2212 identified; the error is its root mean square in this second."
+    return FigureBlock(svg, f"The worst second: {worst.text(result.logs)}{size}. {meaning}")
+
+
+# -- parameters
+
+
+def _parameters(result: Identification) -> list[Block]:
+    """Return table and figure of the parameters, and what the data determines."""
+    bounded = [e for e in result.parameters if e.verdict == "at a bound"]
+    active = f"At a bound: {', '.join(_at_bound(e) for e in bounded)}." if bounded else "No estimate is at a bound."
+    caption = f"Each estimate with its 95 % interval within the bounds of the search. {active}"
+    blocks: list[Block] = [
+        _parameter_table(result.parameters),
+        FigureBlock(intervals_svg(result.parameters, "identify-intervals"), caption),
+    ]
+    if result.check:
+        check = result.check
+        items = [sentence(m) for m in check.messages] or ["The data determines each parameter."]
+        items.append(f"Condition number of the Jacobian, in widths of the bounds: {number(check.condition, 2)}.")
+        blocks.append(ListBlock("Determined by the data", items))
+        errors = check.standard_error_per_minute
+        rows = [_minute(e, value) for e in result.parameters if (value := errors.get(e.name)) is not None]
+        if rows:
+            heads = ("parameter", "standard error", "unit", "share of the estimate")
+            caption = "Standard error from one minute of such data"
+            blocks.append(TableBlock(caption, heads, rows, (2,), folded=True))
+    return blocks
+
+
+def _parameter_table(estimates: Sequence[Estimate]) -> TableBlock:
+    estimates = [e for e in estimates if not e.absent]
+    with_truth = any(e.truth is not None for e in estimates)
+    columns = ["parameter", "estimate", "s.e.", "95 % interval", "unit", "nominal", "bounds"]
+    columns += ["truth", "error", "verdict"] if with_truth else ["verdict"]
+    rows = []
+    # Show two digits of the standard error, and as many decimals of the estimate.
+    for e in map(in_readable_unit, estimates):
+        places = decimals_for(e.standard_error, e.estimate)
+        ends = MISSING if e.low95 is None else f"{fixed(e.low95, places)} to {fixed(e.high95, places)}"
+        row = [e.name, fixed(e.estimate, places), fixed(e.standard_error, places), ends, pretty_unit(e.unit)]
+        if e.verdict == "fixed":
+            row[2:4] = [MISSING, MISSING]
+        row += [number(e.nominal), interval(e.lower, e.upper)]
+        if with_truth:
+            row += [fixed(e.truth, places), _error(e)]
+        rows.append([*row, e.verdict or MISSING])
+    remarks = [pretty_unit(e.about) if e.about else "" for e in estimates]
+    return TableBlock("Parameters", columns, rows, text_columns=(4, len(columns) - 1), remarks=remarks)
+
+
+def in_readable_unit(e: Estimate) -> Estimate:
+    """Return an estimate in ms if it is a time below a second; others unchanged."""
+    largest = max(abs(v) for v in (e.estimate, e.upper, e.truth) if v is not None)
+    if e.unit != "s" or largest >= 1.0:
+        return e
+    scaled = {n: getattr(e, n) for n in _NUMBERS}
+    return replace(e, unit="ms", **{n: None if v is None else 1e3 * v for n, v in scaled.items()})
+
+
+def _minute(e: Estimate, error: float) -> list[str]:
+    scale, unit = (1e3, "ms") if e.unit == "s" else (1.0, pretty_unit(e.unit))
+    share = f"{100 * error / abs(e.estimate):.2g} %" if e.estimate else MISSING
+    return [e.name, number(scale * error, 2), unit, share]
+
+
+def _at_bound(e: Estimate) -> str:
+    if e.lower is None or e.upper is None:
+        return e.name
+    upper = abs(e.upper - e.estimate) < abs(e.estimate - e.lower)
+    readable = in_readable_unit(e)
+    bound = readable.upper if upper else readable.lower
+    return f"{e.name} (the {'upper' if upper else 'lower'}, {number(bound)} {pretty_unit(readable.unit)})"
+
+
+def _error(e: Estimate) -> str:
+    if e.truth is None:
+        return MISSING
+    if not e.truth:
+        return number(e.estimate - e.truth, 2)
+    return f"{100 * (e.estimate - e.truth) / abs(e.truth):+.1f} %".replace("-", "\u2212")
+
+
+def intervals_svg(estimates: Sequence[Estimate], name: str) -> str:
+    """Draw each estimate with its interval, its nominal value and its truth within its bounds."""
+    groups = [(kind, g) for kind in _KINDS if (g := [e for e in estimates if _kind(e) == kind])]
+    with styled():
+        figure = new_figure(0.7 + 0.3 * len(estimates) + 0.45 * len(groups), style.PHONE_IN)
+        grid = figure.subplots(len(groups), 1, squeeze=False, height_ratios=[len(g) + 0.6 for _, g in groups])
+        for (kind, group), axes in zip(groups, grid[:, 0], strict=True):
+            _inside_bounds(axes, group, kind)
+            axes.set_yticks(range(len(group)), [e.name for e in group])
+            axes.set_ylim(len(group) - 0.4, -0.6)
+            axes.grid(False, axis="y")
+            axes.tick_params(axis="y", length=0)
+        entries = [
+            Line2D([], [], color=BLUE, marker="o", ms=5.5, lw=3, label="estimate, 95 %"),
+            Line2D([], [], color=GRID, marker="|", mec=MUTED, ms=8, lw=4, label="bounds"),
+            Line2D([], [], color=ORANGE, marker="s", mfc="none", ms=5.5, lw=0, label="nominal"),
+        ]
+        if any(e.truth is not None for e in estimates):
+            entries.append(Line2D([], [], color=GREEN, marker="D", ms=5, lw=0, label="truth"))
+        style.legend_above(figure, entries)
+        names = ", ".join(e.name for e in estimates)
+        return to_svg(figure, name, f"Estimates with 95 percent intervals, bounds and nominal values of {names}")
+
+
+def _kind(e: Estimate) -> str:
+    if e.unit == "s":
+        return _KINDS[2]
+    values = [v for v in (e.nominal, e.estimate, e.lower, e.truth) if v is not None]
+    return _KINDS[0] if e.nominal is None or e.lower is None or min(values) > 0 else _KINDS[1]
+
+
+def _inside_bounds(axes: Axes, group: Sequence[Estimate], kind: str) -> None:
+    """Draw estimates within their bounds: relative to nominal on a log axis, as a share of the bounds, or in ms."""
+    for row, e in enumerate(group):
+        at = _placed(e, kind)
+        if e.lower is not None and e.upper is not None:
+            bounds = [at(e.lower), at(e.upper)]
+            axes.plot(bounds, [row, row], color=GRID, marker="|", mec=MUTED, ms=8, lw=4, zorder=1)
+        if e.low95 is not None and e.high95 is not None:
+            axes.plot([at(e.low95), at(e.high95)], [row, row], color=BLUE, lw=3, zorder=3)
+        axes.plot(at(e.estimate), row, color=BLUE, marker="o", ms=5.5, zorder=4)
+        if e.nominal is not None:
+            axes.plot(at(e.nominal), row, color=ORANGE, marker="s", mfc="none", ms=5.5, zorder=5)
+        if e.truth is not None:
+            axes.plot(at(e.truth), row, color=GREEN, marker="D", ms=4, zorder=6)
+    # Use a logarithmic axis for positive values relative to nominal.
+    values = [v for e in group for v in (e.lower, e.estimate, e.truth, e.nominal) if v is not None]
+    if kind == _KINDS[0] and min(values, default=0.0) > 0:
+        axes.set_xscale("log")
+        style.plain_log(axes.xaxis)
+    axes.set_xlabel(kind)
+
+
+def _placed(e: Estimate, kind: str) -> Callable[[float], float]:
+    """Return the function from a parameter's value to its place on the group's axis."""
+    if kind == _KINDS[2]:
+        return lambda v: 1e3 * v
+    if kind == _KINDS[0]:
+        return lambda v: v / (e.nominal or abs(e.estimate) or 1.0)
+    low = e.lower if e.lower is not None else min(e.estimate, 0.0)
+    high = e.upper if e.upper is not None else low + 1.0
+    return lambda v: 100.0 * (v - low) / ((high - low) or 1.0)
+
+
+def _recordings(result: Identification) -> list[Block]:
+    """Return the estimates from each recording alone, and their spread."""
+    if not result.aggregate:
+        return []
+    count = len(result.aggregate[0].estimates)
+    names = _log_names(result)[:count]
+    logs = "".join(f" {i}: {log}." for i, log in enumerate(names)) if len(names) == count else ""
+    loose = ", ".join(q.name for q in result.aggregate if not q.agree)
+    agreement = f"differ in {loose} by more than the standard errors" if loose else "agree in all quantities"
+    caption = f"Estimates from each of {count} recordings alone, which {agreement}.{logs}"
+    return [TableBlock.of(caption, result.recordings_table())]
+
+
+def alternative_blocks(result: Identification) -> list[Block]:
+    """Return the tried terms, and the models that fit the recordings as well as the estimate, with their shares."""
+    blocks: list[Block] = []
+    if result.tried:
+        caption = "Optional terms: root mean square error on held-out parts, in deviations of a measurement"
+        blocks.append(TableBlock.of(caption, tried_table(result.tried)))
+    if result.posterior is not None and result.posterior.others:
+        caption = "Models that fit the recordings equally well; training draws robots from all of them"
+        blocks.append(TableBlock.of(caption, result.alternatives_table()))
+    return blocks
+
+
+def _correlation(result: Identification) -> list[Block]:
+    """Return the strong correlations, of which the data determines only combinations."""
+    if not result.correlation:
+        return []
+    names, matrix = result.correlation.names, result.correlation.matrix
+    pairs = [(names[j], names[i], float(matrix[i, j])) for i in range(len(names)) for j in range(i)]
+    strong = sorted((p for p in pairs if abs(p[2]) > _STRONG), key=lambda p: -abs(p[2]))
+    caption = f"Correlations beyond ±{_STRONG:g}: the data hardly separates the two estimates"
+    rows = [[a, b, fixed(value, 2)] for a, b, value in strong]
+    return [TableBlock(caption, ("parameter", "and", "correlation"), rows, (1,), folded=True)] if rows else []
+
+
+# -- delays of links
+
+
+def link_blocks(links: Sequence[Link]) -> list[Block]:
+    """Return figure and table of links; empty without links."""
+    if not links:
+        return []
+    with styled():
+        figure = new_figure(0.4 + 1.9 * len(links), style.PHONE_IN)
+        for axes, link in zip(figure.subplots(len(links), 1, squeeze=False)[:, 0], links, strict=True):
+            _draw_link(axes, link)
+        svg = to_svg(figure, "identify-links", "How delays are distributed")
+    caption = (
+        "Delays of messages, estimated from the motion: the share of each delay; line: the mean, band: its 95 % "
+        "interval, dashed: the 95th percentile. The motion determines only the sum of delays that are the same for all "
+        "messages."
+    )
+    return [FigureBlock(svg, caption), TableBlock.of("Links", links_table(links))]
+
+
+def _draw_link(axes: Axes, link: Link) -> None:
+    large = np.flatnonzero(link.share >= _MIN_SHARE * link.share.max())
+    drawn = slice(max(large[0] - 1, 0), large[-1] + 2)
+    axes.fill_between(1e3 * link.delays[drawn], 100.0 * link.share[drawn], step="mid", color=BLUE, alpha=0.8, lw=0)
+    if link.mean.low95 is not None and link.mean.high95 is not None:
+        axes.axvspan(1e3 * link.mean.low95, 1e3 * link.mean.high95, color=ORANGE, alpha=0.35, lw=0)
+    axes.axvline(1e3 * as_number(link.mean.value), color=INK, lw=1.0)
+    axes.axvline(1e3 * as_number(link.p95.value), color=INK, lw=1.0, ls="--")
+    lost = "" if link.lost.value is None else f"; {100.0 * link.lost.value:.2g} % lost"
+    if lost and link.burst.value is not None:
+        lost += f", {link.burst.value:.2g} in a row"
+    axes.set_title(f"{' + '.join(link.parts)}{lost}", fontsize="small")
+    axes.set(xlabel="delay [ms]", ylabel="% of messages", ylim=(0.0, None))
+
+
+# -- errors and predictions
+
+
+def _expected(result: Identification) -> list[Block]:
+    """Return the expected errors, and the errors on held-out data beside them, the largest ratios first."""
+    items = [sentence(str(e), [h.name for h in result.held_out]) for e in result.expected_error]
+    lead = ListBlock("The errors to expect on later data, for motion like the fitted one", items)
+    blocks: list[Block] = [lead] if items else []
+    table = TableBlock.of("Errors on held-out data beside the expected errors", result.compared_table())
+    ratios = [r.ratio or 0.0 for r in result.compared if r.ratio is not None]
+    tones: list[Tone] = ["bad" if r > MAX_ERROR_RATIO else "good" for r in sorted(ratios, reverse=True)]
+    first = replace(table, rows=table.rows[:_MOST_COMPARED], tones=tones[:_MOST_COMPARED])
+    more = replace(table, rows=table.rows[_MOST_COMPARED:], tones=tones[_MOST_COMPARED:], folded=True)
+    more = replace(more, caption=f"Errors with smaller ratios ({len(more.rows)})")
+    return [*blocks, *(block for block in (first, more) if block.rows)]
+
+
+def _held_out_parts(result: Identification) -> list[Block]:
+    """Return the errors on held-out parts of the recordings, with their mean and the largest."""
+    rows = result.left_out
+    if not rows:
+        return []
+    # Make a column for each field, ahead and in a free run.
+    kinds = [(kind, column) for kind in ("ahead", "free") for column in getattr(rows[0], kind)]
+    units = {column: unit_of(column, result.units) for _, column in kinds}
+    heads = [f"{column} {'ahead' if kind == 'ahead' else 'in a free run'} [{units[column]}]" for kind, column in kinds]
+    errors = np.array([[getattr(r, kind).get(column, np.nan) for kind, column in kinds] for r in rows], np.float64)
+    with_terms = bool(result.terms) or any(r.terms for r in rows)
+    # Add the mean and the largest error of each column; a part in which a joint rests has no error.
+    finite = [column[np.isfinite(column)] for column in errors.T]
+    summed = [
+        (name, [reduce(column) if column.size else np.nan for column in finite], "")
+        for name, reduce in (("mean", np.mean), ("worst", np.max))
+    ]
+    parts = [(r.name, e, ", ".join(r.terms) or "none") for r, e in zip(rows, errors, strict=True)]
+    table = [
+        [name, *([terms] if with_terms else []), *(number(float(e), 3) for e in values)]
+        for name, values, terms in [*parts, *summed]
+    ]
+    columns = ["held-out part", *(["terms"] if with_terms else []), *heads]
+    caption = "Root mean square errors on each held-out part, of a fit without it"
+    return [TableBlock(caption, columns, table, text_columns=(0, 1) if with_terms else (0,), folded=True)]
+
+
+def _predictions(result: Identification) -> list[Block]:
+    """Return the measurements beside the model's predictions, and the tables of errors."""
+    blocks: list[Block] = []
+    if result.free or result.samples:
+        blocks.append(_prediction_figure(result))
+    if len(result.held_out) > 1:
+        caption = f"Held-out RMSE of every position after {result.held_out[0].horizon_s:g} s, the largest first"
+        blocks.append(replace(TableBlock.of(caption, result.held_out_table()), folded=True))
+    if result.prediction:
+        fields = list(dict.fromkeys(f for row in result.prediction for f in row.rmse))
+        heads = [f"RMSE of {with_unit(f, result.units)}" for f in fields]
+        rows = [
+            [r.model, number(r.horizon_s, 3), "held out" if r.held_out else "fitted"]
+            + [number(r.rmse.get(f)) for f in fields]
+            for r in result.prediction
+        ]
+        heads = ("model", "horizon [s]", "data", *heads)
+        blocks.append(TableBlock("Errors over the horizon", heads, rows, (2,), folded=True))
+    if result.free_run:
+        several = len(result.recordings) > 1
+        rows = [
+            [
+                *(r.model, *([_title(result, r.recording)] if several else []), r.field, number(r.seconds, 3)),
+                *(number(r.rmse), number(r.mae), unit_of(r.field, result.units) or MISSING),
+            ]
+            for r in result.free_run
+        ]
+        heads = ("model", *(["recording"] if several else []), "field", "length [s]", "RMSE", "MAE", "unit")
+        text = (1, 2, 6) if several else (1, 5)
+        blocks.append(TableBlock("Free runs", heads, rows, text, folded=True))
+    return blocks
+
+
+def _prediction_figure(result: Identification) -> FigureBlock:
+    """Return the held-out data in one simulation; without one the segments, each from its own initial state."""
+    recordings = np.unique(result.free["recording"]).tolist() if result.free else result.recordings
+    if result.free:
+        svg = free_runs_svg(result, "identify-free")
+        caption = "All held-out data in one simulation, from one initial state, with the recorded commands and timing."
+    else:
+        svg = segments_svg(result, "identify-predictions")
+        caption = "Each segment is simulated from its own initial state. Shaded data is held out of the fit."
+    hidden = len(result.fields) * len(recordings) - len(_panels(result, recordings))
+    return FigureBlock(svg, f"{caption} {hidden} further panels are not shown." if hidden else caption)
+
+
+def free_runs_svg(result: Identification, name: str) -> str:
+    """Draw the held-out part of each recording, and one simulation of all of it with its errors."""
+    panels = []
+    for recording, field in _panels(result, np.unique(result.free["recording"]).tolist()):
+        rows = result.free["recording"] == recording
+        segments, counts = np.unique(result.free["segment"][rows], return_counts=True)
+        rows &= result.free["segment"] == segments[counts.argmax()]  # the longest segment
+        t_s = result.free["t"][rows]
+        models = [m for m in ("measured", "no delay", "identified") if f"{field}_{m}" in result.free]
+        lines = [Line(t_s, result.free[f"{field}_{m}"][rows].astype(float), _LABELS[m], m) for m in models]
+        settled = t_s[result.free["into"][rows] <= result.settle_s]
+        spans = [(float(settled[0]), float(settled[-1]))] if len(settled) else []
+        panels.append(
+            Panel(
+                with_unit(field, result.units),
+                lines,
+                _title(result, recording),
+                spans,
+                framed=("measured", "identified"),
+            )
+        )
+    label = "The held-out part of each recording, measured and simulated from one initial state"
+    return over_time(panels, name, label, shade="initial state fitted here")
+
+
+def segments_svg(result: Identification, name: str) -> str:
+    """Draw measurements and predictions of segments that do not overlap; held-out data is shaded."""
+    panels = []
+    for recording, field in _panels(result, result.recordings):
+        of_recording = result.samples["recording"] == recording
+        rows = result.disjoint() & of_recording
+        t_s, segment = result.samples["t"][rows], result.samples["segment"][rows]
+        lines = [
+            Line(*with_gaps(t_s, result.samples[f"{field}_{m}"][rows], segment), _LABELS.get(m, m), m)
+            for m in ("measured", *(m for m in result.models(field) if m != "no delay"))
+        ]
+        ordered = np.flatnonzero(of_recording)[np.argsort(result.samples["t"][of_recording], kind="stable")]
+        spans = _spans(result.samples["t"][ordered], result.samples["held_out"][ordered].astype(bool))
+        title = _title(result, recording)
+        panels.append(Panel(with_unit(field, result.units), lines, title, spans, framed=("measured", "identified")))
+    label = f"Measured {', '.join(result.fields)} beside predictions of the models"
+    return over_time(panels, name, label)
+
+
+def _spans(t_s: np.ndarray, chosen: np.ndarray) -> list[tuple[float, float]]:
+    """Return the intervals over which ``chosen`` holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(int)))
+    return [(float(t_s[b]), float(t_s[e - 1])) for b, e in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _panels(result: Identification, recordings: Sequence[int]) -> list[tuple[int, str]]:
+    """Return recording and field of the panels that fit into a figure."""
+    pairs = [(r, field) for field in result.fields for r in recordings][:_MAX_PANELS]
+    return sorted(pairs, key=lambda pair: (pair[0], result.fields.index(pair[1])))
+
+
+def _title(result: Identification, recording: int) -> str:
+    """Return the name of a recording; empty for a single recording."""
+    names = _log_names(result)
+    if len(result.recordings) < 2:
+        return ""
+    return names[recording] if recording < len(names) else f"recording {recording}"
+
+
+def _log_names(result: Identification) -> list[str]:
+    return [log.path.replace("\\", "/").rsplit("/", 1)[-1] for log in result.logs]

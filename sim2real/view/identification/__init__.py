@@ -1,1 +1,0 @@
-"""The section of an identification on a page, and its figures."""

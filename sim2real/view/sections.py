@@ -1,0 +1,451 @@
+"""The sections of a page: record, train, deploy and the iterations, each from the stage's folder."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter
+
+from sim2real.artifacts.bundle import GOOD_SUCCESS, History
+from sim2real.artifacts.deployment import Deployment, Scores
+from sim2real.artifacts.episodes import Episodes
+from sim2real.artifacts.identification import Identification, with_small_unit, worst_window
+from sim2real.artifacts.recording import Recording
+from sim2real.artifacts.run.iterations import Iterations
+from sim2real.artifacts.run.run_folder import StageFolder, finished
+from sim2real.artifacts.sensitivity import SENSITIVITY, Sensitivity
+from sim2real.artifacts.summary import words_and_unit
+from sim2real.graph.episode import Episode
+from sim2real.log.schema import unit_of
+from sim2real.types import Json
+from sim2real.view import style
+from sim2real.view.blocks import (
+    Banner,
+    Block,
+    FigureBlock,
+    FoldBlock,
+    ListBlock,
+    NoteBlock,
+    PageSection,
+    TableBlock,
+    Tile,
+    Tone,
+    about,
+    fixed,
+    number,
+    sentence,
+)
+from sim2real.view.delay_parts import delay_blocks
+from sim2real.view.episodes import episodes_svg
+from sim2real.view.identification import identify_section
+from sim2real.view.panels import Line, Panel, compared, over_time, with_unit
+from sim2real.view.signals import ComparedSeries, Signals, is_dry, pairs_of, signals_of, simulated_beside
+from sim2real.view.style import BLUE, INK, new_figure, styled, to_svg
+from sim2real.view.timing import timing_blocks, timing_tiles
+
+_MAX_LATE = 0.01
+"""Share of late answers above which the page gives advice."""
+_MOST_PANELS = 40
+"""Largest number of panels of a figure: each takes 0.2 s to draw."""
+_SAME = 1e-6
+"""Range of values that are all the same in single precision."""
+_DRY = Banner(
+    "doubt",
+    "Dry run: the robot did not move",
+    (
+        "Torque was off: the page shows the commands after the safety gate, but they were not sent.",
+        "The robot did not react, so identify cannot use this recording, and the deployment has no verdict.",
+    ),
+)
+_DEPLOYED: dict[str, Tone] = {"fine": "good", "look at this joint": "bad"}
+
+
+# -- record
+
+
+def record_section(artifact: StageFolder) -> PageSection:
+    """Return the section of a recording: its signals, the timing of the nodes, and the parts of the delay."""
+    recording = Recording.load(artifact.folder)
+    log, identified = signals_of(recording), finished(artifact.run_dir, "identify")
+    blocks: list[Block] = [NoteBlock(text) for text in log.warnings]
+    commanded = "the commands that were not sent" if log.dry else "the commands"
+    truth = " The true state comes from the embedded robot." if log.truth else ""
+    caption = f"Measurements, at the time of each sample, and {commanded}.{truth} Right: a part of the left plots."
+    blocks.append(FigureBlock(recording_svg(log, "record-signals"), caption))
+    blocks += timing_blocks(log.episode, "record")
+    blocks += delay_blocks(recording, None if identified is None else Identification.load(identified.folder))
+    blocks += servo_blocks([log.episode])
+    steps = max((len(s) for s in log.episode.steps.values()), default=0)
+    tiles = [Tile("length", f"{log.episode.duration_s:.1f} s", f"{steps} steps"), *timing_tiles([log.episode])]
+    lead = "The robot under an excitation" + (", without torque." if log.dry else "; all later stages use this log.")
+    return PageSection("record", "Record", lead, tiles, [*blocks, *about(artifact)], record_banner(log))
+
+
+def record_banner(log: Signals) -> Banner:
+    """Return the verdict on a recording: whether it is complete, and its answers came in time."""
+    if log.dry:
+        return _DRY
+    end = log.episode.metadata.get("log", {}).get("session_end") or {}
+    faults = list(log.warnings)
+    late = int(end.get("late_replies") or 0) / max(1, int(end.get("transactions") or 0))
+    if late > _MAX_LATE:
+        faults.append(f"{late:.1%} of the answers came so late that the time of the sample is uncertain.")
+    if faults:
+        return Banner("doubt", "Incomplete" if log.warnings else "Late answers", faults)
+    lost = f"; {number(end['lost_replies'])} lost answers were requested again" if "lost_replies" in end else ""
+    return Banner("good", "Complete", [f"{log.episode.duration_s:.1f} s{lost}."])
+
+
+def recording_svg(log: Signals, name: str) -> str:
+    """Draw the measurements of a log, with the true states of an embedded robot, and the commands to the motors."""
+    middle, length = log.episode.duration_s / 2, min(2.0, log.episode.duration_s / 4)
+    zoom = (round(middle, 1), round(middle + length, 1))
+    panels = []
+    for series in log.measured:
+        lines = [Line(series.t_s, series.values, "measured", "measured")]
+        if series.name in log.truth:
+            truth = log.truth[series.name]
+            lines.append(Line(truth.t_s, truth.values, "true state", "truth"))
+        panels.append(Panel(with_unit(series.name, log.units), lines, zoom=zoom))
+    commanded = "command, not sent" if log.dry else "command"
+    for series in log.last_command():
+        label = with_unit(f"{series.source}.{series.name}", log.units, series.name)
+        panels.append(Panel(label, [Line(series.t_s, series.values, commanded, "command", held=True)], zoom=zoom))
+    return over_time(panels, name, f"Measured and commanded signals over {log.episode.duration_s:.1f} s")
+
+
+def servo_blocks(episodes: Sequence[Episode]) -> list[Block]:
+    """Return sentences and table on the servos of one session; empty for a log without servos."""
+    ends: list[Mapping[str, Json]] = [e.metadata.get("log", {}).get("session_end") or {} for e in episodes]
+    items = list(_answers(ends[-1]))  # the count of answers covers all episodes of a session
+    blocks: list[Block] = [ListBlock("Servos and their measurements", items)] if items else []
+    rows = []
+    for i, end in enumerate(ends):
+        which = f"episode {i}: " if len(ends) > 1 else ""
+        for sent in end.get("sent", []):
+            values = [number(float(sent[k])) for k in ("low", "mean", "high")]
+            rows.append([f"{which}{sent['name']}", str(sent["unit"]), number(int(sent["commands"])), *values])
+    if rows:
+        caption = "Commands to the motors" + (", which were not sent" if any(map(is_dry, episodes)) else "")
+        blocks.append(TableBlock(caption, ("actuator", "unit", "commands", "min", "mean", "max"), rows, (1,)))
+    return blocks
+
+
+def _answers(end: Mapping[str, Json]) -> Iterator[str]:
+    """Yield sentences on the number of answers, and on late answers."""
+    if "late_replies" not in end or not end.get("transactions"):
+        return
+    count, late = int(end["transactions"]), int(end["late_replies"])
+    yield f"{number(count)} answers came; {number(end.get('lost_replies', 0))} were lost, and requested again."
+    count_late = f"{number(late)} answers ({late / count:.1%})" if late else "No answer"
+    advice = ": set the adapter's latency timer to 1 ms, and close other programs" if late > _MAX_LATE * count else ""
+    yield f"{count_late} came so late that the sample's time is uncertain{advice}."
+    if all(isinstance(q, int | float) for q in end.get("late_s") or [None]):
+        half, most, last = (fixed(1e3 * q, 2) for q in end["late_s"])
+        yield (
+            f"Beyond the time that its bytes take, half of the answers took {half} ms or less, 99 % {most} ms or less, "
+            f"the slowest {last} ms."
+        )
+
+
+# -- train
+
+
+def train_section(artifact: StageFolder) -> PageSection:
+    """Return the section of a training: the learning curves, the episodes, and the sensitivity of the policy."""
+    curves = History.load(artifact.folder)
+    last, seeds = curves.success[-1], curves.returns.shape[1]
+    best = curves.best_seed
+    whose = f"seed {best}, the best of {seeds}" if best is not None else f"median of {seeds} seeds"
+    # Show the success of the policy in the bundle, that of the best evaluation.
+    success = float(np.nanmedian(last) if best is None else np.nanmax(curves.success[:, best]))
+    tiles = [
+        Tile("success in simulation", f"{success:.0%}", whose if seeds > 1 else "one seed"),
+        Tile("steps in simulation", number(int(curves.steps[-1]))),
+        Tile("time", f"{curves.seconds[-1]:.0f} s"),
+    ]
+    blocks = [
+        FigureBlock(training_svg(curves, "train-curves"), "Evaluations during training, in simulation."),
+        TableBlock.of("Each seed at the end", curves.rows()),
+        *_episode_blocks(artifact),
+        *sensitivity_blocks(artifact.folder),
+        *about(artifact),
+    ]
+    reason = f"The limit is {GOOD_SUCCESS:.0%}, the same as for success on the robot."
+    tone: Tone = "good" if success >= GOOD_SUCCESS else "doubt"
+    banner = Banner(tone, f"{success:.0%} success in simulation", [reason])
+    lead = "A policy for the identified model, with the timing of the robot."
+    return PageSection("train", "Train", lead, tiles, blocks, banner)
+
+
+def training_svg(curves: History, name: str) -> str:
+    """Draw return and success of each seed over the steps of training, and their median."""
+    seeds = curves.returns.shape[1]
+    with styled():
+        figure = new_figure(2.7, style.PHONE_IN)
+        left, right = figure.subplots(1, 2, sharex=True)
+        # Draw one curve for each seed, and their median.
+        for axes, values, label in ((left, curves.returns, "return"), (right, curves.success, "success")):
+            for seed in range(seeds):
+                selected = seed == curves.best_seed
+                dash = style.DASHES[0 if selected else 1 + seed % 3]
+                look: dict[str, Any] = {"marker": "o", "ms": 3.5, "lw": 1.8} if selected else {"lw": 0.9, "alpha": 0.7}
+                axes.plot(curves.steps, values[:, seed], color=BLUE, ls=dash, **look)
+            if seeds > 1:
+                axes.plot(curves.steps, np.nanmedian(values, axis=1), color=INK, lw=2.2)
+            axes.set(xlabel="steps in simulation", ylabel=label)
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _thousands(value)))
+        right.set_ylim(-0.03, 1.03)
+        if seeds > 1:
+            entries = [
+                Line2D([], [], color=BLUE, lw=0.9, ls=style.DASHES[1], label="one seed each"),
+                Line2D([], [], color=INK, lw=2.2, label=f"median of {seeds} seeds"),
+            ]
+            if curves.best_seed is not None:
+                selected = f"seed {curves.best_seed}, in the bundle"
+                entries.insert(1, Line2D([], [], color=BLUE, lw=1.8, marker="o", ms=3.5, label=selected))
+            style.legend_above(figure, entries)
+        return to_svg(figure, name, f"Return and success of {seeds} seeds over the steps of training")
+
+
+def _thousands(count: float) -> str:
+    for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if abs(count) >= size:
+            return f"{count / size:g}{letter}"
+    return f"{count:g}"
+
+
+def _episode_blocks(artifact: StageFolder) -> list[Block]:
+    """Return the distributions of the episodes; empty for trainings of older versions."""
+    if "episodes" not in artifact.outputs:
+        return []
+    drawn = Episodes.load(artifact.folder)
+    if not drawn.parameters and not drawn.drawn_s:
+        return [NoteBlock("All episodes had the same parameters, without delays.")]
+    caption = (
+        "Distributions of the episodes: parameters with the 95 % interval of the estimate, computation times with "
+        "those of the recording, noise with the differences between measurements and model. The posterior's deviations "
+        f"are multiplied by {drawn.widening:.1f}, to cover errors of the model."
+    )
+    # Describe pauses, pushes and the curriculum if there are any.
+    if drawn.cut or drawn.again:
+        caption += (
+            f" {drawn.cut} of {drawn.timelines} timelines end before a pause of the computer that is too long for the "
+            f"training; {drawn.again} were drawn again, as the pause was in their first half."
+        )
+    if drawn.push_hz:
+        caption += f" Each joint is pushed {drawn.push_hz:g} times a second, at random times."
+    if drawn.curriculum != (1.0, 1.0):
+        first, last = drawn.curriculum
+        follow = f" while success is above {drawn.follow:g}" if drawn.follow else ""
+        caption += (
+            f" The share of all differences grows from {first:g} to {last:g} in training{follow}; the plots show "
+            f"{last:g}."
+        )
+    return [FigureBlock(episodes_svg(drawn, "train-episodes"), caption)]
+
+
+def sensitivity_blocks(folder: Path) -> list[Block]:
+    """Return the success with wrong parameters; empty if it was not simulated."""
+    if not (folder / SENSITIVITY).is_file():
+        return []
+    sensitivity = Sensitivity.load(folder)
+    if not sensitivity.parameters:
+        return []
+    caption = (
+        "Success on models with one changed parameter, over the change in half-widths of its 95 % interval, the most "
+        "harmful first. The other parameters follow by their covariance; all models play the same "
+        f"{sensitivity.episodes} episodes"
+    )
+    return [NoteBlock(sensitivity.advice), TableBlock.of(caption, sensitivity.rows())]
+
+
+# -- deploy
+
+
+def deploy_section(artifact: StageFolder) -> PageSection:
+    """Return the section of a deployment: the gap between robot and simulation, and each episode."""
+    deployed = Deployment.load(artifact.folder)
+    logs = [signals_of(recording) for recording in deployed.recordings]
+    if deployed.dry_run:
+        return _dry_section(artifact, logs)
+    blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
+    # Draw each episode beside its simulation.
+    units = {**logs[0].units, **deployed.units}
+    joints = {row.column: row.name for row in deployed.replay}
+    episodes = [
+        pairs_of(log, simulated_beside(columns, log, units), units, joints)
+        for log, columns in zip(logs, deployed.simulated, strict=True)
+    ]
+    for index, pairs in enumerate(episodes):
+        caption = f"Episode {index}: the robot, and the same policy in simulation. {_scores(deployed.episodes[index])}"
+        shown = _shown(pairs)
+        if len(shown) < len(pairs):
+            caption += " Speeds of the joints, and commands that do not change, are in the log."
+        blocks.append(FigureBlock(deployment_svg(shown, units, index, f"deploy-{index}"), caption))
+    blocks += _deploy_tables(deployed)
+    # Fold the timing of all episodes but the first.
+    for index, log in enumerate(logs):
+        blocks += timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
+    blocks += servo_blocks([log.episode for log in logs])
+    # The tiles have the success on the robot and in simulation.
+    real, simulated = (
+        [float(value) for s in scores if (value := (s or {}).get("success")) is not None]
+        for scores in ([e.real for e in deployed.episodes], [e.simulation for e in deployed.episodes])
+    )
+    tiles = []
+    if real:
+        note = f"in simulation {np.mean(simulated):.0%}" if simulated else ""
+        tiles.append(Tile("success on the robot", f"{np.mean(real):.0%}", note))
+    tiles += [Tile("episodes", str(len(deployed.episodes))), *timing_tiles([log.episode for log in logs])]
+    lead = "The policy on the robot, beside the same policy in simulation."
+    figure = largest_difference(episodes, [row.column for row in deployed.replay], units, "deploy-worst")
+    # Tables come after all figures and sentences.
+    blocks = sorted(blocks, key=lambda block: isinstance(block, TableBlock | FoldBlock))
+    return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *about(artifact)], _deploy_banner(deployed), figure)
+
+
+def _dry_section(artifact: StageFolder, logs: Sequence[Signals]) -> PageSection:
+    """Return the commands that a dry run computed; it has no gap."""
+    blocks: list[Block] = [NoteBlock(text) for log in logs for text in log.warnings]
+    blocks.append(NoteBlock("A dry run has no gap report, as the robot does not move."))
+    for index, log in enumerate(logs):
+        caption = f"Episode {index}: measurements, and the policy's commands, which were not sent."
+        blocks.append(FigureBlock(recording_svg(log, f"deploy-{index}"), caption))
+        blocks += timing_blocks(log.episode, f"deploy-{index}", f" Episode {index}.", folded=index > 0)
+    episodes = [log.episode for log in logs]
+    tiles = [Tile("episodes", str(len(episodes)), "dry run"), *timing_tiles(episodes)]
+    lead = "The policy on the robot, without torque."
+    return PageSection("deploy", "Deploy", lead, tiles, [*blocks, *servo_blocks(episodes), *about(artifact)], _DRY)
+
+
+def _deploy_banner(deployed: Deployment) -> Banner | None:
+    """Return the verdict on a deployment: the first reason, the next command, further reasons; None for older files."""
+    advice = deployed.advice
+    if advice is None:
+        return None
+    title = f"{advice.status[:1].upper()}{advice.status[1:]}" + (f": {advice.joint}" if advice.joint else "")
+    reasons = [sentence(reason, [row.name for row in deployed.replay]) for reason in advice.reasons]
+    reasons[1:1] = [f"next: {advice.next}"] if advice.next else []
+    return Banner(_DEPLOYED.get(advice.status, "doubt"), title, reasons)
+
+
+def deployment_svg(pairs: Sequence[ComparedSeries], units: Mapping[str, str], number: int, name: str) -> str:
+    """Draw one episode on the robot, the same policy in simulation, and on the right their difference."""
+    panels = []
+    for pair in pairs:
+        off = None
+        if pair.difference is not None:
+            off = Line(pair.robot.t_s, pair.difference, "robot \u2212 simulation", "residual", held=pair.held)
+        panels.append(Panel(with_unit(pair.label, units, pair.robot.name), _lines(pair), difference=off))
+    return over_time(panels, name, f"Episode {number} on the robot, in simulation, and their difference")
+
+
+def largest_difference(
+    episodes: Sequence[Sequence[ComparedSeries]], positions: Sequence[str], units: Mapping[str, str], name: str
+) -> FigureBlock | None:
+    """Draw the measurement with the largest difference to its simulation; None without a simulation.
+
+    It is the largest root mean square over a second, as a share of the motion on the robot.
+
+    Args:
+        positions: Names of the measurements to choose from; empty: all.
+        units: Field -> unit.
+    """
+    found = []
+    for number_, pairs in enumerate(episodes):
+        for pair in pairs:
+            off = pair.difference
+            if (positions and pair.robot.name not in positions) or pair.held or off is None:
+                continue
+            if (finite := np.isfinite(off)).any():
+                window = worst_window(pair.robot.t_s[finite], off[finite] ** 2)
+                found.append((window[2] / max(float(np.std(pair.robot.values)), 1e-12), number_, pair, off, window))
+    if not found:
+        return None
+    _, episode, pair, off, (begin_s, end_s, error) = max(found, key=lambda row: row[0])
+    unit = unit_of(pair.robot.name, units)
+    line = Line(pair.robot.t_s, off, f"difference [{unit}]" if unit else "difference", "residual")
+    svg = compared(_lines(pair), line, with_unit(pair.label, units, pair.robot.name), (begin_s, end_s), name)
+    where = f"{pair.label} in episode {episode}, from {begin_s:.1f} s, root mean square {with_small_unit(error, unit)}"
+    return FigureBlock(svg, f"The second with the largest difference, as a share of the motion: {where}.")
+
+
+def _lines(pair: ComparedSeries) -> list[Line]:
+    lines = [Line(pair.robot.t_s, pair.robot.values, "robot", "measured", held=pair.held)]
+    if pair.simulation is not None:
+        other = pair.simulation
+        lines.append(Line(other.t_s, other.values, "simulation", "identified", held=pair.held))
+    return lines
+
+
+def _shown(pairs: Sequence[ComparedSeries]) -> list[ComparedSeries]:
+    """Return the series of the figure: of a robot with many joints all but speeds and commands that do not change."""
+    if len(pairs) <= _MOST_PANELS:
+        return list(pairs)
+    names = {pair.robot.name for pair in pairs}
+    return [
+        pair
+        for pair in pairs
+        if not (pair.held and np.ptp(pair.robot.values) < _SAME)
+        and not (pair.robot.name.startswith("velocity[") and pair.robot.name.replace("velocity", "position") in names)
+    ]
+
+
+def _scores(score: Scores) -> str:
+    """Return the scores of an episode as a sentence."""
+    simulation = score.simulation or {}
+    both = [
+        f"{label}: robot {number(score.real.get(n), 3)}"
+        + (f", simulation {number(simulation.get(n), 3)}" if n in simulation else "")
+        + ("" if unit == "1" else f" {unit}")
+        for n in dict.fromkeys([*score.real, *simulation])
+        for label, unit in [words_and_unit(n)]
+    ]
+    text = "; ".join(both)
+    return text[:1].upper() + text[1:] + "." if both else ""
+
+
+def _deploy_tables(deployed: Deployment) -> list[Block]:
+    """Return the gap between robot and simulation, and the tests behind the verdict."""
+    blocks: list[Block] = [TableBlock.of("Robot and simulation", deployed.rows())]
+    if deployed.drift is not None:
+        caption = (
+            "Has the robot changed? Each row compares one estimate with its value in the new log, if only this has "
+            "changed. The first row explains the largest share of the error. For a robot that has not changed, the "
+            f"tests together raise a false alarm in {deployed.drift.level:.0%} of the logs."
+        )
+        blocks.append(TableBlock.of(caption, deployed.drift.rows()))
+    if deployed.replay:
+        caption = (
+            "The recorded commands, played again on models: root mean square error of each model's prediction "
+            f"{deployed.replay[0].horizon_s:g} s ahead, and the expected error of the identification."
+        )
+        blocks.append(TableBlock.of(caption, deployed.replay_table()))
+    if deployed.trained:
+        caption = "Times on the robot, and the times that the policy was trained with"
+        blocks.append(TableBlock.of(caption, deployed.times_table()))
+    return blocks
+
+
+# -- iterations
+
+
+def iterations_sections(run_dir: Path) -> list[PageSection]:
+    """Return the section about a run's iterations; empty for a run without iterations."""
+    iterations = Iterations.load(run_dir)
+    rows = iterations.rows
+    if not rows:
+        return []
+    block = TableBlock.of("Stages, success and verdict of each iteration", iterations.table())
+    best = [r.real for r in rows if r.real is not None]
+    tiles = [Tile("iterations", str(len(rows)), rows[-1].verdict)]
+    if best:
+        tiles.append(Tile("success of the last", number(best[-1]), f"of the first {number(best[0])}"))
+    lead = "The log of each deployment decides which stages run again."
+    return [PageSection("iterations", "Iterations", lead, tiles, [block])]
+
+
+SECTIONS = {"record": record_section, "identify": identify_section, "train": train_section, "deploy": deploy_section}
