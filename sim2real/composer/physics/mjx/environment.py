@@ -241,6 +241,7 @@ class MjxEnvironment:
         law: stepping.Law | None = None,
         initial: mjx.Data | None = None,
         dry: bool = False,
+        samples: bool = True,
     ) -> State:
         physics, random_state = self._physics(None, model, law, initial, dry)
         random_state.key = key
@@ -256,9 +257,10 @@ class MjxEnvironment:
         failed = physics.retry(attempt, random_state, self._attempts)
         physics.forward(actuation=False)
         # Take the first samples.
-        rings = {r.name: r.reset(physics, random_state) for r in self._rings}
+        observed = self._rings if samples else []
+        rings = {r.name: r.reset(physics, random_state) for r in observed}
         steps = jnp.zeros((), jnp.int32)
-        observation = {r.name: r.read(rings[r.name], steps) for r in self._rings}
+        observation = {r.name: r.read(rings[r.name], steps) for r in observed}
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
         reward, discount, terms = jax.tree.map(lambda x: jnp.zeros(x.shape, data.qpos.dtype), self._earned)
@@ -271,14 +273,14 @@ class MjxEnvironment:
         key: jax.Array,
         model: mjx.Model | None = None,
         start: tuple[ArrayLike, ArrayLike] | None = None,
-        data: mjx.Data | None = None,
+        data: PyTree = None,
     ) -> State:
-        """Return the result of ``reset`` without physics: no quantity is computed from positions and velocities.
+        """Return the result of ``reset`` without physics and observations.
 
         Args:
-            data: Start of the episodes; default: ``initial``.
+            data: The ``mjx.Data`` at the start; default: ``initial``.
         """
-        return self._reset(key, model, start, initial=data, dry=True)
+        return self._reset(key, model, start, initial=data, dry=True, samples=False)
 
     def step_apart(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> tuple[State, jax.Array]:
         """Run the hooks of a control step without its physics.

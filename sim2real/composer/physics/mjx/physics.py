@@ -281,7 +281,7 @@ class MjxPhysics(Traced):
             return self.failed, self.tree(random_state), count + 1
 
         carry = once((None, start, jnp.zeros((), int)))
-        if attempts > 1:
+        if attempts > 1 and not self.dry:
             carry = jax.lax.while_loop(lambda c: c[0] & (c[2] < attempts), once, carry)
         self.mjx_model, self.failed, self.is_dirty = model, outer, True
         self.load(carry[1], random_state)
