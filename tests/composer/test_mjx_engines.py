@@ -17,6 +17,8 @@ from sim2real.composer.physics.mjx import constants, stepping
 from sim2real.composer.physics.mjx.environment import is_unstable
 from sim2real.composer.variation import PhysicsVariator, deterministic
 
+ENGINE = stepping.JaxEngine()
+
 CHAIN = """
 <mujoco model="chain"><compiler angle="radian"/><default><geom contype="0" conaffinity="0"/></default>
   <worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" damping=".1"/>
@@ -199,7 +201,7 @@ def test_mjx_is_traced_once_for_all_programs_that_a_model_is_in(monkeypatch):
 
     def speeds(qvel, mass):
         heavier = stepping.with_fields(given, {"body_mass": given.body_mass * mass})
-        return stepping.advance(heavier, stepping.advance(heavier, data.replace(qvel=qvel), True), True).qvel
+        return ENGINE.advance(heavier, ENGINE.advance(heavier, data.replace(qvel=qvel), True), True).qvel
 
     still = jnp.zeros((4, model.nv))
     jax.eval_shape(speeds, still[0], 2.0)
@@ -216,7 +218,7 @@ def test_a_step_is_that_of_mj_step_with_all_sensors(double, integrator):
     data = mujoco.MjData(model)
     data.qvel[:] = 1.0
     start = mjx.put_data(model, data)
-    found = jax.jit(lambda m, d: stepping.advance(m, d, False))(mjx.put_model(model), start)
+    found = jax.jit(lambda m, d: ENGINE.advance(m, d, False))(mjx.put_model(model), start)
     mujoco.mj_step(model, data)
     np.testing.assert_allclose(found.sensordata, data.sensordata, rtol=1e-9)
     np.testing.assert_allclose(found.qvel, data.qvel, rtol=1e-12)
@@ -231,7 +233,7 @@ def test_the_state_at_the_start_of_an_episode_is_that_of_c(double):
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[0] = [1.02, 0.02, 0.02, 0.02], 0.5
     given = mjx.put_model(model), mjx.put_data(model, data)
-    found = jax.jit(lambda m, d: stepping.forward(m, d, False))(*given)
+    found = jax.jit(lambda m, d: ENGINE.forward(m, d, False))(*given)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     mujoco.mj_forward(model, data)
     assert found.sensordata[0] == data.sensordata[0]

@@ -21,7 +21,7 @@ from sim2real.composer.physics.c.physics import Physics
 from sim2real.composer.physics.mjx import gate, stepping, views
 from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.physics.mjx.random import JaxRandomState, Registry
-from sim2real.composer.physics.mjx.rings import Samples, make_rings
+from sim2real.composer.physics.mjx.rings import Ring, Samples
 from sim2real.composer.physics.mjx.tracing import TracedHooks, check_variables
 from sim2real.composer.physics.mjx.warp import warp
 from sim2real.composer.task import Task, split_reward
@@ -142,8 +142,8 @@ class MjxEnvironment:
         limit = time_limit / task.control_timestep
         self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
         initial = delayed_observation_padding is ObservationPadding.INITIAL_VALUE
-        strip = strip_singleton_obs_buffer_dim
-        self._rings = make_rings(observables, self.substeps, strip, initial, self._hooks.call)
+        sampling = self.substeps, strip_singleton_obs_buffer_dim, initial
+        self._rings = [Ring(name, o, sampling, self._hooks.call) for name, o in observables.items() if o.enabled]
         # Move the model and its initial state to MJX.
         self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
         self.initial = _initial_data(self.model) if self._warp is None else self._warp.start
@@ -179,7 +179,7 @@ class MjxEnvironment:
         initial = self.initial if initial is None else initial
         compiled = self.mjx_model if model is None else model
         data = initial if state is None else state.data
-        engine = stepping.Lawful(law) if law else self._warp or stepping
+        engine = self._warp or stepping.JaxEngine(law)
         physics = MjxPhysics(self.model, compiled, data, {}, self._legacy, engine)
         physics.changed.update(self._changed)  # every copy carries every field that any hook sets
         physics.switch_on()

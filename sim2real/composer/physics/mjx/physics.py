@@ -22,10 +22,7 @@ from sim2real.errors import UsageError
 from sim2real.types import PyTree
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from sim2real.composer.mjcf.element import Elements
-    from sim2real.composer.physics.mjx.warp.warp import WarpEngine
     from sim2real.composer.types import ArrayLike, MjModel
 
 _FLUID = ("opt.density", "opt.viscosity", "opt.wind")
@@ -63,9 +60,9 @@ class MjxPhysics(Traced):
         data: mjx.Data | None,
         variables: dict[str, PyTree],
         legacy: bool = True,
-        engine: ModuleType | stepping.Lawful | WarpEngine = stepping,
+        engine: stepping.Engine | None = None,
     ) -> None:
-        self._engine = engine
+        self._engine = engine or stepping.JaxEngine()
         self.host, self.mjx_model = host, model
         self.mjx_data: PyTree = data
         self.variables, self.start = variables, data

@@ -7,7 +7,7 @@ for a batch or for a derivative. That shortens compilation.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -28,43 +28,58 @@ def with_fields(tree: T, values: dict[str, PyTree]) -> T:
     return cast("T", tree.tree_replace(values))
 
 
-def advance(model: mjx.Model, data: mjx.Data, legacy: bool, law: Law | None = None) -> mjx.Data:
-    """Return the data a time step later.
-
-    With ``legacy`` the data must be consistent, what ``forward`` or an earlier step returned, and that is no dearer:
-    the same stages, begun elsewhere (``mj_step2; mj_step1``).
-
-    Args:
-        legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
-        law: Sets fields of the model for constraints, from the state that a step begins with.
-    """
-    now = law(model, data) if law else model
-    if not legacy:
-        return _integrate(now, forward(now, data))
-    if model.opt.integrator == mjx.IntegratorType.RK4:
-        data = _integrate(now, forward(now, data))
-    else:
-        data = _integrate(now, _react(now, data))
-    return _positions(law(model, data) if law else model, data)
-
-
-class Lawful:
-    """Steps as this module does, under a law."""
-
-    def __init__(self, law: Law) -> None:
-        self._law = law
+class Engine(Protocol):
+    """What steps a model: MJX in JAX, or MuJoCo Warp."""
 
     def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
         """Return the data a time step later.
 
         Args:
-            legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
+            legacy: Whether positions and velocities of the new state are computed too, as in dm_control. The data must
+                then be consistent: what ``forward`` or an earlier step returned.
         """
-        return advance(model, data, legacy, self._law)
+        ...
 
     def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
         """Compute everything that follows from the state; without actuation, as at the start of an episode."""
-        return forward(self._law(model, data), data, actuation)
+        ...
+
+
+class JaxEngine(Engine):
+    """MJX in JAX.
+
+    Args:
+        law: Sets fields of the model for constraints, from the state that a step begins with.
+    """
+
+    def __init__(self, law: Law | None = None) -> None:
+        self._law = law or _unchanged
+
+    def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
+        now = self._law(model, data)
+        if not legacy:
+            return _integrate(now, _forward(now, data))
+        # The same stages as without legacy, begun elsewhere (``mj_step2; mj_step1``): it is no dearer.
+        rk4 = model.opt.integrator == mjx.IntegratorType.RK4
+        data = _integrate(now, _forward(now, data) if rk4 else _react(now, data))
+        return _positions(self._law(model, data), data)
+
+    def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
+        model = self._law(model, data)
+        if not actuation:
+            flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
+            model = with_fields(model, {"opt.disableflags": flags})
+        return _forward(model, data)
+
+
+def _unchanged(model: mjx.Model, data: mjx.Data) -> mjx.Model:
+    del data
+    return model
+
+
+def _forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Compute what ``mjx.forward`` does, which leaves accelerometers at 0 in models without constraints."""
+    return _react(model, _positions(model, data))
 
 
 @jax.jit
@@ -74,17 +89,6 @@ def _integrate(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         # MuJoCo leaves sensors as they were before the step, mjx.rungekutta4 as in its last stage
         return mjx.rungekutta4(model, data).replace(sensordata=data.sensordata)
     return mjx.euler(model, data) if model.opt.integrator == mjx.IntegratorType.EULER else mjx.implicit(model, data)
-
-
-def forward(model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
-    """Compute everything that follows from the state; without actuation, as at the start of an episode.
-
-    ``mjx.forward`` leaves accelerometers and force sensors at 0 in models without constraints; this does not.
-    """
-    if not actuation:
-        flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
-        model = with_fields(model, {"opt.disableflags": flags})
-    return _react(model, _positions(model, data))
 
 
 @jax.jit

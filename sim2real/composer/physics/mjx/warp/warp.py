@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from sim2real.composer.physics.mjx.stepping import with_fields
+from sim2real.composer.physics.mjx.stepping import Engine, with_fields
 from sim2real.errors import UsageError
 from sim2real.installation import with_extra
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sim2real.composer.types import MjModel
 
 
-class WarpEngine:
+class WarpEngine(Engine):
     """Steps a model with MuJoCo Warp, in single precision, on a CUDA device or on the CPU.
 
     MuJoCo Warp keeps the contacts of all copies in common arrays. They are created for every call and are no part of
@@ -53,16 +53,10 @@ class WarpEngine:
         self.start = self._pack(data)
 
     def advance(self, model: mjx.Model, data: mjx.Data, legacy: bool) -> mjx.Data:
-        """Return the data a time step later.
-
-        Args:
-            legacy: Whether positions and velocities of the new state are computed too, as in dm_control.
-        """
         step = self._stages.legacy_step if legacy else self._stages.step
         return self._pack(step(model, self._unpack(data)))
 
     def forward(self, model: mjx.Model, data: mjx.Data, actuation: bool = True) -> mjx.Data:
-        """Compute everything that follows from the state; without actuation, as at the start of an episode."""
         if not actuation:
             flags = model.opt.disableflags | mjx.DisableBit.ACTUATION
             model = with_fields(model, {"opt.disableflags": flags})
