@@ -1,8 +1,7 @@
 """Worlds from parts: entities, arenas, tasks, observables and the environment that runs them.
 
-Names and semantics are those of ``dm_control.composer``; models are MuJoCo's ``MjSpec``. A task uses the names here and
-in ``mjcf``, ``observation`` and ``variation``. ``models`` edits and composes models, ``physics`` has
-the two engines. ``BraxEnv`` and ``MjxVectorEnv`` live in ``sim2real.interop``.
+Names and semantics are those of ``dm_control.composer``. ``mjcf`` has models, ``physics`` the two engines.
+``BraxEnv`` and ``MjxVectorEnv`` live in ``sim2real.interop``.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 import warnings
@@ -15,15 +16,15 @@ import numpy as np
 
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.hooks import Hooks
+from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.observation.updater import Updater
-from sim2real.composer.physics.c.compiled import Compiler
-from sim2real.composer.task import Task, split_reward
+from sim2real.composer.physics.c.physics import Physics
+from sim2real.composer.task import Task, count_steps, split_reward
 from sim2real.errors import UsageError
 from sim2real.types import PyTree
 
 if TYPE_CHECKING:
     from sim2real.composer.entity import Entity
-    from sim2real.composer.physics.c.physics import Physics
     from sim2real.composer.types import Hook
 
 _log = logging.getLogger(__name__)
@@ -103,7 +104,7 @@ class Environment(dm_env.Environment):
         # The state of the environment; ``_build`` compiles the physics.
         self._compiled_by_reset = False
         self._physics: PyTree = None
-        self._compiler = Compiler(task)
+        self._text, self._model = "", None
         self._hooks = Hooks(task)
         self._build()
         self._fixed_random_state = self._random_state.get_state()
@@ -111,14 +112,18 @@ class Environment(dm_env.Environment):
         self._steps_taken = 0
 
     def _build(self) -> None:
-        """Compile the models and start from them."""
+        """Compile the models, if something in them has changed, and start from them."""
         self._drop()
-        self._physics = self._compiler.start(self._legacy_step)
+        model = self._task.root_entity.mjcf_model.root_model
+        text = model.to_xml_string()  # which names files by their contents
+        if text != self._text:
+            self._model, self._text = mj.MjModel.from_xml_string(text, model.get_assets()), text
+        # Each episode has memory of its own: arrays of earlier ones stay.
+        self._physics = Physics(copy.copy(self._model), self._legacy_step)
         self._proxy: PyTree = weakref.proxy(self._physics)
         steps = self._fixed_sub_steps or self._task.physics_steps_per_control_step
         self._n_sub_steps = steps
-        limit = self._time_limit / (self._physics.timestep() * steps)
-        self._step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else math.inf
+        self._step_limit = count_steps(self._time_limit, self._physics.timestep() * steps)
         self._hooks.refresh()
         self._hooks.run("after_compile", self._proxy, self._random_state)
         self._updater, self._is_probed = self._make_updater(), False
@@ -211,10 +216,10 @@ class Environment(dm_env.Environment):
         # A diverged episode has no reward, and discount 0.
         reward, discount, last = 0.0, 0.0, True
         if not diverged:
-            reward, discount = self._task.get_reward(self._proxy), self._task.get_discount(self._proxy)
+            reward, discount, ends = self._hooks.judge(self._proxy)
             if self._task.get_reward_spec() is None:
                 reward, _ = split_reward(reward)
-            last = bool(self._task.should_terminate_episode(self._proxy)) or self._steps_taken >= self._step_limit
+            last = bool(ends) or self._steps_taken >= self._step_limit
         self._reset_next_step = last
         step_type = dm_env.StepType.LAST if last else dm_env.StepType.MID
         return dm_env.TimeStep(step_type, reward, discount, self._observe())

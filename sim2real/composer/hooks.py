@@ -68,6 +68,13 @@ class Hooks:
         for hook in self._extra[name]:
             self.call(name, hook, *args)
 
+    def judge(self, physics: PyTree) -> tuple[PyTree, PyTree, PyTree]:
+        """Return the task's reward, its discount, and whether it ends the episode, after a control step."""
+        task, name = self._task, type(self._task).__name__
+        asked = ("get_reward", "get_discount", "should_terminate_episode")
+        reward, discount, ends = (self.call(f"{name}.{what}", getattr(task, what), physics) for what in asked)
+        return reward, discount, ends
+
     def call(self, label: str, function: Callable[..., T], *args: PyTree) -> T:
         """Return what a function returns; ``label`` names it in errors."""
         del label

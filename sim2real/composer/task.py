@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
@@ -43,6 +44,12 @@ def _steps(control_timestep: float, physics_timestep: float) -> int:
             f"a control step of {control_timestep!r} s is shorter than a physics step of {physics_timestep!r} s"
         )
     return steps
+
+
+def count_steps(time_limit: float, control_timestep: float) -> float:
+    """Return after how many control steps a time limit [s] is reached; infinite without one."""
+    limit = time_limit / control_timestep
+    return math.ceil(limit - 1e-6) if math.isfinite(limit) else math.inf
 
 
 def split_reward(reward: PyTree) -> tuple[PyTree, dict[str, PyTree]]:

@@ -32,50 +32,15 @@ Draw: TypeAlias = Callable[..., Any]
 class RandomState(Protocol):
     """A source of randomness: ``numpy.random.RandomState``, the module ``numpy.random``, or a ``JaxRandomState``."""
 
-    @property
-    def uniform(self) -> Draw:
-        """Floats in ``[low, high)``."""
-        ...
-
-    @property
-    def normal(self) -> Draw:
-        """Normally distributed floats."""
-        ...
-
-    @property
-    def lognormal(self) -> Draw:
-        """Exponentials of normally distributed floats."""
-        ...
-
-    @property
-    def exponential(self) -> Draw:
-        """Exponentially distributed floats."""
-        ...
-
-    @property
-    def poisson(self) -> Draw:
-        """Poisson distributed integers."""
-        ...
-
-    @property
-    def binomial(self) -> Draw:
-        """Binomially distributed integers."""
-        ...
-
-    @property
-    def randint(self) -> Draw:
-        """Integers in ``[low, high)``."""
-        ...
-
-    @property
-    def choice(self) -> Draw:
-        """Items of a sequence."""
-        ...
-
-    @property
-    def permutation(self) -> Draw:
-        """A sequence in random order."""
-        ...
+    def uniform(self, *args: Any, **kwargs: Any) -> Any: ...
+    def normal(self, *args: Any, **kwargs: Any) -> Any: ...
+    def lognormal(self, *args: Any, **kwargs: Any) -> Any: ...
+    def exponential(self, *args: Any, **kwargs: Any) -> Any: ...
+    def poisson(self, *args: Any, **kwargs: Any) -> Any: ...
+    def binomial(self, *args: Any, **kwargs: Any) -> Any: ...
+    def randint(self, *args: Any, **kwargs: Any) -> Any: ...
+    def choice(self, *args: Any, **kwargs: Any) -> Any: ...
+    def permutation(self, *args: Any, **kwargs: Any) -> Any: ...
 
 
 class CarriedRandomState(RandomState, Protocol):

@@ -64,12 +64,8 @@ def commit_defaults(element: Element, attributes: Iterable[str] | None = None) -
 
 def __getattr__(name: str) -> Any:
     """Import the physics when it is first asked for: it needs the elements."""
-    if name == "Physics":
-        from sim2real.composer.physics.c.physics import Physics
+    if name in ("Physics", "Binding"):
+        from sim2real.composer.physics.c import physics
 
-        return Physics
-    if name == "Binding":
-        from sim2real.composer.physics.c.binding import Binding
-
-        return Binding
+        return getattr(physics, name)
     raise AttributeError(f"module 'sim2real.composer.mjcf' has no attribute {name!r}")

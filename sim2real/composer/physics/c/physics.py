@@ -14,23 +14,53 @@ import numpy as np
 from sim2real.composer.errors import EpisodeInitializationError, PhysicsError
 from sim2real.composer.mjcf.element import as_elements
 from sim2real.composer.mjcf.schema import mj
-from sim2real.composer.physics.base import EmptyBinding
-from sim2real.composer.physics.c.binding import Binding, BoundPhysics, Staleness
-from sim2real.composer.physics.c.views import DataView, ModelView
+from sim2real.composer.physics import layout
+from sim2real.composer.physics.base import BaseBinding, BaseModelView, BasePhysics, EmptyBinding, NativeView
 from sim2real.composer.physics.images import Images
 from sim2real.composer.physics.named import Named
 
 if TYPE_CHECKING:
+    from typing import Literal
+
     from sim2real.composer.mjcf import RootElement as Model
     from sim2real.composer.mjcf.element import Element, Elements
-    from sim2real.composer.types import ArrayLike, MjData, MjModel, MjvOption, MjvScene
+    from sim2real.composer.types import ArrayLike, Index, MjData, MjModel, MjvOption, MjvScene
     from sim2real.types import PyTree
 
 _log = logging.getLogger(__name__)
 _RK4 = int(mj.mjtIntegrator.mjINT_RK4)
 
 
-class Physics(BoundPhysics):
+class ModelView(BaseModelView):
+    """``physics.model``: the ``MjModel``."""
+
+    __slots__ = ()
+
+    @contextlib.contextmanager
+    def disable(self, *flags: str) -> Iterator[None]:
+        """Switch parts of the physics off, such as ``'actuation'`` or ``'contact'``, inside a ``with`` block."""
+        before = self.ptr.opt.disableflags
+        try:
+            for flag in flags:
+                self.ptr.opt.disableflags |= int(getattr(mj.mjtDisableBit, f"mjDSBL_{flag.upper()}"))
+            yield
+        finally:
+            self.ptr.opt.disableflags = before
+
+
+class Staleness:
+    """Whether a physics was written to since all quantities were last computed.
+
+    A separate object, as every read of a bound attribute looks it up.
+    """
+
+    __slots__ = ("dirty",)
+
+    def __init__(self) -> None:
+        self.dirty = False
+
+
+class Physics(BasePhysics):
     """A compiled model and its state on MuJoCo's C engine; see ``BasePhysics``.
 
     Args:
@@ -52,7 +82,7 @@ class Physics(BoundPhysics):
 
     def _load(self, model: MjModel, data: MjData) -> None:
         self.model = ModelView(model)
-        self.data = DataView(data)
+        self.data = NativeView(data)
         self.named = Named(model, model, self.data.ptr)
         self._bindings: dict[Element | tuple[Element, ...], Binding | EmptyBinding] = {}
         self.images = Images(model)
@@ -90,7 +120,6 @@ class Physics(BoundPhysics):
     # -- state
 
     def set_control(self, control: ArrayLike) -> None:
-        """Set the controls, shape ``(nu,)`` [the actuators' units]."""
         np.copyto(self.data.ptr.ctrl, control)
 
     def _copied(self, array: np.ndarray) -> np.ndarray:
@@ -146,14 +175,12 @@ class Physics(BoundPhysics):
         self._check_warnings()
 
     def forward(self) -> None:
-        """Compute everything that follows from the state, without advancing."""
         self._warned = self._warnings.tobytes()
         mj.mj_forward(self.model.ptr, self.data.ptr)
         self.staleness.dirty = False
         self._check_warnings()
 
     def reset(self, keyframe_id: int | None = None) -> None:
-        """Return to the initial state, or to a keyframe."""
         model, data = self.model.ptr, self.data.ptr
         if keyframe_id is None:
             mj.mj_resetData(model, data)
@@ -178,7 +205,6 @@ class Physics(BoundPhysics):
 
     @contextlib.contextmanager
     def suppress_physics_errors(self) -> Iterator[None]:
-        """Log MuJoCo's warnings inside a ``with`` block instead of raising them."""
         before, self._suppress = self._suppress, True
         try:
             yield
@@ -203,7 +229,6 @@ class Physics(BoundPhysics):
         return self.staleness.dirty
 
     def mark_as_dirty(self) -> None:
-        """Have everything computed again before the next computed attribute is read through a binding."""
         self.staleness.dirty = True
 
     def bind(self, elements: Elements) -> PyTree:
@@ -225,12 +250,10 @@ class Physics(BoundPhysics):
         return Binding(weakref.proxy(self), kind, ids, single)
 
     def fail(self, condition: ArrayLike = True) -> None:
-        """Reject this initial state where the condition holds; EpisodeInitializationError when it holds."""
         if np.any(condition):
             raise EpisodeInitializationError
 
     def recompute_constants(self) -> None:
-        """Compute the constants that MuJoCo derives from masses and lengths, after these were changed."""
         mj.mj_setConst(self.model.ptr, mj.MjData(self.model.ptr))  # this state would be left as at the reference
         self.mark_as_dirty()
 
@@ -291,3 +314,115 @@ def _restored(
     physics.legacy_step, physics.variables, physics._suppress = legacy_step, variables, False
     physics._load(model, data)
     return physics
+
+
+class Place:
+    """The place of an attribute of bound elements.
+
+    Attributes:
+        index: The rows in it.
+        derived: Whether it is computed from other attributes, and out of date once those are written.
+        shown: The array that readers get; None where they get a number.
+        plain: The memory of ``shown`` as a plain array.
+    """
+
+    __slots__ = ("array", "derived", "index", "plain", "shown")
+
+    def __init__(self, array: np.ndarray, index: Index, derived: bool) -> None:
+        self.array, self.derived = array, derived
+        if isinstance(index, np.ndarray) and index.size and np.array_equal(index, index[0] + np.arange(index.size)):
+            index = slice(int(index[0]), int(index[-1]) + 1)  # the same rows, several times faster
+        self.index = index
+        value = array[index]
+        self.shown = None if value.ndim == 0 else value.copy().view(SyncedArray)
+        self.plain = None if self.shown is None else self.shown.view(np.ndarray)
+
+
+class SyncedArray(np.ndarray):
+    """A part of a MuJoCo array: writing an item writes it there too, and marks computed quantities.
+
+    Reading it again through its binding brings the newest values.
+    """
+
+    _binding: Binding | None = None  # parts of this array do not take these over: they write to nothing
+    _name: str = ""
+
+    def __array_wrap__(
+        self, array: np.ndarray, context: tuple[Any, ...] | None = None, return_scalar: bool = False
+    ) -> PyTree:
+        """Return results of functions of this array as plain arrays: sums of products then take a third less time."""
+        return array[()] if return_scalar else array
+
+    def __setitem__(self, key: Index, value: object) -> None:
+        binding = self._binding
+        if binding is None:
+            super().__setitem__(key, value)
+            return
+        value = np.array(value)  # it may be a part of this array: `array[1:] *= 2` changes that before it comes here
+        getattr(binding, self._name)  # which brings the newest values here
+        super().__setitem__(key, value)
+        binding.write(self._name, np.asarray(self))
+
+    def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> np.ndarray:
+        """Return a plain array."""
+        return np.array(self, order=order, subok=False)
+
+    def __copy__(self) -> np.ndarray:
+        return self.copy()
+
+    def __deepcopy__(self, memo: dict[int, object] | None) -> np.ndarray:
+        return self.copy()
+
+    def __reduce__(self) -> str | tuple[Any, ...]:
+        raise NotImplementedError("a bound array cannot be pickled: copy it first")
+
+
+class Binding(BaseBinding):
+    """Bound elements on MuJoCo's C engine; see ``BaseBinding``. Writing an item of an array writes it to MuJoCo."""
+
+    __slots__ = ("_places", "_staleness")
+    _physics: Physics
+    _places: dict[str, Place]
+    _staleness: Staleness
+
+    def __init__(self, physics: Physics, kind: str, ids: tuple[int, ...], single: bool) -> None:
+        super().__init__(physics, kind, ids, single)
+        object.__setattr__(self, "_places", {})
+        object.__setattr__(self, "_staleness", physics.staleness)
+
+    def _place(self, name: str) -> Place:
+        """Return the place of an attribute, and keep it for the next access."""
+        field, index = self.locate(name)
+        holder = self._physics.model.ptr if field.struct == "model" else self._physics.data.ptr
+        place = self._places[name] = Place(getattr(holder, field.name), index, not field.triggers)
+        if place.shown is not None:
+            place.shown._binding, place.shown._name = self, name
+        return place
+
+    def write(self, name: str, value: ArrayLike) -> None:
+        place = self._places.get(name) or self._place(name)
+        if not place.derived:
+            self._staleness.dirty = True
+        elif self._staleness.dirty:
+            self._physics.forward()
+        place.array[place.index] = value
+        for other in layout.DISABLED_BY.get(self._fields[name].name, ()):
+            getattr(self._physics.model.ptr, other)[list(self._ids)] = 0
+        if name == "gravcomp" and not self._physics.model.ptr.ngravcomp:
+            self._physics.count_compensated()
+
+    def free(self) -> None:
+        """Drop the references to MuJoCo's arrays."""
+        self._places.clear()
+
+    def read(self, name: str) -> PyTree:
+        place = self._places.get(name) or self._place(name)
+        if place.derived and self._staleness.dirty:
+            self._physics.forward()
+        if place.plain is None:
+            return place.array[place.index]
+        place.plain[...] = place.array[place.index]
+        return place.shown
+
+    def _plain(self, array: PyTree) -> np.ndarray:
+        return np.asarray(array)

@@ -18,13 +18,13 @@ from sim2real import pytree
 from sim2real.composer.environment import ObservationPadding
 from sim2real.composer.mjcf.schema import mj
 from sim2real.composer.physics.c.physics import Physics
-from sim2real.composer.physics.mjx import gate, stepping, views
-from sim2real.composer.physics.mjx.physics import MjxPhysics
+from sim2real.composer.physics.mjx import gate, stepping
+from sim2real.composer.physics.mjx.physics import MjxPhysics, freeze
 from sim2real.composer.physics.mjx.random import JaxRandomState, Registry
 from sim2real.composer.physics.mjx.rings import Ring, Samples
 from sim2real.composer.physics.mjx.tracing import TracedHooks, check_variables
 from sim2real.composer.physics.mjx.warp import warp
-from sim2real.composer.task import Task, split_reward
+from sim2real.composer.task import Task, count_steps, split_reward
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
@@ -139,15 +139,15 @@ class MjxEnvironment:
             gate.settle_cone(self.model)
         # Reserve the samples of the observables.
         self.substeps = task.physics_steps_per_control_step
-        limit = time_limit / task.control_timestep
-        self.step_limit = math.ceil(limit - 1e-6) if math.isfinite(limit) else None
+        limit = count_steps(time_limit, task.control_timestep)
+        self.step_limit = int(limit) if math.isfinite(limit) else None
         initial = delayed_observation_padding is ObservationPadding.INITIAL_VALUE
         sampling = self.substeps, strip_singleton_obs_buffer_dim, initial
         self._rings = [Ring(name, o, sampling, self._hooks.call) for name, o in observables.items() if o.enabled]
         # Move the model and its initial state to MJX.
         self.mjx_model = mjx.put_model(self.model, impl="jax") if self._warp is None else self._warp.model
         self.initial = _initial_data(self.model) if self._warp is None else self._warp.start
-        views.freeze(self.model)
+        freeze(self.model)
         # Trace once without physics to learn what a copy must carry.
         self._changed: tuple[str, ...] = ()
         self.has_reward = self._stays_dirty = False
@@ -331,12 +331,11 @@ class MjxEnvironment:
         now = steps * self.substeps
         # Take the last samples after the hooks, which may change the state.
         rings = {r.name: r.update(rings[r.name], now, physics, random_state, True) for r in self._rings}
-        dtype, task = state.reward.dtype, type(self.task).__name__
         # Compute the reward, the discount and the end of the episode.
-        earned = self._hooks.call(f"{task}.get_reward", self.task.get_reward, physics)
+        dtype = state.reward.dtype
+        earned, discount, ends = self._hooks.judge(physics)
         reward, terms = split_reward(earned)
-        discount = jnp.asarray(self._hooks.call(f"{task}.get_discount", self.task.get_discount, physics), dtype)
-        ends = self._hooks.call(f"{task}.should_terminate_episode", self.task.should_terminate_episode, physics)
+        discount = jnp.asarray(discount, dtype)
         observation = {r.name: r.read(rings[r.name], now) for r in self._rings}
         if dry:  # while the environment is made
             self.has_reward = not (isinstance(earned, int | float) and earned == 0)
