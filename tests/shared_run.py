@@ -57,6 +57,7 @@ def make(root: Path) -> Path:
     run_dir = stage.run_dir
     with pytest.MonkeyPatch.context() as patch, sketched(pictures=1):
         patch.setattr(episodes, "opened", lambda *_: nullcontext())
+        patch.setattr(episodes, "announce_following", lambda rig: None)
         patch.setattr(episodes, "_run_one", lambda *given: deployed(run_dir, *given))
         assert cli.main(["run", "pendulum", "--resume", str(run_dir), "--runs", str(root), *TINY]) == 0
     return run_dir

@@ -1,4 +1,4 @@
-"""A search streams its best fit, a training its curves; ``view --follow`` joins, and ``--web`` serves browsers."""
+"""A search streams its best fit, a training its curves; ``report --rerun --follow`` joins, ``--rerun web`` serves."""
 
 import contextlib
 import os
@@ -19,7 +19,16 @@ pytest.importorskip("rerun")
 @pytest.mark.night
 @pytest.mark.parametrize("follow", [True, False])
 def test_a_run_is_served_to_browsers_until_ctrl_c(run_copy, follow):
-    command = [sys.executable, "-m", "sim2real.cli", "view", str(run_copy), "--web", *(["--follow"] if follow else [])]
+    command = [
+        sys.executable,
+        "-m",
+        "sim2real.cli",
+        "report",
+        str(run_copy),
+        "--rerun",
+        "web",
+        *(["--follow"] if follow else []),
+    ]
     environment = {**os.environ, "RERUN_ANALYTICS_ENABLED": "0"}
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment) as process:
         said = ""
