@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, is_dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from sim2real.arrays import is_jax
-from sim2real.errors import UsageError
-from sim2real.later import jax
 from sim2real.types import Json, PyTree
 
 if TYPE_CHECKING:
-    from sim2real.graph.base import StepState
+    pass
 
 TICKS_PER_S = 1_000_000
 """All times of schedules and logs are whole ticks: microseconds."""
@@ -73,23 +70,6 @@ class Recorder(Protocol):
         """Take a message that was consumed, or that no step will consume any more."""
 
 
-@runtime_checkable
-class StepStateRecorder(Recorder, Protocol):
-    """A recorder that also receives the step state of each step."""
-
-    @property
-    def keep(self) -> frozenset[str]:
-        """Parts of the step state that it keeps; empty: none."""
-        ...
-
-    def given(self, node: str, step_state: StepState) -> None:
-        """Take the step state that a node's step gets, before the record of the step."""
-
-
-PARTS_OF_STEPS = ("state", "params", "inputs")
-"""Parts of a step state that a recorder may keep."""
-
-
 @dataclass(frozen=True)
 class Steps:
     """All steps of one node, by seq; every array has shape ``(N,)``, int64 ticks [us]."""
@@ -142,10 +122,6 @@ class Episode:
         metadata: Metadata of the session's log (pipeline, configuration, versions, ...).
         complete: Whether the session ended properly; False after a crash.
         units: Node -> field, or entry of one (``"aim[0]"``) -> unit, if the recording has it.
-        states: Node -> field -> array with one row a step, the state before it; empty if states were not recorded.
-        params: The same for parameters.
-        inputs: (node, input name) -> ``seq``, ``ts_sent``, ``ts_recv`` and ``data.FIELD``, shape ``(N, W, ...)``: the
-            window of each step; empty if inputs were not recorded.
     """
 
     steps: Mapping[str, Steps]
@@ -154,9 +130,6 @@ class Episode:
     metadata: Mapping[str, Json] = field(default_factory=dict)
     complete: bool = True
     units: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    states: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
-    params: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
-    inputs: Mapping[tuple[str, str], Mapping[str, np.ndarray]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Episode({self.duration_s:.3f} s, steps: {', '.join(f'{n} {len(s)}' for n, s in self.steps.items())})"
@@ -169,21 +142,9 @@ class Episode:
 
 
 class MemoryRecorder:
-    """A recorder that keeps everything in memory and returns it as an ``Episode``.
+    """A recorder that keeps everything in memory and returns it as an ``Episode``."""
 
-    Args:
-        keep: Parts of the step state to keep beside the output: ``state`` (before the step), ``params``, ``inputs``.
-            On the wall clock the copy takes time in each step.
-
-    Raises:
-        UsageError: ``keep`` has another name.
-    """
-
-    def __init__(self, keep: Sequence[str] = ()) -> None:
-        self.keep = frozenset([keep] if isinstance(keep, str) else keep)
-        if unknown := sorted(self.keep - set(PARTS_OF_STEPS)):
-            raise UsageError(f"a recorder cannot keep {', '.join(unknown)}. Available: {', '.join(PARTS_OF_STEPS)}")
-        self._offered: dict[str, list[StepState]] = {}
+    def __init__(self) -> None:
         self._steps: dict[str, list[StepRecord]] = {}
         self._outputs: dict[str, list[PyTree]] = {}
         self._messages: dict[tuple[str, str], list[MessageRecord]] = {}
@@ -191,12 +152,7 @@ class MemoryRecorder:
     def start(self, epoch_ns: int, monotonic_ns: int) -> None:
         """Drop the records of the episode before."""
         del epoch_ns, monotonic_ns
-        self._steps, self._outputs, self._messages, self._offered = {}, {}, {}, {}
-
-    def given(self, node: str, step_state: StepState) -> None:
-        """Keep parts of a step state."""
-        parts = {part: getattr(step_state, part) if part in self.keep else None for part in PARTS_OF_STEPS}
-        self._offered.setdefault(node, []).append(_copied(step_state.replace(rng=None, **parts)))
+        self._steps, self._outputs, self._messages = {}, {}, {}
 
     def step(self, record: StepRecord, output: PyTree) -> None:
         """Keep a step and its output."""
@@ -209,27 +165,12 @@ class MemoryRecorder:
 
     def episode(self) -> Episode:
         """Return the records so far."""
+        rows = {n: [named_leaves(o) for o in outputs] for n, outputs in self._outputs.items()}
         return Episode(
             steps={n: steps_from_records(r) for n, r in self._steps.items()},
             messages={k: messages_from_records(r) for k, r in self._messages.items()},
-            outputs={n: _stack(o) for n, o in self._outputs.items()},
-            states=self._part("state"),
-            params=self._part("params"),
-            inputs={
-                (n, i): _stack([step.inputs[i].replace(delay_dist=None) for step in self._of_steps(n)])
-                for n in (self._offered if "inputs" in self.keep else ())
-                for i in self._offered[n][0].inputs
-            },
+            outputs={n: {k: np.stack([np.asarray(row[k]) for row in of]) for k in of[0]} for n, of in rows.items()},
         )
-
-    def _part(self, part: str) -> dict[str, dict[str, np.ndarray]]:
-        if part not in self.keep:
-            return {}
-        return {n: _stack([getattr(step, part) for step in self._of_steps(n)]) for n in self._offered}
-
-    def _of_steps(self, node: str) -> list[StepState]:
-        """Return the step states of finished steps: a step that failed has no record."""
-        return self._offered[node][: len(self._steps.get(node, ()))]
 
 
 def steps_from_records(records: list[StepRecord]) -> Steps:
@@ -256,20 +197,3 @@ def named_leaves(tree: PyTree) -> dict[str, PyTree]:
         return ".".join(str(getattr(p, "name", getattr(p, "key", getattr(p, "idx", p)))) for p in path) or "value"
 
     return {label(path): leaf for path, leaf in flat}
-
-
-def _copied(tree: PyTree) -> PyTree:
-    """Return a tree with numpy copies of its arrays; of a JAX key its numbers."""
-    from sim2real import pytree
-
-    def one(leaf: PyTree) -> np.ndarray:
-        key = is_jax(leaf) and jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return np.array(jax.random.key_data(leaf) if key else leaf)
-
-    return pytree.map(one, tree)
-
-
-def _stack(outputs: list[PyTree]) -> dict[str, np.ndarray]:
-    """Return the outputs of N steps as one array per leaf, shape ``(N, ...)``."""
-    rows = [named_leaves(o) for o in outputs]
-    return {name: np.stack([np.asarray(row[name]) for row in rows]) for name in (rows[0] if rows else {})}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,6 @@ from sim2real.graph.episode import Episode, Messages
 from sim2real.graph.node import BaseNode, Connection, to_ticks
 from sim2real.graph.rules import at_delay
 from sim2real.graph.times import NEVER, Edge, Vertex
-
-_FORMAT = 2
 
 
 @dataclass(frozen=True, repr=False)
@@ -38,23 +36,6 @@ class Timeline:
         return Timeline(
             {n: Vertex(v.start[index], v.end[index], v.count[index]) for n, v in self.vertices.items()},
             {k: Edge(e.received[index], e.seq_in[index], e.sender) for k, e in self.edges.items()},
-        )
-
-    def filter(self, names: Iterable[str]) -> Timeline:
-        """Return the timeline of some of the nodes, with the edges between them.
-
-        Raises:
-            UsageError: A name is not in the timeline.
-        """
-        names = set(names)
-        missing = names - set(self.vertices)
-        if missing:
-            raise UsageError(
-                f"no node {', '.join(sorted(missing))} in the timeline. Available: {', '.join(self.vertices)}"
-            )
-        return Timeline(
-            {n: v for n, v in self.vertices.items() if n in names},
-            {k: e for k, e in self.edges.items() if k[0] in names and e.sender in names},
         )
 
     @staticmethod
@@ -114,52 +95,6 @@ class Timeline:
             )
             for k in first.edges
         }
-        return Timeline(vertices, edges)
-
-    def cut(
-        self, begins: Sequence[int], length: int, lead: Mapping[str, int] | None = None
-    ) -> tuple[Timeline, dict[str, np.ndarray]]:
-        """Cut one episode into segments; in each, time starts at 0.
-
-        Args:
-            begins: Starts of the segments [ticks].
-            length: Length of every segment [ticks].
-            lead: Node -> time before the segment's start from which its steps are kept, at negative times [ticks].
-
-        Returns:
-            The segments as E episodes; and for each node, shape ``(E,)``, the number of the original step that is step
-            0 of each segment.
-
-        Raises:
-            UsageError: The timeline has more than one episode.
-        """
-        if self.episodes != 1:
-            raise UsageError(f"only a timeline of one episode can be cut, this one has {self.episodes}")
-        ahead = lead or {}
-        firsts = {
-            n: np.searchsorted(v.start[0, : v.count[0]], np.asarray(begins) - ahead.get(n, 0))
-            for n, v in self.vertices.items()
-        }
-        parts = [self._part({n: int(f[i]) for n, f in firsts.items()}, b, length) for i, b in enumerate(begins)]
-        return Timeline.stack(parts), firsts
-
-    def _part(self, firsts: Mapping[str, int], begin: int, length: int) -> Timeline:
-        """Return one segment; ``firsts`` has the first step of each node that belongs to it."""
-        vertices, edges = {}, {}
-        last: dict[str, int] = {}
-        for n, v in self.vertices.items():
-            stop = int(np.searchsorted(v.start[0, : v.count[0]], begin + length))
-            last[n] = stop
-            take = slice(firsts[n], stop)
-            count = np.array([stop - firsts[n]])
-            vertices[n] = Vertex(v.start[:, take] - begin, v.end[:, take] - begin, count)
-        for (n, i), e in self.edges.items():
-            take = slice(firsts[e.sender], last[e.sender])
-            seq_in = e.seq_in[:, take]
-            # A message that was consumed before the segment's first step is in the window of that step.
-            inside = (seq_in >= 0) & (seq_in < last[n])
-            seq_in = np.where(inside, np.maximum(seq_in - firsts[n], 0), -1)
-            edges[n, i] = Edge(e.received[:, take] - begin, seq_in, e.sender)
         return Timeline(vertices, edges)
 
 

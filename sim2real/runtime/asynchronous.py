@@ -46,7 +46,6 @@ class AsyncGraph:
         nodes: The nodes, by name or as a list.
         supervisor: The node at whose steps ``reset``, ``step`` and ``run`` return, usually the policy.
         clock: The clock; a ``MonotonicClock`` is the wall clock with the time of this object, e.g. of a test.
-        real_time_factor: Largest number of simulated seconds per second; 0: no limit. Simulated clock only.
         duration_s: Length of drawn timelines [s]; the simulated clock needs this or ``timeline``.
         timeline: Timelines to play; the graph state's ``eps`` selects the episode. Simulated clock only.
         timeout_s: Longest wait of a call for the next step, and of the supervisor for its caller [s].
@@ -63,7 +62,6 @@ class AsyncGraph:
         nodes: Mapping[str, BaseNode] | Sequence[BaseNode],
         supervisor: BaseNode,
         clock: Clock | MonotonicClock = Clock.WALL_CLOCK,
-        real_time_factor: float = 0.0,
         recorder: Recorder | None = None,
         duration_s: float | None = None,
         timeline: Timeline | None = None,
@@ -71,17 +69,16 @@ class AsyncGraph:
         spin_s: float = 0.0,
         step_timeout_s: float | None = None,
     ) -> None:
-        _check_supervisor(supervisor, nodes)
         self.nodes = collect(nodes, supervisor)
         self.supervisor = supervisor
         own_time = isinstance(clock, MonotonicClock)
         self.clock = Clock.WALL_CLOCK if own_time else Clock(clock)
         self._monotonic = clock if own_time else MonotonicClock()
         self.recorder = recorder
-        self._factor, self._duration_s, self._timeline = real_time_factor, duration_s, timeline
+        self._duration_s, self._timeline = duration_s, timeline
         self._timeout_s, self._spin_s, self._step_timeout_s = timeout_s, spin_s, step_timeout_s
         self._steppers = {name: Stepper(node) for name, node in self.nodes.items()}
-        self._jit: dict[str, bool] = dict.fromkeys(self.nodes, True)
+        self._jit = True
         self._run: WallClockRun | SimulatedRun | None = None
         self._run_data: dict[str, NodeData] = {}
         self._lock = self._monotonic.lock()
@@ -94,26 +91,19 @@ class AsyncGraph:
         """Return the state in which the graph starts; see ``init_graph_state`` for the arguments."""
         return init_graph_state(self.nodes, self.supervisor, rng, params, order)
 
-    def warmup(self, graph_state: GraphState, jit_step: bool | Mapping[str, bool] = True) -> None:
+    def warmup(self, graph_state: GraphState, jit_step: bool = True) -> None:
         """Compile all steps ahead of time for graph states like this one, unless they are compiled already.
 
         A step without side effects is then run once, which fills caches. A step with a callback or in plain Python is
         not run.
 
         Args:
-            jit_step: Whether to compile the steps: one value for all nodes, or node name -> value (default: True).
-                Nodes with ``jittable = False`` are never compiled.
+            jit_step: Whether to compile the steps; nodes with ``jittable = False`` are never compiled.
 
         Raises:
             UsageError: A step's results do not fit its node's state or default output.
         """
-        if isinstance(jit_step, Mapping):
-            unknown = [n for n in jit_step if n not in self.nodes]
-            if unknown:
-                raise UsageError(f"jit_step names {', '.join(unknown)}. Nodes: {', '.join(self.nodes)}")
-            self._jit = {name: bool(jit_step.get(name, True)) for name in self.nodes}
-        else:
-            self._jit = dict.fromkeys(self.nodes, bool(jit_step))
+        self._jit = jit_step
         self._prepare(graph_state)
 
     def start(self, graph_state: GraphState, timeout_s: float = 60.0) -> None:
@@ -234,12 +224,10 @@ class AsyncGraph:
                 raise UsageError("the simulated clock takes a duration_s or a timeline, one of them")
             if self._spin_s or self._step_timeout_s is not None:
                 raise UsageError("spin_s and step_timeout_s are for the wall clock")
-        elif self._factor or self._duration_s is not None or self._timeline is not None:
-            raise UsageError("real_time_factor, duration_s and timeline are for the simulated clock")
-        if not (self._factor >= 0 and self._spin_s >= 0 and (self._step_timeout_s or 0.0) >= 0 and self._timeout_s > 0):
-            raise UsageError(
-                "real_time_factor, spin_s and step_timeout_s must be at least 0, timeout_s must be positive"
-            )
+        elif self._duration_s is not None or self._timeline is not None:
+            raise UsageError("duration_s and timeline are for the simulated clock")
+        if not (self._spin_s >= 0 and (self._step_timeout_s or 0.0) >= 0 and self._timeout_s > 0):
+            raise UsageError("spin_s and step_timeout_s must be at least 0, timeout_s must be positive")
 
         # Averaged inputs.
         for node in self.nodes.values():
@@ -266,7 +254,7 @@ class AsyncGraph:
         simulated = self.clock is Clock.SIMULATED
         data = {name: NodeData(node, graph_state, simulated) for name, node in self.nodes.items()}
         for name, stepper in self._steppers.items():
-            stepper.prepare(data[name], self._jit[name])
+            stepper.prepare(data[name], self._jit)
         return data
 
     def _start(self, graph_state: GraphState, autonomous: bool, timeout_s: float) -> WallClockRun | SimulatedRun:
@@ -283,7 +271,7 @@ class AsyncGraph:
         data = self._prepare(graph_state)
         common = (self.nodes, self.supervisor.name, self._steppers, data, graph_state, self.recorder, autonomous)
         if self.clock is Clock.SIMULATED:
-            run = SimulatedRun(*common, *self._timeline_of(graph_state), self._factor)
+            run = SimulatedRun(*common, *self._timeline_of(graph_state))
         else:
             run = WallClockRun(*common, self._monotonic, self._spin_s, self._timeout_s, self._step_timeout_s)
 
@@ -335,19 +323,3 @@ class AsyncGraph:
         if output is None:
             return Reply(step_state)
         return Reply(step_state, self._run_data[self.supervisor.name].form.pack(output))
-
-
-def _check_supervisor(supervisor: object, nodes: Mapping[str, BaseNode] | Sequence[BaseNode]) -> None:
-    if isinstance(supervisor, BaseNode):
-        return
-    nodes = list(nodes.values()) if isinstance(nodes, Mapping) else list(nodes)
-    if isinstance(supervisor, str):
-        kind, hint = f"the name {supervisor!r}", "pass the node, not its name"
-    elif isinstance(supervisor, Mapping | list | tuple | set):
-        kind, hint = f"{len(supervisor)} nodes", "pass the one at whose steps reset() and step() shall return"
-    else:
-        kind, hint = f"a {type(supervisor).__name__}", "pass one of the nodes"
-    raise UsageError(
-        f"the supervisor must be a node, not {kind}. Nodes: {', '.join(str(getattr(n, 'name', n)) for n in nodes)}",
-        hint=hint,
-    )

@@ -75,7 +75,9 @@ def collect(nodes: Mapping[str, BaseNode] | Sequence[BaseNode], supervisor: Base
             ``advance`` is set for a node without a blocking input.
     """
     if not isinstance(supervisor, BaseNode):
-        raise UsageError(f"the supervisor is one node, got {supervisor!r}", hint="pass the node itself, not its name")
+        raise UsageError(
+            f"the supervisor must be one of the nodes, not {supervisor!r}", hint="pass the node, not its name"
+        )
     graph = by_name(nodes)
     graph = graph if graph.get(supervisor.name) is supervisor else by_name([*graph.values(), supervisor])
     check_senders(graph)

@@ -107,7 +107,6 @@ class SimulatedRun:
 
     Args:
         recorder: Receives all steps and messages, or None.
-        real_time_factor: Largest number of simulated seconds per second; 0: no limit.
     """
 
     def __init__(
@@ -121,15 +120,9 @@ class SimulatedRun:
         autonomous: bool,
         timeline: Timeline,
         episode: int,
-        real_time_factor: float,
     ) -> None:
         self._nodes, self._supervisor, self._data = nodes, supervisor, data
-        self._graph_state, self._recorder, self._autonomous, self._factor = (
-            graph_state,
-            recorder,
-            autonomous,
-            real_time_factor,
-        )
+        self._graph_state, self._recorder, self._autonomous = graph_state, recorder, autonomous
         # Senders before readers: of two steps that start at the same time, the sender's comes first.
         self._players = {n: _Player(steppers[n], data[n], timeline, episode) for n in topological(nodes)}
         for player in self._players.values():
@@ -140,7 +133,6 @@ class SimulatedRun:
         self._stopping = threading.Event()
         self._stop_lock = threading.Lock()
         self.stopped = False
-        self._origin_s = 0.0
 
     @property
     def ended(self) -> bool:
@@ -155,7 +147,6 @@ class SimulatedRun:
     def begin(self, timeout_s: float) -> None:
         """Start the clock."""
         del timeout_s
-        self._origin_s = time.monotonic()
         for node in self._nodes.values():
             node.set_clock(lambda: self._now / TICKS_PER_S)
         if self._recorder is not None:
@@ -260,12 +251,6 @@ class SimulatedRun:
         player = min(ready, key=lambda p: p.begins[p.k])  # of equals, the first in the graph's order
         begin = player.begins[player.k]
         self._now = max(self._now, begin)
-        if self._factor > 0:
-            rest = self._origin_s + begin / TICKS_PER_S / self._factor - time.monotonic()
-            self._stopping.wait(max(0.0, rest))
-        if self.ended:
-            return
-
         # Take in the messages that the step consumes.
         for name, link in player.links.items():
             messages = [self._message(link, m) for m in link.consumed(player.k)]
@@ -285,7 +270,6 @@ class SimulatedRun:
         begin, end = player.begins[k], player.ends[k]
         ages = player.data.ages(begin)
         try:
-            player.stepper.show(self._recorder, offered, ages, reply)
             result = player.stepper.answer(player.data, offered, ages, reply)
             moved = overwritten(result.ts, begin, end, node.name)
         except Exception as error:

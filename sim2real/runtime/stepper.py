@@ -11,7 +11,6 @@ from sim2real import pytree
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.base import InputState, StepState
 from sim2real.graph.delays import TrainableDist
-from sim2real.graph.episode import Recorder, StepStateRecorder
 from sim2real.graph.node import BaseNode, to_ticks
 from sim2real.later import jax, jnp
 from sim2real.runtime.data import NodeData
@@ -119,11 +118,6 @@ class Stepper:
             return Result(before, before.pop("ts", None), reply.leaves)
         result = self.run(data, reply.step_state or offered, ages)
         return Result({**before, **result.changed}, result.ts, result.leaves)
-
-    def show(self, recorder: Recorder | None, offered: StepState, ages: Mapping[str, np.ndarray], reply: Reply) -> None:
-        """Give the next step's input to a recorder that keeps such inputs."""
-        if isinstance(recorder, StepStateRecorder) and recorder.keep:
-            recorder.given(self.node.name, _with_delays(self.node, reply.step_state or offered, ages))
 
     def _call(self, step_state: StepState, ages: Mapping[str, Array]) -> tuple[dict[str, PyTree], PyTree]:
         result = self.node.step(_with_delays(self.node, step_state, ages))

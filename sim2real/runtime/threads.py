@@ -395,7 +395,6 @@ class NodeThread(threading.Thread):
     def _step(self, k: int, begin: int) -> Result:
         offered = self.data.step_state(k, begin)
         reply = self.handover.meet(offered, self.shared.answer_timeout_s) if self.handover else Reply()
-        self.stepper.show(self.shared.recorder, offered, {}, reply)
         self.since_s = self.shared.clock.monotonic_s()  # only now: the caller's time does not count
         return self.stepper.answer(self.data, offered, {}, reply)
 

@@ -242,7 +242,10 @@ def test_a_recorded_sender_that_stops_leaves_its_blocking_reader_without_a_step(
 def test_what_is_recorded_stays_and_the_rest_is_drawn():
     nodes = random_graph(3, size=3, worlds=1)
     full = draw(nodes, 0.5, episodes=2, rng=1)
-    partly = full.filter(["n0", "n1"])
+    partly = Timeline(
+        {n: v for n, v in full.vertices.items() if n in ("n0", "n1")},
+        {k: e for k, e in full.edges.items() if k[0] in ("n0", "n1") and e.sender in ("n0", "n1")},
+    )
     again = draw(nodes, 0.5, rng=2, recorded=partly)
     assert set(again.edges) == set(full.edges)
     for name in ("n0", "n1"):

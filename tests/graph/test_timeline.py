@@ -1,4 +1,4 @@
-"""Timelines: stacking, cutting, filtering, files, records."""
+"""Timelines: stacking, and those of records."""
 
 import numpy as np
 import pytest
@@ -55,19 +55,7 @@ def test_stack_pads_and_indexing_takes_apart():
     with pytest.raises(UsageError, match="no timelines"):
         Timeline.stack([])
     with pytest.raises(UsageError, match="same nodes"):
-        Timeline.stack([short, short.filter(["n0"])])
-
-
-def test_filter_keeps_shadow_names():
-    a, b = BaseNode("a", 20), BaseNode("b", 20)
-    b.connect(a)
-    b.connect(a, name="old", window=3, skip=True)
-    timeline = draw({"a": a, "b": b, "c": BaseNode("c", 5)}, 0.3)
-    kept = timeline.filter(["a", "b"])
-    assert set(kept.edges) == {("b", "a"), ("b", "old")}
-    assert set(timeline.filter(["b", "c"]).edges) == set()
-    with pytest.raises(UsageError, match=r"no node d, e in the timeline\. Available: a, b, c"):
-        timeline.filter(["a", "e", "d"])
+        Timeline.stack([short, draw(chain(), 0.3)])
 
 
 def chain():
@@ -75,30 +63,6 @@ def chain():
     sensor, reader = BaseNode("s", 50, delay_dist=0.004), BaseNode("r", 50, delay_dist=0.001)
     reader.connect(sensor, delay_dist=0.002, window=2)
     return {"s": sensor, "r": reader}
-
-
-def test_segments_start_at_0_with_steps_numbered_from_0():
-    timeline = draw(chain(), 1.0)
-    parts, firsts = timeline.cut([100_000, 305_000], 100_000)
-    assert parts.episodes == 2
-    assert (firsts["s"].tolist(), firsts["r"].tolist()) == ([5, 16], [5, 15])
-    assert parts.vertices["s"].start[0, :5].tolist() == [0, 20_000, 40_000, 60_000, 80_000]
-    assert parts.vertices["r"].start[1, 0] == 1_000
-    assert parts.edges["r", "s"].seq_in[0].tolist() == [0, 1, 2, 3, 4]
-    # The message of sensor step 15 was sent before the second segment: its reader's first step lacks it.
-    assert parts.edges["r", "s"].seq_in[1].tolist() == [1, 2, 3, 4, -1]
-
-
-def test_with_lead_the_first_step_of_a_segment_sees_what_came_before():
-    parts, firsts = draw(chain(), 1.0).cut([305_000], 100_000, {"s": 60_000})
-    assert (firsts["s"].tolist(), firsts["r"].tolist()) == ([13], [15])
-    assert parts.vertices["s"].start[0, 0] == -45_000
-    assert parts.edges["r", "s"].seq_in[0, :5].tolist() == [0, 0, 0, 1, 2]
-
-
-def test_only_one_episode_can_be_cut():
-    with pytest.raises(UsageError, match="this one has 2"):
-        draw(chain(), 1.0, 2).cut([0], 1)
 
 
 def record(messages, steps=3):

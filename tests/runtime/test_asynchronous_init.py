@@ -89,5 +89,5 @@ def test_collect_checks_the_graph():
 
 @pytest.mark.parametrize("wrong", ["a", None, ["a", "b"]])
 def test_the_supervisor_is_one_node(wrong):
-    with pytest.raises(UsageError, match="the supervisor is one node, got "):
+    with pytest.raises(UsageError, match="the supervisor must be one of the nodes"):
         collect(graph(), wrong)

@@ -1,7 +1,5 @@
 """The simulated clock: the rules as an independent simulation, determinism, trainable delays, the gym-like calls."""
 
-import time
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -169,17 +167,6 @@ def test_a_node_that_raises_is_named():
     assert len(episode.messages["agent", "world"]) == len(episode.steps["world"]) == 3
     with pytest.raises(UsageError, match="stopped"):
         graph.step(gs)
-
-
-def test_real_time_factor_throttles():
-    nodes = chain()
-    graph = AsyncGraph(nodes, nodes["agent"], Clock.SIMULATED, duration_s=1, real_time_factor=2.0)
-    gs = graph.init(jax.random.key(0))
-    graph.warmup(gs)
-    graph.start(gs)
-    begin = time.monotonic()
-    graph.run_for(0.4)
-    assert time.monotonic() - begin > 0.18
 
 
 class Command(BaseNode):

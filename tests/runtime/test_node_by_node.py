@@ -98,12 +98,14 @@ def shortened(timeline, lengths):
 
 def both(nodes, timeline, given, defaults):
     """Return the computed nodes' outputs by ``CompiledGraph``, an array an episode, and by ``OpenLoopGraph``."""
-    compiled = CompiledGraph(nodes, "sensor", timeline, given)
-    spread = lambda x, ring: jnp.broadcast_to(x, ring.shape)  # noqa: E731
+    for name, messages in given.items():  # here its node sends what is given there
+        rows = jnp.asarray(messages.x)
+        nodes[name].step = lambda s, rows=rows: (s, Value(x=rows[s.eps, s.seq]))
+    compiled = CompiledGraph(nodes, "sensor", timeline)
 
     def rolled(eps):
         gs = compiled.init(KEY, eps=eps)
-        held = {n: jax.tree.map(spread, d, gs.buffer[n]) for n, d in defaults.items()}
+        held = {n: (d,) * len(gs.buffer[n]) for n, d in defaults.items() if n in gs.buffer}
         return compiled.rollout(gs.replace(buffer={**gs.buffer, **held}), record=tuple(COMPUTED))[1]
 
     rows, each = jax.jit(jax.vmap(rolled))(jnp.arange(EPISODES)), {}

@@ -48,7 +48,6 @@ class CompiledGraph:
         nodes: The nodes, by name or as a list; nodes that are not in the timeline have no effect.
         supervisor: The node whose steps the caller of ``reset`` and ``step`` makes, usually the policy; or its name.
         timeline: Timelines of one or more episodes.
-        given: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
         reusable: Whether other timelines of the robot, given as ``data``, shall have the same program.
 
     Raises:
@@ -60,16 +59,14 @@ class CompiledGraph:
         nodes: Mapping[str, BaseNode] | Sequence[BaseNode],
         supervisor: str | BaseNode,
         timeline: Timeline,
-        given: Mapping[str, PyTree] | None = None,
         reusable: bool = False,
     ) -> None:
         self.nodes = nodes_of(nodes, timeline)
         self.supervisor = supervisor_of(supervisor, self.nodes)
         self.timeline = timeline
-        self.replayed = tuple(given or ())
-        check_fit(self.nodes, timeline, given or {})
-        self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, frozenset(self.replayed), reusable)
-        self.program = RowProgram(self.nodes, self.wiring, given or {}, timeline.episodes, reusable=reusable)
+        check_fit(self.nodes, timeline, {})
+        self.wiring: Wiring = wire(self.nodes, self.supervisor, timeline, reusable)
+        self.program = RowProgram(self.nodes, self.wiring, timeline.episodes, reusable)
         # The supervisor may have several slots in a row; the i-th is its turn i. Where each of its steps is, `(E, K)`:
         # row * turns + turn; behind the last row if the program does not compute it.
         self._turns = [i for i, n in enumerate(self.wiring.slots) if n == self.supervisor]
@@ -138,8 +135,6 @@ class CompiledGraph:
         gs = init_graph_state(self.nodes, self.supervisor, rng, params, order, self.program.bounds)
         outputs = gs.aux[OUTPUTS]
         buffer = {name: (outputs[name],) * length for name, length in self.wiring.rings.items() if length}
-        self.program.check_given(outputs)
-        buffer |= {name: outputs[name] for name in self.replayed}
         aux = {k: v for k, v in gs.aux.items() if k != OUTPUTS}
         # A numpy number, not a traced one: code later in the same program can see that this is the first row.
         return gs.replace(eps=jnp.asarray(eps, jnp.int32), step=np.int32(0), seq={}, buffer=buffer, aux=aux)
@@ -213,9 +208,8 @@ class CompiledGraph:
         rows = left if rows is None else rows
         if not 1 <= rows <= left:
             raise UsageError(f"{left} of this graph's {self.rows} rows are left, rows={rows}")
-        running = [n for n in self.nodes if n not in self.replayed]
-        if unknown := [n for n in record if n not in running]:
-            raise UsageError(f"no node {unknown[0]!r} runs that could be recorded. Nodes: {', '.join(running)}")
+        if unknown := [n for n in record if n not in self.nodes]:
+            raise UsageError(f"no node {unknown[0]!r} could be recorded. Nodes: {', '.join(self.nodes)}")
 
         def run_row(state: GraphState) -> tuple[GraphState, dict[str, list[Rollout]]]:
             outputs: dict[str, list[Rollout]] = {}
@@ -302,12 +296,10 @@ class CompiledGraph:
         """Return the supervisor's first slot; raise a ``UsageError`` if it has none."""
         if self._turns:
             return self._turns[0]
-        if self.supervisor == self.wiring.world:
-            raise UsageError(
-                f"the supervisor {self.supervisor!r} is the world: it ticks in every row, and its steps have no turn",
-                hint="make the node that acts the supervisor, or use rollout(), which works with any",
-            )
-        raise UsageError(f"the outputs of the supervisor {self.supervisor!r} are given: it makes no steps")
+        raise UsageError(
+            f"the supervisor {self.supervisor!r} is the world: it ticks in every row, and its steps have no turn",
+            hint="make the node that acts the supervisor, or use rollout(), which works with any",
+        )
 
     def _only_turn(self) -> int:
         """Return the supervisor's only slot; raise a ``UsageError`` if it has none, or several."""

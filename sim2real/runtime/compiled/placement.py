@@ -57,7 +57,6 @@ class Placer:
 
     Args:
         supervisor: The supervisor's name; a row is at most as long as its period.
-        replayed: Nodes with recorded outputs, which are not computed.
 
     Attributes:
         nodes: The nodes of the timeline, senders before readers.
@@ -67,14 +66,12 @@ class Placer:
         newest: Connection -> the newest message that each step has consumed, shape ``(E, N)``; -1: none.
     """
 
-    def __init__(
-        self, nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline, replayed: frozenset[str]
-    ) -> None:
-        self.timeline, self.supervisor, self.replayed = timeline, supervisor, replayed
+    def __init__(self, nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> None:
+        self.timeline, self.supervisor = timeline, supervisor
         self.nodes = {n: nodes[n] for n in topological(nodes) if n in timeline.vertices}
-        worlds = [n for n in self.nodes.values() if isinstance(n, BaseWorld) and n.name not in replayed]
+        worlds = [n for n in self.nodes.values() if isinstance(n, BaseWorld)]
         self.world = max(worlds, key=lambda n: n.rate).name if worlds else None
-        self.others = [n for n in self.nodes if n != self.world and n not in replayed]
+        self.others = [n for n in self.nodes if n != self.world]
         self.edges = {k: e for k, e in timeline.edges.items() if k[0] in self.nodes and e.sender in self.nodes}
         self.newest = {k: newest_message(e, timeline.vertices[k[0]]) for k, e in self.edges.items()}
 
@@ -99,10 +96,9 @@ class Placer:
         return self.steps(name) < self.timeline.vertices[name].count[:, None]
 
     def _live(self) -> Iterator[tuple[str, Edge, np.ndarray]]:
-        """Yield (reader, edge, newest) of each connection between nodes that are computed, ordered by reader."""
+        """Yield (reader, edge, newest) of each connection, ordered by reader."""
         order = list(self.nodes)
-        keys = [k for k, e in self.edges.items() if e.sender not in self.replayed and k[0] not in self.replayed]
-        for key in sorted(keys, key=lambda k: order.index(k[0])):
+        for key in sorted(self.edges, key=lambda k: order.index(k[0])):
             yield key[0], self.edges[key], self.newest[key]
 
     def _cheapest(self, world_ticks: int) -> Placement:

@@ -14,7 +14,7 @@ from sim2real.graph.base import GraphState, InputState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.runtime.compiled.wiring import SlotTable, Wiring
 from sim2real.runtime.init import DelayBounds, bounds_of
-from sim2real.runtime.match import check_match, matched
+from sim2real.runtime.match import matched
 from sim2real.types import PyTree
 
 if TYPE_CHECKING:
@@ -40,7 +40,6 @@ class RowProgram:
     """Traces rows; its tables, constants or those of ``with_data``, are looked up at the state's ``eps`` and ``step``.
 
     Args:
-        replayed: Recorded outputs of nodes that do not run: node -> leaves ``(E, N, ...)``.
         reusable: Whether each slot is masked, also if it makes a step in all rows of these timelines.
     """
 
@@ -48,13 +47,11 @@ class RowProgram:
         self,
         nodes: Mapping[str, BaseNode],
         wiring: Wiring,
-        replayed: Mapping[str, PyTree],
         episodes: int,
         reusable: bool = False,
     ) -> None:
         self.nodes, self.wiring, self.episodes = nodes, wiring, episodes
         self.bounds: DelayBounds = bounds_of(nodes)
-        self._replayed = jax.tree_util.tree_map(jnp.asarray, dict(replayed))
         # Shape (R, E, ...): the entries of one row, which all copies look up at once, are adjacent in memory.
         by_row = lambda t: jnp.asarray(t.swapaxes(0, 1))  # noqa: E731
         self._tables = jax.tree_util.tree_map(by_row, [_pytree(t) for t in wiring.tables])
@@ -71,12 +68,6 @@ class RowProgram:
         program = copy.copy(self)
         program.nodes, (program._tables, program._world, program.bounds) = nodes, data
         return program
-
-    def check_given(self, outputs: Mapping[str, PyTree]) -> None:
-        """Check that recorded outputs have the form of their nodes' default outputs."""
-        for name, recorded in self._replayed.items():
-            one = jax.tree_util.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), recorded)
-            check_match(name, "an output that is given for it", one, "that of init_output", outputs[name])
 
     def always(self, slot: int) -> bool:
         """Return whether a slot makes a step in every row of every episode."""
@@ -192,13 +183,7 @@ class RowProgram:
             connection = self.nodes[name].inputs[input_name]
             width, age = connection.total_window, t["age"]
             sender = connection.output_node.name
-            # Messages: recorded ones by seq, computed ones by their age in the sender's ring.
-            if sender in self._replayed:
-                data = self._look_up(gs, sender, t["seq"])
-            else:
-                ring = gs.buffer[sender]
-                data = _window(ring, age, width)
-            state = InputState(t["seq"], t["sent"], t["received"], data)
+            state = InputState(t["seq"], t["sent"], t["received"], _window(gs.buffer[sender], age, width))
 
             # A trainable delay picks or interpolates within the window.
             dist = gs.delays.get(name, {}).get(input_name)
@@ -210,15 +195,6 @@ class RowProgram:
             inputs[input_name] = state
         rng, state, params = (part[name] for part in (gs.rng, gs.state, gs.params))
         return StepState(rng, state, params, inputs, gs.eps, table["seq"], table["ts"])
-
-    def _look_up(self, gs: GraphState, sender: str, seq: jax.Array) -> PyTree:
-        """Return the recorded messages with these ``seq (W,)``; the default output where it is -1."""
-
-        def one(recorded: jax.Array, default: jax.Array) -> jax.Array:
-            filled = seq.reshape(-1, *[1] * default.ndim) >= 0
-            return jnp.where(filled, recorded[gs.eps, jnp.maximum(seq, 0)], default)
-
-        return jax.tree_util.tree_map(one, self._replayed[sender], gs.buffer[sender])
 
 
 def _window(ring: tuple[T, ...], age: jax.Array, width: int) -> T:

@@ -84,21 +84,19 @@ def wire(
     nodes: Mapping[str, BaseNode],
     supervisor: str,
     timeline: Timeline,
-    replayed: frozenset[str] = frozenset(),
     reusable: bool = False,
 ) -> Wiring:
     """Turn timelines into index tables.
 
     Args:
         supervisor: The supervisor's name; a row is at most as long as its period.
-        replayed: Nodes with recorded outputs: they get no slot; readers look up their messages by ``seq``.
         reusable: Whether rings are longer than these timelines need, so that most timelines of a robot have rings of
             the same lengths.
     """
     if supervisor not in timeline.vertices:
         raise UsageError(f"the supervisor {supervisor!r} is not in the timeline. Nodes: {', '.join(timeline.vertices)}")
     check_bursts(nodes, timeline)
-    placer = Placer(nodes, supervisor, timeline, replayed)
+    placer = Placer(nodes, supervisor, timeline)
     return _Tables(placer, placer.place(), reusable).wiring()
 
 
@@ -182,33 +180,29 @@ class _Tables:
         ``moment (C,)`` is the time at which the program computes each, ``ticks (C,)`` the world's number of ticks then.
         """
         ts = np.where(seq >= 0, np.take_along_axis(self.timeline.vertices[name].start, seq.clip(0), 1), 0)
-        # Number of the sender's outputs before each step; None if they are recorded.
+        # Number of the sender's outputs before each step.
         inputs = {}
         for key, edge in self.placer.edges.items():
             if key[0] != name:
                 continue
-            if edge.sender in self.placer.replayed:
-                count = None
-            elif edge.sender == self.world:
+            if edge.sender == self.world:
                 count = np.broadcast_to(ticks, seq.shape)
             else:
                 count = search_rows(self.done[edge.sender], np.broadcast_to(moment, seq.shape))
             inputs[key[1]] = self._input_table(key, seq, ts, count)
         return SlotTable(seq.astype(np.int32), (ts / TICKS_PER_S).astype(np.float32), inputs)
 
-    def _input_table(
-        self, key: tuple[str, str], seq: np.ndarray, ts: np.ndarray, count: np.ndarray | None
-    ) -> InputTable:
+    def _input_table(self, key: tuple[str, str], seq: np.ndarray, ts: np.ndarray, count: np.ndarray) -> InputTable:
         """Return the messages that steps read on an input.
 
         ``seq (E, C)`` and ``ts (E, C)`` [ticks] are the steps and their starts; ``count (E, C)`` is the number of the
-        sender's steps before each, None if its outputs are recorded.
+        sender's steps before each.
         """
         connection, edge = self.nodes[key[0]].inputs[key[1]], self.placer.edges[key]
         sender: Vertex = self.timeline.vertices[edge.sender]
         # The age of the newest message counts the sender's outputs since.
         newest = np.take_along_axis(self.placer.newest[key], seq.clip(0), 1)
-        age = np.zeros_like(seq) if count is None else np.where(seq >= 0, count - 1 - newest, 0)
+        age = np.where(seq >= 0, count - 1 - newest, 0)
         if (age < 0).any():
             raise UsageError(
                 f"input {key[1]!r} of node {key[0]!r} would read a message that has not been computed",
@@ -230,8 +224,6 @@ class _Tables:
             for input_name, t in table.inputs.items():
                 connection = self.nodes[reader].inputs[input_name]
                 sender = connection.output_node.name
-                if sender in self.placer.replayed:
-                    continue
                 room = int(t.age.max(initial=0))
                 # 2, 4, 8 ...; a recording with a late step reads older messages than another recording of the robot.
                 if self.reusable and (room or not connection.blocking):

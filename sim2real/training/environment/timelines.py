@@ -239,7 +239,7 @@ def _end_at_pauses(
 
 def _row_cost(nodes: Mapping[str, BaseNode], supervisor: str, timeline: Timeline) -> tuple[int, float]:
     """Return the policy's slots in a row, and the slots for each tick of the world."""
-    placement: Placement = Placer(nodes, supervisor, timeline, frozenset()).place()
+    placement: Placement = Placer(nodes, supervisor, timeline).place()
     return placement.slots.count(supervisor), len(placement.slots) / placement.ticks
 
 
