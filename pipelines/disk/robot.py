@@ -11,8 +11,7 @@ from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.robots.identified import LoggedRobot
-from sim2real.worlds.encoder import Encoder
-from sim2real.worlds.recorded import RecordedActuator, RecordedSensor
+from sim2real.worlds.recorded import Encoder, RecordedActuator, RecordedSensor
 
 from .model import Command, DiskWorld, Measurement
 

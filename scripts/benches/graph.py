@@ -26,7 +26,7 @@ from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.runtime.compiled.wiring import wire
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.types import Array, Key, PyTree
-from sim2real.worlds.ode import OdeWorld
+from sim2real.worlds.joint import JointWorld
 
 MODEL = load_pipeline("pendulum").load("model")
 DURATION_S, EPISODES = 4.0, 32
@@ -62,7 +62,7 @@ class RandomAgent(MODEL.Agent):
         return self.act(step_state.replace(rng=rng), action)
 
 
-class CostWorld(OdeWorld):
+class CostWorld(JointWorld):
     """The seed's world, Runge-Kutta with Coulomb friction by sign: it adds up the cost beside the physics."""
 
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
@@ -86,9 +86,20 @@ class CostWorld(OdeWorld):
         gravity = p.mass * MODEL.GRAVITY * p.length * jnp.sin(th)
         return MODEL.Measurement(th=thdot, thdot=(motor + gravity - p.b * thdot - p.c * jnp.sign(thdot)) / p.J)
 
-    def limit(self, params: PyTree, state: PyTree) -> PyTree:
-        """Clip the speed."""
-        return state.replace(thdot=jnp.clip(state.thdot, -params.max_speed, params.max_speed))
+    def integrate(self, params: PyTree, state: PyTree, command: PyTree) -> PyTree:
+        """Return the state one tick later, by the classical Runge-Kutta method of order four."""
+
+        def substep(x: PyTree, h: float) -> PyTree:
+            moved = lambda k, t: jax.tree.map(lambda a, b: a + t * b, x, k)  # noqa: E731
+            k1 = self.derivative(params, x, command)
+            k2 = self.derivative(params, moved(k1, h / 2), command)
+            k3 = self.derivative(params, moved(k2, h / 2), command)
+            k4 = self.derivative(params, moved(k3, h), command)
+            slope = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k1, k2, k3, k4)
+            after = moved(slope, h)
+            return after.replace(thdot=jnp.clip(after.thdot, -params.max_speed, params.max_speed))
+
+        return self.over_substeps(substep, state)
 
     def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> PyTree:
         """Return the initial angle and velocity."""
@@ -156,7 +167,7 @@ def graph_program(graph: CompiledGraph) -> Callable[[PyTree], PyTree]:
     return run
 
 
-def hand_program(rows: int, ticks: tuple[int, ...], world: OdeWorld, unroll: int = 1) -> Callable[[PyTree], PyTree]:
+def hand_program(rows: int, ticks: tuple[int, ...], world: CostWorld, unroll: int = 1) -> Callable[[PyTree], PyTree]:
     """Return the same robot without a graph: shift registers, one step of delay each way."""
     p = params()
     shift = lambda ring, new: jnp.concatenate([new[None], ring[:-1]])  # noqa: E731
@@ -192,7 +203,7 @@ def hand_program(rows: int, ticks: tuple[int, ...], world: OdeWorld, unroll: int
     return run
 
 
-def bare_program(rows: int, ticks: tuple[int, ...], world: OdeWorld) -> Callable[[PyTree], PyTree]:
+def bare_program(rows: int, ticks: tuple[int, ...], world: CostWorld) -> Callable[[PyTree], PyTree]:
     """Return the physics alone, under a constant voltage."""
     p = params()
 
@@ -209,7 +220,7 @@ def bare_program(rows: int, ticks: tuple[int, ...], world: OdeWorld) -> Callable
     return run
 
 
-def tick(world: OdeWorld, p: PyTree, x: PyTree, cost: PyTree, u: Array) -> tuple[PyTree, PyTree]:
+def tick(world: CostWorld, p: PyTree, x: PyTree, cost: PyTree, u: Array) -> tuple[PyTree, PyTree]:
     """Integrate one tick of the world under a voltage, and add the cost."""
     x = world.integrate(p, x, u)
     return x, cost + task_cost(x, u)

@@ -10,10 +10,42 @@ from sim2real.graph.base import Base, GraphState, StepState
 from sim2real.graph.node import BaseNode
 from sim2real.later import jax, jnp
 from sim2real.types import PyTree
-from sim2real.worlds.encoder import Encoder
 
 if TYPE_CHECKING:
     from sim2real.graph.base import Value
+
+
+@pytree.dataclass
+class Encoder(Base):
+    """An encoder with a zero offset and an eccentric mount.
+
+    It reads ``angle + offset + eccentricity * sin(angle + phase)``.
+
+    Attributes:
+        offset: Zero offset [rad].
+        eccentricity: Amplitude of the error of the mount: distance of the disc's centre from the axis, divided by the
+            disc's radius [rad].
+        phase: Direction of that displacement [rad].
+    """
+
+    offset: Value = 0.0
+    eccentricity: Value = 0.0
+    phase: Value = 0.0
+
+    def read(self, angle: Value) -> Value:
+        """Return the reading [rad] at an angle [rad]."""
+        return angle + self.offset + self.eccentricity * jnp.sin(angle + self.phase)
+
+    def rate(self, angle: Value, velocity: Value) -> Value:
+        """Return the rate of change of the reading [rad/s] at an angle [rad] and a velocity [rad/s]."""
+        return velocity * (1.0 + self.eccentricity * jnp.cos(angle + self.phase))
+
+    def angle(self, reading: Value) -> Value:
+        """Return the angle [rad] for a reading [rad]: three fixed-point iterations, error of order eccentricity^4."""
+        angle = reading - self.offset
+        for _ in range(3):
+            angle = reading - self.offset - self.eccentricity * jnp.sin(angle + self.phase)
+        return angle
 
 
 @pytree.dataclass
@@ -51,7 +83,7 @@ class RecordedActuator(BaseNode):
 
 
 class RecordedSensor(BaseNode):
-    """The node that measured one joint: shows the world's position, as an encoder reads it.
+    """A simulated sensor for identification: outputs the world's joint position through the encoder model.
 
     Args:
         rate: Samples per second [Hz].

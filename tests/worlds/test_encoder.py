@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim2real.worlds.encoder import Encoder
+from sim2real.worlds.recorded import Encoder
 
 angles = st.floats(-20.0, 20.0)
 offsets = st.floats(-0.5, 0.5)

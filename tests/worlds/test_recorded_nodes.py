@@ -9,9 +9,8 @@ from flax import struct
 from oracles.hash_nodes import Value
 
 from sim2real.graph.base import Base, GraphState
-from sim2real.worlds.encoder import Encoder
 from sim2real.worlds.joint import Forces, JointState, JointWorld
-from sim2real.worlds.recorded import CommandDelay, RecordedSensor
+from sim2real.worlds.recorded import CommandDelay, Encoder, RecordedSensor
 
 
 @struct.dataclass
