@@ -1,17 +1,22 @@
-"""The families of servos that all tests of safety run on, each with an emulated robot in virtual time."""
+"""The families of robots that all tests of safety run on, each with an emulated robot in virtual time."""
 
+import importlib.util
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from turntable import odrive
+from turntable.odrive_emulation import ODriveEmulation
+from turntable.plant import Turntable
 
+from pipelines.go2.plant import LYING, Go2Body
 from sim2real.emulation.bus import BusEmulation
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.feetech import StsEmulation
 from sim2real.emulation.virtual import VirtualRobot
-from sim2real.hardware.device import Device
+from sim2real.hardware.device import Device, OperatingMode
 from sim2real.hardware.dynamixel import registers as dynamixel
 from sim2real.hardware.dynamixel.bus import BusConfig
 from sim2real.hardware.dynamixel.device import DynamixelServos
@@ -53,6 +58,50 @@ class Family:
         """Return the servos whose torque is on now."""
         return [i for i, servo in robot.bus.servos.items() if servo.get(self.torque)]
 
+    def strike(self, robot: VirtualRobot, **faults: Any) -> None:
+        """Let faults begin now."""
+        robot.strike(**faults)
+
+    def is_safe(self, effects: np.ndarray) -> np.ndarray:
+        """Return for each change of a motor whether it is off, or has no voltage."""
+        mode, goal = effects["values"][:, :2].T
+        return (mode == OperatingMode.OFF) | ((mode == OperatingMode.PWM) & (goal == 0.0))
+
+
+class _Board(Family):
+    """An ODrive, which has no guardian: its own watchdog takes the torque off."""
+
+    def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> VirtualRobot:
+        return VirtualRobot(Turntable(**plant_args), self.emulation(**(settings or {})))
+
+    def on(self, robot: VirtualRobot) -> list[int]:
+        return [0] if robot.bus.axis.properties[odrive.STATE] == odrive.CLOSED_LOOP else []
+
+    def is_safe(self, effects: np.ndarray) -> np.ndarray:
+        mode, goal = effects["values"][:, :2].T
+        return (mode == OperatingMode.OFF) | (goal == 0.0)
+
+
+class _Legs(Family):
+    """Legs of a Go2 over DDS, which damp before their torque goes off."""
+
+    def robot(self, plant: str = "", settings: Mapping[str, Any] | None = None, **plant_args: Any) -> Any:
+        from sim2real.emulation.virtual_legs import VirtualLegs
+
+        return VirtualLegs(Go2Body("stand"), self.emulation(alone_after_s=None, **(settings or {})))
+
+    def on(self, robot: Any) -> list[int]:
+        return np.flatnonzero(robot.legs._modes).tolist()
+
+    def strike(self, robot: Any, **faults: Any) -> None:
+        if "silent_after_s" in faults:  # which counts from the robot's start
+            faults["silent_after_s"] += 1e-9 * robot.now_ns()
+        robot._config = robot.legs._config = robot._sender._config = replace(robot._config, **faults)
+
+    def is_safe(self, effects: np.ndarray) -> np.ndarray:
+        mode, _, kp = effects["values"][:, :3].T
+        return (mode == OperatingMode.OFF) | (kp == 0.0)
+
 
 def _volts(port, **limits):
     return DynamixelServos(BusConfig(port, **limits), IDS, VoltageDrive(5.0))
@@ -64,6 +113,31 @@ def _angles(port, **limits):
 
 def _sts(port, **limits):
     return StsServos(StsConfig(port, **limits), [CalibratedJoint(f"joint{i}", i) for i in IDS])
+
+
+def _board(port, silence_s=0.1):
+    return odrive.ODrive(port, (0,), odrive.SpeedLoop(), baud_rate=115_200, silence_s=silence_s)
+
+
+def _legs(port, **limits):
+    from sim2real.hardware.unitree.device import UnitreeLegs
+    from sim2real.hardware.unitree.legs import LegDrive
+
+    return UnitreeLegs(port, drive=LegDrive(lie_s=0.2), **limits)
+
+
+def _standing():
+    table = np.tile([0.0, 0.0, 40.0, 1.0, 0.0], (12, 1))
+    table[:, 0] = LYING
+    return table
+
+
+def _leg_gate():
+    from sim2real.hardware.unitree.device import UnitreeLegs
+
+    device = UnitreeLegs("lo:0")
+    low, high = device.reach()
+    return {"limit": (low.tolist(), high.tolist()), "stale": device.commanded.stale}
 
 
 _ANGLE_GATE = {"limit": 1.0, "slew_per_s": 5.0, "stale": "hold"}
@@ -86,4 +160,11 @@ ANGLES = Family(
     _ANGLE_GATE,
 )
 STS = Family("Feetech", StsEmulation, "Joints", _sts, feetech.TORQUE_ENABLE, np.array([0.6, -0.7, 0.4]), _ANGLE_GATE)
-FAMILIES = (VOLTS, ANGLES, STS)
+SERVOS = (VOLTS, ANGLES, STS)
+BOARD = _Board("ODrive", ODriveEmulation, "", _board, None, np.full(1, 4.0), {"limit": 10.0})
+LEGS = None
+if importlib.util.find_spec("cyclonedds"):
+    from sim2real.emulation.legs import UnitreeEmulation
+
+    LEGS = _Legs("Go2", UnitreeEmulation, "", _legs, None, _standing(), _leg_gate())
+ROBOTS = (*SERVOS, BOARD, *([LEGS] if LEGS else []))

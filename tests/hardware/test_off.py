@@ -5,7 +5,7 @@ import threading
 
 import numpy as np
 import pytest
-from families import FAMILIES, IDS, STS
+from families import IDS, SERVOS, STS
 from virtual_bus import IdleDevice
 
 from sim2real.emulation.truth import Kind
@@ -16,7 +16,7 @@ from sim2real.hardware.safety.plausibility import Plausibility
 from sim2real.hardware.safety.rig import Rig
 
 WAYS = ("stop", "stop_quietly", "close", "disable", "make_safe")
-NAMES = [family.name for family in FAMILIES]
+NAMES = [family.name for family in SERVOS]
 
 
 def leave(rig, way):
@@ -77,7 +77,7 @@ def held_up(rig, robot, point):
         "after its bytes are written",
     ],
 )
-@pytest.mark.parametrize("family", FAMILIES, ids=NAMES)
+@pytest.mark.parametrize("family", SERVOS, ids=NAMES)
 def test_a_watchdog_that_is_held_up_sends_nothing_after_off(family, point, way):
     robot = family.robot()
     rig = family.rig(robot)
@@ -113,7 +113,7 @@ def test_a_watchdog_that_is_held_up_sends_nothing_after_off(family, point, way):
     [KeyError("gain"), struct.error("short"), MemoryError(), SystemExit(2), HardwareLost("no answer")],
     ids=repr,
 )
-@pytest.mark.parametrize("family", FAMILIES, ids=NAMES)
+@pytest.mark.parametrize("family", SERVOS, ids=NAMES)
 def test_any_error_in_the_watchdog_makes_the_motors_safe_and_is_raised(family, error, monkeypatch, caplog):
     robot = family.robot()
     with family.rig(robot, {"command_timeout_s": 0.1}) as rig:
@@ -141,7 +141,7 @@ def test_any_error_in_the_watchdog_makes_the_motors_safe_and_is_raised(family, e
 
 
 @pytest.mark.parametrize("silent", IDS)
-@pytest.mark.parametrize("family", FAMILIES, ids=NAMES)
+@pytest.mark.parametrize("family", SERVOS, ids=NAMES)
 def test_a_silent_servo_keeps_no_other_one_on(family, silent):
     robot = family.robot()
     with family.rig(robot, {"command_timeout_s": 2.0}, silence_s=1.0) as rig:
@@ -205,7 +205,7 @@ def switch_on_twice(device):
 
 
 @pytest.mark.parametrize("writes", range(1, 40))
-@pytest.mark.parametrize("family", FAMILIES, ids=NAMES)
+@pytest.mark.parametrize("family", SERVOS, ids=NAMES)
 def test_made_safe_while_the_torque_goes_on(family, writes, monkeypatch):
     """As by a signal, after any of the instructions of `enable`."""
     robot = family.robot()

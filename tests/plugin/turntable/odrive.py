@@ -270,8 +270,9 @@ class ODrive(Device):
                     self._late_s.append(1e-9 * late_ns)
                     return numbers, Transaction(sent_ns, began_ns - asked_ns, now_ns - began_ns, losses, late_ns)
                 self._losses += 1
-                # Answers have no numbers: one that comes too late must not pass for that to the next question.
-                line.clock.sleep(_ANSWER_S)
+                # Answers have no numbers: one that comes too late must not pass for that to the next question. The port
+                # waits, as the lock is held: a clock's sleep may call the rig's watchdog, which needs the lock.
+                self._receive(line, line.clock.now_ns(), end=b"")
         raise HardwareLost(f"no answer to {text!r} on {self._port}, {_LOSSES} times", hint="check power and cable")
 
     def _send(self, text: str) -> tuple[Port, int]:
@@ -287,11 +288,11 @@ class ODrive(Device):
             raise HardwareLost(f"{self._port} failed: {error}") from error
         return line, sent_ns
 
-    def _receive(self, line: Port, sent_ns: int) -> bytes:
-        """Return what comes up to the end of a line; less if that is late."""
+    def _receive(self, line: Port, sent_ns: int, end: bytes = b"\n") -> bytes:
+        """Return what comes up to the end of a line; all that comes within the wait for an answer if it is late."""
         end_ns, heard = sent_ns + round(1e9 * _ANSWER_S), b""
         try:
-            while not heard.endswith(b"\n") and (came := line.read(end_ns)):
+            while not (end and heard.endswith(end)) and (came := line.read(end_ns)):
                 heard += came
         except OSError as error:
             raise HardwareLost(f"{self._port} failed: {error}") from error

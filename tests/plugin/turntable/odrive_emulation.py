@@ -113,7 +113,7 @@ class Board(PlannedBus):
         start_ns: int,
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.axis, self._wild = Axis(), config.wild
+        self.axis = Axis()
         super().__init__(plant, config, truth, send, start_ns, now_ns, Lines(), {0: self.axis})
 
     def execute(self, request: Request) -> None:
@@ -131,7 +131,7 @@ class Board(PlannedBus):
             axis.properties[_ERROR] = 0
         elif word == "f":
             sample = self.measure(axis, request.t_ns)
-            turns = axis.turns + 1000.0 * self.happens(self._wild)
+            turns = axis.turns + 1000.0 * self.ill(self._config.wild, request.t_ns)
             answer = f"{turns:f} {axis.turns_per_s:f}"
         elif word == "r":
             answer = f"{axis.properties[rest[0]]:f}" if rest[0] in axis.properties else "invalid property"
