@@ -38,7 +38,7 @@ PARTS: Final[Mapping[str, ReadingPart]] = MappingProxyType(
 )
 """Parts of a reading. The quaternion is (w, x, y, z). Gyro and accelerometer of this kind reach 35 rad/s and 157 m/s^2.
 The force on a foot is the count of its sensor, in the order FR, FL, RR, RL: Unitree documents no unit."""
-_WEAK_NM, _WEAK_S = 8.0, 0.1
+_WEAK_NM, _WEAK_S = 5.0, 0.1
 """By how much a motor's torque may be weaker than its law [N m], on average over a time [s]."""
 _SOURCE: Final = (
     "Unitree documents no reaction of a Go2; a motor of its GO family goes on (unitree_actuator_sdk, issue 29); "
