@@ -110,7 +110,7 @@ class HingeDrive(RobotDrive):
 
         from .plant import SUPPLY_V
 
-        return DynamixelServos(BusConfig(port, silence_s=silence_s), [SERVO_ID], VoltageDrive(SUPPLY_V))
+        return DynamixelServos(BusConfig.patient(port, 1_000_000, silence_s), [SERVO_ID], VoltageDrive(SUPPLY_V))
 
     def gate(self, limits: GateLimits) -> GateConfig:
         """Return a gate that falls back to 0 V."""

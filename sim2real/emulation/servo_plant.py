@@ -4,7 +4,6 @@ Its parameters differ from the model's by factors, so that an identification has
 structure: an error of the MJCF is also in its twin.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,9 +11,9 @@ from mujoco import MjData, MjModel, mj_step  # pyright: ignore[reportAttributeAc
 
 from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
+from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
 
-_RAD_PER_COUNT = 2.0 * math.pi / 4096  # of the encoders of DYNAMIXEL X and Feetech STS servos
-_CENTRE_RAD = 2048 * _RAD_PER_COUNT
+_CENTRE_RAD = 2048 * RAD_PER_COUNT  # Feetech STS servos have the same encoders
 _FACTORS = ("gain", "damping", "armature", "friction")
 
 
@@ -96,7 +95,7 @@ class TwinPlant:
                 # Move the setpoint along its profile, and round the error to counts as the firmware does.
                 reach = self._profiles[i] * step_s
                 self._references[i] += min(max(goal - self._references[i], -reach), reach)
-                count_rad = _RAD_PER_COUNT / self._gears[i]
+                count_rad = RAD_PER_COUNT / self._gears[i]
                 counts = round(self._references[i] / count_rad) - round(angle / count_rad)
                 data.ctrl[motor] = angle + counts * count_rad
             mj_step(model, data)

@@ -112,3 +112,27 @@ def test_overload_stops_with_its_name(start_robot, open_bus):
     bus.clock.sleep(0.5)
     with pytest.raises(SafetyStop, match="servo 1 has stopped itself: overload"):
         bus.read_state()
+
+
+@pytest.mark.parametrize("held_up_s", [0.0, 0.02])
+def test_a_lost_bus_names_the_computer_if_its_own_thread_did_not_run(start_robot, monkeypatch, held_up_s):
+    robot = start_robot(config=EmulatorConfig(silent_after_s=0.5))
+    with ServoBus(BusConfig(robot.port, silence_s=1.0), (1,)) as bus:
+        robot.clock.sleep(0.6)
+        read = robot.read
+
+        def late(until_ns):
+            data = read(until_ns)
+            robot.stall(held_up_s)
+            return data
+
+        monkeypatch.setattr(robot, "read", late)
+        with pytest.raises(HardwareLost) as lost:
+            bus.read(1, reg.PRESENT_POSITION)
+    assert ("computer is too busy" in str(lost.value)) == (held_up_s > 0.0)
+    assert ("cable" in str(lost.value)) == (held_up_s == 0.0)
+
+
+def test_a_bus_counts_as_lost_when_its_host_would_count_as_dead():
+    assert BusConfig.patient("/dev/null", 1_000_000, 2.0).max_silence_s == 2.0
+    assert BusConfig.patient("/dev/null", 1_000_000, 0.02).max_silence_s == 0.1

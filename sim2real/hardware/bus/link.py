@@ -25,6 +25,7 @@ _SAFE_REPEATS: Final = 5
 _SAFE_PAUSE_S: Final = 0.002
 _FORCED_ATTEMPTS: Final = 5
 _MIN_LOSSES: Final = 3  # fewer missing answers in a long time mean that this process was not scheduled
+_BUSY_SHARE: Final = 0.3  # of a silence: if this thread was held up for longer, the computer is to blame
 _PADS: Final = 4
 _SCANNED: Final = 20
 _CONFIRMING_BYTES: Final = 17  # no other read is as long, so a late answer to another read cannot confirm
@@ -68,7 +69,7 @@ class ServoLink(ABC):
         self._unheard: set[int] = set()  # lengths of answers that are missing and may still come
         # Begin and end of the present silence, None after an answer; and its missing answers.
         self._silent_ns: tuple[int, int] | None = None
-        self._missed = 0
+        self._missed = self._held_up_ns = 0
         self._sent_ns = 0
         self.port = open_port(config.port, config.baud_rate)
         self.clock = self.port.clock
@@ -251,7 +252,7 @@ class ServoLink(ABC):
             # A bus that was lost just now is lost for the next instruction, too, after a single missing answer.
             silent_ns = self._silent_ns
             if silent_ns is None or began_ns - silent_ns[1] > 1e9 * self.config.max_silence_s:
-                silent_ns, self._missed = (began_ns, began_ns), 0
+                silent_ns, self._missed, self._held_up_ns = (began_ns, began_ns), 0, 0
             while True:
                 # Show the guardian that this process lives, as often as the bus is used.
                 if self.guardian is not None:
@@ -364,6 +365,8 @@ class ServoLink(ABC):
                 if packet.intact and (answer := self.form.answer(packet)) is not None:
                     return answer
             if not (data := self.port.read(end_ns)):
+                # A thread that wakes up late did not get the processor.
+                self._held_up_ns += max(0, self.clock.now_ns() - end_ns)
                 return None
             self._waiting += [packet for packet, _ in self._parser.feed(data)]
 
@@ -378,8 +381,16 @@ class ServoLink(ABC):
     def _require_heard(self, what: str, silent_s: float) -> None:
         if self._missed >= _MIN_LOSSES and silent_s > self.config.max_silence_s:
             self._require_watching()
+            port, silent_ms = self.config.port, 1e3 * silent_s
+            missed = f"no answer to {what} on {port}: {self._missed} missed in a row, {silent_ms:.0f} ms"
+            if 1e-9 * self._held_up_ns > _BUSY_SHARE * silent_s:
+                raise HardwareLost(
+                    f"this computer is too busy: its control thread did not run for {1e-6 * self._held_up_ns:.0f} ms; "
+                    f"{missed}",
+                    hint="close what else runs on it, or raise servo_watchdog_s, which is also the longest silence",
+                )
             raise HardwareLost(
-                f"no answer to {what} on {self.config.port}: {self._missed} missed in a row, {1e3 * silent_s:.0f} ms",
+                missed,
                 hint="check power, cable, ids and baud rate; is a USB adapter's latency timer longer than "
                 "reply_timeout_s?",
             )

@@ -6,7 +6,7 @@ import select
 import termios
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final, Protocol, cast
+from typing import ClassVar, Final, Protocol, Self, cast
 
 import serial
 from serial.tools import list_ports
@@ -46,6 +46,11 @@ class LinkConfig:
     """Bits per second that the servos support."""
     longest_silence_s: ClassVar[float] = math.inf
     """The longest time that the servos' own watchdogs can be set to [s]."""
+
+    @classmethod
+    def patient(cls, port: str, baud_rate: int, silence_s: float) -> Self:
+        """Return limits with one time for both directions: a bus counts as lost when its host would count as dead."""
+        return cls(port, baud_rate, max_silence_s=max(cls.max_silence_s, silence_s), silence_s=silence_s)
 
     def __post_init__(self) -> None:
         if self.baud_rate not in self.baud_rates:
@@ -116,8 +121,9 @@ class SerialPort:
 
     def read(self, until_ns: int) -> bytes:
         """Return the bytes that have arrived; none if there are none until a time [ns]; OSError if the port is gone."""
-        left_s = (until_ns - self.clock.now_ns()) * 1e-9
-        if left_s <= 0.0 or not select.select([self._fd], [], [], left_s)[0]:
+        # What has arrived counts, also if this thread did not run until after that time.
+        left_s = max(0.0, (until_ns - self.clock.now_ns()) * 1e-9)
+        if not select.select([self._fd], [], [], left_s)[0]:
             return b""
         data = os.read(self._fd, 4096)
         if not data:

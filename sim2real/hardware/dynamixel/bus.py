@@ -263,5 +263,5 @@ def watchdog_message(servo_id: int) -> tuple[str, str]:
     """Return the message and the hint for a servo whose bus watchdog has tripped."""
     return (
         f"the bus watchdog of servo {servo_id} has tripped: no instruction came for longer than silence_s",
-        "look for a loop that stalls; switching torque on again clears it",
+        "is this computer too busy, or does a loop stall? switching torque on again clears it",
     )

@@ -62,4 +62,4 @@ class DynamixelServos(ServoBus, Device):
 
 def servos(port: str, ids: Sequence[int], drive: Drive, *, baud_rate: int, silence_s: float) -> DynamixelServos:
     """Return servos on a port, not opened yet: the device of the name ``dynamixel``; see ``DeviceFactory``."""
-    return DynamixelServos(BusConfig(port, baud_rate, silence_s=silence_s), ids, drive)
+    return DynamixelServos(BusConfig.patient(port, baud_rate, silence_s), ids, drive)

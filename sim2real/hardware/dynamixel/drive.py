@@ -127,7 +127,7 @@ class PositionDrive(Drive):
         """How joints follow their goals: near the limit, a servo pushes with nearly all of its torque."""
         if not self.p_gain:
             return None
-        full_rad = reg.PWM_FULL_SCALE * reg.P_GAIN_PER_PWM / self.p_gain * reg.RAD_PER_COUNT
+        full_rad = reg.full_torque_error_rad(self.p_gain)
         return Following(MOST_SHARE * full_rad, RESPONSE_S, min(SLOW_RAD_S, 0.5 * self.profile_velocity_rad_s))
 
     def reach(self, bus: ServoBus) -> tuple[np.ndarray, np.ndarray]:

@@ -79,6 +79,11 @@ TABLE: Final = MemoryTable(
 )
 
 
+def full_torque_error_rad(p_gain: int) -> float:
+    """Return the position error at which the controller gives full PWM [rad]."""
+    return PWM_FULL_SCALE * P_GAIN_PER_PWM / p_gain * RAD_PER_COUNT
+
+
 def rad_from_count(count: int) -> float:
     """Return the angle [rad] of a position count."""
     return count * RAD_PER_COUNT

@@ -106,7 +106,7 @@ class StsServos(GuardedServos[StsLink], Device):
         drive = self._drive
         if not drive.p_gain:
             return None
-        full_rad = 1.0 / (drive.p_gain * reg.DUTY_PER_RAD_AND_GAIN)
+        full_rad = reg.full_torque_error_rad(drive.p_gain)
         return Following(MOST_SHARE * full_rad, RESPONSE_S, min(SLOW_RAD_S, 0.5 * drive.speed_rad_s))
 
     def enable(self) -> None:
@@ -236,4 +236,4 @@ def servos(port: str, ids: Sequence[int], drive: StsDrive, *, baud_rate: int, si
     """Return servos on a port, not opened yet: the device of the name ``feetech``; see ``DeviceFactory``."""
     joints = {joint.servo_id: joint for joint in drive.joints}
     selected = [joints.get(i) or CalibratedJoint(f"servo {i}", i) for i in ids]
-    return StsServos(StsConfig(port, baud_rate, silence_s=silence_s), selected, drive)
+    return StsServos(StsConfig.patient(port, baud_rate, silence_s), selected, drive)

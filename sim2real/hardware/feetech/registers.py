@@ -98,3 +98,8 @@ TABLE: Final = MemoryTable(
 def speed_unit_rad_s(phase: int) -> float:
     """Return the unit of the speed registers [rad/s], which bit 2 of the register Phase sets."""
     return RAD_PER_COUNT * (1 if phase & PHASE_COUNTS_PER_S else 50)
+
+
+def full_torque_error_rad(p_gain: int) -> float:
+    """Return the position error at which the controller gives full duty [rad]."""
+    return 1.0 / (p_gain * DUTY_PER_RAD_AND_GAIN)

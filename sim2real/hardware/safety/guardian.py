@@ -193,7 +193,7 @@ class Guardian:
                 return
         raise SafetyStop(
             f"the guardian has taken the torque off: this process was silent for {self._silence_s:g} s",
-            hint="was it stopped, or the machine too busy? servo_watchdog_s sets the limit",
+            hint="is this computer too busy, or was the process stopped? servo_watchdog_s sets the limit",
         )
 
     def require_watching(self) -> None:

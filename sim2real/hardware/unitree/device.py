@@ -232,4 +232,4 @@ class UnitreeLegs(GuardedLegs, Device):
 def legs(port: str, ids: Sequence[int], drive: Any, *, baud_rate: int, silence_s: float) -> UnitreeLegs:
     """Return the legs of a Go2, not opened yet: the device of the name ``unitree``; see ``DeviceFactory``."""
     del baud_rate  # a network has none
-    return UnitreeLegs(port, ids, drive, silence_s=silence_s)
+    return UnitreeLegs(port, ids, drive, silence_s=silence_s, max_silence_s=max(0.1, silence_s))

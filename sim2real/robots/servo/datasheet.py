@@ -6,15 +6,12 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from sim2real.hardware.dynamixel import registers as dynamixel
+from sim2real.hardware.feetech import registers as feetech
+
 if TYPE_CHECKING:
     from sim2real.hardware.dynamixel.drive import PositionDrive
     from sim2real.hardware.feetech.drive import StsDrive
-
-_PWM_FULL_SCALE, _P_GAIN_UNIT, _RAD_PER_COUNT = 885, 256, 2.0 * math.pi / 4096
-"""Counts of PWM at full supply; P gain at which one count of position error gives one count of PWM, measured on XL330
-(128 in the e-Manual); angle of a count."""
-_STS_P_GAIN_UNIT_PER_RAD = 0.166
-"""Duty per radian of position error and count of P gain: measured by Rhoban with an oscilloscope (BAM, STS3215)."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ class DataSheet:
     @property
     def full_rad(self) -> float:
         """Position error at which the duty is full [rad]."""
-        return _PWM_FULL_SCALE * _P_GAIN_UNIT / self.p_gain * _RAD_PER_COUNT
+        return dynamixel.full_torque_error_rad(self.p_gain)
 
     @property
     def gain(self) -> float:
@@ -75,7 +72,7 @@ class StsSheet(DataSheet):
     @property
     def full_rad(self) -> float:
         """Position error at which the duty is full [rad]."""
-        return 1.0 / (self.p_gain * _STS_P_GAIN_UNIT_PER_RAD)
+        return feetech.full_torque_error_rad(self.p_gain)
 
     @property
     def drive(self) -> StsDrive:
