@@ -28,7 +28,7 @@ import pytest
 from sim2real.emulation.bus import BusEmulation
 from sim2real.emulation.truth import Kind, Truth
 from sim2real.emulation.virtual import VirtualRobot
-from sim2real.errors import HardwareLost, SafetyStop, UsageError
+from sim2real.errors import HardwareLost, SafetyStop
 from sim2real.hardware.clock import Clock
 from sim2real.hardware.device import Device, OperatingMode, Reading
 from sim2real.hardware.safety.gate import GateConfig
@@ -144,7 +144,6 @@ class DeviceConformance(ABC):
         assert all(part.unit for part in device.parts.values())
         assert {"position": "rad", "velocity": "rad/s"}.items() <= device.measures.items()
         assert device.counters.transactions == 0
-        assert not device.torque_withheld
         device.make_safe()
         device.close()
         with pytest.raises(HardwareLost):
@@ -263,27 +262,18 @@ class DeviceConformance(ABC):
         assert (rows["t_ns"][-1] - killed_ns) * 1e-9 < self.patience_s
 
     def test_a_dry_run_moves_nothing(self, start: Started) -> None:
-        """All calls work, but no motor is driven; the dry run lasts until the device is closed."""
+        """A rig in a dry run drives no motor, and its bus is as busy."""
         robot, device = start()
-        with device:
-            device.withhold_torque()
-            assert device.torque_withheld
-            device.enable()
-            self.play(device, 5)
-            device.check()
-            assert device.counters.withheld >= 5
-            device.disable()
-            assert device.torque_withheld
+        with Rig(device, self.gate(device)) as rig:
+            rig.withhold_torque()
+            rig.start()
+            for _ in range(5):
+                rig.measure()
+                rig.command(rig.gate.fallback, 0.0, 1e-9 * rig.clock.now_ns())
+            assert len(rig.commanding.transfer_us) == 5
+            rig.stop()
         robot.stop()
         assert robot.truth().of(Kind.EFFECT).size == 0
-
-    def test_torque_that_is_on_cannot_be_withheld(self, start: Started) -> None:
-        """A dry run begins before torque is on."""
-        _, device = start()
-        with device:
-            device.enable()
-            with pytest.raises(UsageError):
-                device.withhold_torque()
 
     def _fail(self, device: Device) -> None:
         with device:

@@ -87,7 +87,6 @@ class Counters:
         transactions: Instructions that were answered, or needed no answer.
         late_replies: Answers after the timeout, or so late that the time of their sample is uncertain.
         late_s: Delay of each answer beyond the time of its bytes on the wire, shape (N,) [s].
-        withheld: Instructions that a dry run did not send, as they could have moved a motor.
     """
 
     transactions: int = 0
@@ -95,7 +94,6 @@ class Counters:
     retries: int = 0
     late_replies: int = 0
     late_s: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    withheld: int = 0
 
 
 Stale: TypeAlias = Literal["zero", "hold"] | float
@@ -290,21 +288,6 @@ class Device(ABC):
         return None
 
     @abstractmethod
-    def withhold_torque(self) -> None:
-        """Keep the torque off until the device is closed, for a dry run.
-
-        An instruction that could move a motor is counted, and replaced by one that takes as long and moves nothing.
-
-        Raises:
-            UsageError: Torque is on.
-        """
-
-    @property
-    @abstractmethod
-    def torque_withheld(self) -> bool:
-        """Whether this is a dry run; see `withhold_torque`."""
-
-    @abstractmethod
     def enable(self) -> None:
         """Write the settings that motors lose without power, and switch the torque on; the motors stay at rest.
 
@@ -334,7 +317,7 @@ class Device(ABC):
 
     @abstractmethod
     def command(self, values: np.ndarray) -> Transaction:
-        """Send a command; in a dry run, an instruction that takes as long and moves nothing.
+        """Send a command.
 
         Args:
             values: Shape (n,) [the unit of `commanded`], or (n, k).

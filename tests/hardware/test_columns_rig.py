@@ -48,7 +48,7 @@ class Legs(IdleDevice):
 
     motors = ("FR_hip", "FL_hip")
     commanded = CommandKind.of_columns("controllers", *COLUMNS)
-    silence_s, torque_withheld, counters = 0.0, False, Counters()
+    silence_s, counters = 0.0, Counters()
     measures = {"position": "rad", "velocity": "rad/s", "load": "N m"}  # noqa: RUF012
     parts = {"quaternion": ReadingPart("1", (4,), norm=(0.9, 1.1)), "gyro": ReadingPart("rad/s", (3,), -50.0, 50.0)}  # noqa: RUF012
 

@@ -31,7 +31,7 @@ class Bench(IdleDevice):
     """
 
     motors = tuple(f"motor {i}" for i in range(N))
-    commanded, silence_s, torque_withheld, counters = POSITION, 0.0, False, Counters()
+    commanded, silence_s, counters = POSITION, 0.0, Counters()
     measures = MappingProxyType({"position": "rad", "velocity": "rad/s", "load": "1"})
 
     def __init__(self, kind, rows, reach=(-50.0, 50.0), leap_at=None):

@@ -230,7 +230,7 @@ def test_made_safe_while_the_torque_goes_on(family, writes, monkeypatch):
 class Plain(IdleDevice):
     """A device that sends whatever it is told, as a driver of a plug-in may."""
 
-    motors, commanded, silence_s, torque_withheld, counters = ("wheel",), VOLTAGE, 0.0, False, Counters()
+    motors, commanded, silence_s, counters = ("wheel",), VOLTAGE, 0.0, Counters()
 
     def __init__(self):
         self.log, self.hold = [], None

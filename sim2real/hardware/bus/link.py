@@ -1,4 +1,4 @@
-"""Transactions on a half-duplex bus of servos, one at a time: port, lock, retries, late answers, withheld torque.
+"""Transactions on a half-duplex bus of servos, one at a time: port, lock, retries, late answers.
 
 The makers' packages are not used because they do not time their reads. They poll for an answer, report a missing one
 after a fixed 34 ms, drop the error bytes of a synchronised read, and confuse a late answer with the next one.
@@ -35,9 +35,9 @@ _BARRIER_BYTES: Final = 18  # and more: the shortest read that only a barrier ma
 class ServoLink(ABC):
     """Owner of port and lock. Every method may be called from any thread.
 
-    Once `torque_withheld` is set, nothing that could move a motor leaves through here: neither "torque on" nor a goal.
-    The same holds while `at_rest` is set: such an instruction raises SafetyStop, also if it waits for the lock, or for
-    the answer to its first attempt, when `at_rest` is set.
+    While `at_rest` is set, nothing that could move a motor leaves through here, neither "torque on" nor a goal: such an
+    instruction raises SafetyStop, also if it waits for the lock, or for the answer to its first attempt, when `at_rest`
+    is set.
 
     Attributes:
         at_rest: Whether the torque was taken off and not switched on again.
@@ -56,12 +56,11 @@ class ServoLink(ABC):
         self.config = config
         self.guardian: Guardian | None = None
         self.closed = False
-        self.torque_withheld = self.at_rest = False
+        self.at_rest = False
         self.off_packet = b""
         # Counts of this session; the lock serialises transactions.
-        self._transactions = self._retries = self._lost = self._late = self._withheld = 0
+        self._transactions = self._retries = self._lost = self._late = 0
         self._late_us = array("i")
-        self._withheld_goals: dict[tuple[int, Register], int] = {}
         self._lock = threading.Lock()
         self._parser = Parser(self.form)
         self._waiting: list[Packet] = []
@@ -82,17 +81,17 @@ class ServoLink(ABC):
     def counters(self) -> Counters:
         """Counts of the transactions since the port was opened."""
         late_s = np.array(self._late_us, np.float64) * 1e-6
-        return Counters(self._transactions, self._lost, self._retries, self._late, late_s, self._withheld)
+        return Counters(self._transactions, self._lost, self._retries, self._late, late_s)
 
     def read(self, servo_id: int, register: Register, despite_error: bool = False) -> int:
-        """Return a register's value in counts; a goal that was withheld replaces the register's own value.
+        """Return a register's value in counts.
 
         Args:
             despite_error: Whether an error in the answer is ignored.
         """
         what = f"read of {register.name}"
         data = self.read_each((servo_id,), register.address, register.size, what, despite_error)[0][0]
-        return self._withheld_goals.get((servo_id, register), register.decode(data))
+        return register.decode(data)
 
     def read_each(
         self, servo_ids: Sequence[int], address: int, length: int, what: str, despite_error: bool = False
@@ -125,8 +124,6 @@ class ServoLink(ABC):
     def write(self, servo_id: int, register: Register, value: int) -> Transaction:
         """Write a register, and wait for the answer; some servos confirm a value that they refuse, see `set`."""
         moves = self._moves(register, (value,))
-        if moves and self.torque_withheld:
-            return self._withhold(register, {servo_id: value})
         packet, what = self.form.write(servo_id, register, value), f"write of {value} to {register.name}"
         return self._exchange(lambda: (packet, 0), (servo_id,), what, moves=moves)[1]
 
@@ -149,8 +146,6 @@ class ServoLink(ABC):
     def write_each(self, register: Register, values: Mapping[int, int]) -> Transaction:
         """Write a register of several servos, id -> value in counts, with one instruction that no servo answers."""
         moves = self._moves(register, values.values())
-        if moves and self.torque_withheld:
-            return self._withhold(register, values)
         packet = self.form.write_each(register, values)
         return self._exchange(lambda: (packet, 0), (), f"write of {register.name}", moves=moves)[1]
 
@@ -403,11 +398,3 @@ class ServoLink(ABC):
     def _moves(self, register: Register, values: Iterable[int]) -> bool:
         """Whether a write could move a motor, or switch its torque on."""
         return register in self.table.goals or (register == self.table.torque and any(values))
-
-    def _withhold(self, register: Register, values: Mapping[int, int]) -> Transaction:
-        """Read the register in place of a write, so that the bus is as busy and its loss is noticed."""
-        self._withheld += 1
-        if register in self.table.goals:
-            self._withheld_goals |= {(servo_id, register): value for servo_id, value in values.items()}
-        what = f"read of {register.name}"
-        return self.read_each((next(iter(values)),), register.address, register.size, what)[1]

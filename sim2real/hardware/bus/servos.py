@@ -91,11 +91,6 @@ class GuardedServos(Generic[L]):
         """Counts of the transactions since `open`."""
         return Counters() if self._link is None else self._link.counters
 
-    @property
-    def torque_withheld(self) -> bool:
-        """Whether this is a dry run; see `withhold_torque`."""
-        return self._link is not None and self._link.torque_withheld
-
     def require_watching(self) -> None:
         """Raise SafetyStop if the guardian has taken over, or has died."""
         if self._link is not None and self._link.guardian is not None:
@@ -161,20 +156,6 @@ class GuardedServos(Generic[L]):
             facts["voltage"][motor] = f"{0.1 * numbers[-1]:.1f} V"
             facts["temperature"][motor] = f"{link.read(servo_id, table.temperature, despite_error=True)} °C"
         return facts
-
-    def withhold_torque(self) -> None:
-        """Send neither "torque on" nor any goal from now until the bus is opened again, for a dry run.
-
-        Everything else happens as usual: watchdog and guardian are armed, goals are checked, and `ServoLink.read`
-        returns a withheld goal. Each withheld instruction is replaced by a read of its register, which takes the bus
-        about as long.
-
-        Raises:
-            UsageError: Torque is on.
-        """
-        if self.armed:
-            raise UsageError("torque cannot be withheld: it is on", hint="call withhold_torque before torque goes on")
-        self.link.torque_withheld = True
 
     def guard(self) -> None:
         """Arm the guardian before torque goes on; start it at the first call.

@@ -161,7 +161,7 @@ class StsServos(GuardedServos[StsLink], Device):
 
     def check(self) -> None:
         """Raise SafetyStop if a servo has lost its settings, or its torque is off."""
-        if not self.armed or self.torque_withheld:
+        if not self.armed:
             return
         counts, _ = self.link.read_counts(self.ids, _SETTINGS, "read of the settings")
         for servo_id, row in zip(self.ids, counts.tolist(), strict=True):

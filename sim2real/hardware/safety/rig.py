@@ -67,6 +67,7 @@ class Rig:
     Attributes:
         measuring: The bus's use by `measure` since `start`.
         commanding: The bus's use by `command` since `start`.
+        torque_withheld: Whether this is a dry run; see `withhold_torque`.
         following: How the joints follow their commands, which `measure` checks; None: not known, or not checked.
         repeats: Readings since `start` that were the sample before once again, by the device's tick.
 
@@ -97,6 +98,7 @@ class Rig:
         self._lock = threading.Lock()
         self._done = threading.Event()
         self._on = False  # whether commands may be sent
+        self.torque_withheld = False
         self._failure: Sim2RealError | None = None
         self.timeouts = 0
         self.measuring, self.commanding = BusUse(), BusUse()
@@ -118,20 +120,18 @@ class Rig:
         """Take the torque off and close the device."""
         self.close()
 
-    @property
-    def torque_withheld(self) -> bool:
-        """Whether this is a dry run; see `withhold_torque`."""
-        return self.device.torque_withheld
-
     def withhold_torque(self) -> None:
-        """Send neither torque nor goals from now on, for a dry run; `command` returns the output of the gate.
+        """Begin a dry run: until the rig is closed, the device is measured, and neither enabled nor commanded.
+
+        All else happens as usual: `command` returns the output of the gate, and measures in the command's place, so
+        that the bus is about as busy.
 
         Raises:
-            UsageError: Torque is on, or the device does not confirm that it withholds it.
+            UsageError: Torque is on.
         """
-        self.device.withhold_torque()
-        if not self.device.torque_withheld:
-            raise UsageError(f"{type(self.device).__name__} cannot do a dry run: it does not withhold its torque")
+        if self._on:
+            raise UsageError("torque cannot be withheld: it is on", hint="call withhold_torque before start")
+        self.torque_withheld = True
 
     def start(self) -> None:
         """Switch the torque on, at rest, and start the watchdog of stale commands; torque is off if this raises."""
@@ -145,15 +145,15 @@ class Rig:
             self._require_reach()
             try:
                 # The slew limit starts from the command that the motors follow at rest.
-                self.device.enable()
-                self.gate.reset(self._mounting.to_joints(self.device.rest()))
+                self.gate.reset(self._begin_at_rest())
                 self._plausibility.reset()
                 self._position_rad = None
                 self._sent = self.gate.fallback
                 self._begin_following()
                 self._is_first = True
                 self._on = True
-                self._start_watchdog(self._done)
+                if not self.torque_withheld:
+                    self._start_watchdog(self._done)
             except BaseException as error:
                 self._on = False
                 self._done.set()
@@ -180,7 +180,8 @@ class Rig:
             )
         try:
             self._on, self._sent = False, None
-            self.device.disable()
+            if not self.torque_withheld:
+                self.device.disable()
         finally:
             self._lock.release()
 
@@ -257,7 +258,10 @@ class Rig:
             allowed = self.gate.apply(self._softened(command), age_s, now_s, self._speed_rad_s)
             if self._follow_check is not None:
                 self._follow_check.sent(allowed, self._now_s())
-            self.commanding.add(self.device.command(self._mounting.to_motors(allowed)))
+            if self.torque_withheld:
+                self.commanding.add(self.device.measure().transaction)
+            else:
+                self.commanding.add(self.device.command(self._mounting.to_motors(allowed)))
             self._sent = allowed
             self._commanded_s = self._now_s()
         return allowed
@@ -331,6 +335,14 @@ class Rig:
                     hint="hold it still, or allow longer with --settle-s",
                 )
             self.clock.sleep(0.02)
+
+    def _begin_at_rest(self) -> np.ndarray:
+        """Switch the torque on, and return the command that the joints follow then; without torque, their pose."""
+        if not self.torque_withheld:
+            self.device.enable()
+        elif self.device.commanded.stale == "hold":
+            return self._mounting.reading(self.device.measure()).position_rad
+        return self._mounting.to_joints(self.device.rest())
 
     def _follows(self) -> Following | None:
         """Return how the joints follow their commands, by the device's own figures."""

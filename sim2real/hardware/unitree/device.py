@@ -132,17 +132,6 @@ class UnitreeLegs(GuardedLegs, Device):
         low, high = self.drive.reach
         return low[self._places], high[self._places]
 
-    def withhold_torque(self) -> None:
-        """Publish no command until the device is closed."""
-        if self.armed:
-            raise UsageError("torque cannot be withheld: it is on", hint="call withhold_torque before torque goes on")
-        self.withheld = True
-
-    @property
-    def torque_withheld(self) -> bool:
-        """Whether this is a dry run; see `withhold_torque`."""
-        return self.withheld
-
     def enable(self) -> None:
         """Start the guardian, and let all motors damp at their positions; see `Device.enable`."""
         self._left, self._rest = 1.0, np.zeros((MOTORS, 5))

@@ -47,15 +47,12 @@ class GuardedLegs:
     Attributes:
         armed: Whether commands are published.
         halted: Whether torque stays off because `make_safe` or `close` was called.
-        withheld: Whether this is a dry run, which publishes nothing.
-        refused: Commands that a dry run did not publish.
     """
 
     def __init__(self, address: Address, drive: LegDrive, silence_s: float, max_silence_s: float) -> None:
         self.address, self.drive = address, drive
         self._clock: Clock = SYSTEM_CLOCK
-        self.armed = self.halted = self.withheld = False
-        self.refused = 0
+        self.armed = self.halted = False
         self._silence_s, self._max_silence_s = silence_s, max_silence_s
         self._damp = drive.damp()  # built here, as make_safe must not need any time
         self._session: _Session | None = None
@@ -84,7 +81,7 @@ class GuardedLegs:
     @property
     def counters(self) -> Counters:
         """Counts of states and commands since `open`."""
-        return Counters() if self._session is None else self._session.stream.counters(self._published, self.refused)
+        return Counters() if self._session is None else self._session.stream.counters(self._published)
 
     def open(self) -> None:
         """Connect, wait for states, and lay the robot down if its motors are on.
@@ -94,8 +91,8 @@ class GuardedLegs:
         """
         if self._session is not None:
             raise UsageError("the robot is open already", hint="close it first")
-        self.armed = self.halted = self.withheld = self._on = self._leaving = False
-        self._published = self.refused = 0
+        self.armed = self.halted = self._on = self._leaving = False
+        self._published = 0
         mark = f"sim2real {uuid.uuid4().hex[:8]} of process {os.getpid()}"
         robot = connect(self.address, mark)
         self._clock = robot.clock
@@ -131,8 +128,6 @@ class GuardedLegs:
         session = self.session
         if self.halted:
             raise SafetyStop("torque stays off: the legs have been made safe", hint="open the robot again")
-        if self.withheld:
-            return
         # The guardian watches before the first command.
         if self._guardian is None:
             self._guardian = session.robot.guardian(self.drive, self._silence_s, self.drive.lie_s + _SETTLE_S)
@@ -165,14 +160,11 @@ class GuardedLegs:
         """
         with self._commanding:
             begin_ns = self.clock.now_ns()
-            if self.halted or not (self.armed or self.withheld):
+            if self.halted or not self.armed:
                 raise SafetyStop("no command is sent: the torque is off", hint="enable it, or open the robot again")
-            if self.withheld:
-                self.refused += 1
-            else:
-                self.beat()
-                self.session.robot.write(message)
-                self._stop_if_halted()
+            self.beat()
+            self.session.robot.write(message)
+            self._stop_if_halted()
             self._published += 1
             return begin_ns, self.clock.now_ns() - begin_ns
 

@@ -82,10 +82,10 @@ class StateStream:
         times = begin_ns - called_ns, arrived_ns - begin_ns, retries, int(1e9 * late_s)
         return state, Transaction(arrived_ns, *times)
 
-    def counters(self, commands: int, withheld: int) -> Counters:
+    def counters(self, commands: int) -> Counters:
         """Return the counts, with those of the commands."""
         done = self._answered + commands
-        return Counters(done, self._lost, self._retries, self._late, np.array(self._late_s), withheld)
+        return Counters(done, self._lost, self._retries, self._late, np.array(self._late_s))
 
     def _is_next(self, state: LowState) -> bool:
         """Note a state; return whether it is intact and newer than the one before."""

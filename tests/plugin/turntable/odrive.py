@@ -91,9 +91,9 @@ class ODrive(Device):
         self._port, self._loop, self._baud_rate, self._silence_s = port, drive, baud_rate, silence_s
         self._line: Port | None = None
         self._lock = threading.Lock()
-        self._halted = self._withheld = self._on = False
+        self._halted = self._on = False
         self._speed = np.zeros(1)
-        self._answers = self._losses = self._late = self._kept = 0
+        self._answers = self._losses = self._late = 0
         self._late_s: list[float] = []
 
     # -- its description
@@ -138,14 +138,14 @@ class ODrive(Device):
     def counters(self) -> Counters:
         """What went over the line so far."""
         late_s = np.array(self._late_s)
-        return Counters(self._answers, self._losses, self._losses, self._late, late_s, self._kept)
+        return Counters(self._answers, self._losses, self._losses, self._late, late_s)
 
     # -- from open to close
 
     def open(self) -> None:
         """Open the port, find the board, take the torque off, and write the settings."""
         self._line = open_port(self._port, self._baud_rate)
-        self._halted = self._withheld = self._on = False
+        self._halted = self._on = False
         try:
             self.disable()
             self._tell("sc")  # errors of an earlier session
@@ -157,24 +157,11 @@ class ODrive(Device):
             self.close()
             raise
 
-    def withhold_torque(self) -> None:
-        """Move nothing from now on: neither "closed loop" nor a speed is sent."""
-        if self._on:
-            raise UsageError("torque is on: a dry run is decided before")
-        self._withheld = True
-
-    @property
-    def torque_withheld(self) -> bool:
-        """Whether no command can move the motor."""
-        return self._withheld
-
     def enable(self) -> None:
         """Switch the torque on at speed 0; from then on the board wants to be fed."""
         if self._halted:
             raise SafetyStop("the torque was taken off for good", hint="open the device again")
         self._require_no_error()
-        if self._withheld:
-            return
         self._on = True
         self._tell("v 0 0 0")  # feeds the watchdog too, which is not enabled before
         self._set(WATCHDOG, bool(self._silence_s))
@@ -199,9 +186,6 @@ class ODrive(Device):
             raise SafetyStop("the torque was taken off for good", hint="open the device again")
         if not np.isfinite(values).all() or np.abs(values).max() > self._loop.speed:
             raise SafetyStop(f"{values} rad/s is no speed that the board would take")
-        if self._withheld:
-            self._kept += 1
-            return self._ask("r axis0.controller.input_vel", 1)[1]  # takes as long, and moves nothing
         return self._tell(f"v 0 {values[0] / TURN:.6f} 0")
 
     def check(self) -> None:
