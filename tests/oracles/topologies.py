@@ -22,6 +22,14 @@ def loop(make):
     return by_name(a, b), "b"
 
 
+def pair(make):
+    """The smallest robot: a policy and its world."""
+    world, policy = make("world", 100, True), make("policy", 50, False, delay_dist=0.002)
+    policy.connect(world, skip=True, window=2)
+    world.connect(policy, skip=True, delay_dist=0.004)
+    return by_name(world, policy), "policy"
+
+
 def robot(make, world_hz=100, policy_hz=50, **agent):
     """World, sensor, policy and actuator, as on a robot."""
     sensor, policy, actuator = (

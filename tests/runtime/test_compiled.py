@@ -36,13 +36,19 @@ def compiled():
     return get
 
 
-def others_in_full(topologies_, *few):
-    """Return rows of a parametrisation: `make test` takes a few, and the dearer ones of the same claim are `full`."""
+FEW = (
+    topologies.loop,
+    topologies.robot,
+    topologies.unequal_rates,
+    topologies.policy_with_hiccups,
+    topologies.two_worlds,
+)
+"""Topologies of the gate: a loop, rates that do not divide, several steps in a row. Each program compiles for seconds."""
+
+
+def some_at_night(topologies_, *few):
+    """Return rows of a parametrisation; those not among the few run at night."""
     return [pytest.param(t, marks=() if t in few else pytest.mark.night, id=t.__name__) for t in topologies_]
-
-
-DEAR = (topologies.open_loop, topologies.random_one, topologies.two_in_five, topologies.slow_world)
-"""Their programs take longest to compile; the others have loops, bursts and several steps in a row, too."""
 
 
 def rolled(graph, eps, record=None, params=None):
@@ -58,7 +64,7 @@ def by_seq(record):
     return jax.tree.map(lambda x: np.asarray(x)[ran], record.output)
 
 
-@pytest.mark.parametrize("topology", others_in_full(topologies.ALL, *(t for t in topologies.ALL if t not in DEAR)))
+@pytest.mark.parametrize("topology", some_at_night(topologies.ALL, *FEW))
 def test_compiled_equals_simulated_bit_by_bit(topology, compiled):
     graph = compiled(topology)
     final, records = jax.jit(jax.vmap(lambda e: rolled(graph, e)))(np.arange(2))
@@ -81,7 +87,7 @@ GYM = [topologies.robot, topologies.unequal_rates, topologies.policy_with_hiccup
        topologies.slow_supervisor]  # fmt: skip
 
 
-@pytest.mark.parametrize("topology", others_in_full(GYM, topologies.robot, topologies.slow_supervisor))
+@pytest.mark.parametrize("topology", some_at_night(GYM, topologies.robot, topologies.slow_supervisor))
 def test_steps_show_what_the_supervisor_would_have_seen(topology, compiled):
     graph = compiled(topology)
     supervisor = graph.supervisor
@@ -107,7 +113,7 @@ def test_steps_show_what_the_supervisor_would_have_seen(topology, compiled):
 
 
 def test_a_caller_may_give_any_output(compiled):
-    graph = compiled(topologies.robot)
+    graph = compiled(topologies.pair)
     gs, ss = graph.reset(graph.init(KEY))
     for _ in range(2):
         gs, ss = jax.jit(graph.step)(gs, ss.replace(state=jnp.uint32(5)), Value(x=jnp.uint32(42)))
@@ -149,7 +155,7 @@ def equations(function, *arguments):
 
 def test_nothing_changes_behind_the_last_row(compiled):
     """Under ``jit`` where a state stands is not known before: an error cannot be raised, so it stays as it is."""
-    graph = compiled(topologies.robot)
+    graph = compiled(topologies.pair)
     roll = jax.jit(lambda s: graph.rollout(s, ("world", "policy")))
     end, _ = roll(graph.init(KEY, eps=1))
     after, records = roll(end)
@@ -184,7 +190,7 @@ def observes(graph, gs):
 
 @pytest.mark.parametrize(
     ("way", "topology"),
-    [(w, topologies.robot) for w in (rolls, rolls_in_parts, steps, observes)],
+    [(w, topologies.pair) for w in (rolls, rolls_in_parts, steps, observes)],
     ids=lambda x: x.__name__,
 )
 def test_an_episode_that_does_not_exist_has_no_steps(way, topology, compiled):
@@ -209,7 +215,7 @@ def equal(a, b):
 
 
 def test_a_rollout_in_parts_is_a_rollout(compiled):
-    graph = compiled(topologies.robot)
+    graph = compiled(topologies.pair)
     gs, first = graph.rollout(graph.init(KEY), ("world",), rows=5)
     gs, second = graph.rollout(gs, ("world",))
     whole = rolled(graph, 0, ("world",))[1]["world"].output.x
@@ -248,7 +254,7 @@ def test_a_leaf_of_size_zero(trainable):
 
 
 def test_errors_instead_of_silence(compiled):
-    graph = compiled(topologies.robot)
+    graph = compiled(topologies.pair)
     gs = graph.init(KEY)
     for call in (graph.step, lambda s: graph.advance(s, None, None), jax.jit(graph.step)):
         with pytest.raises(UsageError, match=r"step of the supervisor 'policy' awaits"):
