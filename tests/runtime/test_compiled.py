@@ -43,7 +43,7 @@ FEW = (
     topologies.policy_with_hiccups,
     topologies.two_worlds,
 )
-"""Topologies of the gate: a loop, rates that do not divide, several steps in a row. Each program compiles for seconds."""
+"""Of the gate: a loop, rates that do not divide, several steps in a row. Each program compiles for seconds."""
 
 
 def some_at_night(topologies_, *few):
@@ -259,17 +259,17 @@ def test_errors_instead_of_silence(compiled):
     for call in (graph.step, lambda s: graph.advance(s, None, None), jax.jit(graph.step)):
         with pytest.raises(UsageError, match=r"step of the supervisor 'policy' awaits"):
             call(gs)
-    awaiting, ss = graph.reset(gs)
+    awaiting, ss = jax.jit(graph.reset)(gs)
+    step = jax.jit(graph.step)
     for call in (graph.reset, graph.rollout, graph.observe):
         with pytest.raises(UsageError, match="was called while a step"):
             call(awaiting)
     with pytest.raises(UsageError, match="row 3 of"):
         graph.reset(gs.replace(step=jnp.int32(3)))
     for _ in range(graph.steps - 1):
-        awaiting, ss = jax.jit(graph.step)(awaiting, ss, Value(x=jnp.uint32(1)))
+        awaiting, ss = step(awaiting, ss, Value(x=jnp.uint32(1)))
     with pytest.raises(UsageError, match=f"timeline ends after step {graph.steps - 1} of the supervisor 'policy'"):
         graph.step(awaiting, ss, Value(x=jnp.uint32(1)))
-    step = jax.jit(graph.step)
     ended, ss = step(awaiting, ss, Value(x=jnp.uint32(1)))  # traced: it cannot be seen, but is marked
     assert int(ss.seq) == -1
     assert int(ended.step) == graph.rows

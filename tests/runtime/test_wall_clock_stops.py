@@ -555,17 +555,3 @@ def test_what_fails_on_the_way_out_becomes_a_note():
     assert reason.__notes__ == ["then: OSError: disk full"]
     with pytest.raises(KeyboardInterrupt), noted(reason):
         raise KeyboardInterrupt
-
-
-@pytest.mark.parametrize(
-    ("supervisor", "match"),
-    [
-        ("agent", "must be a node, not the name 'agent'. Nodes: sensor, agent"),
-        (["sensor", "agent"], "must be a node, not 2 nodes. Nodes: sensor, agent"),
-        (None, "must be a node, not a NoneType"),
-    ],
-)
-def test_the_supervisor_is_one_node(supervisor, match):
-    with pytest.raises(UsageError, match=match) as caught:
-        AsyncGraph(list(pair()), supervisor)
-    assert caught.value.hint
