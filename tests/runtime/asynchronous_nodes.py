@@ -1,12 +1,17 @@
-"""Nodes for the tests of AsyncGraph, and a way to draw random graphs of them."""
+"""Nodes for the tests of AsyncGraph, and what any record must fulfil."""
 
 import threading
 import time
 
+import jax
 import numpy as np
 from oracles.hash_nodes import Value
 
-from sim2real.graph import BaseNode, EmpiricalDist, Jitter, Scheduling
+from sim2real.graph import BaseNode, Timeline
+from sim2real.graph.episode import MemoryRecorder
+from sim2real.graph.schedule import rederive
+from sim2real.runtime.asynchronous import AsyncGraph
+from sim2real.runtime.clock import Clock
 
 
 class Plain(BaseNode):
@@ -63,36 +68,26 @@ def pair(cls=Plain, rate=100.0, **options):
     return sensor, agent
 
 
-def random_graph(seed: int, make, delays_of) -> list[BaseNode]:
-    """Return 3 to 5 nodes with random options; the last one is a fine supervisor.
-
-    ``make(name, rate, **options)`` returns a node, ``delays_of(rng, rate)`` delays of messages and steps [s].
-    """
-    rng = np.random.default_rng(seed)
-    nodes = []
-    for i in range(int(rng.integers(3, 6))):
-        rate = float(rng.choice([20, 30, 40, 50, 64, 100]))
-        scheduling = [Scheduling.FREQUENCY, Scheduling.PHASE][int(rng.integers(2))]
-        nodes.append(make(f"n{i}", rate, scheduling=scheduling, **delays_of(rng, rate)))
-    for i, reader in enumerate(nodes):
-        for j, sender in enumerate(nodes):
-            if i == j or rng.random() < 0.45:
-                continue
-            reader.connect(
-                sender,
-                blocking=bool(rng.random() < 0.4),
-                window=int(rng.integers(1, 4)),
-                skip=j > i or bool(rng.random() < 0.2),
-                jitter=[Jitter.LATEST, Jitter.BUFFER][int(rng.integers(2))],
-                **delays_of(rng, sender.rate),
-            )
-        if any(c.blocking for c in reader.inputs.values()):
-            reader.advance = bool(rng.random() < 0.5)
-    return nodes
+def simulate(nodes, supervisor, timeline, eps=0, seed=0):
+    """Return initial state and record of one episode on the simulated clock."""
+    recorder = MemoryRecorder()
+    graph = AsyncGraph(nodes, nodes[supervisor], Clock.SIMULATED, recorder=recorder, timeline=timeline)
+    initial = graph.init(jax.random.key(seed))
+    graph.start(initial.replace(eps=eps))
+    assert graph.wait(timeout_s=60)
+    graph.stop()
+    return initial, recorder.episode()
 
 
-def jittery(rng: np.random.Generator, rate: float) -> dict:
-    """Return delays that are often longer than expected, and sometimes longer than a period."""
-    scale = rng.uniform(0.05, 0.5) / rate
-    samples = rng.exponential(scale, 200).round(4)  # to 0.1 ms, so that ties happen
-    return {"delay_dist": EmpiricalDist(samples, block=1), "delay": round(float(scale), 4)}
+def assert_rules_explain(episode, nodes):
+    """The timeline that the rules derive from measured delays is the recorded one."""
+    recorded, derived = Timeline.from_episode(episode, nodes), rederive(episode, nodes)
+    for n, vertex in recorded.vertices.items():
+        for field in ("start", "end", "count"):
+            np.testing.assert_array_equal(getattr(derived.vertices[n], field), getattr(vertex, field), err_msg=n)
+    for (n, i), edge in recorded.edges.items():
+        sender = nodes[n].inputs[i].output_node.name
+        np.testing.assert_array_equal(episode.messages[n, i].seq_out, np.arange(len(episode.steps[sender])))
+        np.testing.assert_array_equal(episode.messages[n, i].sent, episode.steps[sender].end)
+        np.testing.assert_array_equal(derived.edges[n, i].received, edge.received, err_msg=f"{n}/{i}")
+        np.testing.assert_array_equal(derived.edges[n, i].seq_in, edge.seq_in, err_msg=f"{n}/{i}")

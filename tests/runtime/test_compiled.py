@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from asynchronous_nodes import simulate
 from jax.extend.core import jaxprs_in_params
 from oracles import topologies
 from oracles.hash_nodes import HashInPython, Value, hash_node, jax_hash_node
-from test_wiring import simulate
 
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, EmpiricalDist, Timeline, TrainableDist
