@@ -196,7 +196,9 @@ def _latest() -> Case:
         {("reader", "sender"): travel, ("skip=True", "sender"): travel, ("skip=True", "clock"): [5] * 4},
     )
     title = "Rule 6: a message that arrives exactly at the start is read, or with skip left to the next step"
-    return case(title, nodes, timeline.filter([n.name for n in nodes]))
+    shown = {n.name for n in nodes}
+    edges = {k: e for k, e in timeline.edges.items() if {k[0], e.sender} <= shown}
+    return case(title, nodes, Timeline({n: v for n, v in timeline.vertices.items() if n in shown}, edges))
 
 
 def _buffer() -> Case:

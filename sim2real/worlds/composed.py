@@ -19,6 +19,7 @@ from sim2real.composer.variation.variators import CONSTANTS
 from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseWorld
+from sim2real.worlds.recorded import command_delay
 from sim2real.worlds.rollouts import Start, StepLaw, WorldParams, check_steps
 
 if TYPE_CHECKING:
@@ -125,8 +126,7 @@ class ComposedWorld(BaseWorld):
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
         """Return the delay of commands in an episode [s]: `delay` in the parameters of their sender."""
         del rng
-        delay = getattr((graph_state or GraphState()).params.get(self.input_name), "delay", None)
-        return {} if delay is None else {self.input_name: delay}
+        return command_delay(graph_state, self.input_name)
 
     def output(self, state: State) -> PyTree:
         """Return the message of a state; default: the task's observation."""

@@ -274,6 +274,8 @@ def test_errors_instead_of_silence(compiled):
     assert int(ss.seq) == -1
     assert int(ended.step) == graph.rows
     assert equal(step(ended, ss, Value(x=jnp.uint32(2)))[0], ended)
+    with pytest.raises(UsageError, match="own timelines"):
+        graph.with_data(graph.data).reset(gs)
     for rows in (0, graph.rows + 1):
         with pytest.raises(UsageError, match="rows are left"):
             graph.rollout(gs, rows=rows)

@@ -79,6 +79,7 @@ class CompiledGraph:
             self._places[e, seq[e, at]] = at
         # Unrolling halves a GPU's copies of the carried state: 100,000 pendulums on an H200 take 0.63 of the time. On a
         # CPU it costs time to compile.
+        self._has_other_data = False
         self._rows_per_pass = 1 if jax.default_backend() == "cpu" else 2
 
     @property
@@ -89,6 +90,7 @@ class CompiledGraph:
     def with_data(self, data: PyTree) -> CompiledGraph:
         """Return a copy with other data, which may be traced; for ``rollout``, ``observe`` and ``advance``."""
         graph, (numbers, of_nodes) = copy.copy(self), data
+        graph._has_other_data = True
         graph.nodes = {n: with_data(node, of_nodes[n]) for n, node in self.nodes.items()}
         graph.program = self.program.with_data(graph.nodes, numbers)
         return graph
@@ -146,6 +148,7 @@ class CompiledGraph:
             The graph's state, whose ``seq`` has the number of the supervisor's next step; and its step state.
         """
         self._check_row_start(gs, "reset")
+        self._check_own_timelines("reset")
         gs = self.program.run_slots(gs, 0, self._first_turn(), {})
         arrived = self.program.seq(gs, self._turns[0]) >= 0
         return self._at_step(*self._play_on(gs, jnp.int32(0), arrived, int(self._places[:, 0].max())))
@@ -166,6 +169,7 @@ class CompiledGraph:
             UsageError: ``reset`` was not called, or the episode has no further step.
         """
         self._first_turn()
+        self._check_own_timelines("step")
         k = self._awaited(gs, "step")
         if not (_traced(k) or _traced(gs.eps)):
             last = int(self._counts()[int(gs.eps)]) - 1
@@ -365,6 +369,13 @@ class CompiledGraph:
             )
         self._check_episode(gs.eps)
         return gs.seq[self.supervisor]
+
+    def _check_own_timelines(self, call: str) -> None:
+        """Refuse other timelines as data: the longest gap between two steps is part of the program."""
+        if self._has_other_data:
+            raise UsageError(
+                f"{call}() plays the graph's own timelines, not other data", hint="use observe() and advance()"
+            )
 
     def _check_episode(self, eps: Number) -> None:
         if not _traced(eps) and not 0 <= int(eps) < self.episodes:
