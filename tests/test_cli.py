@@ -106,6 +106,7 @@ def test_every_command_has_help(capsys, command):
         (["validate", "--parameters", "run"], "write its value without --parameters"),
         (["validate", "--no-force", "--mjcf=robot.xml", "--log", "b.npz"], "unknown flag --mjcf. Available: --log,"),
         (["report", "no_such"], "Pipelines: "),
+        (["report", "--rerun", "pendulum"], "sim2real report pendulum --rerun"),
     ],
 )
 def test_wrong_commands_exit_2_and_name_what_there_is(capsys, calls, arguments, named):

@@ -24,6 +24,7 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.run.run_folder import Source
 from sim2real.artifacts.summary import ArtifactTable, Interval, Shown
 from sim2real.artifacts.timing import TIMING, Timing
+from sim2real.errors import Sim2RealError
 from sim2real.types import Json
 
 FORMAT = 3
@@ -745,6 +746,13 @@ class Identification(Shown):
         """
         path = Path(path)
         file = path / PARAMETERS if path.is_dir() else path
+        if file.is_file() and file.suffix != ".json":
+            raise Sim2RealError(
+                f"{file} is no identification, which is a {PARAMETERS} or the folder of an identify stage",
+                hint="a policy is no identification: sim2real deploy takes its bundle"
+                if file.suffix == ".onnx"
+                else "name runs/PIPELINE/TIME/identify",
+            )
         # Read the estimates, then the samples and the timing if their files exist.
         identification = read_versioned(file, Identification, _AGAIN, FORMAT)
         with malformed(file, _AGAIN):

@@ -11,7 +11,7 @@ from sim2real.commands import flags
 from sim2real.commands.stages import examples_of
 from sim2real.errors import UsageError
 from sim2real.stages.flag import Flag
-from sim2real.stages.live.config import WINDOW, check_view
+from sim2real.stages.live.config import WINDOW, is_viewer
 from sim2real.stages.pipeline.find_run import find_run
 from sim2real.stages.pipeline.pipeline import available
 
@@ -44,7 +44,11 @@ class ReportConfig:
 
     def __post_init__(self) -> None:
         """Check the flags against each other."""
-        check_view(self.rerun)
+        if self.rerun is not None and not is_viewer(self.rerun):
+            raise UsageError(
+                f"--rerun takes 'web', an address or FILE.rrd, got {self.rerun}",
+                hint=f"write the run first: sim2real report {self.rerun} --rerun",
+            )
         if len(self.targets) > 1 and self.rerun:
             raise UsageError("the viewer shows one run", hint="name one run, or leave out --rerun")
         if self.follow and (self.rerun is None or self.rerun.endswith(".rrd")):

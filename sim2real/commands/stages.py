@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, TypeVar
@@ -60,9 +61,7 @@ def check(command: str, arguments: list[str]) -> None:
     examples = examples_of(f"check {name} --log session.mcap", f"check {name} --plan --record.duration-s 60")
     config = flags.parse(default, rest, f"sim2real check {name}", description, examples)
     compilation_cache.enable()
-    from sim2real.stages.check import stage as check_stage  # imports JAX
-
-    _end(check_stage.run(pipeline, config))
+    _end(_imported("check").run(pipeline, config))
 
 
 def validate(command: str, arguments: list[str]) -> None:
@@ -77,9 +76,7 @@ def validate(command: str, arguments: list[str]) -> None:
     examples = examples_of("validate runs/NAME/TIME/identify --log b.mcap")
     config = flags.parse(default, arguments, f"sim2real {command}", description, examples)
     compilation_cache.enable()
-    from sim2real.stages.validate import stage as validate_stage  # imports JAX
-
-    _end(validate_stage.run(config))
+    _end(_imported("validate").run(config))
 
 
 def import_files(command: str, arguments: list[str]) -> None:
@@ -89,9 +86,7 @@ def import_files(command: str, arguments: list[str]) -> None:
     default = ImportConfig()
     examples = examples_of("import run.csv --mjcf robot.xml", "import DATASET --like so101", "info LOG")
     config = flags.parse(default, arguments, f"sim2real {command}", summary_of(default), examples)
-    from sim2real.stages.import_logs import stage as import_stage
-
-    import_stage.run(config)
+    _imported("import_logs").run(config)
 
 
 def run_stage(
@@ -107,8 +102,7 @@ def run_stage(
     """
     from sim2real.stages.terminal import console
 
-    module = importlib.import_module(f"sim2real.stages.{name}.stage")
-    folder: StageFolder | None = module.run(pipeline, config, runs, run_dir)
+    folder: StageFolder | None = _imported(name).run(pipeline, config, runs, run_dir)
     if folder is None:
         return None
     if folder.manifest["summary"]:
@@ -158,6 +152,14 @@ def summary_of(config: object) -> str:
 def examples_of(*commands: str) -> str:
     """Return the text below the flags in ``--help``: examples and exit codes."""
     return "\n".join(["examples", *(f"  sim2real {command}" for command in commands), "", EXIT_CODES])
+
+
+def _imported(stage: str) -> Any:
+    """Import a stage with JAX, which takes seconds; a terminal shows that they pass."""
+    from sim2real.stages.terminal import console
+
+    with console.progress(None, "loading") if sys.stderr.isatty() else nullcontext():
+        return importlib.import_module(f"sim2real.stages.{stage}.stage")
 
 
 def _end(good: bool) -> None:

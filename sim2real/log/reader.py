@@ -447,7 +447,10 @@ def _opened(path: str | Path) -> Iterator[mmap.mmap]:
         if len(magic) < len(MCAP0_MAGIC) and MCAP0_MAGIC.startswith(magic):
             raise _cut_before_session(path)
         if magic != MCAP0_MAGIC:
-            raise Sim2RealError(f"{path} is no MCAP file", hint="logs are recorded with `sim2real record`")
+            raise Sim2RealError(
+                f"{path} is no MCAP file",
+                hint="`sim2real record` writes logs, and `sim2real import` makes one of a file of another recorder",
+            )
         with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
             yield data
 

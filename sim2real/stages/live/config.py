@@ -16,13 +16,15 @@ def check_view(view: str | None) -> None:
     Raises:
         UsageError: It is neither ``window`` nor ``web``, an address or a file of Rerun.
     """
-    is_known = (
-        view is None or view == WINDOW or view.partition(":")[0] == "web" or "://" in view or view.endswith(".rrd")
-    )
-    if not is_known:
+    if view is not None and not is_viewer(view):
         raise UsageError(
             f"--view {view} is no viewer",
             hint="--view alone opens a window, --view web a page for browsers of this computer, --view web:0.0.0.0 one "
             "for the network; an address such as rerun+http://HOST:9876/proxy is a viewer elsewhere, and FILE.rrd a "
             "file",
         )
+
+
+def is_viewer(view: str) -> bool:
+    """Return whether a text names a viewer: ``window``, ``web``, an address, or a file of Rerun."""
+    return view == WINDOW or view.partition(":")[0] == "web" or "://" in view or view.endswith(".rrd")
