@@ -112,6 +112,8 @@ def _commands(definition: Pipeline) -> str:
         return f"none: {error.args[0]}"
     from sim2real.robots.robot import Robot  # imports JAX
 
+    if isinstance(robot, Robot) and getattr(robot, "motors", True) is None:  # legs without a device
+        return f"sim2real train {name}, sim2real play {name}"
     if isinstance(robot, Robot):
         return f"sim2real run {name}; record, identify, train, deploy one by one"
     return f"sim2real check {name} --log FILE; identify, validate, export (a robot without a task is not trained)"

@@ -101,7 +101,8 @@ def run(config: PlayConfig) -> "Walked":
             _write_picture(twin, walked.qpos, config.video)
         wrote(config.video)
     end = f"fell after {walked.fell_s:.1f} s" if walked.fell_s is not None else f"walked for {config.seconds:g} s"
-    note(f"{end}; off the command by {walked.error_m_s:.3f} m/s and {walked.error_rad_s:.3f} rad/s")
+    off = f"off the command by {walked.error_m_s:.3f} m/s and {walked.error_rad_s:.3f} rad/s"
+    note(f"{end}; {'too short to measure its error' if np.isnan(walked.error_m_s) else off}")
     return walked
 
 

@@ -179,5 +179,5 @@ def walk(
             break
     window = np.ones(round(0.4 * robot.rate_hz)) / round(0.4 * robot.rate_hz)
     error = np.stack([np.convolve(velocity[:, k] - wanted[:, k], window, "same") for k in range(3)], axis=-1)
-    error = error[settled] if settled.any() else np.zeros((1, 3))
+    error = error[settled] if settled.any() else np.full((1, 3), np.nan)  # too short to settle
     return Walked(fell_s, float(np.hypot(error[:, 0], error[:, 1]).mean()), float(np.abs(error[:, 2]).mean()), qpos)
