@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from sim2real.hardware.device import Reading
     from sim2real.hardware.dynamixel.device import DynamixelServos
     from sim2real.hardware.joint import Joint
+    from sim2real.hardware.safety.following import Following
     from sim2real.hardware.safety.gate import GateConfig
     from sim2real.hardware.safety.limits import GateLimits
 
@@ -181,6 +182,18 @@ class HingeModel(RobotModel):
     def params(self, values: Mapping[str, Any], start: EpisodeStart) -> PendulumParams:
         """Return the world's parameters for values and a start."""
         return from_groups(values, jnp.concatenate([jnp.asarray(x) for x in (start.position, start.velocity)]))
+
+    def following(self, values: Mapping[str, float]) -> Following:
+        """Return how the pendulum accelerates by its voltage."""
+        from sim2real.hardware.safety.following import Following
+
+        gain, gravity, damping, friction = (float(values[n]) for n in ("gain", "gravity", "damping", "friction"))
+
+        def push(th: np.ndarray, thdot: np.ndarray, volts: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            free = gravity * np.sin(th) - damping * thdot - friction * np.clip(thdot / 0.1, -1.0, 1.0)
+            return free, gain * volts, np.full_like(th, friction)
+
+        return Following(0.5, 0.3, source="the identified model", push=push)
 
     @property
     def export_lead_s(self) -> float:

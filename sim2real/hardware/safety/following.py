@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -21,6 +21,13 @@ _BEYOND_S: Final = 0.04
 """Time for which a joint must be beyond its limit before the robot is stopped [s]."""
 _SAMPLES: Final = 3
 """Number of samples in a row that must be beyond the limit."""
+_PARTS: Final = 10
+"""Parts of the time between two measurements for which the command is looked up."""
+_SLOW_RAD_S: Final = 0.5
+_ENOUGH: Final = 1.0
+"""Sum of the squares of a joint's changes of speed from which on they tell, against noise of 0.05 rad/s [rad^2/s^2]."""
+
+Push: TypeAlias = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -34,13 +41,19 @@ class Following:
     Torques, if ``most_nm`` is given: the load that a motor reports is weaker than the torque of its law
     ``tau + kp (q - position) + kd (dq - velocity)`` by at most ``limit``, on average over ``response_s``.
 
+    Pushes, if ``push`` is given: of the acceleration by its command a joint lacks at most the share ``limit``, in the
+    motion of the last ``response_s``.
+
     Attributes:
-        limit: Largest deviation, one value or one per joint [rad, or N m].
+        limit: Largest deviation, one value or one per joint [rad, N m, or 1].
         speed_rad_s: One value or one per joint.
         source: Where the figures come from, for messages.
         weight: Returns for positions ``(n,)`` by how much weight and dry friction move each joint off its goal, the
             lowest and the highest value [rad]; None: ``limit`` includes that.
         most_nm: Torque that each motor reaches, one value or one per joint; None: goals are compared.
+        push: Returns for positions, velocities and commands ``(n,)`` the acceleration of each joint without its
+            command, that by its command, and the largest one by dry friction [rad/s^2].
+        delay_s: Time from a command to the measurement that shows it, for pushes [s].
     """
 
     limit: float | Sequence[float] | np.ndarray
@@ -49,6 +62,13 @@ class Following:
     source: str = "the servos' own figures"
     weight: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
     most_nm: float | Sequence[float] | np.ndarray | None = None
+    push: Push | None = None
+    delay_s: float = 0.0
+
+    @property
+    def unit(self) -> str:
+        """Unit of `limit`."""
+        return "1" if self.push is not None else "rad" if self.most_nm is None else "N m"
 
 
 class FollowingCheck:
@@ -71,6 +91,8 @@ class FollowingCheck:
         self._position = np.array(self._low if following.most_nm is None else self._low[:, 0])
         self._t_s = t_s
         self._weak, self._law = np.zeros(n), np.zeros(n)
+        self._moved: list[tuple[float, np.ndarray, np.ndarray]] = []
+        self._velocity: np.ndarray | None = None
         # Since when each joint is beyond its limit, and for how many samples.
         self._since_s, self._count = np.zeros(n), np.zeros(n, np.int64)
 
@@ -90,9 +112,11 @@ class FollowingCheck:
             commands = self._commands
             while len(commands) > 1 and commands[1][0] <= t_s - self._following.response_s:
                 commands.pop(0)
-            recent = np.array([command for _, command in commands])
+            times, recent = np.array([sent_s for sent_s, _ in commands]), np.array([command for _, command in commands])
         elapsed_s, self._t_s = max(0.0, t_s - self._t_s), t_s
-        if self._following.most_nm is None:
+        if self._following.push is not None:
+            off = self._missing_push(times, recent, position_rad, velocity_rad_s, elapsed_s)
+        elif self._following.most_nm is None:
             off = self._distance(recent, position_rad, elapsed_s)
         else:
             off = self._weakness(recent[-1], position_rad, velocity_rad_s, load, elapsed_s)
@@ -130,9 +154,38 @@ class FollowingCheck:
         self._weak = self._weak + share * (np.abs(torque) - np.sign(torque) * load - self._weak)
         return np.maximum(self._weak, 0.0)
 
+    def _missing_push(
+        self,
+        times_s: np.ndarray,
+        commands: np.ndarray,
+        position_rad: np.ndarray,
+        velocity_rad_s: np.ndarray,
+        elapsed_s: float,
+    ) -> np.ndarray:
+        """Return which share of the acceleration by its commands each joint lacks."""
+        push, before, self._velocity = self._following.push, self._velocity, velocity_rad_s
+        if push is None or before is None or not elapsed_s > 0.0:
+            return np.zeros(len(position_rad))
+        # The change of speed since the last measurement, and the commands that acted meanwhile, on average.
+        ends_s = self._t_s - self._following.delay_s - elapsed_s * np.linspace(1.0, 0.0, _PARTS, endpoint=False)
+        acted = commands[np.maximum(np.searchsorted(times_s, ends_s, "right") - 1, 0)].mean(axis=0)
+        speed = 0.5 * (velocity_rad_s + before)
+        free, pushed, friction = push(position_rad - 0.5 * elapsed_s * speed, speed, acted)
+        # A joint that is slow may be held by its friction, unless it is pushed much harder.
+        moves = (np.abs(speed) > _SLOW_RAD_S) | (np.abs(free + pushed) > 3.0 * friction)
+        by_command = np.where(moves, elapsed_s * pushed, 0.0)
+        answer = velocity_rad_s - before - elapsed_s * free
+        self._moved.append((self._t_s, by_command**2, by_command * answer))
+        while self._moved[0][0] < self._t_s - self._following.response_s:
+            self._moved.pop(0)
+        squares, products = (np.sum([row[i] for row in self._moved], axis=0) for i in (1, 2))
+        return np.where(squares > _ENOUGH, 1.0 - products / np.maximum(squares, _ENOUGH), 0.0)
+
     def _stop(self, joint: int, position_rad: np.ndarray, load: np.ndarray, off: np.ndarray) -> SafetyStop:
         name, limit, source = self._name(joint), self._limit[joint], self._following.source
-        if self._following.most_nm is None:
+        if self._following.push is not None:
+            fault = f"{name} moves without {off[joint]:.0%} of its commands' push, {limit:.0%} are allowed ({source})"
+        elif self._following.most_nm is None:
             low, high = self._place[0][joint], self._place[1][joint]
             place = f"{low:.3g} rad" if high - low < 5e-3 else f"{low:.3g} to {high:.3g} rad"
             fault = (

@@ -361,7 +361,7 @@ class Rig:
             return following
         if np.all(np.isinf(limit)):
             return None
-        return following if following.most_nm is not None else replace(following, limit=limit, source="following_rad")
+        return replace(following, limit=limit, source="following_rad") if following.unit == "rad" else following
 
     def _begin_following(self) -> None:
         self._follow_check = None

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from sim2real.artifacts.bundle import Bundle
 from sim2real.artifacts.deployment import PROBE, Deployment, Scores, log_of
-from sim2real.artifacts.identification import Identification
+from sim2real.artifacts.identification import ROUND_TRIP, Identification
 from sim2real.artifacts.recording import TRUTH, Recording
 from sim2real.artifacts.run.run_folder import StageFolder, finished, open_stage
 from sim2real.errors import UsageError
+from sim2real.hardware.safety.following import Following
 from sim2real.installation import has_jax
 from sim2real.robots.robot import Robot
 from sim2real.stages.deploy.config import DeployConfig
@@ -62,7 +63,7 @@ def deploy(
 
     # Run the episodes on the robot.
     logs = [log_of(folder, i) for i in range(config.episodes)]
-    following = robot.model.following(identification.values) if identification is not None and has_jax() else None
+    following = None if identification is None else _following(robot, identification)
     summaries = run_episodes(pipeline, robot, bundle, config, logs, following)
     recordings = [Recording.load(log, folder / TRUTH) for log in logs]
     if config.dry_run:
@@ -133,6 +134,15 @@ def _robot(pipeline: Pipeline, config: DeployConfig, world: str | None = None) -
     if commanded is None:
         raise UsageError(f"pipeline {pipeline.name!r} follows no velocity", hint="run it without --command")
     return commanded(config.command)
+
+
+def _following(robot: Robot, identification: Identification) -> Following | None:
+    """Return how the robot follows its commands, by the identified model; None: the robot's computer has no model."""
+    following = robot.model.following(identification.values) if has_jax() else None
+    delays = [p.estimate for p in identification.parameters if p.name == ROUND_TRIP]
+    if following is None or following.push is None:
+        return following
+    return replace(following, delay_s=delays[0]) if delays else None
 
 
 def _identification(pipeline: Pipeline, run_dir: Path) -> Identification | None:

@@ -64,8 +64,9 @@ def announce_following(rig: Rig) -> None:
     if following is None:
         note("no motor is watched for letting go: how it follows its commands is not known, or following_rad is inf")
         return
-    unit, limit = "rad" if following.most_nm is None else "N m", np.max(following.limit)
-    note(f"a joint more than {limit:.2g} {unit} off its commands stops the robot, by {following.source}")
+    limit = np.max(following.limit)
+    most = f"{limit:.0%} of their push" if following.unit == "1" else f"{limit:.2g} {following.unit}"
+    note(f"a joint that is more than {most} off its commands stops the robot, by {following.source}")
 
 
 def rig_summary(rig: Rig) -> dict[str, Any]:
