@@ -99,10 +99,9 @@ def test_no_sound_deployment_is_stopped(arm, heaviest):
 
 
 @pytest.mark.night
-@pytest.mark.parametrize("heaviest", [0.0, 0.5, 1.0])
-def test_of_many_sound_deployments_none_is_stopped(arm, heaviest):
-    stopped = [sound(arm, seed, heaviest) for seed in range(100, 167)]
-    assert stopped == [[None, None]] * len(stopped)
+@pytest.mark.parametrize("seed", range(100, 200))
+def test_of_many_sound_deployments_none_is_stopped(arm, seed):
+    assert sound(arm, seed, (0.0, 0.5, 1.0)[seed % 3]) == [None, None]
 
 
 @pytest.mark.parametrize("kg", [0.0, 0.1])

@@ -178,7 +178,8 @@ class FollowingCheck:
         self._moved.append((self._t_s, by_command**2, by_command * answer))
         while self._moved[0][0] < self._t_s - self._following.response_s:
             self._moved.pop(0)
-        squares, products = (np.sum([row[i] for row in self._moved], axis=0) for i in (1, 2))
+        squares = np.sum([squared for _, squared, _ in self._moved], axis=0)
+        products = np.sum([product for _, _, product in self._moved], axis=0)
         return np.where(squares > _ENOUGH, 1.0 - products / np.maximum(squares, _ENOUGH), 0.0)
 
     def _stop(self, joint: int, position_rad: np.ndarray, load: np.ndarray, off: np.ndarray) -> SafetyStop:
