@@ -92,3 +92,22 @@ def test_a_damaged_record_still_has_one_message_a_step():
 def test_a_record_of_other_nodes_is_refused():
     with pytest.raises(UsageError, match=r"none of x\. Available: s, r"):
         Timeline.from_episode(record([]), {"x": BaseNode("x", 1)})
+
+
+def test_segments_start_at_0_with_steps_numbered_from_0():
+    timeline = draw(chain(), 1.0)
+    parts, firsts = timeline.cut([100_000, 305_000], 100_000)
+    assert parts.episodes == 2
+    assert (firsts["s"].tolist(), firsts["r"].tolist()) == ([5, 16], [5, 15])
+    assert parts.vertices["s"].start[0, :5].tolist() == [0, 20_000, 40_000, 60_000, 80_000]
+    assert parts.vertices["r"].start[1, 0] == 1_000
+    assert parts.edges["r", "s"].seq_in[0].tolist() == [0, 1, 2, 3, 4]
+    # The message of sensor step 15 was sent before the second segment: its reader's first step lacks it.
+    assert parts.edges["r", "s"].seq_in[1].tolist() == [1, 2, 3, 4, -1]
+
+
+def test_with_lead_the_first_step_of_a_segment_sees_what_came_before():
+    parts, firsts = draw(chain(), 1.0).cut([305_000], 100_000, {"s": 60_000})
+    assert (firsts["s"].tolist(), firsts["r"].tolist()) == ([13], [15])
+    assert parts.vertices["s"].start[0, 0] == -45_000
+    assert parts.edges["r", "s"].seq_in[0, :5].tolist() == [0, 0, 0, 1, 2]
