@@ -61,7 +61,7 @@ class Clock:
 
 
 DIES = """
-import os, signal, sys, time
+import os, signal, sys
 from pathlib import Path
 from sim2real.artifacts.run.run_folder import open_stage
 with open_stage(Path(sys.argv[1]), "pendulum", "train", None) as stage:
@@ -72,7 +72,7 @@ with open_stage(Path(sys.argv[1]), "pendulum", "train", None) as stage:
         os.close(write)
         os.read(read, 1)  # until the child is another program: before that, it holds all that its parent has open
     print(stage.folder, flush=True)
-    time.sleep(60)
+    signal.pause()
 """
 
 

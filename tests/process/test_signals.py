@@ -70,6 +70,55 @@ def test_a_signal_inside_a_finaliser_is_not_lost(tmp_path, number, code, by_coll
     assert "Traceback" not in err
 
 
+SLEEPER = """
+import sys, time
+from pathlib import Path
+from types import ModuleType
+from sim2real import cli
+from sim2real.artifacts.run import run_folder
+
+def run(pipeline, config, root, run_dir):
+    with run_folder.open_stage(root, pipeline.name, "record", config) as stage:
+        try:
+            print("started", flush=True)
+            for _ in range(300):  # a signal between the print and a sleep does not end that sleep
+                time.sleep(0.1)
+        finally:
+            print("torque off", flush=True)
+            time.sleep(0.3)
+            print("log closed", flush=True)
+
+module = ModuleType("sim2real.stages.record.stage")
+module.run = run
+sys.modules[module.__name__] = module
+sys.exit(cli.main(["record", "pendulum"]))
+"""
+
+
+def test_a_signal_unwinds_once_and_gives_its_code(tmp_path):
+    """Here the end of a terminal; Ctrl-C and SIGTERM end stages in test_stages.py."""
+    number, code = signal.SIGHUP, 129
+    process = subprocess.Popen(
+        [sys.executable, "-c", SLEEPER],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "started\n"
+    process.send_signal(number)
+    assert process.stdout.readline() == "torque off\n"
+    process.send_signal(number)  # the second one must not break off the clean-up
+    out, err = process.communicate()
+    assert process.returncode == code
+    assert out == "log closed\n"
+    assert "still cleaning up" in err
+    (manifest,) = tmp_path.glob("runs/pendulum/*/record/manifest.json")
+    manifest = json.loads(manifest.read_text())
+    assert (manifest["status"], manifest["exit_code"]) == ("interrupted", code)
+
+
 AT_WORK = """
 import sys, time
 from types import ModuleType
