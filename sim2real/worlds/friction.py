@@ -62,18 +62,6 @@ def dry(p: FrictionParams, velocity: Value, load: Value = 0.0) -> Value:
     return sum(terms, start=0.0)
 
 
-def smooth(velocity: Value, width_rad_s: float) -> jax.Array:
-    """Return a differentiable sign function of the velocity, for friction that is a smooth function of it.
-
-    With such a friction a loaded joint creeps, where a real one sticks; ``stopped`` does stick.
-
-    Args:
-        velocity: [rad/s].
-        width_rad_s: Speed at which the value reaches tanh(1) = 0.76 [rad/s].
-    """
-    return jnp.tanh(velocity / width_rad_s)
-
-
 def stopped(velocity: Value, most: Value) -> jax.Array:
     """Return the velocity after dry friction: its magnitude is reduced by ``most`` [rad/s], but not below 0.
 

@@ -1,4 +1,4 @@
-"""Parts of a servo model: position loop, duty limit, motor torque with back-EMF and saturation, gears with play."""
+"""Parts of a servo model: position loop, duty limit, motor torque with back-EMF and saturation."""
 
 from __future__ import annotations
 
@@ -40,14 +40,3 @@ def motor_torque(duty: Value, velocity: Value, stall: Value, back_emf: Value, so
     """
     linear = stall * duty - back_emf * velocity
     return linear / (1.0 + softness * jnp.abs(linear))
-
-
-def play(driver: Value, follower: Value, gap: Value) -> Value:
-    """Return the position of a part that is driven with play: it rests until the driver has crossed the gap.
-
-    Args:
-        driver: Position of the driving part [rad].
-        follower: Position of the driven part before [rad].
-        gap: Total play [rad].
-    """
-    return jnp.clip(follower, driver - 0.5 * gap, driver + 0.5 * gap)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim2real.worlds.servo import motor_torque, play, position_duty, saturated
+from sim2real.worlds.servo import motor_torque, position_duty, saturated
 
 COUNTS = 4096 / (2 * math.pi)
 FULL = 885
@@ -57,36 +57,3 @@ def test_without_softness_the_torque_is_linear(duty, velocity, stall, back_emf):
 def test_the_torque_nears_its_limit_and_ends_at_the_idle_speed():
     assert float(motor_torque(1.0, 0.0, 1e6, 0.05, 0.8)) == pytest.approx(1 / 0.8, rel=1e-4)
     assert float(motor_torque(1.0, 20.0, 1.0, 0.05, 0.8)) == pytest.approx(0.0, abs=1e-7)
-
-
-def loop(gap, amplitude=1.0):
-    """Drive a part through two turns of a sine; return driver and follower of the second."""
-    driver = amplitude * np.sin(np.linspace(0.0, 4 * np.pi, 2001))
-
-    def step(follower, d):
-        follower = play(d, follower, gap)
-        return follower, follower
-
-    _, follower = jax.lax.scan(step, jnp.float32(0.0), jnp.asarray(driver, jnp.float32))
-    return driver[1000:], np.asarray(follower)[1000:]
-
-
-@pytest.mark.parametrize("gap", [0.1, 0.6])
-def test_the_loop_of_play_is_as_wide_as_the_gap(gap):
-    driver, follower = loop(gap)
-    up, down = np.gradient(driver) > 0, np.gradient(driver) < 0
-    for level in (-0.4 * (1 - gap), 0.0, 0.4 * (1 - gap)):
-        crossings = []
-        for way in (up, down):
-            near = np.flatnonzero(way & (np.abs(follower - level) < 0.01) & (np.abs(np.gradient(follower)) > 1e-4))
-            crossings.append(np.interp(level, *(a[near][np.argsort(follower[near])] for a in (follower, driver))))
-        assert crossings[0] - crossings[1] == pytest.approx(gap, abs=1e-3)
-    assert np.ptp(follower) == pytest.approx(2.0 - gap, abs=1e-3)
-
-
-def test_within_the_gap_the_part_stays_and_without_one_it_follows():
-    driver, follower = loop(0.5, amplitude=0.24)
-    assert np.ptp(driver) > 0.4
-    assert set(follower) == {0.0}
-    driver, follower = loop(0.0)
-    np.testing.assert_allclose(follower, driver, atol=1e-6)
