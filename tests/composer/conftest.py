@@ -1,7 +1,6 @@
 """What the tests of the composer share: dm_control as the oracle, where it is installed."""
 
 import importlib
-import os
 from types import SimpleNamespace
 
 import pytest
@@ -27,13 +26,6 @@ def oracle():
         "variation": "dm_control.composer.variation",
     }
     return SimpleNamespace(**{key: importlib.import_module(name) for key, name in names.items()})
-
-
-@pytest.fixture(scope="session")
-def opengl():
-    """Skips tests of images unless they are asked for: without a display, dm_control ends the process."""
-    if os.environ.get("MUJOCO_GL") not in ("egl", "osmesa"):
-        pytest.skip("images without a display: MUJOCO_GL=egl, with a Mesa or a driver that has it")
 
 
 @pytest.fixture(scope="session")

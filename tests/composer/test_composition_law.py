@@ -136,10 +136,10 @@ def target_name(row):
 OF_BALLS = ("ballquat", "ballangvel", "orientation")
 
 
-def add(row, owner, target, name, prefix=None):
-    """Add an element to a model that names one of another model, as an element or by a text with a prefix."""
+def add(row, owner, target, name):
+    """Add an element to a model that names one of another model."""
     *path, attribute = row
-    named = target.find(target_kind(attribute), target_name(row)) if prefix is None else prefix + target_name(row)
+    named = target.find(target_kind(attribute), target_name(row))
 
     def own(kind):
         return owner.find(kind, "own")
@@ -159,7 +159,7 @@ def add(row, owner, target, name, prefix=None):
     tendon.add("site", site=own("site"))
 
 
-def world(lib, row, by_text=False):
+def world(lib, row):
     """Return four models of a world that have elements of the same names, and whose elements name one another's."""
     top = lib.from_xml_string(PART.replace('model="r"', 'model="w"'))
     left, right, inner = (lib.from_xml_string(PART) for _ in range(3))
@@ -169,33 +169,21 @@ def world(lib, row, by_text=False):
     left.find("site", "here").attach(inner)
     models = {"outer": top, "left": left, "right": right, "inner": inner}
     for i, (owner, target) in enumerate(RELATIONS):
-        add(row, models[owner], models[target], f"new_{i}", PREFIXES[target] if by_text and owner == "outer" else None)
+        add(row, models[owner], models[target], f"new_{i}")
     return models
 
 
 RELATIONS = [("outer", "inner"), ("inner", "outer"), ("left", "right"), ("right", "inner"), ("right", "right")]
-PREFIXES = {"outer": "", "left": "r/", "right": "r_1/", "inner": "r/r/"}
 
 
-def theirs_of(oracle, row, by_text=False):
+def theirs_of(oracle, row):
     """Return dm_control's models of a row; None where its table of MJCF is older than MuJoCo's."""
     try:
-        return world(oracle.mjcf, row, by_text)
+        return world(oracle.mjcf, row)
     except AttributeError as error:
         if "is not a valid" in str(error):
             return None
         raise
-
-
-def swap(models, row):
-    """Let what the element of a row names, and its namesake in all models, change their names."""
-    kind, name = target_kind(row[-1]), target_name(row)
-    for model in models.values():
-        one, other = model.find(kind, name), model.find(kind, "own")
-        one.name = "aside"
-        if other is not None:
-            other.name = name
-        one.name = "own"
 
 
 FEW = {row[1] + row[-1]: row for row in ROWS if "material" not in row[-1]}
@@ -213,23 +201,5 @@ def test_every_reference_across_models_is_that_of_dm_control(oracle, row):
     if other is None:
         return
     theirs = oracle.mjcf.Physics.from_mjcf_model(other["outer"]).model.ptr
-    assert names(model) == names(theirs)
-    assert not differing_arrays(model, theirs)
-
-
-@of_rows
-def test_references_by_text_stay_text_when_elements_swap_their_names(oracle, row):
-    mine, other = world(mjcf, row, by_text=True), theirs_of(oracle, row, by_text=True)
-    if other is None:
-        return
-    for models in (mine, other):
-        swap(models, row)
-    try:
-        theirs = oracle.mjcf.Physics.from_mjcf_model(other["outer"]).model.ptr
-    except ValueError:
-        with pytest.raises(ValueError, match="Error"):
-            mine["outer"].compile()
-        return
-    model = mine["outer"].compile()
     assert names(model) == names(theirs)
     assert not differing_arrays(model, theirs)
