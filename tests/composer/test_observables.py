@@ -4,8 +4,7 @@ import pytest
 
 from sim2real import composer
 from sim2real.composer import mjcf
-from sim2real.composer.observation.observable import Generic, MJCFCamera, MJCFFeature
-from sim2real.composer.observation.observable.base import AGGREGATORS
+from sim2real.composer.observation.observable import AGGREGATORS, Generic, MJCFCamera, MJCFFeature
 
 
 class Pair(composer.Observables):

@@ -28,7 +28,7 @@ NAMES = {
 }  # fmt: skip
 MODULES = [
     "arena", "define", "entity", "environment", "initializer", "robot", "task", "mjcf.element",
-    "observation.observable.base", "observation.observable.mjcf", "observation.updater",
+    "observation.observable.base", "observation.updater",
     *(f"variation.{name}" for name in (
         "base", "deterministic", "distributions", "noises", "variators",
     )),

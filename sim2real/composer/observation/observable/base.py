@@ -1,22 +1,25 @@
-"""What can be observed: a function of the physics, a MuJoCo array by name, a camera by name."""
+"""What can be observed: functions of the physics, attributes of elements, arrays by name, images of cameras."""
 
 from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_env import specs
 
+from sim2real.composer.mjcf.element import Element
 from sim2real.composer.physics.arrays import namespace
+from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from sim2real.composer.mjcf.element import Elements
     from sim2real.composer.physics.base import BasePhysics
-    from sim2real.composer.types import Aggregate, Array, Corrupt, RandomState, Steps
+    from sim2real.composer.types import Aggregate, Array, Corrupt, MjvOption, RandomState, Steps
     from sim2real.types import PyTree
 
 
@@ -130,19 +133,14 @@ class Generic(Observable):
 
     Args:
         raw_observation_callable: Takes the physics, returns a number or an array.
+        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
     """
 
     def __init__(
-        self,
-        raw_observation_callable: Callable[[PyTree], PyTree],
-        update_interval: Steps = 1,
-        buffer_size: Steps | None = None,
-        delay: Steps | None = None,
-        aggregator: str | Aggregate | None = None,
-        corruptor: Corrupt | None = None,
+        self, raw_observation_callable: Callable[[PyTree], PyTree], *sampling: PyTree, **options: PyTree
     ) -> None:
         self._raw_callable = raw_observation_callable
-        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
+        super().__init__(*sampling, **options)
 
     def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         return functools.partial(self._raw_callable, physics)
@@ -153,53 +151,150 @@ class MujocoFeature(Observable):
 
     Args:
         feature_name: Name or names of elements, or a callable that returns them.
+        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
     """
 
     def __init__(
         self,
         kind: str,
         feature_name: str | Sequence[str] | Callable[[], str | Sequence[str]],
-        update_interval: Steps = 1,
-        buffer_size: Steps | None = None,
-        delay: Steps | None = None,
-        aggregator: str | Aggregate | None = None,
-        corruptor: Corrupt | None = None,
+        *sampling: PyTree,
+        **options: PyTree,
     ) -> None:
         self._kind, self._feature_name = kind, feature_name
-        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
+        super().__init__(*sampling, **options)
 
     def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
         array, name = getattr(physics.named.data, self._kind), self._feature_name
         return lambda: array[name() if callable(name) else name]
 
 
-class MujocoCamera(Observable):
-    """The image of a camera, by name; uint8 ``(height, width, 3)``, or float32 ``(height, width, 1)`` [m] for depth."""
+class MJCFFeature(Observable):
+    """An attribute of an element, or of several of one kind, as ``physics.bind`` names it.
+
+    ``feature[index]`` observes a part of it.
+
+    Args:
+        kind: The attribute, such as ``qpos`` or ``xpos``.
+        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
+
+    Raises:
+        UsageError: When something given is no element.
+    """
+
+    def __init__(
+        self, kind: str, mjcf_element: Elements, *sampling: PyTree, index: PyTree = None, **options: PyTree
+    ) -> None:
+        elements: PyTree = mjcf_element
+        is_one = isinstance(elements, Element) or not isinstance(elements, Iterable)
+        for element in (elements,) if is_one else elements:
+            _check_element(element)
+        self._kind, self._element, self._index = kind, mjcf_element, index
+        super().__init__(*sampling, **options)
+
+    def _callable(self, physics: BasePhysics) -> Callable[[], PyTree]:
+        binding, kind, index = physics.bind(self._element), self._kind, self._index
+        if index is None:
+            return lambda: getattr(binding, kind)
+        index = np.asarray(index) if isinstance(index, list) else index
+        return lambda: getattr(binding, kind)[index]
+
+    def __getitem__(self, key: PyTree) -> MJCFFeature:
+        if self._index is not None:
+            raise NotImplementedError("slicing an already-sliced MJCFFeature observable is not supported")
+        sampling = (self.update_interval, self.buffer_size, self.delay, self.aggregator, self.corruptor)
+        return MJCFFeature(self._kind, self._element, *sampling, index=key)
+
+
+class _Image(Observable):
+    """An image: uint8 ``(height, width, 3)``, depth float32 ``(.., 1)`` [m] or segmentation int32 ``(.., 2)``."""
+
+    def _set_image(
+        self, height: int, width: int, depth: bool, segmentation: bool, scene_option: MjvOption | None
+    ) -> None:
+        if depth and segmentation:
+            raise UsageError("`segmentation` and `depth` cannot both be `True`.")
+        self.height, self.width, self._depth, self._segmentation = height, width, depth, segmentation
+        self.scene_option = scene_option
+
+    @property
+    def array_spec(self) -> specs.BoundedArray:
+        if self._depth:
+            channels, dtype, low, high = 1, np.float32, 0.0, np.inf
+        elif self._segmentation:
+            channels, dtype, low, high = 2, np.int32, -1, np.iinfo(np.int32).max
+        else:
+            channels, dtype, low, high = 3, np.uint8, 0, 255
+        return specs.BoundedArray((self.height, self.width, channels), dtype, minimum=low, maximum=high)
+
+    @abstractmethod
+    def _camera(self, physics: PyTree) -> str | int:
+        """Return the camera's name or number."""
+
+    def _callable(self, physics: PyTree) -> Callable[[], PyTree]:
+        kind = {"depth": self._depth, "segmentation": self._segmentation, "scene_option": self.scene_option}
+        size = (self.height, self.width)
+        return lambda: np.atleast_3d(physics.render(*size, self._camera(physics), **kind))
+
+
+class MujocoCamera(_Image):
+    """The image of a camera, by name.
+
+    Args:
+        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
+    """
 
     def __init__(
         self,
         camera_name: str,
         height: int = 240,
         width: int = 320,
-        update_interval: Steps = 1,
-        buffer_size: Steps | None = None,
-        delay: Steps | None = None,
-        aggregator: str | Aggregate | None = None,
-        corruptor: Corrupt | None = None,
+        *sampling: PyTree,
         depth: bool = False,
+        **options: PyTree,
     ) -> None:
-        self._camera_name, self.height, self.width, self._depth = camera_name, height, width, depth
-        super().__init__(update_interval, buffer_size, delay, aggregator, corruptor)
+        self._name = camera_name
+        self._set_image(height, width, depth, False, None)
+        super().__init__(*sampling, **options)
 
-    @property
-    def array_spec(self) -> specs.Array:
-        """Shape and dtype of the image."""
-        shape = (self.height, self.width, 1 if self._depth else 3)
-        return specs.Array(shape, np.float32 if self._depth else np.uint8)
+    def _camera(self, physics: PyTree) -> str:
+        return self._name
 
-    def _callable(self, physics: PyTree) -> Callable[[], PyTree]:
-        def image() -> np.ndarray:
-            pixels = physics.render(self.height, self.width, self._camera_name, depth=self._depth)
-            return np.atleast_3d(pixels)
 
-        return image
+class MJCFCamera(_Image):
+    """The image of a camera element.
+
+    Args:
+        *sampling: Options of ``Observable``, from ``update_interval`` to ``corruptor``; also by name.
+        segmentation: Numbers and types of objects instead of colours.
+        scene_option: The ``MjvOption`` of the image.
+
+    Raises:
+        UsageError: When the element is no camera, or depth and segmentation are both asked for.
+    """
+
+    def __init__(
+        self,
+        mjcf_element: Element,
+        height: int = 240,
+        width: int = 320,
+        *sampling: PyTree,
+        depth: bool = False,
+        segmentation: bool = False,
+        scene_option: MjvOption | None = None,
+        **options: PyTree,
+    ) -> None:
+        _check_element(mjcf_element)
+        if mjcf_element.kind != "camera":
+            raise UsageError(f"expected a <camera> element: got {mjcf_element}")
+        self._element = mjcf_element
+        self._set_image(height, width, depth, segmentation, scene_option)
+        super().__init__(*sampling, **options)
+
+    def _camera(self, physics: PyTree) -> int:
+        return physics.bind(self._element).element_id
+
+
+def _check_element(element: object) -> None:
+    if not isinstance(element, Element):
+        raise UsageError(f"expected an `mjcf.Element`, got type {type(element)}: {element}")

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from mujoco import mjx
 
 from sim2real.composer.mjcf.schema import mj
-from sim2real.composer.observation.observable.base import MujocoCamera, Observable
-from sim2real.composer.observation.observable.mjcf import MJCFCamera
+from sim2real.composer.observation.observable.base import MJCFCamera, MujocoCamera, Observable
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
