@@ -78,9 +78,9 @@ def test_features_are_indexed_once_and_want_elements():
     assert feature[[0, 2]](physics).tolist() == [-1, -3]
     with pytest.raises(NotImplementedError, match="already-sliced"):
         feature[0][0]
-    with pytest.raises(ValueError, match=r"expected an `mjcf\.Element`"):
+    with pytest.raises(ValueError, match="expected an element"):
         MJCFFeature("xpos", [geom, "g"])
-    with pytest.raises(ValueError, match=r"expected an `mjcf\.Element`, got type <class 'list'>"):
+    with pytest.raises(ValueError, match="expected a <camera>"):
         MJCFCamera([geom])
 
 

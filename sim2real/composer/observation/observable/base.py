@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from dm_env import specs
 
-from sim2real.composer.mjcf.element import Element
+from sim2real.composer.mjcf.element import Element, as_elements
 from sim2real.composer.physics.arrays import namespace
 from sim2real.errors import UsageError
 
@@ -185,10 +185,7 @@ class MJCFFeature(Observable):
     def __init__(
         self, kind: str, mjcf_element: Elements, *sampling: PyTree, index: PyTree = None, **options: PyTree
     ) -> None:
-        elements: PyTree = mjcf_element
-        is_one = isinstance(elements, Element) or not isinstance(elements, Iterable)
-        for element in (elements,) if is_one else elements:
-            _check_element(element)
+        as_elements(mjcf_element)  # refuses what is none
         self._kind, self._element, self._index = kind, mjcf_element, index
         super().__init__(*sampling, **options)
 
@@ -284,8 +281,7 @@ class MJCFCamera(_Image):
         scene_option: MjvOption | None = None,
         **options: PyTree,
     ) -> None:
-        _check_element(mjcf_element)
-        if mjcf_element.kind != "camera":
+        if not isinstance(mjcf_element, Element) or mjcf_element.kind != "camera":
             raise UsageError(f"expected a <camera> element: got {mjcf_element}")
         self._element = mjcf_element
         self._set_image(height, width, depth, segmentation, scene_option)
@@ -293,8 +289,3 @@ class MJCFCamera(_Image):
 
     def _camera(self, physics: PyTree) -> int:
         return physics.bind(self._element).element_id
-
-
-def _check_element(element: object) -> None:
-    if not isinstance(element, Element):
-        raise UsageError(f"expected an `mjcf.Element`, got type {type(element)}: {element}")
