@@ -42,7 +42,7 @@ class Fitted(NamedTuple):
 
 
 ENTRANTS = {
-    "ours": "sim2real identify with the pipeline's settings; sets without a pipeline with --mjcf and --log",
+    "ours": "sim2real identify with the pipeline's settings; sets without a pipeline as new describes them",
     "sysid": "mujoco.sysid with a user's terms: gain, damping, dry friction, inertia; no delay",
     "sysid_delay": "mujoco.sysid with a delay and our terms",
     "pace": "PACE's form: inertia, damping, friction, bias of each joint, a delay in steps; CMA-ES",

@@ -1,4 +1,4 @@
-"""Our identification of recordings: with the settings of a pipeline, or of ``--mjcf`` for a robot from a model."""
+"""Our identification of recordings: with the settings of a pipeline, or those of ``new`` for a robot from a model."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def _fit_pipeline(name: str, fold: Fold, data: Path, seed: int) -> Fit:
 
 
 def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
-    """Identify a robot from a model and logs, with the terms and the settings of `--mjcf`."""
+    """Identify a robot from a model and logs, with the terms and the settings of `new`."""
     # The logs have the gains only if the fitted recordings differ in them: a constant gain has no effect of its own.
     constants, gains = fold.fitted[0].constants, len({r.constants.get("duty_per_rad") for r in fold.fitted}) > 1
     with tempfile.TemporaryDirectory() as folder:
@@ -166,7 +166,7 @@ def _fit_described(name: str, fold: Fold, seed: int) -> Fit:
         columns = _free_run(case, identified.values, test, test_recordings)
         return [_at(case, columns, r, one, started=True) for r, one in enumerate(test_recordings)]
 
-    about = f"{len(identified.problem.table)} parameters of --mjcf, refined from the model's"
+    about = f"{len(identified.problem.table)} parameters of a robot from its model, refined from the model's"
     about += f"; terms {', '.join(identified.problem.table.terms) or 'none'}"
     return predict, f"{about}; engine {identified.problem.engine.name}"
 

@@ -1,6 +1,6 @@
 """Recordings of real motors, and the sets of the league: their parts that are held out in turn.
 
-A folder with a ``league.toml`` is a set without code. Its files are read as by ``identify --mjcf``:
+A folder with a ``league.toml`` is a set without code. Its files are read as by ``new``:
 
     mjcf = "robot.xml"
     fit = ["a.csv", "b.npz[0:0.6]"]     # the fitted files; [a:b]: a part, in shares of the file's samples
