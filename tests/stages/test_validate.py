@@ -53,13 +53,16 @@ def test_an_error_above_the_expected_one_is_named_and_fails(rows, changes, holds
     assert found.holds == holds
     assert named in found.verdict
     monkeypatch.setattr(stage.Identification, "load", lambda path: Identification("arm", (), Judgement("", ()), ()))
-    monkeypatch.setattr(stage, "load_pipeline", lambda name: None)
+    monkeypatch.setattr(stage, "load_pipeline", lambda name: load_pipeline("arm"))
     monkeypatch.setattr(stage, "open_recording", lambda *given: None)
     monkeypatch.setattr(stage, "score", lambda *given: found)
     for as_json in (False, True):
         assert stage.run(ValidateConfig(Path("run"), ("b.mcap",), json=as_json)) == holds
     out, err = capsys.readouterr()
-    assert f"verdict: {found.verdict}" in err
+    verdict, following, *_ = err.splitlines()
+    assert verdict == f"verdict: {found.verdict}"
+    assert ("sim2real identify arm --log b.mcap" in following) == bool(found.exceeded or found.beaten)
+    assert ("sim2real train arm" in following) == holds
     document = json.loads(out[out.index("{") :])
     assert document["holds"] == holds
     ratio = document["errors"][0]["ratio"]

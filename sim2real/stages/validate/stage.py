@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +30,14 @@ from sim2real.identify.problem.segments import Span, check_log, ranges
 from sim2real.identify.validation import prediction
 from sim2real.identify.validation.folds import moving
 from sim2real.identify.validation.verdict import ACCEPTED, Position, positions, scores
+from sim2real.robots.robot import Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline import python_arguments
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline, load_pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyIdentification, AnyRecording, AnyRobot
-from sim2real.stages.shared.identification import identified_robot, require_new, side_by_side, usable
-from sim2real.stages.terminal.console import artifact_table, note, progress
+from sim2real.stages.shared.identification import command, identified_robot, require_new, side_by_side, usable
+from sim2real.stages.terminal.console import artifact_table, note, progress, shown
 from sim2real.stages.validate.config import ValidateConfig
 from sim2real.types import Json
 
@@ -143,18 +146,35 @@ def run(config: ValidateConfig) -> bool:
         document = {**plain(found), "errors": rows, "verdict": found.verdict, "holds": found.holds}
         print(to_json(document).decode())
         return found.holds
-    table = found.rows()
-    print(artifact_table(ArtifactTable(table.headers, table.rows[:_SHOWN])))
-    if more := table.rows[_SHOWN:]:
-        note(f"and {len(more)} more rows with smaller ratios: --json has all")
+    note(f"verdict: {found.verdict}")
+    note(f"next: {_following(found, identification, pipeline, config)}")
+    print(artifact_table(found.rows(), _SHOWN))
     for log, joints in (found.resting or {}).items():
         note(f"{', '.join(joints)} does not move in {log}, which tests nothing about it")
     for log, reason in (found.refused or {}).items():
         note(f"not scored: {log}: {reason}")
     if found.identified != ACCEPTED:
         note(f"the identification itself was not accepted: {found.identified}")
-    note(f"verdict: {found.verdict}")
     return found.holds
+
+
+def _following(found: Validation, identification: Identification, pipeline: Pipeline, config: ValidateConfig) -> str:
+    """Return the next command, or what to do where none follows."""
+    folder = Path(config.parameters or "")
+    folder = folder if folder.is_dir() else folder.parent
+    if found.exceeded or found.beaten:
+        # An identification from all logs covers the motion of the new ones.
+        fitted = [os.path.relpath(folder.parent / source.path) for source in identification.logs]
+        logs = tuple(dict.fromkeys([*fitted, *config.log]))
+        again = command(pipeline, replace(pipeline.identify, log=logs), Path("runs"))
+        return f"if the robot is still the same, identify from all of these logs: {again}"
+    if found.identified != ACCEPTED:
+        return identification.verdict.next or "identify again: this identification was not accepted"
+    if found.refused:
+        return "mend the logs that were not scored, or leave them out"
+    if isinstance(pipeline.load(), Robot):
+        return f"sim2real train {pipeline.name} --run {shlex.quote(shown(folder.parent))}"
+    return f"sim2real export {shlex.quote(shown(folder))}"
 
 
 def validate(
