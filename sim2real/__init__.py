@@ -71,7 +71,7 @@ class _Package(ModuleType):
 
 
 class _CallablePackage(ModuleType):
-    """A package whose attributes are also attributes of its function: ``sim2real.identify.delays.links``."""
+    """A package whose attributes are also attributes of its function: ``sim2real.identify.delays``."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         super().__setattr__(name, value)

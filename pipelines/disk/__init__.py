@@ -8,7 +8,5 @@ PIPELINE = Pipeline(
     summary="recorded motor with an eccentric mass: identify friction, encoder and delay",
     package=__name__,
     # Windows of a second determine the delay, longer ones the friction; a kinked loss needs its kinks averaged out.
-    identify=IdentifyConfig(
-        settle_s=0.3, horizon_s=2.0, long_s=5.0, jacobian="finite", free_run_s=130.0, population=24, generations=40
-    ),
+    identify=IdentifyConfig(settle_s=0.3, horizon_s=2.0, long_s=5.0, free_run_s=130.0, population=24, generations=40),
 )

@@ -18,7 +18,6 @@ PIPELINE = Pipeline(
         initial_state="measured",
         skip_s=0.3,
         spacing_s=4.0,
-        jacobian="finite",
         population=24,
         generations=12,
         refine_steps=10,

@@ -13,7 +13,6 @@ PIPELINE = Pipeline(
         settle_s=0.0,
         horizon_s=8.0,
         generations=0,
-        jacobian="finite",
         max_delay_s=0.03,
         free_run_s=130.0,
     ),

@@ -15,7 +15,6 @@ PIPELINE = Pipeline(
         horizon_s=0.6,
         spacing_s=0.3,
         generations=0,
-        jacobian="finite",
         difference=0.03,
         max_delay_s=0.01,
         reach=1.0,

@@ -518,8 +518,6 @@ class Link:
         deviation: Standard deviation of this link's delay alone [s].
         p95: 95th percentile of the sum [s].
         lost: Share of lost messages: their reader uses the previous message again.
-        burst: Mean number of lost messages in a row; None without losses.
-        drift: Rate of the stamps' clock relative to the commands' clock, minus 1 [s/s].
         delays: Shape ``(K,)``: values of the sum [s].
         share: Shape ``(K,)``: share of the messages with each of these values.
     """
@@ -530,8 +528,6 @@ class Link:
     deviation: Ranged
     p95: Ranged
     lost: Ranged
-    burst: Ranged
-    drift: Ranged
     delays: np.ndarray
     share: np.ndarray
 
@@ -543,8 +539,6 @@ class Link:
             (f"{total}, 95 % of the messages", self.p95, 1e3, "ms"),
             (f"{name}, deviation", self.deviation, 1e3, "ms"),
             (f"{name}, lost", self.lost, 100.0, "%"),
-            (f"{name}, lost in a row", self.burst, 1.0, ""),
-            (f"{name}, drift of the clock", self.drift, 1e6, "us/s"),
         ]
         rows = [
             [label, factor * r.value, Interval(_scaled(r.low95, factor), _scaled(r.high95, factor)), unit]
@@ -589,7 +583,7 @@ class Identification(Shown):
         samples: Columns of the segments ``(N,)``: ``t``, ``into`` (since the segment's start) [s], ``segment``,
             ``recording``, ``held_out``, and ``FIELD_measured`` and ``FIELD_MODEL`` of each field.
         free: The same columns of the free runs; empty without free runs.
-        replays: Initial states and commands of held-out segments and free runs; see ``identify.validation.replays``.
+        replays: Initial states and commands of held-out segments and free runs; see ``identify.predictions.replays``.
         timing: Timing of the first recording, from which training draws its delays; None if only the estimates exist.
     """
 

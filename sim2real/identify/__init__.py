@@ -5,11 +5,10 @@
     import numpy as np
 
     import sim2real
+    from sim2real.identify import predictions, uncertainty, verdict
     from sim2real.identify.config import FitConfig
     from sim2real.identify.fit import fit
-    from sim2real.identify.problem.segments import Span
-    from sim2real.identify.uncertainty import identifiability, uncertainty
-    from sim2real.identify.validation import prediction, verdict
+    from sim2real.identify.segments import Span
 
     LENGTH_S, SETTLE_S, HORIZON_S = 1.3, 0.3, 1.0
 
@@ -28,24 +27,24 @@
 
     # Linearise the residuals at the estimate: intervals follow from the derivatives, and which parameters the log
     # determines.
-    at = uncertainty.linearise(estimate.problem, estimate.z)  # 5
+    at = estimate.problem.linearise(estimate.x)  # 5
     spread = uncertainty.from_linearised(estimate.problem, at)  # 6
-    determined = identifiability.from_linearised(estimate.problem, at)  # 7
+    determined = uncertainty.determined(estimate.problem, at)  # 7
 
     # Predict the held-out segments: SETTLE_S of each give its initial state, HORIZON_S are compared.
     models = {"identified": estimate.values, "nominal": {p.name: p.nominal for p in model.parameters}}
-    columns = prediction.samples(estimate.windows, models, SETTLE_S)  # 8
-    errors = prediction.errors(estimate.windows, columns, list(models), SETTLE_S, [HORIZON_S])
+    columns = predictions.samples(estimate.windows, models, SETTLE_S)  # 8
+    errors = predictions.errors(estimate.windows, columns, list(models), SETTLE_S, [HORIZON_S])
 
     # Judge: the estimate must predict every position better than every baseline, within its bounds.
-    scores = verdict.scores(errors, verdict.positions(model, robot.units))  # 9
+    scores = verdict.scores(errors, predictions.positions(model, robot.units))  # 9
     left = None if estimate.converged else estimate.left
     judgement = verdict.judge(scores, estimate.problem.table, at.x, spread, determined, left=left)  # 10
     for line in (judgement.status, *judgement.reasons):
         print(line)
 
-Packages: ``problem`` (segments, residuals, programs), ``search`` (evolution strategy, least squares), ``uncertainty``
-(intervals, posterior), ``validation`` (held-out parts, verdict), ``delays`` (links), ``drift``, ``export``.
+In the order of the data: ``segments``, ``rollouts``, ``residuals``, ``problem``, ``search``, ``fit``, ``uncertainty``,
+``predictions``, ``held_out``, ``terms``, ``expected``, ``verdict``; beside it ``delays``, ``drift``, ``export``.
 """
 
 from typing import TYPE_CHECKING
@@ -53,7 +52,7 @@ from typing import TYPE_CHECKING
 from sim2real import callable_package
 
 if TYPE_CHECKING:
-    from sim2real.identify.search.minimum import minimise as minimise
+    from sim2real.identify.search import minimise as minimise
 
 __all__ = ["minimise"]
 
@@ -63,7 +62,7 @@ callable_package(__name__)
 def __getattr__(name: str) -> object:
     """Import a public function on first use."""
     if name in __all__:
-        from sim2real.identify.search import minimum
+        from sim2real.identify import search
 
-        return getattr(minimum, name)
+        return getattr(search, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

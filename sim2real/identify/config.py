@@ -37,11 +37,8 @@ class FitConfig:
     goals of positions are commanded, as errors of a force add up in a free run, else 0."""
     engine: Literal["auto", "c", "compiled"] = "auto"
     """Simulator: C MuJoCo or the compiled graph; 'auto' takes C if the world is MuJoCo's."""
-    jacobian: Literal["auto", "forward", "finite"] = "auto"
-    """Derivatives: forward mode or finite differences; 'auto' takes the latter if a node has no derivative."""
-    difference: float = 3e-3
-    """Step of finite differences; 1 is about a quarter of the bounds' width. Large steps smooth the kinks of
-    friction."""
+    difference: float = 1e-3
+    """Step of finite differences, as a share of the bounds' width. Large steps smooth the kinks of friction."""
     seed: int = 0
     """Seed of the search."""
 
@@ -56,8 +53,8 @@ class FitConfig:
             )
         if self.generations == 0 and self.refine_steps == 0:
             raise UsageError("generations and refine_steps are both 0: no parameter would be identified")
-        if not 1e-4 <= self.difference <= 1.0:
-            raise UsageError(f"difference must lie in [0.0001, 1], got {self.difference}")
+        if not 1e-5 <= self.difference <= 0.2:
+            raise UsageError(f"difference must lie in [0.00001, 0.2], got {self.difference}")
         if not (self.reach > 0.0 and self.std > 0.0):
             raise UsageError(f"reach and std must be above 0, got {self.reach} and {self.std}")
         if not 0.0 <= self.skip_s <= 10.0:

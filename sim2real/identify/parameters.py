@@ -1,4 +1,4 @@
-"""Parameters as data: names, units, bounds, priors, and the map from an unbounded vector to values in bounds."""
+"""Parameters as data: names, units, bounds, priors, and the map from points on their scales to values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from sim2real.artifacts.posterior import TRANSFORMS, Posterior, Transform, from_scale
 from sim2real.errors import UsageError
 from sim2real.identify.parameter_paths import set_leaf
-from sim2real.installation import has_jax
 from sim2real.later import jax, jnp
 from sim2real.types import Array, PyTree
 
@@ -133,10 +132,7 @@ class Column:
 
 
 class ParameterTable:
-    """Parameters in a fixed order, and the map from an unbounded vector ``z`` of the free ones to values.
-
-    A logistic function on each parameter's scale keeps values within their bounds, as evosax does not clip.
-    """
+    """Parameters in a fixed order, and the map from points of the free ones, each on its own scale, to values."""
 
     def __init__(self, parameters: Iterable[Parameter], recordings: int = 1) -> None:
         self.parameters = tuple(parameters)
@@ -263,27 +259,29 @@ class ParameterTable:
         """Return which of ``terms`` are limits, ``(T,)``, bool."""
         return np.array([any(p.limits for p in self if p.term == name) for name in self.terms], bool)
 
-    def decode(self, z: Array, present: Array | None = None) -> dict[str, jax.Array]:
-        """Map an unbounded vector ``(P,)`` to values by name, ``(recordings,)`` if each has its own; traceable.
+    def decode(self, x: np.ndarray, present: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """Return values by name at points on the parameters' scales ``(..., P)``, leaves ``(...)``.
+
+        A parameter that each recording has its own value of has leaves ``(..., recordings)``.
 
         Args:
             present: Shape ``(P,)``, bool: others have their values in a model without them; default: all are kept.
         """
-        x = self._low + (self._high - self._low) * (jax.nn.sigmoid(z) if has_jax() else 1.0 / (1.0 + np.exp(-z)))
-        columns: dict[str, list[jax.Array]] = {}
+        x = np.asarray(x, np.float64)
+        columns: dict[str, list[np.ndarray]] = {}
         for i, c in enumerate(self.columns):
-            p, value = c.parameter, from_scale(c.parameter.transform, x[..., i], jnp)
-            if present is not None:
-                value = jnp.where(present[i], value, p.without)
-            columns.setdefault(p.name, []).append(value)
+            value = from_scale(c.parameter.transform, x[..., i])
+            if present is not None and not present[i]:
+                value = np.full_like(value, c.parameter.without)
+            columns.setdefault(c.parameter.name, []).append(value)
         # Add the fixed parameters, and stack those that each recording has its own value of.
         values, copies = {}, x.shape[:-1]
         for p in self.parameters:
             column = columns.get(p.name)
             if column is None:
-                values[p.name] = jnp.full(self.recordings if p.per_recording else copies, p.nominal, jnp.float32)
+                values[p.name] = np.full((*copies, self.recordings) if p.per_recording else copies, p.nominal)
             else:
-                values[p.name] = jnp.stack(column) if p.per_recording else column[0]
+                values[p.name] = np.stack(column, axis=-1) if p.per_recording else column[0]
         return values
 
     def of_recording(self, values: Mapping[str, Array], recording: Array | int) -> dict[str, Array]:
@@ -301,32 +299,30 @@ class ParameterTable:
         return tree
 
     def encode(self, values: Mapping[str, ArrayLike]) -> np.ndarray:
-        """Map values to the unbounded vector ``(P,)``; values at or outside a bound map to a point just inside."""
+        """Return the point ``(P,)`` on the parameters' scales of values by name, within the bounds."""
         arrays = [np.ravel(np.asarray(values[c.parameter.name], np.float64)) for c in self.columns]
         at = [v[min(c.recording or 0, v.size - 1)] for v, c in zip(arrays, self.columns, strict=True)]
         inside = [min(max(v, c.parameter.low), c.parameter.high) for v, c in zip(at, self.columns, strict=True)]
-        x = np.array([c.parameter.to_scale(v) for v, c in zip(inside, self.columns, strict=True)])
-        return self.at_scale(x)
+        return self.within(np.array([c.parameter.to_scale(v) for v, c in zip(inside, self.columns, strict=True)]))
 
-    def at_scale(self, x: np.ndarray) -> np.ndarray:
-        """Return the unbounded vector ``(P,)`` for a point on the parameters' scales, just inside their bounds."""
-        share = np.clip((x - self._low) / self.span, 1e-3, 1 - 1e-3)
-        return np.log(share / (1 - share))
+    def within(self, x: np.ndarray) -> np.ndarray:
+        """Return points on the parameters' scales ``(..., P)``, clipped to the bounds."""
+        return np.clip(x, self._low, self._high)
 
-    def posterior(self, z: np.ndarray, covariance: np.ndarray) -> Posterior:
+    def posterior(self, x: np.ndarray, covariance: np.ndarray) -> Posterior:
         """Return the distribution from which training draws.
 
         Args:
-            z: Shape ``(P,)``: the estimate.
+            x: Shape ``(P,)``: the estimate, on the parameters' scales.
             covariance: Shape ``(P, P)``, on the parameters' scales.
         """
         transform: tuple[Transform, ...] = tuple(c.parameter.transform for c in self.columns)
-        return Posterior(self.names, transform, self.scale(z)[0], covariance, self.low, self.high)
+        return Posterior(self.names, transform, np.asarray(x), covariance, self.low, self.high)
 
     def start(self, share: float = 0.25) -> np.ndarray:
-        """Return the start of a search, ``(P,)``: each parameter at its ``begin``, delays at a share of their interval.
+        """Return the start of a fit, ``(P,)``: each parameter at its ``begin``, delays at a share of their interval.
 
-        Starts at a lower bound are moved up, as the map to values is flat there.
+        A friction of 0 begins above it: a joint that never sticks does not show how it would.
         """
         at = lambda p, share: p.low + share * (p.high - p.low)  # noqa: E731
         begins = {p.name: p.nominal if p.begin is None else p.begin for p in self.parameters}
@@ -342,37 +338,18 @@ class ParameterTable:
         delayed = any(c.parameter.kind == "delay" and c.parameter.begin is None for c in self.columns)
         return np.stack([self.start(share) for share in ((0.25, 0.75) if delayed else (0.25,))])
 
-    def prior_residuals(self, z: Array) -> jax.Array:
-        """Return ``(K,)`` residuals whose half sum of squares is the negative log prior, up to a constant."""
-        x = self.decode(z)
-        residuals = []
-        for c in self.columns:
-            prior = c.parameter.prior
-            if prior is None:
-                continue
-            value = x[c.parameter.name] if c.recording is None else x[c.parameter.name][c.recording]
-            # A Normal prior has an exact residual; other priors have the root of the drop of their log density.
-            if type(prior).__name__ == "Normal":  # exact; the square root below has no derivative at the mode
-                residuals.append((value - prior.loc) / prior.scale)
-            else:
-                mode = jnp.float32(prior.mode())
-                off = value - mode
-                # The square root of the drop from the mode has no derivative at the mode: there the curvature is used.
-                curvature = -jax.grad(jax.grad(lambda v, d=prior: jnp.sum(d.log_prob(v))))(mode)
-                near = (curvature > 0.0) & (off**2 * curvature < 1e-4)
-                drop = jnp.maximum(prior.log_prob(mode) - prior.log_prob(value), 0.0)
-                far = jnp.sign(off) * jnp.sqrt(2.0 * jnp.where(near, 1.0, drop) + 1e-12)
-                residuals.append(jnp.where(near, off * jnp.sqrt(jnp.where(near, curvature, 1.0)), far))
-        return jnp.stack(residuals) if residuals else jnp.zeros(0)
+    def nominal(self) -> np.ndarray:
+        """Return the nominal values, ``(P,)``, on the parameters' scales."""
+        return self.encode({p.name: p.nominal for p in self.parameters})
 
-    def scale(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return each parameter on its own scale and d scale / d z; both ``(P,)``."""
-        share = 1.0 / (1.0 + np.exp(-np.asarray(z, np.float64)))
-        return self._low + self.span * share, self.span * share * (1 - share)
+    def prior_residuals(self, x: np.ndarray) -> np.ndarray:
+        """Return residuals ``(Q,)`` at ``x (P,)`` whose half sum of squares is minus the log prior, but a constant."""
+        with_prior = [(i, c) for i, c in enumerate(self.columns) if c.parameter.prior is not None]
+        return np.array([_prior_residual(c.parameter.prior, c.parameter.from_scale(x[i])) for i, c in with_prior])
 
     def unscale(self, x: np.ndarray) -> np.ndarray:
         """Return values for points on the parameters' scales ``(..., P)``, clipped to the bounds."""
-        inside = np.clip(x, self._low, self._high)
+        inside = self.within(x)
         values = [from_scale(c.parameter.transform, inside[..., i]) for i, c in enumerate(self.columns)]
         return np.stack(values, axis=-1)
 
@@ -395,6 +372,20 @@ class ParameterTable:
     def span(self) -> np.ndarray:
         """Width of the bounds on the parameters' scales, ``(P,)``."""
         return self._high - self._low
+
+
+def _prior_residual(prior: Any, value: float) -> float:
+    """Return the residual of a distrax distribution: exact for a Normal, else the root of the drop from the mode."""
+    if type(prior).__name__ == "Normal":
+        return float((value - prior.loc) / prior.scale)
+    mode = float(np.asarray(prior.mode()))
+    off = value - mode
+    # Close to the mode the drop is lost in rounding, and the curvature is used.
+    curvature = -float(jax.grad(jax.grad(lambda v: jnp.sum(prior.log_prob(v))))(jnp.float32(mode)))
+    if curvature > 0.0 and off**2 * curvature < 1e-4:
+        return float(off * np.sqrt(curvature))
+    drop = float(np.sum(np.asarray(prior.log_prob(jnp.float32(mode)) - prior.log_prob(jnp.float32(value)))))
+    return float(np.sign(off) * np.sqrt(2.0 * max(drop, 0.0)))
 
 
 def _has_mode(prior: Any) -> bool:

@@ -11,7 +11,6 @@ MODEL_IDENTIFY = IdentifyConfig(
     settle_s=0.0,
     horizon_s=1.0,
     generations=0,
-    jacobian="finite",
     max_delay_s=0.05,
     long_s=None,
 )

@@ -362,8 +362,6 @@ def _draw_link(axes: Axes, link: Link) -> None:
     axes.axvline(1e3 * as_number(link.mean.value), color=INK, lw=1.0)
     axes.axvline(1e3 * as_number(link.p95.value), color=INK, lw=1.0, ls="--")
     lost = "" if link.lost.value is None else f"; {100.0 * link.lost.value:.2g} % lost"
-    if lost and link.burst.value is not None:
-        lost += f", {link.burst.value:.2g} in a row"
     axes.set_title(f"{' + '.join(link.parts)}{lost}", fontsize="small")
     axes.set(xlabel="delay [ms]", ylabel="% of messages", ylim=(0.0, None))
 

@@ -35,7 +35,7 @@ IMPORTS = {
     "from rex.base import GraphState, StepState": "from sim2real.graph import GraphState, StepState",
     "from rex.node import BaseNode": "from sim2real.graph import BaseNode",
     "from rex.node import BaseWorld": "from sim2real.graph import BaseWorld",
-    "from rex.jax_utils import tree_dynamic_slice": "from sim2real.identify.search.pytrees import tree_dynamic_slice",
+    "from rex.jax_utils import tree_dynamic_slice": "from sim2real.graph.slicing import tree_dynamic_slice",
     "from rex.ppo import Policy": "from sim2real import Policy",
 }
 RATE_HZ, DURATION_S = 50.0, 3.0

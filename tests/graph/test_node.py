@@ -7,7 +7,7 @@ import pytest
 import sim2real.graph as base
 from sim2real.errors import UsageError
 from sim2real.graph import BaseNode, BaseWorld, Jitter, Scheduling
-from sim2real.identify.search.pytrees import strong, tree_dynamic_slice
+from sim2real.graph.slicing import strong, tree_dynamic_slice
 
 
 @pytest.mark.parametrize("rate", [0, -1, float("nan"), float("inf"), None, "10"])

@@ -2,22 +2,21 @@
 
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import run_search
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.uncertainty.uncertainty import uncertainty
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
+from sim2real.identify.uncertainty import from_linearised
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 SENSOR_DELAY_S, ACTUATOR_DELAY_S, MAX_DELAY_S = 0.0207, 0.0253, 0.06
-LEAD_S = 0.00025
+LEAD_S = 0.00005
 """Half a time step of the plant: MuJoCo moves a joint as if forces had acted that earlier, see ``DrivenWorld``."""
 DURATION_S, RATE_HZ, SEGMENT_S = 20.0, 50.0, 1.3
 
@@ -76,15 +75,15 @@ def fitted():
     episode, truth = synthetic_log(np.random.default_rng(0))
     problem = make_problem(episode)
     found = run_search(problem, problem.table.start())
-    values = {n: float(v) for n, v in problem.table.decode(jnp.asarray(found.z)).items()}
+    values = {n: float(v) for n, v in problem.table.decode(found.x).items()}
     return SimpleNamespace(
         episode=episode,
         truth={**truth, "sensor_delay": SENSOR_DELAY_S, "actuator_delay": ACTUATOR_DELAY_S - LEAD_S},
         problem=problem,
         found=found,
         values=values,
-        spread=uncertainty(problem, found.z),
-        loss=lambda z: float(problem.losses(z[None], z)[0]),
+        spread=from_linearised(problem, problem.linearise(found.x)),
+        loss=problem.loss,
         make_problem=make_problem,
     )
 

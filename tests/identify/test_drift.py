@@ -2,17 +2,14 @@
 
 from types import SimpleNamespace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim2real.artifacts.posterior import Posterior
 from sim2real.errors import Sim2RealError, UsageError
-from sim2real.identify.drift.drift_test import Fitted, Way, _beside_the_rest, drift, ways, weigh
+from sim2real.identify.drift import Fitted, Way, _beside_the_rest, drift, ways, weigh
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.problem.problem import Evaluation
-from sim2real.identify.uncertainty.uncertainty import Linearised
+from sim2real.identify.residuals import Linearised
 
 TABLE = ParameterTable(
     [
@@ -112,22 +109,15 @@ class Robot:
         self.true, self.slopes = np.log(true), rng.standard_normal((segments, 3, 1, 2))
         self.noise = 0.1 * rng.standard_normal((segments, 3, 1))
 
-    def _residuals(self, z):
-        x = self.table.low + self.table.span / (1.0 + jnp.exp(-z))
-        return jnp.tensordot(self.slopes, x - self.true, 1) + self.noise
+    def linearise(self, x, part=None):
+        r = np.tensordot(self.slopes, x - self.true, 1) + self.noise
+        return Linearised(r, self.slopes, np.diag(12.0 / self.table.span**2), x, r, loss=float(np.mean(r**2)))
 
-    def compared(self, data=None):
-        return np.ones(self.at(np.zeros(len(self.table))).residuals.shape[:2], bool)
+    def loss(self, x, part=None):
+        return self.linearise(x).loss
 
-    def at(self, z, data=None):
-        r, J = (np.asarray(f(jnp.asarray(z))) for f in (self._residuals, jax.jacfwd(self._residuals)))
-        return Evaluation(r, J, r, np.zeros(0), np.zeros((0, 2)), float(np.mean(r**2)))
-
-    def loss(self, z, data=None):
-        return self.at(z).loss
-
-    def losses(self, candidates, around):
-        return np.asarray(jax.vmap(lambda z: jnp.mean(self._residuals(z) ** 2))(jnp.asarray(candidates)))
+    def losses(self, candidates, middle):
+        return np.array([self.loss(x) for x in candidates])
 
 
 POSTERIOR_ENDS = TABLE.low[:2], TABLE.high[:2]

@@ -5,7 +5,7 @@ import pytest
 
 from sim2real.artifacts.identification import AHEAD, FREE_RUN, HeldOutPart, Identification, Judgement, Prediction
 from sim2real.identify.expected import wider_for, with_expected_errors
-from sim2real.identify.validation.verdict import Position
+from sim2real.identify.verdict import Position
 
 JOINT = Position("position[0]", "pan", "rad", 0.001)
 NO_MOTION = np.zeros(40)

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_fit import GAIN, LENGTH_S, SPANS, LagParams, Model, episode  # noqa: F401
+from lag import CONFIG as FAST
+from lag import GAIN, LENGTH_S, Model, Params, lag_log, spans
 
 from sim2real.identify import fit as fitting
 from sim2real.identify.fit import fit
@@ -15,24 +16,26 @@ from sim2real.stages.identify.fitting import Fits, determined
 from sim2real.stages.identify.judgement import Findings
 from sim2real.stages.shared.identification import long_spans
 
-CONFIG = IdentifyConfig(max_delay_s=0.02, generations=0, terms="auto", horizon_s=LENGTH_S, settle_s=0.0)
+CONFIG = IdentifyConfig(max_delay_s=FAST.max_delay_s, generations=0, terms="auto", horizon_s=LENGTH_S, settle_s=0.0)
 
 
 class Twice(Model):
     """A lag whose gain is a product of two parameters: any share of one is made up for by the other."""
 
-    def __init__(self):
-        super().__init__(outside=False)
-        shares = [Parameter("first", "1", 1.3, 0.25, 4.0), Parameter("second", "1", 1.1, 0.25, 4.0)]
-        self.parameters = ParameterTable([*shares, *(p for p in self.parameters if p.name != "gain")])
+    shares = (Parameter("first", "1", 1.3, 0.25, 4.0), Parameter("second", "1", 1.1, 0.25, 4.0))
+    parameters = ParameterTable(
+        [*shares, Model.parameters["tau"], Model.parameters["bias"], Model.parameters["offset"]]
+    )
 
     def params(self, values, start):
-        return {"world": LagParams(values["first"] * values["second"], values["tau"], start[0])}
+        gain = values["first"] * values["second"]
+        return {"world": replace(Params(), gain=gain, tau=values["tau"], bias=values["bias"], start=start[0])}
 
 
 @pytest.mark.night
 @pytest.mark.parametrize("long_s", [0.0, 2.0])
-def test_one_factor_of_a_product_is_held_and_the_other_is_for_that_value(episode, long_s, monkeypatch):  # noqa: F811
+def test_one_factor_of_a_product_is_held_and_the_other_is_for_that_value(long_s, monkeypatch):
+    episode, SPANS = lag_log(0), spans(0)
     config = replace(CONFIG, long_s=long_s)
     longer = long_spans([episode], 1, config)
     assert bool(longer) == bool(long_s)

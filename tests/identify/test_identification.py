@@ -7,9 +7,9 @@ import pytest
 
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Steps
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.validation.prediction import errors, samples
+from sim2real.identify.predictions import errors, samples
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
 
 SETTLE_S = 0.3
 
@@ -69,7 +69,7 @@ def check_measurements(fitted, columns):
 
 def test_the_interval_of_the_round_trip_covers_the_truth(fitted):
     spread, names = fitted.spread, list(fitted.problem.table.names)
-    assert spread.verdict == ("accepted",) * 5
+    assert spread.verdict == ("ok",) * 5
     error = spread.standard_error[names.index("actuator_delay")]
     assert abs(round_trip(fitted.values) - round_trip(fitted.truth)) < 1.96 * error
     assert error < 0.002

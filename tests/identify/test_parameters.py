@@ -56,11 +56,11 @@ def test_encode_and_decode_are_inverse(drawn):
 
 
 @settings(max_examples=40)
-@given(tables(), st.floats(-30.0, 30.0))
-def test_every_vector_decodes_into_the_bounds(drawn, z):
+@given(tables(), st.floats(-1e3, 1e3))
+def test_every_point_is_kept_within_the_bounds(drawn, x):
     table, _ = drawn
-    for p, value in zip(table, table.decode(jnp.full(len(table), z)).values(), strict=True):
-        room = 2e-5 * max(abs(p.low), abs(p.high))
+    for p, value in zip(table, table.decode(table.within(np.full(len(table), x))).values(), strict=True):
+        room = 1e-9 * max(abs(p.low), abs(p.high))
         assert p.low - room <= float(value) <= p.high + room
 
 
@@ -77,18 +77,16 @@ def three():
 
 
 def test_scales_and_their_slopes_are_what_the_transforms_say(three):
-    z = np.array([0.7, -0.4, 1.1])
-    x, stretch = three.scale(z)
-    values = {n: float(v) for n, v in three.decode(jnp.asarray(z, jnp.float32)).items()}
-    np.testing.assert_allclose(
-        x, [np.log(values["a"]), values["b"], np.log(values["c"] / (1 - values["c"]))], rtol=1e-5
-    )
-    np.testing.assert_allclose(three.unscale(x), list(values.values()), rtol=1e-5)
-    np.testing.assert_allclose(stretch, (three.scale(z + 1e-6)[0] - three.scale(z - 1e-6)[0]) / 2e-6, rtol=1e-6)
+    values = {"a": 1.3, "b": -0.4, "c": 0.7}
+    x = three.encode(values)
+    np.testing.assert_allclose(x, [np.log(1.3), -0.4, np.log(0.7 / 0.3)], rtol=1e-9)
+    assert {n: float(v) for n, v in three.decode(x).items()} == pytest.approx(values)
+    np.testing.assert_allclose(three.unscale(x), list(values.values()), rtol=1e-9)
     np.testing.assert_allclose(three.slope(x), (three.unscale(x + 1e-6) - three.unscale(x - 1e-6)) / 2e-6, rtol=1e-6)
-    both = np.diag(jax.jacfwd(lambda y: jnp.stack(list(three.decode(y).values())))(jnp.asarray(z, jnp.float32)))
-    np.testing.assert_allclose(three.slope(x) * stretch, both, rtol=1e-4)
     np.testing.assert_allclose(three.span, [np.log(16.0), 4.0, np.log(0.9 / 0.1) - np.log(0.1 / 0.9)])
+    many = three.decode(np.stack([x, x + 0.01]), np.array([True, False, True]))
+    assert many["b"].tolist() == [0.0, 0.0], "a parameter that is not there has its value without it"
+    assert many["a"].shape == (2,)
 
 
 def test_points_beyond_the_bounds_are_kept_within(three):
@@ -96,14 +94,6 @@ def test_points_beyond_the_bounds_are_kept_within(three):
     many = three.unscale(np.zeros((4, 5, 3)))
     assert many.shape == (4, 5, 3)
     np.testing.assert_allclose(many[2, 3], [1.0, 0.0, 0.5])
-
-
-def test_values_at_or_beyond_a_bound_end_just_inside():
-    table = ParameterTable([Parameter("a", "1", 2.0, 1.0, 4.0)])
-    for value, side in ((1.0, 1.0), (0.1, 1.0), (9.0, 4.0)):
-        z = table.encode({"a": value})
-        assert np.isfinite(z).all()
-        assert float(table.decode(z)["a"]) == pytest.approx(side, rel=0.01)
 
 
 def test_delays_start_at_a_quarter_of_their_interval():
@@ -201,7 +191,8 @@ def test_a_prior_has_its_curvature_at_its_mode_too(name, off):
     prior, reference, mode = PRIORS[name]
     table = ParameterTable([Parameter("a", "1", 2.0, 0.1, 20.0, "linear", prior=prior)])
     z = table.encode({"a": mode + off})
-    slope = float(jax.jacfwd(table.prior_residuals)(jnp.asarray(z, jnp.float32))[0, 0]) / table.scale(z)[1][0]
+    step = 1e-3
+    slope = float((table.prior_residuals(z + step) - table.prior_residuals(z - step))[0]) / (2 * step)
     h = 1e-3
     curvature = -(reference.logpdf(mode + h) - 2 * reference.logpdf(mode) + reference.logpdf(mode - h)) / h**2
     assert slope**2 == pytest.approx(curvature, rel=0.02)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim2real.identify.model import Channel
-from sim2real.identify.validation.prediction import errors, free_runs, labels
+from sim2real.identify.predictions import errors, free_runs, labels
 
 SETTLE_S = 0.2
 

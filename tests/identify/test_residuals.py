@@ -1,20 +1,29 @@
-"""Residuals of a segment: its initial state is fitted, and to no more than it may be."""
+"""Residuals, their derivatives and initial states of a lag, which is solved by hand."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_folds import BIAS, CONFIG, GAIN, NOISE, TAU_S, Model, lag_log
+from lag import BIAS, CONFIG, GAIN, NOISE, PERIOD_S, TAU_S, TRUE, Lag, Model, lag_log
+from scipy.optimize import least_squares
 
 from sim2real.artifacts.identification import Noise
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.validation import prediction
+from sim2real.identify import predictions
+from sim2real.identify.problem import Problem
+from sim2real.identify.residuals import Groups, corrected, robust
+from sim2real.identify.rollouts import Program
+from sim2real.identify.segments import Span
 from sim2real.stages.deploy.replay import _of_noise
 
 LENGTH_S, SPLIT_S = 0.93, 0.4
 SPANS = [Span(0, 0.4 + 0.9 * i, fitted=i != 4) for i in range(9)]
-TRUE = {"gain": GAIN, "tau": TAU_S, "bias": BIAS, "square": 0.0, "offset": 0.0}
+OFF = {"gain": 1.3 * GAIN, "tau": 0.8 * TAU_S, "bias": 0.1, "square": -0.2, "offset": 0.0}
+
+
+class Outside(Lag):
+    outside = True
+
+
+class OutsideModel(Model):
+    world = Outside
 
 
 @pytest.fixture(scope="module")
@@ -22,68 +31,167 @@ def problem():
     return Problem(Model(), [lag_log(0)], SPANS, LENGTH_S, CONFIG)
 
 
-@pytest.fixture(scope="module")
-def values(problem):
-    """The true parameters, with a bias that is a little off."""
-    return {n: jnp.float32(v) for n, v in (TRUE | {"bias": BIAS + 0.01}).items()}
+def by_hand(problem, segment, values, start):
+    """Return the residuals of a segment ``(K,)`` from a start: commands hold for a period and act at once."""
+    ts = problem.ts[segment]
+    first = round(problem.begins_s[segment] / PERIOD_S)
+    u = lag_log(0).outputs["actuator"]["u"]
+    y, found = start, []
+    for k in range(len(ts)):
+        found.append((y - problem.measured(0)[segment][k]) / NOISE if ts[k] >= 0 else 0.0)
+        steady = values["gain"] * (u[first + k] + values["bias"] + values["square"] * u[first + k] ** 2)
+        y = steady + (y - steady) * np.exp(-PERIOD_S / values["tau"])
+    return np.array(found)
 
 
-@pytest.mark.parametrize("fit_s", [None, SPLIT_S])
-def test_an_initial_state_is_that_of_least_squares(problem, values, fit_s):
+def rows(values, count):
+    return {n: np.full(count, v) for n, v in values.items()}
+
+
+@pytest.mark.parametrize("model", [Model, OutsideModel])
+def test_errors_are_those_of_the_solution_by_hand_for_any_number_of_copies(model):
+    problem = Problem(model(), [lag_log(0)], SPANS, LENGTH_S, CONFIG)
+    rng = np.random.default_rng(0)
+    segment, shift = rng.integers(0, 9, 70), rng.normal(size=(70, 2))
+    gain = rng.uniform(1.0, 2.0, 70)
+    values = rows(OFF, 70) | {"gain": gain}
+    found = problem.residuals.errors(values, segment, shift)
+    starts = problem.rollouts.starts(values, segment, shift, problem.data)[:, 0]
+    for i in (0, 31, 69):
+        expected = by_hand(problem, segment[i], OFF | {"gain": gain[i]}, starts[i])
+        np.testing.assert_allclose(found[i, :, 0], expected, atol=2e-3 * np.abs(expected).max())
+    alone = problem.residuals.errors({n: v[31:32] for n, v in values.items()}, segment[31:32], shift[31:32])
+    np.testing.assert_allclose(alone[0], found[31], atol=1e-3)
+
+
+def stacked(problem, x, part=None):
+    """Return the robust residuals with each initial state solved for, all at once."""
+    value, _ = problem.residuals.near(x, part or problem.part())
+    return robust(value(x), CONFIG.loss, CONFIG.reach)[0]
+
+
+def test_the_jacobian_is_that_of_the_residuals_with_the_best_initial_states(problem):
+    x = problem.table.encode({"gain": 1.05 * GAIN, "tau": 0.97 * TAU_S, "bias": 0.18, "square": -0.03, "offset": 0.0})
+    at = problem.linearise(x)
+    np.testing.assert_allclose(at.residuals.ravel(), stacked(problem, x), atol=1e-3 * np.abs(at.residuals).max())
+    for i in range(len(x)):
+        h = 2e-3 * problem.table.span[i] * (np.arange(len(x)) == i)
+        slope = (stacked(problem, x + h) - stacked(problem, x - h)) / (2 * h[i])
+        assert np.linalg.norm(at.jacobian[..., i].ravel() - slope) < 0.05 * np.linalg.norm(slope)
+    assert at.loss == pytest.approx(problem.loss(x), rel=1e-3)
+    assert at.loss == pytest.approx(0.5 * np.mean(at.residuals[at.compared] ** 2), rel=1e-6)
+
+
+@pytest.mark.parametrize("end", ["low", "high"])
+def test_at_a_bound_the_derivative_is_taken_inside(problem, end):
+    table = problem.table
+    x = table.encode(TRUE | {"gain": table["gain"].low if end == "low" else table["gain"].high})
+    at, inside = problem.linearise(x), problem.linearise(x + (1e-3 if end == "low" else -1e-3) * table.span)
+    own, expected = at.jacobian[..., 0], inside.jacobian[..., 0]
+    assert np.linalg.norm(own - expected) < 0.05 * np.linalg.norm(expected)
+
+
+def test_what_is_left_out_counts_nowhere(problem):
+    x, gone = problem.table.encode(OFF), problem.train[[0, 3]]
+    at, rest = problem.linearise(x), problem.linearise(x, problem.part(gone))
+    kept = ~np.isin(problem.train, gone)
+    np.testing.assert_allclose(rest.residuals[kept], at.residuals[kept], atol=1e-3 * np.abs(at.residuals).max())
+    assert not rest.residuals[~kept].any()
+    assert not rest.compared[~kept].any()
+    fewer = problem.linearise(x, problem.part(present=np.array([True, True, False, False])))
+    assert not fewer.jacobian[..., 2:].any()
+    without = problem.linearise(problem.table.encode(OFF | {"bias": 0.0, "square": 0.0}))
+    np.testing.assert_allclose(fewer.raw, without.raw, atol=1e-3 * np.abs(without.raw).max())
+
+
+def test_programs_are_compiled_once_for_all_problems_of_a_model(problem):
+    x = problem.table.encode(TRUE)
+    problem.linearise(x)
+    compiled = {n: len(p._compiled) for n, p in problem.rollouts.programs.items()}
+    other = problem.recut([Span(0, s.begin_s + 0.3, s.fitted) for s in SPANS[:-1]] + [SPANS[-1]], LENGTH_S)
+    other.linearise(x, other.part(present=np.arange(4) < 2))
+    assert {n: len(p._compiled) for n, p in problem.rollouts.programs.items()} == compiled
+
+
+def test_a_program_is_compiled_for_each_form_and_says_so():
+    traced, told = [], []
+    program = Program(lambda x: traced.append(x.shape) or 2.0 * x)
+    for size in (3, 3, 4):
+        np.testing.assert_array_equal(program(np.ones(size, np.float32), on_compile=told.append), 2.0 * np.ones(size))
+    assert traced == [(3,), (4,)]
+    assert told == [True, False] * 2
+
+
+@pytest.mark.parametrize("fit_s", [LENGTH_S, SPLIT_S])
+def test_an_initial_state_is_that_of_least_squares(problem, fit_s):
     """A lag is linear in it: numpy solves for it at once, with a prior around the estimate."""
-    own, data = problem.residuals, problem.data
-    found = jax.jit(lambda e: own.initial_state(values, e, data, fit_s))(2)
-    run = jax.jit(lambda u: own.residuals(values, 2, u * own.prior, data))
-    r = np.asarray(run(jnp.zeros(2)), np.float64).ravel()
-    J = np.stack([np.asarray(run(jnp.eye(2)[i]), np.float64).ravel() - r for i in range(2)], axis=1)
-    ts = np.asarray(data.ts[2])
-    J, near = J * ((ts <= (fit_s or LENGTH_S)) & (ts >= 0))[:, None], r * (ts <= (fit_s or LENGTH_S))
-    shift = -np.linalg.solve(J.T @ J + np.eye(2), J.T @ near)
-    np.testing.assert_allclose(found.shift, shift, atol=2e-3 * np.abs(shift).max())
-    np.testing.assert_allclose(found.residuals, run(jnp.asarray(found.shift)), atol=1e-3)
-    assert np.sum(np.asarray(found.residuals) ** 2) < np.sum(r**2)
-
-
-def test_a_state_that_is_known_close_by_is_stepped_to(problem, values):
-    """The candidates of a generation have the states of its middle, and the step from there."""
-    own, data = problem.residuals, problem.data
-    other = values | {"gain": jnp.float32(1.02 * GAIN)}
-    state = jax.jit(lambda e: own.initial_state(values, e, data))(3)
-    stepped = jax.jit(lambda s: own.projected(other, 3, s, data))(state)
-    exact = jax.jit(lambda e: own.initial_state(other, e, data))(3).residuals
-    np.testing.assert_allclose(stepped, exact, atol=2e-3 * np.abs(exact).max())
+    values, segment = rows(TRUE | {"bias": BIAS + 0.01}, 1), np.array([2])
+    found, start = problem.simulated(values, segment, np.array([fit_s]))
+    run = lambda u: problem.residuals.errors(values, segment, np.asarray(u, float)[None]).ravel()  # noqa: E731
+    r, ts = run([0.0, 0.0]), problem.ts[2]
+    J = np.stack([run(np.eye(2)[i]) - r for i in range(2)], axis=1)
+    counts = (ts >= 0) & (ts <= fit_s)
+    shift = -np.linalg.solve((J * counts[:, None]).T @ J + np.eye(2), J.T @ (r * counts))
+    np.testing.assert_allclose(found[0, :, 0], r + J @ shift, atol=2e-2)
+    expected = problem.rollouts.starts(values, segment, shift[None], problem.data)
+    np.testing.assert_allclose(start, expected, atol=1e-3)
 
 
 def test_what_is_predicted_does_not_know_what_comes(problem):
     """Of held-out segments only the first part is told: measurements behind it change no prediction."""
-    rows = {n: np.full(1, v) for n, v in TRUE.items()}
-    where, fit_s = np.array([4]), np.array([SPLIT_S])
-    before = problem.predict(rows, where, fit_s)
-    other = Problem(Model(), [lag_log(0)], SPANS, LENGTH_S, CONFIG)
-    late = np.asarray(other.data.ts) > SPLIT_S
-    changed = {f: jnp.asarray(np.where(late, 9.0, m)) for f, m in other.data.measured.items()}
-    other.data = other.data._replace(measured=changed)
-    after = other.predict(rows, where, fit_s)
-    ts = problem.ts[4]
-    assert np.abs(before[0][(ts > 0)]).max() < 8.0, "it is a good model"
+    where, fit_s, ts = np.array([4]), np.array([SPLIT_S]), problem.ts[4]
+    before = problem.predict(rows(TRUE, 1), where, fit_s)
+    late = np.where(problem.ts > SPLIT_S, 9.0, problem.measured(0))
+    after = problem.with_readings({"y": late}).predict(rows(TRUE, 1), where, fit_s)
+    assert np.abs(before[0][ts > 0]).max() < 8.0, "it is a good model"
     np.testing.assert_allclose(after[0][ts <= SPLIT_S], before[0][ts <= SPLIT_S], atol=1e-4)
     ahead = ts > SPLIT_S
     predicted = problem.measured(0)[4][ahead] + NOISE * before[0][ahead, 0]
     np.testing.assert_allclose(9.0 + NOISE * after[0][ahead, 0], predicted, atol=1e-4)
-    assert np.abs(problem.predict(rows, where, np.array([LENGTH_S])) - before).max() > 1e-3
 
 
-def test_predictions_do_not_depend_on_how_many_there_are(problem):
-    """They are made in parts of one size: as many rows as there are segments, more or fewer."""
-    rng, every = np.random.default_rng(0), np.arange(9)
-    many = np.concatenate([every, every[::-1], every])
-    rows = {n: v + 0.01 * rng.normal(size=27) for n, v in TRUE.items()}
-    fit_s = rng.uniform(0.2, 0.9, 27)
-    whole = problem.predict(rows, many, fit_s)
-    assert whole.shape == (27, *problem.ts.shape[1:], 1)
-    for i in (0, 10, 26):
-        one = problem.predict({n: v[i : i + 1] for n, v in rows.items()}, many[i : i + 1], fit_s[i : i + 1])
-        np.testing.assert_allclose(one[0], whole[i], atol=1e-4)
+@pytest.mark.parametrize("loss", ["squared", "huber", "cauchy"])
+def test_the_robust_loss_is_scipys(loss):
+    r = np.array([-4e3, -30.0, -1.0, -1e-6, 0.0, 0.3, 7.0, 1e3])
+    name = {"squared": "linear", "huber": "soft_l1", "cauchy": "cauchy"}[loss]
+    cost = [least_squares(lambda x, v=v: x * 0 + v, [1.0], loss=name, f_scale=5.0, max_nfev=1).cost for v in r]
+    found, slope = robust(r, loss, 5.0)
+    np.testing.assert_allclose(0.5 * found**2, cost, rtol=1e-9, atol=1e-14)
+    h = 1e-5 * np.maximum(np.abs(r), 1.0)
+    np.testing.assert_allclose(slope, (robust(r + h, loss, 5.0)[0] - robust(r - h, loss, 5.0)[0]) / (2 * h), rtol=1e-4)
+
+
+def test_a_jacobian_is_corrected_until_it_no_longer_predicts_the_step():
+    A, computed = np.random.default_rng(0).normal(size=(6, 2)), []
+    value, slope = corrected(lambda y: A @ y, lambda y: computed.append(1) or A.copy())
+    for y in ([0.0, 0.0], [1.0, 0.5], [2.0, -1.0]):
+        value(np.array(y))
+        np.testing.assert_allclose(slope(np.array(y)), A)
+    assert len(computed) == 1
+    value, slope = corrected(lambda y: np.sin(9.0 * y), lambda y: computed.append(1) or np.diag(9.0 * np.cos(9.0 * y)))
+    for y in (0.0, 1.0, 2.0):
+        value(np.array([y]))
+        slope(np.array([y]))
+    assert len(computed) == 4
+
+
+def test_columns_of_separate_trees_are_moved_together():
+    """Two legs of two joints each, of which the second moves with the first, and a delay of all."""
+    J = np.zeros((3, 4, 5))
+    J[..., :2, 0] = J[..., 2:, 2] = 1.0
+    J[..., 1, 1] = J[..., 3, 3] = J[..., :, 4] = 2.0
+    groups = Groups(apart=True)
+    assert groups.members(range(5)) == [[0], [1], [2], [3], [4]]
+    np.testing.assert_array_equal(groups.spread(np.moveaxis(J, -1, 0), groups.members(range(5)), 5), J)
+    together = groups.members(range(5))
+    assert sorted(map(sorted, together)) == [[0, 2], [1, 3], [4]]
+    changes = np.stack([J[..., g].sum(axis=-1) for g in together])
+    np.testing.assert_array_equal(groups.spread(changes, together, 5), J)
+    assert Groups(apart=False).members(range(2)) == [[0], [1]]
+    # Initial states belong to their whole tree: at another point more of it may respond.
+    states = Groups(apart=True, by_tree=True)
+    states.spread(np.moveaxis(J[..., :4], -1, 0), [[0], [1], [2], [3]], 4)
+    assert states.members(range(4)) == [[0, 2], [1, 3]]
 
 
 @pytest.mark.parametrize(("tau_s", "least", "most"), [(TAU_S, 0.8, 1.3), (-0.2, 2.0, 20.0)])
@@ -92,8 +200,8 @@ def test_an_unchanged_robot_is_predicted_from_noisy_readings_as_well_as_its_equi
 ):
     """A lag forgets the error of its initial state; with the other sign the error grows by e each 0.2 s."""
     robot, every = TRUE | {"tau": tau_s}, np.ones(problem.segments, bool)
-    columns = prediction.samples(problem, {"identified": robot}, SPLIT_S, every)
-    (name,) = prediction.labels(problem)
+    columns = predictions.samples(problem, {"identified": robot}, SPLIT_S, every)
+    (name,) = predictions.labels(problem)
     exact, noisy = (
         _of_noise(problem, columns, [Noise(name, "", deviation, 0.0, 0.0)], robot, SPLIT_S, LENGTH_S - SPLIT_S)[name]
         for deviation in (0.0, NOISE)
@@ -104,8 +212,8 @@ def test_an_unchanged_robot_is_predicted_from_noisy_readings_as_well_as_its_equi
 
 def test_where_the_models_own_motion_diverges_its_error_is_infinite(problem):
     """Not a number is no error: nothing can be compared with it."""
-    columns = prediction.samples(problem, {"identified": TRUE}, SPLIT_S, np.ones(problem.segments, bool))
-    (name,) = prediction.labels(problem)
+    columns = predictions.samples(problem, {"identified": TRUE}, SPLIT_S, np.ones(problem.segments, bool))
+    (name,) = predictions.labels(problem)
     columns[f"{name}_identified"] = np.full_like(columns["into"], np.nan)
     noise = [Noise(name, "", NOISE, 0.0, 0.0)]
     assert _of_noise(problem, columns, noise, TRUE, SPLIT_S, LENGTH_S - SPLIT_S) == {name: np.inf}

@@ -13,7 +13,7 @@ from sim2real.graph.base import GraphState
 from sim2real.graph.episode import Episode, Steps
 from sim2real.graph.schedule import draw
 from sim2real.identify.parameter_paths import get_leaf
-from sim2real.identify.validation.prediction import samples
+from sim2real.identify.predictions import samples
 from sim2real.log.importing.importer import import_file
 from sim2real.log.importing.mapping import load_mapping
 from sim2real.runtime.compiled.graph import CompiledGraph
@@ -125,10 +125,11 @@ def effects(problem, values, factor=0.1):
         p = table[n]
         step = factor * (p.high - p.low)
         rows[n][i + 1] += step if values[n] + step <= p.high else -step
-    zero = jnp.zeros(2 * len(problem.channels))
-    own, every = problem.residuals, jnp.arange(problem.segments)
-    run = jax.jit(jax.vmap(lambda v: jax.vmap(lambda e: own.residuals(v, e, zero, problem.data))(every)))
-    residuals = np.asarray(run({n: jnp.asarray(r) for n, r in rows.items()}))
+    copies, every = len(names) + 1, np.arange(problem.segments)
+    spread = {n: np.repeat(r, len(every)) for n, r in rows.items()}
+    still = np.zeros((copies * len(every), 2 * len(problem.channels)))
+    residuals = problem.residuals.errors(spread, np.tile(every, copies), still)
+    residuals = residuals.reshape(copies, len(every), *residuals.shape[1:])
     moved = np.abs(residuals[1:] - residuals[0]).reshape(len(names), -1).max(axis=1)
     return dict(zip(names, moved, strict=True))
 

@@ -4,15 +4,14 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from recorded_robots import RecordedRobotConformance, episode, predictions, public, rmse
 from scipy.optimize import least_squares
 
 from sim2real.identify.fit import fit
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("disk")
@@ -114,12 +113,10 @@ def test_the_model_is_the_loop(synthetic):
     model.nodes = lambda _: nodes
     log = replace(synthetic.episode, outputs={**synthetic.episode.outputs, "sensor": {"th": synthetic.exact}})
     problem = Problem(model, [log], [Span(0, 0.0)], 10.0, config)
-    start = jnp.array([encoder(TRUTH, 0.3), 0.0])
-    estimated = problem.residuals.start(0, 0.0, problem.data)
-    values = {n: jnp.float32(v) for n, v in TRUTH.items()}
-    residuals = problem.residuals.residuals(values, 0, start - estimated, problem.data)
-    ts = problem.ts[0]
-    off = np.asarray(residuals)[: len(ts)][ts >= 0, 0] * model.channels[0].position_sigma
+    values, segment = {n: np.full(1, v) for n, v in TRUTH.items()}, np.array([0])
+    estimated = problem.rollouts.starts(values, segment, np.zeros((1, 2)), problem.data)
+    shift = (np.array([[encoder(TRUTH, 0.3), 0.0]]) - estimated) / problem.rollouts.prior
+    off = problem.residuals.errors(values, segment, shift)[0][problem.ts[0] >= 0, 0] * model.channels[0].position_sigma
     assert len(off) > 380
     assert np.ptp(synthetic.exact[:400]) > 2.0
     assert rmse(off) < 0.002

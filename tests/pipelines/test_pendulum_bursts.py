@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
 from sim2real.log.reader import read_log
 from sim2real.robots.loop import BURST
 from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -18,7 +18,7 @@ LOG = Path(__file__).parents[2] / "datasets" / "pendulum" / "steps.mcap"
 def burst_of(episode):
     """Return how many messages more than usual the window of a problem's commands holds."""
     model = load_pipeline("pendulum").load().identifiable(0.06)
-    nodes = Problem(model, [episode], [Span(0, 1.0)], 3.0).residuals.graph.nodes
+    nodes = Problem(model, [episode], [Span(0, 1.0)], 3.0).rollouts.graph.nodes
     return nodes["world"].inputs["actuator"].delay_dist.burst
 
 

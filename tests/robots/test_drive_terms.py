@@ -12,10 +12,9 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.search.refine import refine
-from sim2real.identify.uncertainty.uncertainty import linearise
+from sim2real.identify.fit import refine
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
 from sim2real.robots.from_model.mjcf import driven
 from sim2real.robots.from_model.mjcf_parameters import (
     LAWS,
@@ -136,7 +135,7 @@ def test_a_law_without_absent_terms_returns_what_the_whole_law_does(one):
 
 @pytest.fixture(scope="module")
 def engines(tmp_path_factory):
-    """Residuals of a segment as functions of the parameters, of both engines, in double precision."""
+    """Residuals of a segment on both engines."""
     path = tmp_path_factory.mktemp("model") / "robot.xml"
     path.write_text(XML.format(friction=0.0).replace(f'"{STEP_S}"', '"0.002"'))
     terms = (ParameterPattern("kp"), ParameterPattern("kd"), ParameterPattern("frictionloss"), PER_TURN)
@@ -149,24 +148,18 @@ def engines(tmp_path_factory):
     goals, on = (a[:: len(a) // count][:count, None] for a in commands(600))
     outputs = {"sensor": {"position": 0.0 * goals}, "actuator": {"goal": goals, "enabled": on}}
     episode = Episode(steps={"sensor": steps, "actuator": steps}, messages={}, outputs=outputs)
-    jax.config.update("jax_enable_x64", True)  # everywhere: the thread that calls C has no context of ours
-    try:
-        programs = {}
-        for engine in ("c", "compiled"):
-            config = FitConfig(max_delay_s=0.02, initial_state="measured", engine=engine)
-            problem = Problem(robot.identifiable(0.02), [episode], [Span(0, 0.1)], 0.4, config)
-            assert problem.engine.name == engine
-            programs[engine] = jax.jit(
-                lambda v, p=problem: 0.002 * p.residuals.residuals(v, 0, jnp.array([0.3, -1.0]), p.data)
-            )
-        yield SimpleNamespace(**programs)
-    finally:
-        jax.config.update("jax_enable_x64", False)
+    made = {}
+    for engine in ("c", "compiled"):
+        config = FitConfig(max_delay_s=0.02, initial_state="measured", engine=engine)
+        made[engine] = Problem(robot.identifiable(0.02), [episode], [Span(0, 0.1)], 0.4, config)
+        assert made[engine].engine.name == engine
+    return SimpleNamespace(**made)
 
 
-def played(program, terms):
+def played(problem, terms):
     values = {"kp": 9.0, "kd": 0.1, "frictionloss": 0.03, "delay": 0.0071, **terms}
-    return np.asarray(program({n: jnp.asarray(v) for n, v in values.items()}))
+    rows = {p.name: np.full(1, values.get(p.name, p.nominal)) for p in problem.table}
+    return 0.002 * problem.residuals.errors(rows, np.array([0]), np.array([[0.3, -1.0]]) / problem.rollouts.prior)[0]
 
 
 @pytest.mark.night
@@ -210,7 +203,7 @@ PLAY = {"play": 0.03, "tilt_y": 0.15}
 @pytest.mark.night
 def test_play_and_tilt_are_found_in_a_recording_made_by_hand(by_hands_log):
     """In `make test` each term moves a joint as by hand, and what refinement sees of a delay is known, below."""
-    found = by_hands_log.table.decode(refine(by_hands_log, by_hands_log.table.start()[None]).z)
+    found = by_hands_log.table.decode(refine(by_hands_log, by_hands_log.table.start()[None]).x)
     assert {n: float(found[n]) for n in PLAY} == pytest.approx(PLAY, rel=0.1)
 
 
@@ -219,10 +212,10 @@ def test_play_and_tilt_are_found_in_a_recording_made_by_hand(by_hands_log):
 def test_what_a_delay_of_nothing_would_change_is_known(by_hands_log, share):
     """At a bound the search's own unknown changes nothing, and the delay does: 10 ms of it would be seen."""
     table = by_hands_log.table
-    z, late = table.start(), table.names.index("delay")
+    x, late = table.start(), table.names.index("delay")
 
     def column(share):
-        at = linearise(by_hands_log, np.where(np.arange(len(z)) == late, np.log(share / (1 - share)), z))
+        at = by_hands_log.linearise(np.where(np.arange(len(x)) == late, table.low + share * table.span, x))
         return at.jacobian[..., late]
 
     known = column(0.02)

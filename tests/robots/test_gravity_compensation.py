@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from recorded_on_c import play
 
+from sim2real.identify import held_out, terms
+from sim2real.identify import problem as problems
 from sim2real.identify.fit import fit
-from sim2real.identify.problem import thinned
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.validation import folds, term_trials
-from sim2real.identify.validation.folds import folds_of
-from sim2real.identify.validation.optional_terms import select
-from sim2real.identify.validation.refits import Refits
-from sim2real.identify.validation.term_trials import Trials
+from sim2real.identify.held_out import Refits, folds_of
+from sim2real.identify.segments import Span
+from sim2real.identify.terms import TermSearch
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import IdentifyConfig
@@ -39,8 +37,8 @@ def recorded(tmp_path_factory):
     t = STEP_S * PERIOD * np.arange(round(SECONDS / STEP_S / PERIOD))
     goals = (0.8 * np.sin(2.1 * t) + 0.4 * np.sin(5.3 * t))[:, None]
     episode = play(model, goals, lambda k, _, data: KP * (goals[k] - data.qpos), PERIOD, NOISE)
-    terms = (ParameterPattern("kp"), ParameterPattern("damping"))
-    config = RobotConfig(path, ("shoulder",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=terms)
+    patterns = (ParameterPattern("kp"), ParameterPattern("damping"))
+    config = RobotConfig(path, ("shoulder",), ("goal",), step_s=STEP_S, rate_hz=100.0, terms=patterns)
     config = replace(config, sigma_rad=NOISE)
     return MjcfRobot(config), episode
 
@@ -55,22 +53,23 @@ def test_auto_finds_that_the_controller_carries_the_weight(recorded, monkeypatch
     table = model.parameters.with_terms(["gravcomp"])
     spans = [Span(0, begin) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
     widest = fit(model, [episode], spans, 0.6, config, table)
-    of_segment = 0.6 / STEP_S * (thinned.BESIDE + 1) * len(widest.problem.table)
-    monkeypatch.setattr(term_trials, "MOST_OF_SETS", kept * of_segment + 1)
+    of_segment = 0.6 / STEP_S * (problems._BESIDE + 1) * len(widest.problem.table)
+    monkeypatch.setattr(terms, "MOST_OF_SETS", kept * of_segment + 1)
     parts, sets = folds_of(widest.problem, 3), []
-    trials = Trials(widest, parts, config.settle_s, config.free_run_s, Refits(), sets.append)
-    simulated, ahead = [], folds._ahead
-    monkeypatch.setattr(folds, "_ahead", lambda windows, *rest: (simulated.append(windows), ahead(windows, *rest))[1])
-    every = trials.grown()
-    assert trials.segments == kept
+    search = TermSearch(widest, parts, config.settle_s, config.free_run_s, Refits(), sets.append)
+    simulated, ahead = [], held_out._ahead
+    monkeypatch.setattr(
+        held_out, "_ahead", lambda windows, *rest: (simulated.append(windows), ahead(windows, *rest))[1]
+    )
+    found = search.select()
+    assert search.segments == kept
     assert sets[:2] == ["no term", "gravcomp"]
     assert {len(windows.train) for windows in simulated} == {5}
-    chosen = select(every)
-    assert chosen.names(table) == ("gravcomp",)
-    values = table.decode(chosen.near[0].z, table.of_terms(chosen.near[0].present))
+    assert found.chosen.names(table) == ("gravcomp",)
+    values = table.decode(found.chosen.x, table.of_terms(found.chosen.present))
     assert float(values["gravcomp"]) == pytest.approx(SHARE, abs=0.02)
     assert float(values["kp"]) == pytest.approx(KP, rel=0.02)
-    errors = {t.names(table): float(np.sqrt(t.ahead.mean())) for t in every}
+    errors = {t.names(table): t.error for t in found.trials}
     assert errors["gravcomp",] < 0.1 * errors[()]
 
 

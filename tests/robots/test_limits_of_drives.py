@@ -10,12 +10,10 @@ from recorded_on_c import play
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.uncertainty.negligible import NOT_REACHED
-from sim2real.identify.validation.folds import folds_of
-from sim2real.identify.validation.optional_terms import select
-from sim2real.identify.validation.refits import Refits
-from sim2real.identify.validation.term_trials import Trials
+from sim2real.identify.held_out import folds_of
+from sim2real.identify.segments import Span
+from sim2real.identify.terms import TermSearch
+from sim2real.identify.uncertainty import NOT_REACHED
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.stages.identify.judgement import Findings
@@ -70,15 +68,14 @@ BOTH = "torque_limit,speed_limit"
 def test_auto_finds_a_limit_that_was_reached(tmp_path, offered, limits, chosen, name, truth):
     robot, episode = recorded(tmp_path, **limits)
     widest = fitted(robot, episode, offered)
-    every = Trials(widest, folds_of(widest.problem, 3), 0.3, 0.0, Refits()).grown()
-    found, table = select(every), widest.problem.table
-    assert found.names(table) == ((chosen,) if chosen else ())
-    values = table.decode(found.near[0].z, table.of_terms(found.near[0].present))
+    found, table = TermSearch(widest, folds_of(widest.problem, 3), 0.3, 0.0).select(), widest.problem.table
+    assert found.chosen.names(table) == ((chosen,) if chosen else ())
+    values = table.decode(found.chosen.x, table.of_terms(found.chosen.present))
     assert all(float(values[n]) == NO_LIMIT for n in {"torque", "top_speed"}.intersection(table.names) - {name})
     assert float(values["kp"]) == pytest.approx(KP, rel=0.05)
     if chosen:
         assert float(values[name]) == pytest.approx(truth, rel=0.05)
-        errors = {t.names(table): float(np.sqrt(t.ahead.mean())) for t in every}
+        errors = {t.names(table): t.error for t in found.trials}
         assert errors[chosen,] < 0.5 * errors[()]
 
 

@@ -5,7 +5,7 @@ import pytest
 from small_robot import PairRobot, PairTask
 
 from sim2real.errors import UsageError
-from sim2real.identify.problem.engine import choose
+from sim2real.identify.rollouts import choose_engine
 from sim2real.robots.servo.parts import GOAL
 from sim2real.robots.servo.simulated_world import ServoWorld
 from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -80,22 +80,16 @@ def motor():
 
 
 def test_a_world_that_is_not_of_mujoco_takes_the_compiled_engine(motor):
-    taken = choose("auto", *motor)
+    taken = choose_engine("auto", *motor)
     assert taken.name == "compiled"
     assert "not one of MuJoCo's" in str(taken)
     with pytest.raises(UsageError, match="engine c: the world is not one of MuJoCo's"):
-        choose("c", *motor)
+        choose_engine("c", *motor)
 
 
 @pytest.mark.parametrize("backend", ["cpu", pytest.param("gpu", marks=pytest.mark.night)])
 def test_auto_takes_c_where_it_can_beside_an_accelerator_too(pair, backend, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     model = pair.identifiable(0.03)
-    for wanted, jacobian, name in (
-        ("auto", "auto", "c"),
-        ("compiled", "auto", "compiled"),
-        ("auto", "forward", "compiled"),
-    ):
-        assert choose(wanted, model.nodes(0.03), model.given, jacobian).name == name
-    with pytest.raises(UsageError, match="forward mode"):
-        choose("c", model.nodes(0.03), model.given, "forward")
+    for wanted, name in (("auto", "c"), ("compiled", "compiled")):
+        assert choose_engine(wanted, model.nodes(0.03), model.given).name == name

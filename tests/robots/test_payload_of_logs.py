@@ -9,8 +9,8 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
 from sim2real.log.importing.names import meaning
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
@@ -51,7 +51,7 @@ def robot(tmp_path, commands=COMMANDS, **changes) -> MjcfRobot:
 def test_logs_with_different_payloads_give_the_drive_of_all(tmp_path, engine):
     model = robot(tmp_path).identifiable(0.02)
     spans = [Span(r, begin) for r in (0, 1) for begin in np.arange(0.2, SECONDS - 0.8, 0.6)]
-    config = FitConfig(generations=0, max_delay_s=0.02, engine=engine, jacobian="finite")
+    config = FitConfig(generations=0, max_delay_s=0.02, engine=engine)
     found = fit(model, [recorded(*load) for load in LOADS], spans, 0.6, config)
     assert found.values["kp"] == pytest.approx(KP, rel=0.005)
     assert found.values["damping"] == pytest.approx(DAMPING, rel=0.01)
@@ -64,7 +64,7 @@ def test_without_the_field_one_mass_fits_neither_log(tmp_path):
         [recorded(*load) for load in LOADS],
         [Span(0, 0.2), Span(1, 0.2)],
         0.6,
-        FitConfig(max_delay_s=0.02, engine="c", jacobian="finite"),
+        FitConfig(max_delay_s=0.02, engine="c"),
     )
     assert problem.loss(problem.table.encode({"kp": KP, "damping": DAMPING, "delay": 0.0})) > 1000.0
 

@@ -6,9 +6,8 @@ import pytest
 from recorded_on_c import play
 
 from sim2real.identify.config import FitConfig
-from sim2real.identify.fit import fit
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.search.refine import refine
+from sim2real.identify.fit import fit, refine
+from sim2real.identify.segments import Span
 from sim2real.robots.from_model.joints.sharing import like_joints, sharing
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig

@@ -9,7 +9,7 @@ from recorded_on_c import play
 
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
-from sim2real.identify.problem.segments import Span
+from sim2real.identify.segments import Span
 from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
 from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 from sim2real.stages.shared.identification import offering

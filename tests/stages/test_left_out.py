@@ -9,8 +9,9 @@ from scipy import stats
 from sim2real.artifacts.identification import HeldOutPart
 from sim2real.errors import UsageError
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty.uncertainty import Uncertainty
-from sim2real.identify.validation.verdict import Position
+from sim2real.identify.predictions import Position
+from sim2real.identify.residuals import Linearised
+from sim2real.identify.uncertainty import Uncertainty
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.identify import fitting
 from sim2real.stages.identify.fitting import widened
@@ -24,6 +25,12 @@ def left(name, value=1.0, ahead=0.1, share=0.2, **more):
     return HeldOutPart(name, (), {"gain": value}, {"gain": share}, {"th": ahead}, **more)
 
 
+def at_point(x):
+    """Return a linearisation of many residuals at a point."""
+    r = np.ones((1, 10_000, 1))
+    return Linearised(r, np.zeros((*r.shape, len(x))), np.eye(len(x)), np.array(x), r)
+
+
 @pytest.fixture
 def known():
     """An estimate of 1 with a standard error of 0.01, on a linear scale from 0 to 10."""
@@ -35,18 +42,16 @@ def known():
         standard_error=error,
         low=np.array([0.98]),
         high=np.array([1.02]),
-        verdict=("accepted",),
+        verdict=("ok",),
         correlation=np.eye(1),
-        inflation=1.0,
         misfit=1.0,
-        widening=np.ones(1),
     )
-    return SimpleNamespace(table=table, spread=spread, x=np.array([1.0]))
+    return SimpleNamespace(table=table, spread=spread, at=at_point([1.0]))
 
 
 def test_estimates_that_differ_between_parts_widen_the_interval_to_the_jackknifes(known):
     values = np.array([0.9, 1.0, 1.1, 1.05, 0.95])
-    found = widened(known.spread, known.table, known.x, [left(str(v), v) for v in values])
+    found = widened(known.spread, known.table, known.at, [left(str(v), v) for v in values])
     error = np.sqrt(4 / 5 * np.sum((values - values.mean()) ** 2))
     reach = error * stats.t.ppf(0.975, 4) / stats.norm.ppf(0.975)
     assert found.standard_error[0] == pytest.approx(reach, rel=0.01)
@@ -64,7 +69,7 @@ def test_estimates_that_differ_between_parts_widen_the_interval_to_the_jackknife
     ids=["agree", "alone", "few"],
 )
 def test_otherwise_intervals_stay(known, rows):
-    found = widened(known.spread, known.table, known.x, rows)
+    found = widened(known.spread, known.table, known.at, rows)
     assert found.standard_error[0] == pytest.approx(0.01)
     assert found.high[0] == pytest.approx(1.02)
 
@@ -73,20 +78,20 @@ def test_what_one_part_alone_determines_widens_as_the_others():
     table = ParameterTable([Parameter(n, "1", 1.0, 0.0, 100.0, "linear") for n in ("gain", "touch")])
     two, error = np.ones(2), 0.01 * np.ones(2)
     square = np.diag(error**2)
-    spread = Uncertainty(square, square, error, 0.98 * two, 1.02 * two, ("accepted",) * 2, np.eye(2), 1.0, 1.0, two)
+    spread = Uncertainty(square, square, error, 0.98 * two, 1.02 * two, ("ok",) * 2, np.eye(2), 1.0)
     values, shares = np.array([0.9, 1.0, 1.1, 1.05, 0.95]), [0.0, 0.9, 0.1, 0.0, 0.0]
     rows = [
         HeldOutPart(str(k), (), {"gain": v, "touch": 1.0 + 5.0 * s}, {"gain": 0.2, "touch": s}, {"th": 0.1})
         for k, (v, s) in enumerate(zip(values, shares, strict=True))
     ]
-    found = widened(spread, table, two, rows)
-    assert found.widening[0] > 5.0
-    assert found.widening[1] == pytest.approx(found.widening[0])
+    found = widened(spread, table, at_point(two), rows)
+    assert found.standard_error[0] > 5.0 * 0.01
+    assert found.standard_error[1] == pytest.approx(found.standard_error[0])
 
 
 def test_a_wider_interval_may_no_longer_be_accepted(known):
-    far = widened(known.spread, known.table, known.x, [left(str(k), 1.0 + k) for k in range(5)])
-    assert far.verdict == ("not identifiable",)
+    far = widened(known.spread, known.table, known.at, [left(str(k), 1.0 + k) for k in range(5)])
+    assert far.verdict == ("not determined",)
     assert far.low[0] >= 0.0
 
 

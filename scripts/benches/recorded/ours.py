@@ -15,12 +15,12 @@ import numpy as np
 from benches.recorded.sets import BEFORE, DISK_BLOCK, DISK_BLOCKS, Fold, Recording, load
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
+from sim2real.identify import predictions as prediction
 from sim2real.identify.fit import Fit as ModelFit
 from sim2real.identify.fit import as_numbers
 from sim2real.identify.fit import fit as fit_model
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.validation import prediction
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.identify import fitting
 from sim2real.stages.pipeline import from_model
@@ -179,7 +179,7 @@ def _fit_with_terms(case: Case, fitted: dict[str, Any]) -> Any:
     spans = windows(episodes, length, c.spacing_s, c.initial_state == "free")
     every = fit_model(model, episodes, spans, length, c, table, as_start=True)
     selection = fitting.chosen(every, c, list(fitted))
-    fewer, values = table.with_terms(selection.names(table)), as_numbers(every.problem.table, selection.near[0].z)
+    fewer, values = table.with_terms(selection.chosen.names(table)), as_numbers(every.problem.table, selection.chosen.x)
     fewer = fewer.with_begin({p.name: float(np.squeeze(values[p.name])) for p in fewer if p.free})
     longer = shared.covering([(0.0, e.duration_s) for e in episodes], c.long_s or 0.0)
     return fit_model(model, episodes, spans, length, c, fewer, longer)

@@ -9,16 +9,16 @@ from sim2real.artifacts.deployment import AS_HERE, Drift, Replay
 from sim2real.artifacts.identification import UNFINISHED, Identification, Noise
 from sim2real.errors import Sim2RealError
 from sim2real.graph.episode import Episode
-from sim2real.identify.drift import drift_test
+from sim2real.identify import drift as drift_test
+from sim2real.identify import predictions as prediction
 from sim2real.identify.expected import expected_at
+from sim2real.identify.fit import refine
+from sim2real.identify.held_out import MOVES
 from sim2real.identify.model import ChecksLogs, IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.search.refine import refine
-from sim2real.identify.validation import prediction
-from sim2real.identify.validation.folds import MOVES
-from sim2real.identify.validation.verdict import NOISE, positions
+from sim2real.identify.predictions import NOISE, positions
+from sim2real.identify.problem import Problem
+from sim2real.identify.segments import Span
 from sim2real.robots.robot import RecordedRobot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
@@ -52,7 +52,7 @@ def tested(
         )
     # Test each parameter, and fit all of them to this log.
     drifted, x = drift_test.drift(problem, identification.posterior, identification.widening or 1.0, robot.causes)
-    z = refine(problem, problem.table.at_scale(x)[None], settle=False).z
+    z = refine(problem, problem.table.within(x)[None], settle=False).x
     refitted = {n: float(np.ravel(v)[0]) for n, v in problem.table.decode(z).items()}
     nominal = {p.name: p.nominal for p in problem.model.parameters}
     # Predict the segments with each model.

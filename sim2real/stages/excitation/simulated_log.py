@@ -13,7 +13,7 @@ from sim2real.graph.schedule import draw
 from sim2real.graph.times import Vertex
 from sim2real.identify.config import FitConfig
 from sim2real.identify.model import IdentifiableModel
-from sim2real.identify.problem.engine import CRollouts, choose
+from sim2real.identify.rollouts import GraphOnC, choose_engine
 from sim2real.robots.loop import ACTUATOR
 from sim2real.robots.robot import Robot
 from sim2real.runtime.compiled.open_loop import OpenLoopGraph
@@ -38,7 +38,7 @@ def simulate(
     """
     # Draw a timeline, and play the signal on it.
     nodes = model.nodes(config.max_delay_s)
-    engine = choose(config.engine, nodes, model.given, config.jacobian)
+    engine = choose_engine(config.engine, nodes, model.given)
     timeline = draw(nodes, len(signal) / robot.rate_hz, rng=seed)
     commands, outputs = {}, {}
     for name in model.given:
@@ -66,8 +66,10 @@ def simulate(
     gs = graph.begin(params, jax.tree_util.tree_map(lambda rows: rows[0], messages), 0)
     # Simulate by the configured engine.
     if engine.name == "c":
-        outside = CRollouts(graph, engine.model)
-        records = jax.jit(lambda state: outside.rollout(state, params, tables, messages, model.sensor))(gs)
+        on_c = GraphOnC(graph, engine.model)
+        moved = on_c.step(jax.jit(lambda state: on_c.inputs(state, params, tables, messages))(gs))
+        single = [jnp.asarray(a, jnp.float32) for a in moved]
+        records = jax.jit(lambda state: on_c.outputs(state, single, tables, messages, model.sensor))(gs)
     else:
         records = jax.jit(lambda state: graph.run(state, tables, messages, model.sensor))(gs)
     # Return the simulation as an episode.

@@ -9,17 +9,15 @@ import numpy as np
 from sim2real.artifacts.identification import Determined, HeldOutPart
 from sim2real.graph.episode import Episode
 from sim2real.identify.fit import Fit, OnProgress, as_numbers, fit
+from sim2real.identify.held_out import MOST, Fold, Refits, folds_of, leave_out
 from sim2real.identify.model import IdentifiableModel
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span
-from sim2real.identify.uncertainty.identifiability import from_linearised
-from sim2real.identify.uncertainty.negligible import ABSENT
-from sim2real.identify.uncertainty.uncertainty import Uncertainty, between_parts, linearise
-from sim2real.identify.validation.folds import MOST, Fold, folds_of, leave_out
-from sim2real.identify.validation.optional_terms import Selection, select
-from sim2real.identify.validation.refits import Refits
-from sim2real.identify.validation.term_trials import Trials
+from sim2real.identify.problem import Problem
+from sim2real.identify.residuals import Linearised
+from sim2real.identify.segments import Span
+from sim2real.identify.terms import Selection, TermSearch
+from sim2real.identify.uncertainty import ABSENT, NOT_REACHED, Uncertainty, between_parts
+from sim2real.identify.uncertainty import determined as what_is_determined
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.identify.progress import Best
@@ -86,11 +84,11 @@ def fit_model(inputs: Inputs, best: Best) -> Fits:
     with progress(None, "identify: sets of terms") as bar:
         on_set = bar.set_postfix_str
         selection = patiently(lambda: chosen(widest, config, inputs.names, inputs.refits, on_set))
-    terms: Sequence[str] = selection.names(widest.problem.table)
+    terms: Sequence[str] = selection.chosen.names(widest.problem.table)
     # Refine the model with the selected terms. A value fixed by a flag stays fixed, in whichever term the parameter is;
     # the parameters of all other terms have their values without the term.
     narrow = table.with_terms(terms).with_fixed(config.fix)
-    values = as_numbers(widest.problem.table, selection.near[0].z)
+    values = as_numbers(widest.problem.table, selection.chosen.x)
     narrow = narrow.with_begin(
         {p.name: float(np.squeeze(values[p.name])) for p in narrow if p.free and not p.per_recording}
     )
@@ -108,20 +106,20 @@ def determined(inputs: Inputs, fits: Fits, check: Determined, spread: Uncertaint
     """
     estimate, groups, sentences = fits.estimate, check.undetermined, list[str]()
     table, tried, data = estimate.problem.table, set[str](), (inputs.model, inputs.episodes, inputs.fitted)
-    absent = [n for n, verdict in zip(table.names, spread.verdict, strict=True) if verdict in ABSENT]
+    absent = [n for n, verdict in zip(table.names, spread.verdict, strict=True) if verdict in (ABSENT, NOT_REACHED)]
     config, able = inputs.config, {p.name for p in table if p.kind == "dynamics" and not (p.term or p.per_recording)}
     while names := [n for group in groups for n in group if n in able - tried]:
         # Begin with parameters that a model may be without, such as an inertia of the rotor.
         name = min(names, key=lambda n: not table[n].vanishes)
         tried.add(name)
         held = estimate.problem.table.with_fixed({name: table[name].nominal})
-        end = estimate.z[[c.parameter.name != name for c in estimate.problem.table.columns]]
+        end = estimate.x[[c.parameter.name != name for c in estimate.problem.table.columns]]
         again = fitted_to(*data, inputs.windows, config, held, end=end)
         if not again.converged or again.loss > (1.0 + _AS_GOOD) * estimate.loss:
             continue
         estimate = again
-        at = linearise(again.problem, again.z)
-        groups = from_linearised(again.problem, at, [n for n in absent if n != name]).undetermined
+        at = again.problem.linearise(again.x)
+        groups = what_is_determined(again.problem, at, [n for n in absent if n != name]).undetermined
         value = f"{table[name].nominal:.4g} {table[name].unit}".rstrip()
         sentences.append(
             f"{name} is held at its nominal value, {value}: the data does not determine it, and the model explains the "
@@ -169,10 +167,10 @@ def chosen(
         on_set: Called with the names of each set of terms before it is fitted.
     """
     parts = parts_of(estimate, config, names, _LEAST_TO_CHOOSE)
-    trials = Trials(estimate, parts, config.settle_s, config.free_run_s, refits or Refits(), on_set)
+    trials = TermSearch(estimate, parts, config.settle_s, config.free_run_s, refits, on_set)
     if trials.segments < (count := len(estimate.problem.train)):
         note(f"sets of terms are compared on {trials.segments} of {count} segments, those with most motion")
-    return select(trials.grown())
+    return trials.select()
 
 
 def without_parts(inputs: Inputs, fits: Fits) -> tuple[HeldOutPart, ...]:
@@ -187,7 +185,7 @@ def without_parts(inputs: Inputs, fits: Fits) -> tuple[HeldOutPart, ...]:
         note(f"{segments} segments are too few to hold parts out of the fit")
         return ()
     if fits.selection is not None:  # the trials have these errors
-        return tuple(trial.rows[k] for k, trial in enumerate(fits.selection.by_part))
+        return tuple(fits.selection.chosen.rows)
     parts = parts_of(estimate, config, inputs.names)
     return tuple(leave_out(estimate, parts, config.settle_s, config.free_run_s, inputs.refits))
 
@@ -197,12 +195,8 @@ def parts_of(estimate: Fit, config: IdentifyConfig, names: Sequence[str], least:
     return folds_of(estimate.problem, max(2, min(config.folds, len(estimate.problem.train) // 2)), names, least)
 
 
-def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Sequence[HeldOutPart]) -> Uncertainty:
-    """Return an uncertainty that includes the spread of the estimates without one part.
-
-    Args:
-        x: Shape ``(P,)``: the estimate, on the parameters' scales.
-    """
+def widened(spread: Uncertainty, table: ParameterTable, at: Linearised, rows: Sequence[HeldOutPart]) -> Uncertainty:
+    """Return an uncertainty that includes the spread of the estimates without one part."""
     if len(rows) < _LEAST_PARTS:
         return spread
     values = [[np.ravel(row.values[c.parameter.name])[c.recording or 0] for c in table.columns] for row in rows]
@@ -213,7 +207,7 @@ def widened(spread: Uncertainty, table: ParameterTable, x: np.ndarray, rows: Seq
     if len(rows) > MOST:  # parts that were held out together have one estimate
         moved, of = np.unique(moved, axis=0, return_inverse=True)
         share = np.array([share[np.ravel(of) == g].sum(axis=0) for g in range(len(moved))])
-    return between_parts(spread, table, x, moved, share)
+    return between_parts(spread, table, at, moved, share)
 
 
 @contextmanager

@@ -26,21 +26,21 @@ from sim2real.artifacts.identification import (
 )
 from sim2real.artifacts.posterior import Posterior
 from sim2real.graph.episode import Episode
-from sim2real.identify.delays.links import links
+from sim2real.identify import predictions as prediction
+from sim2real.identify import verdict
+from sim2real.identify.delays import links
 from sim2real.identify.expected import wider_for, with_expected_errors
 from sim2real.identify.fit import Fit, Value, as_numbers, refit
 from sim2real.identify.model import measured_channels
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.problem.segments import Span, beyond, ranges
-from sim2real.identify.uncertainty import ensemble, identifiability, noise, uncertainty
-from sim2real.identify.uncertainty.negligible import NOT_REACHED, indifferent, negligible
-from sim2real.identify.uncertainty.per_recording import compare_recordings
-from sim2real.identify.validation import prediction, verdict
-from sim2real.identify.validation.replays import replays
-from sim2real.identify.validation.term_gains import gains
-from sim2real.identify.validation.term_trials import Trials
-from sim2real.identify.validation.verdict import ACCEPTED, CHANGE, NO_DELAY, Position, positions, scores, state_of
-from sim2real.identify.validation.worst_second import worst_second
+from sim2real.identify.predictions import Position, positions, replays, worst_second
+from sim2real.identify.problem import Problem
+from sim2real.identify.residuals import Linearised
+from sim2real.identify.segments import Span, beyond, ranges
+from sim2real.identify.terms import TermSearch, gains
+from sim2real.identify.uncertainty import ABSENT, NOT_REACHED, Uncertainty, compare_recordings, from_linearised, noises
+from sim2real.identify.uncertainty import determined as what_is_determined
+from sim2real.identify.uncertainty import widening as posterior_widening
+from sim2real.identify.verdict import ACCEPTED, CHANGE, NO_DELAY, scores, state_of
 from sim2real.robots.robot import in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import (
@@ -98,24 +98,20 @@ def judge(inputs: Inputs, fits: Fits, started_s: float) -> Identification:
             findings = patiently(lambda: Findings.of(fits.estimate, parts)) if held else findings
         fit = findings.fit
         truth = true_values(inputs.logs[0]) if config.reveal else {}
-        # Collect the models that explain the recordings as well, for training to draw from.
-        bar.set_description_str("identify: posterior")
-        posterior = patiently(
-            lambda: ensemble.posterior(fit, findings.at, findings.spread, fits.widest, fits.selection)
-        )
+        posterior = fit.problem.table.posterior(fit.x, findings.spread.scale_covariance)
         document = _estimates(inputs.pipeline.name, findings, posterior, truth, time.monotonic() - started_s)
         # Predict held-out data, beside baselines.
         bar.set_description_str("identify: predictions and baselines")
         document = patiently(lambda: _predicted(document, inputs, fit))
         bar.set_description_str("identify: each recording, distribution of delays")
         several = config.each and inputs.fitted > 1
-        aggregate = patiently(lambda: compare_recordings(fit)) if several else ()
-        links_ = patiently(lambda: links(fit.problem, fit.z)) if config.links else ()
+        aggregate = patiently(lambda: compare_recordings(fit.problem, findings.at)) if several else ()
+        links_ = patiently(lambda: links(fit.problem, fit.x)) if config.links else ()
         document = replace(document, left_out=parts, terms=fits.terms, links=links_, aggregate=aggregate)
         # Try further terms where residuals are far above the noise.
         bar.set_description_str("identify: terms that may be missing")
         if fits.selection is not None:
-            tried = gains(fits.selection.trials, fits.selection.near[0], fits.widest.problem.table)
+            tried = gains(fits.selection, fits.widest.problem.table)
             document = replace(document, tried=tried)
         document, lacks = patiently(lambda: lack(document, inputs, fit))
     if inputs.standing is not None:
@@ -139,8 +135,8 @@ class Findings:
     """
 
     fit: Fit
-    at: uncertainty.Linearised
-    spread: uncertainty.Uncertainty
+    at: Linearised
+    spread: Uncertainty
     check: Determined
     widening: float
 
@@ -156,25 +152,14 @@ class Findings:
         Args:
             without: The estimates without one part of the recordings each.
         """
-        at = uncertainty.linearise(fit.problem, fit.z)
-        spread = widened(uncertainty.from_linearised(fit.problem, at), fit.problem.table, at.x, without)
-        check = identifiability.from_linearised(fit.problem, at)
-        # Give parameters that the model does not need a single bound.
-        spread, check = negligible(fit.problem, fit.z, at, spread, check)
-        fit, at = _with_nominal_limits(fit, at, spread)
-        return Findings(fit, at, spread, check, noise.widening(at, spread))
-
-
-def _with_nominal_limits(
-    fit: Fit, at: uncertainty.Linearised, spread: uncertainty.Uncertainty
-) -> tuple[Fit, uncertainty.Linearised]:
-    """Return a fit with limits that no motion reaches at their nominal values: the loss does not depend on them."""
-    table, x = fit.problem.table, at.x.copy()
-    for i in np.flatnonzero([v == NOT_REACHED for v in spread.verdict]):
-        p = table.columns[i].parameter
-        x[i] = p.to_scale(indifferent(p, float(spread.low[i])))
-    z = np.where(x == at.x, fit.z, table.at_scale(x))
-    return replace(fit, z=z), replace(at, x=x)
+        at = fit.problem.linearise(fit.x)
+        spread = widened(from_linearised(fit.problem, at), fit.problem.table, at, without)
+        table = fit.problem.table
+        one_sided = [n for n, v in zip(table.names, spread.verdict, strict=True) if v in (ABSENT, NOT_REACHED)]
+        check = what_is_determined(fit.problem, at, one_sided)
+        # The loss does not depend on a limit that no motion reaches: it stays nominal.
+        x = np.where([v == NOT_REACHED for v in spread.verdict], np.maximum(table.nominal(), at.x), at.x)
+        return Findings(replace(fit, x=x), replace(at, x=x), spread, check, posterior_widening(at, spread))
 
 
 def _estimates(
@@ -295,8 +280,8 @@ def _without_delays(fit: Fit) -> dict[str, Mapping[str, Value]]:
     largest_s = max(float(np.max(np.abs(np.subtract(fit.values[p.name], p.without)))) for p in delays)
     # A fit without delays is its own baseline: a second fit of a quadruped took 120 s and changed no estimate.
     if largest_s < _NO_DELAY_S:
-        return {NO_DELAY: as_numbers(table, fit.z, kept)}
-    return {NO_DELAY: refit(fit.problem, kept, fit.z)}
+        return {NO_DELAY: as_numbers(table, fit.x, kept)}
+    return {NO_DELAY: refit(fit.problem, kept, fit.x)}
 
 
 def free_runs(
@@ -358,7 +343,7 @@ def lack(document: Identification, inputs: Inputs, fit: Fit) -> tuple[Identifica
     config, measured = inputs.config, positions(inputs.model, inputs.robot.units)
     automatic, chosen = config.terms == "auto", [*(document.terms or ())]
     reasons, flags, term = list[str](), "", _USUAL_TERM
-    worst = largest_residual(document, noise.noises(document.samples, inputs.units), measured)
+    worst = largest_residual(document, noises(document.samples, inputs.units), measured)
     if worst is not None and worst[1] > _FAR:
         position, ratio, level = worst
         unit = f" {position.unit}".rstrip()
@@ -452,12 +437,12 @@ def _tried(inputs: Inputs, fit: Fit) -> tuple[TriedTerm, ...]:
     length_s = config.settle_s + config.horizon_s
     problem = Problem(model, episodes, inputs.windows, length_s, config, table)
     values = {p.name: p.without for p in problem.table} | fit.values
-    z = problem.table.encode(values)
-    whole = replace(fit, problem=problem, windows=problem, z=z, refined=(), search=None)
+    x = problem.table.encode(values)
+    whole = replace(fit, problem=problem, windows=problem, x=x, refined=(), search=None)
     parts = parts_of(whole, config, inputs.names)
     present = np.array([name in chosen for name in problem.table.terms])
-    trials = Trials(whole, parts, config.settle_s, 0.0).singles(z, present)
-    return tuple(r for r in gains(trials, trials[0], problem.table) if r.term in further)
+    selection = TermSearch(whole, parts, config.settle_s, 0.0).further(x, present)
+    return tuple(r for r in gains(selection, problem.table) if r.term in further)
 
 
 def _free_runs_with(inputs: Inputs, wanted: str, term: str) -> Sequence[FreeRun] | None:

@@ -19,8 +19,8 @@ from sim2real.artifacts.progress import write_best_fit, write_progress
 from sim2real.artifacts.run.run_folder import OpenStage
 from sim2real.identify.fit import as_numbers
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.validation.prediction import samples
+from sim2real.identify.predictions import samples
+from sim2real.identify.problem import Problem
 from sim2real.stages.identify.inputs import Inputs
 from sim2real.stages.live.viewer import live_view
 from sim2real.stages.terminal.console import note, shown

@@ -12,8 +12,8 @@ from typing import Any
 from sim2real.artifacts.identification import PARAMETERS, Identification
 from sim2real.artifacts.run.run_folder import OpenStage, StageFolder, newest, open_stage
 from sim2real.errors import UsageError
-from sim2real.identify.uncertainty.noise import noises
-from sim2real.identify.validation.refits import REFITS
+from sim2real.identify.held_out import REFITS
+from sim2real.identify.uncertainty import noises
 from sim2real.robots.robot import RecordedRobot, Robot
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.identify.fitting import fit_model
@@ -68,7 +68,7 @@ def _identify(inputs: Inputs, best: Best) -> Identification:
     started_s = time.monotonic()
     # Fit, then write the fit down before it is judged, which takes longer than the fit.
     fits = fit_model(inputs, best)
-    best.fitted(fits.estimate.z, fits.estimate.loss)
+    best.fitted(fits.estimate.x, fits.estimate.loss)
     identification = judge(inputs, fits, started_s)
     return replace(
         identification,

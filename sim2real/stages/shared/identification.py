@@ -21,7 +21,7 @@ from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.identify.model import IdentifiableModel, position_of
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.segments import GRID_S, Span, on_grid
+from sim2real.identify.segments import GRID_S, Span, on_grid
 from sim2real.robots.robot import RecordedRobot, in_world
 from sim2real.stages.identify.config import IdentifyConfig
 from sim2real.stages.pipeline.pipeline import Pipeline

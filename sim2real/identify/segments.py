@@ -15,7 +15,6 @@ from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.timeline import Timeline
 from sim2real.graph.times import Vertex
 from sim2real.identify.model import ChecksLogs, IdentifiableModel
-from sim2real.identify.problem.sizes import padded, rounded
 from sim2real.later import jnp
 from sim2real.types import Array, PyTree
 
@@ -61,8 +60,7 @@ class Segments:
 class Data(NamedTuple):
     """Segments as an argument of compiled programs: recordings whose counts round up alike share programs.
 
-    E is the number of segments, S that of the fitted ones, K that of the sensor's steps. All are rounded up; the
-    padding repeats the last entry and has no weight.
+    E is the number of segments, K that of the sensor's steps. Both are rounded up; the padding repeats the last entry.
 
     Attributes:
         tables: Timing of the simulated steps, from ``OpenLoopGraph.tables``.
@@ -71,11 +69,6 @@ class Data(NamedTuple):
         ts: Shape ``(E, K)``: its time [s from the segment's start]; -1 without a comparison.
         starts: Shape ``(E, channels, 4)``, as in ``Segments``.
         recording: Shape ``(E,)``: number of the segment's recording.
-        length_s: Length of a segment [s].
-        fitted: Shape ``(S,)``: numbers of the fitted segments.
-        weight: Shape ``(S,)``: 1 for a fitted segment that counts, 0 for another.
-        present: Shape ``(P,)``, bool: which free parameters are part of the model.
-        count: Number of measured numbers in the fitted segments.
     """
 
     tables: PyTree
@@ -84,45 +77,24 @@ class Data(NamedTuple):
     ts: Array
     starts: Array
     recording: Array
-    length_s: Array | np.float32
-    fitted: Array
-    weight: Array
-    present: Array
-    count: Array | np.float32  # pyright: ignore[reportIncompatibleMethodOverride] - a tuple's count() is not used
 
 
-def data_of(cuts: Segments, tables: PyTree, from_s: float, fields: int, parameters: int) -> Data:
+def data_of(cuts: Segments, tables: PyTree, from_s: float) -> Data:
     """Return segments as an argument of compiled programs.
 
     Args:
         from_s: Start of the comparison [s from the segment's start].
     """
-    segments = len(cuts.spans)
-    fitted = np.flatnonzero([s.fitted for s in cuts.spans])
-    # Round the sizes up and pad, so that logs of similar length share programs.
     ts = np.where(cuts.ts >= from_s, cuts.ts, -1.0)
-    steps, size = rounded(ts.shape[1]), rounded(segments)
+    steps = rounded(ts.shape[1])
     ts = np.pad(ts, ((0, 0), (0, steps - ts.shape[1])), constant_values=-1.0)
-    # Pad measurements and messages.
     measured = {f: np.asarray(padded(rows, steps, 1), np.float32) for f, rows in cuts.measured.items()}
     messages = {
         n: pytree.map(lambda leaf: padded(leaf, rounded(leaf.shape[1]), 1), tree) for n, tree in cuts.messages.items()
     }
     rows = (tables, messages, measured, ts.astype(np.float32), np.asarray(cuts.starts, np.float32),
             np.array([s.recording for s in cuts.spans], np.int32))  # fmt: skip
-    # Weights of the fitted segments.
-    counts = rounded(max(len(fitted), 1))
-    return pytree.map(
-        jnp.asarray,
-        Data(
-            *padded(rows, size),
-            length_s=np.float32(cuts.length_s),
-            fitted=np.pad(fitted, (0, counts - len(fitted))).astype(np.int32),
-            weight=(np.arange(counts) < len(fitted)).astype(np.float32),
-            present=np.ones(parameters, bool),
-            count=np.float32(max(int((ts[fitted] >= 0.0).sum()) * fields, 1)),
-        ),
-    )
+    return pytree.map(jnp.asarray, Data(*padded(rows, rounded(len(cuts.spans)))))
 
 
 def cut(
@@ -351,3 +323,35 @@ def beyond(fitted: Mapping[str, Signal], held_out: Mapping[str, Signal], share: 
             text = f"{label} reaches [{lowest:.3g}, {highest:.3g}], fitted was [{low:.3g}, {high:.3g}]"
             messages.append((excess, text))
     return [text for _, text in sorted(messages, reverse=True)[:_MOST_BEYOND]]
+
+
+_EXACT = 4
+"""Largest count that is not rounded."""
+
+
+def rounded(count: int, steps: int = 4) -> int:
+    """Return a count rounded up to one of ``steps`` sizes between a power of two and the next.
+
+    Four steps add a quarter at most and an eighth on average; eight steps add half of that.
+
+    Args:
+        count: At least 1.
+    """
+    if count <= max(_EXACT, steps):
+        return count
+    unit = max(1, 2 ** (int(count - 1).bit_length() - 1) // steps)
+    return -(-count // unit) * unit
+
+
+def padded(tree: PyTree, size: int, axis: int = 0) -> PyTree:
+    """Return arrays that repeat their last entry along an axis up to a size.
+
+    Args:
+        size: At least the length along the axis.
+    """
+
+    def one(leaf: np.ndarray) -> np.ndarray:
+        width = [(0, size - leaf.shape[i]) if i == axis else (0, 0) for i in range(leaf.ndim)]
+        return np.pad(leaf, width, mode="edge")
+
+    return pytree.map(lambda leaf: one(np.asarray(leaf)), tree)

@@ -11,8 +11,9 @@ from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.posterior import Posterior, Transform
 from sim2real.errors import Sim2RealError, UsageError
 from sim2real.identify.parameters import ParameterTable
-from sim2real.identify.problem.problem import Problem
-from sim2real.identify.uncertainty.uncertainty import Linearised, linearise, loss_variance
+from sim2real.identify.problem import Problem
+from sim2real.identify.residuals import Linearised
+from sim2real.identify.uncertainty import loss_variance
 
 LEVEL = 0.05
 """False-alarm rate of the drift test, per log."""
@@ -114,13 +115,13 @@ def drift(problem: Problem, posterior: Posterior, widening: float, causes: Cause
     if not fitted:
         raise Sim2RealError("this log determines no parameter", hint="deploy a policy that moves the robot")
     # Compare with the log's loss without a change.
-    at = _finite(linearise(problem, table.at_scale(posterior.mean)))
+    at = _finite(problem.linearise(table.within(posterior.mean)))
     now = _with_the_rest(at, root, loss_variance(problem, at))
     fitted.sort(key=lambda one: one.loss)
     # Return the better of the best change and the estimate.
     seconds = problem.segment_s * len(problem.train)
     ends = (posterior.mean + fitted[0].size * fitted[0].way.along, posterior.mean)
-    losses = [problem.loss(table.at_scale(x)) for x in ends]
+    losses = [problem.loss(table.within(x)) for x in ends]
     return weigh(fitted, now, table, posterior, seconds), ends[int(losses[1] < losses[0] or not np.isfinite(losses[0]))]
 
 
@@ -152,13 +153,13 @@ def _alone(problem: Problem, mean: np.ndarray, root: np.ndarray, way: Way) -> Fi
     table = problem.table
 
     def point(size: float) -> np.ndarray:
-        return table.at_scale(mean + size * way.along)
+        return table.within(mean + size * way.along)
 
     # Find the size of the change that fits best.
     moving = way.along != 0.0
     unit = float(np.min(table.span[moving] / np.abs(way.along[moving])))
     size = _best(problem, point, unit)
-    at = _finite(linearise(problem, point(size)))
+    at = _finite(problem.linearise(point(size)))
     # A log that does not depend on the change tests nothing.
     variance, informed = loss_variance(problem, at), float(np.sum((at.jacobian @ way.along) ** 2))
     if informed * unit**2 <= _FELT * variance:
@@ -171,7 +172,7 @@ def _best(problem: Problem, point: Callable[[float], np.ndarray], unit: float) -
     """Return the size of a change that fits the log best.
 
     Args:
-        point: Size of the change -> the unbounded vector ``(P,)``.
+        point: Size of the change -> a point ``(P,)``.
         unit: The size between the bounds.
     """
     size, sizes = 0.0, unit * np.array(sorted([0.0, *_SIZES]))

@@ -2,17 +2,14 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from sim2real.artifacts.identification import Determined, HeldOut, Judgement, Prediction
-from sim2real.identify.model import IdentifiableModel, position_of
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.identify.uncertainty.bounds import is_physical, way_out
-from sim2real.identify.uncertainty.uncertainty import Uncertainty
-from sim2real.log.schema import unit_of
+from sim2real.identify.predictions import NOISE, Position
+from sim2real.identify.uncertainty import ABSENT, BOUND, NOT_REACHED, OK, Uncertainty
 
 Status = Literal["accepted", "record again", "change the model", "not finished"]
 ACCEPTED: Status = "accepted"
@@ -21,37 +18,14 @@ CHANGE: Status = "change the model"
 NOT_FINISHED: Status = "not finished"
 _BETTER = 0.95
 """Largest ratio of the held-out error to that of a baseline with which the estimate is better."""
-NOISE = 2.0
-"""Errors below this many deviations of the measurement count as noise."""
 _MOST = 3
 """Largest number of positions that the reasons name, the worst first."""
+_WIDER = 4.0
+"""Factor between the old and the new bound on a logarithmic scale."""
+_LONGEST_S = 1.0
+"""Longest delay that the flags allow [s]."""
 NO_DELAY = "no delay"
 """The same model fitted without delays. If it is as good, the data needs no delays; that is no failure."""
-
-
-@dataclass(frozen=True)
-class Position:
-    """A measured position that is judged.
-
-    Attributes:
-        column: Its name in tables of errors, ``position[1]``.
-        name: Its name for people.
-        sigma: Deviation of a measurement.
-    """
-
-    column: str
-    name: str
-    unit: str
-    sigma: float
-
-
-def positions(model: IdentifiableModel, units: Mapping[str, str]) -> list[Position]:
-    """Return the measured positions of a model, which are judged one by one.
-
-    Args:
-        units: Field -> unit.
-    """
-    return [Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma) for c in model.channels]
 
 
 def scores(prediction: Sequence[Prediction], positions: Sequence[Position]) -> list[HeldOut]:
@@ -153,9 +127,9 @@ def state_of(verdict: str, p: Parameter, upper: bool) -> str:
         verdict: That of ``Uncertainty``.
         upper: Whether the estimate is in the upper half of its bounds.
     """
-    if verdict == "at a bound":
+    if verdict == BOUND:
         return "ok" if is_physical(p, upper) else verdict
-    return "ok" if verdict in ("accepted", "negligible") else "not determined"
+    return "ok" if verdict in (OK, ABSENT) else "not determined"
 
 
 def _not_converged(left: float) -> str:
@@ -171,10 +145,10 @@ def _absent(table: ParameterTable, spread: Uncertainty) -> list[str]:
     messages = []
     for i, name in enumerate(table.names):
         unit = table.columns[i].parameter.unit
-        if spread.verdict[i] == "negligible":
+        if spread.verdict[i] == ABSENT:
             bound = f"at most {spread.high[i]:.2g} {unit} (95 %)"
-            messages.append(f"{name} is negligible: {bound}, and without it the model predicts the same")
-        elif spread.verdict[i] == "not reached":
+            messages.append(f"{name} is small: {bound}, and it may be 0")
+        elif spread.verdict[i] == NOT_REACHED:
             bound = f"it is at least {spread.low[i]:.2g} {unit} (95 %)"
             above = "no larger value changes the predictions for these recordings"
             messages.append(f"{name} is not reached: {bound}, and {above}")
@@ -238,7 +212,7 @@ def _at_bounds(
     """
     messages, at_zero, flags = [], [], []
     for i in determined:
-        if spread.verdict[i] != "at a bound":
+        if spread.verdict[i] != BOUND:
             continue
         label, p = table.columns[i].label, table.columns[i].parameter
         upper = bool(table.high[i] - x[i] < x[i] - table.low[i])
@@ -259,3 +233,34 @@ _CAUSES = (
 def _bound(name: str, upper: bool, bound: str, flags: str) -> str:
     what = f"identify again with {flags}, or doubt the model" if flags else _CAUSES
     return f"at a bound: {name} is at its {'upper' if upper else 'lower'} one, {bound.rstrip()}; {what}"
+
+
+def is_physical(p: Parameter, upper: bool) -> bool:
+    """Return whether no value beyond a bound is possible: delays and frictions are not below 0."""
+    return not upper and p.low == 0.0 and not p.narrowed and (p.kind == "delay" or p.transform == "linear")
+
+
+def way_out(p: Parameter, upper: bool, max_delay_s: float) -> str:
+    """Return flags that widen the bound at which a parameter lies.
+
+    Args:
+        max_delay_s: Longest delay of the model [s].
+    """
+    if p.kind == "delay":
+        return _longer(p, max_delay_s) if upper else f"--bounds {p.name} 0 {p.high:g}"
+    low, high = p.low, p.high
+    if p.transform == "log":
+        low, high = (low, high * _WIDER) if upper else (low / _WIDER, high)
+    elif p.transform == "logit":
+        low, high = (low, 1.0 - (1.0 - high) / _WIDER) if upper else (low / _WIDER, high)
+    else:
+        below = low - (high - low)  # a share or a friction is not negative
+        low, high = (low, high + (high - low)) if upper else (max(below, 0.0) if low > 0.0 else below, high)
+    return f"--bounds {p.name} {low:.6g} {high:.6g}"
+
+
+def _longer(p: Parameter, max_delay_s: float) -> str:
+    """Return flags that allow a longer delay; "" if the delay is the longest possible."""
+    if p.high < 0.999 * max_delay_s:  # it was narrowed
+        return f"--bounds {p.name} {p.low:g} {min(2.0 * p.high, max_delay_s):g}"
+    return f"--max-delay-s {min(2.0 * max_delay_s, _LONGEST_S):g}" if max_delay_s < _LONGEST_S else ""

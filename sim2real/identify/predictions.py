@@ -1,18 +1,48 @@
-"""Errors of a model's predictions, over horizons and in free runs, beside baselines without a model."""
+"""Predictions of a model, their errors over horizons and in free runs, and baselines without a model beside them."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sim2real.artifacts.identification import FreeRun, Prediction
+from sim2real.artifacts.identification import FreeRun, Prediction, WorstSecond, worst_window
 from sim2real.graph.node import TICKS_PER_S
-from sim2real.identify.model import position_of
-from sim2real.identify.problem.problem import Problem
+from sim2real.identify.model import IdentifiableModel, position_of
+from sim2real.identify.problem import Problem
+from sim2real.log.schema import unit_of
 
 GOAL = "told"
 """Name of the baseline that takes the newest goal for the position."""
+NOISE = 2.0
+"""Errors below this many deviations of the measurement count as noise."""
+
+
+@dataclass(frozen=True)
+class Position:
+    """A measured position that is judged.
+
+    Attributes:
+        column: Its name in tables of errors, ``position[1]``.
+        name: Its name for people.
+        sigma: Deviation of a measurement.
+    """
+
+    column: str
+    name: str
+    unit: str
+    sigma: float
+
+
+def positions(model: IdentifiableModel, units: Mapping[str, str]) -> list[Position]:
+    """Return the measured positions of a model, which are judged one by one.
+
+    Args:
+        units: Field -> unit.
+    """
+    return [Position(position_of(c), c.name, unit_of(position_of(c), units), c.position_sigma) for c in model.channels]
 
 
 def samples(
@@ -161,3 +191,77 @@ def _predicted(columns: Mapping[str, np.ndarray], field: str, model: str, ahead:
         past = rows[ahead[rows] <= 0]
         predicted[rows] = columns[f"{field}_measured"][past[-1] if past.size else rows[0]]
     return predicted
+
+
+def replays(problem: Problem, values: Mapping[str, ArrayLike], settle_s: float, kind: str) -> dict[str, np.ndarray]:
+    """Return columns of the R held-out segments, named ``KIND/...``; empty if several nodes drive the model.
+
+    Args:
+        values: Values of all parameters.
+        settle_s: Length of the first part of a segment, to which its initial state is fitted [s].
+
+    Returns:
+        ``segment``, ``recording``, ``begin_s``: ``(R,)``. ``start (R, 2 * channels)``: positions, then velocities.
+        ``sent_s (R, K)``: when each command was sent [s from the segment's start], NaN after the last one.
+        ``command/FIELD (R, K, ...)``.
+    """
+    if len(problem.messages) != 1:
+        return {}
+    held_out = np.flatnonzero(~np.isin(np.arange(problem.segments), problem.train))
+    rows = {n: np.broadcast_to(v, (len(held_out), *np.shape(v))) for n, v in values.items()}
+    starts = problem.simulated(rows, held_out, np.full(len(held_out), settle_s))[1]
+    ((node, messages),) = problem.messages.items()
+    steps = problem.timeline.vertices[node]
+    sent = np.where(np.arange(steps.end.shape[1]) < steps.count[:, None], steps.end / TICKS_PER_S, np.nan)
+    columns = {
+        "segment": held_out,
+        "recording": problem.recording[held_out],
+        "begin_s": problem.begins_s[held_out],
+        "start": starts,
+        "sent_s": sent[held_out],
+    }
+    names = jax.tree_util.tree_leaves(problem.model.given[node])
+    for name, field in zip(names, jax.tree_util.tree_leaves(messages), strict=True):
+        columns[f"command/{name}"] = np.asarray(field)[held_out]
+    return {f"{kind}/{name}": column for name, column in columns.items()}
+
+
+def worst_second(
+    samples: Mapping[str, np.ndarray], positions: Sequence[Position], settle_s: float
+) -> WorstSecond | None:
+    """Return the worst second of all joints, recordings and segments, fitted and held-out ones; None without samples.
+
+    The second with the largest error beyond the noise, as a share of the joint's motion, is the worst: so a joint that
+    moves little, and a joint that moves much, can both be it. If all errors are noise, it is the second with the
+    largest error in deviations of a measurement.
+
+    Args:
+        samples: Result of ``prediction.samples``.
+        settle_s: First part of held-out segments, to which initial states were fitted; it does not count [s].
+    """
+    best: tuple[tuple[float, float], WorstSecond] | None = None
+    segments = list(_segments(samples, settle_s)) if samples else []
+    for p in positions:
+        if f"{p.column}_identified" not in samples:
+            continue
+        measured = samples[f"{p.column}_measured"].astype(np.float64)
+        squares = (measured - samples[f"{p.column}_identified"]) ** 2
+        motion = {r: float(np.std(measured[samples["recording"] == r])) for r in np.unique(samples["recording"])}
+        for rows in segments:
+            recording = int(samples["recording"][rows[0]])
+            begin_s, end_s, error = worst_window(samples["t"][rows], squares[rows])
+            # A joint that does not move is compared with its noise.
+            still = max(motion[recording], NOISE * p.sigma)
+            score = (max(error - NOISE * p.sigma, 0.0) / still, error / p.sigma)
+            if best is None or score > best[0]:
+                sizes = (error, error / p.sigma, error / still) if math.isfinite(error) else (None, None, None)
+                segment = int(samples["segment"][rows[0]])
+                best = score, WorstSecond(p.name, p.column, p.unit, recording, segment, begin_s, end_s, *sizes)
+    return None if best is None else best[1]
+
+
+def _segments(samples: Mapping[str, np.ndarray], settle_s: float) -> Iterator[np.ndarray]:
+    """Yield the rows of each segment that count."""
+    counts = ~samples["held_out"].astype(bool) | (samples["into"] > settle_s)
+    for segment in np.unique(samples["segment"][counts]):
+        yield np.flatnonzero(counts & (samples["segment"] == segment))

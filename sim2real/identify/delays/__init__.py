@@ -1,1 +1,0 @@
-"""Distributions of delays that no time stamp shows: deviations, losses and clock drift of links."""

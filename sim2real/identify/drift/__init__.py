@@ -1,1 +1,0 @@
-"""Whether a later log is still of the robot that was identified."""

@@ -1,0 +1,438 @@
+"""Parts of the recordings that are held out of a fit, one at a time: estimates without them, and their errors there.
+
+Around an estimate the loss of every part of the recordings is a quadratic function of the parameters, so the estimate
+without a part follows by linear algebra; a short descent ends there. Finished refits are stored in a file: a judgement
+that was ended goes on where it was. A refit is used again only for the same inputs: the file's digest covers logs,
+parameters and settings, and the model must still give the loss that the fit of all parts had.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from sim2real.artifacts.files import read_json, write_json
+from sim2real.artifacts.identification import HeldOutPart, TriedTerm
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.identify.fit import Fit, refine, with_terms
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.predictions import labels
+from sim2real.identify.problem import Problem
+from sim2real.identify.residuals import Linearised, Part
+from sim2real.identify.segments import Span, on_grid
+
+REFITS = "refits.json"
+"""File of finished refits."""
+MOST = 12
+"""Most fits without parts."""
+MOVES = 10.0
+"""Range of a joint's positions in motion, in deviations of a measurement."""
+_ROUNDING_S = 1e-6
+"""Largest rounding error of a time."""
+_SAME = 3e-4
+"""Relative difference of two losses up to which two fits ended in one minimum."""
+_GAIN = 1e-3
+"""Relative gain of the loss at which a descent without a part ends."""
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A held-out part of the recordings.
+
+    Attributes:
+        name: For tables.
+        parts: Its stretches: recording, begin and end [s].
+    """
+
+    name: str
+    parts: tuple[tuple[int, float, float], ...]
+
+    def touches(self, spans: Sequence[Span], length_s: float) -> np.ndarray:
+        """Return which segments of a length share time with this part, ``(S,)``, bool."""
+        recording, begins = np.array([s.recording for s in spans]), np.array([s.begin_s for s in spans])
+        touched = np.zeros(len(spans), bool)
+        for r, begin, end in self.parts:
+            within = (begins < end - _ROUNDING_S) & (begins + length_s > begin + _ROUNDING_S)
+            touched |= (recording == r) & within
+        return touched
+
+
+def shared(parts: Sequence[Fold]) -> tuple[list[Fold], np.ndarray]:
+    """Return the parts that fits are made without, at most ``MOST``, and the number of that of each part, ``(K,)``.
+
+    Of more parts, every twelfth is in one group: the other parts of a kind, whose names are similar, stay in the fit.
+    """
+    of = np.arange(len(parts)) % MOST
+    if len(parts) <= MOST:
+        return list(parts), of
+    members = [[p for p, group in zip(parts, of, strict=True) if group == g] for g in range(MOST)]
+    groups = [Fold(f"group {g + 1}", tuple(s for p in some for s in p.parts)) for g, some in enumerate(members)]
+    return groups, of
+
+
+def folds_of(problem: Problem, blocks: int, names: Sequence[str] = (), least: int = 2) -> list[Fold]:
+    """Return the parts to hold out: each recording, or blocks of equal length if there are too few recordings.
+
+    Args:
+        blocks: Number of blocks of all recordings together.
+        names: A name for each recording; recordings of one name are one part. Default: each is a part.
+
+    Raises:
+        UsageError: When there is too little to hold a part out.
+    """
+    spans = [problem.spans[i] for i in problem.train]
+    recordings = sorted({s.recording for s in spans})
+    name_of = {r: names[r] if names else f"recording {r + 1}" for r in recordings}
+    groups = {name: [r for r in recordings if name_of[r] == name] for name in name_of.values()}
+    # Hold each recording out, or cut each into blocks of equal length.
+    if len(groups) >= max(least, 2):
+        folds = [Fold(name, tuple((r, 0.0, np.inf) for r in members)) for name, members in groups.items()]
+    else:
+        folds = []
+        for r in recordings:
+            members = [s.begin_s for s in spans if s.recording == r]
+            first, last = min(members), max(members) + problem.segment_s
+            edges = np.linspace(first, last, -(-blocks // len(recordings)) + 1)
+            edges[1:-1] = first + on_grid(edges[1:-1] - first)
+            which = f"{name_of[r]}, " if len(recordings) > 1 else ""
+            folds += [Fold(f"{which}{a:.0f} to {b:.0f} s", ((r, a, b),)) for a, b in pairwise(edges)]
+    # Require that each part leaves segments to fit, and holds some.
+    counts = [int(f.touches(spans, problem.segment_s).sum()) for f in folds]
+    if not 2 <= len(folds) <= len(spans) or min(counts) == 0 or max(counts) == len(spans):
+        raise UsageError(
+            f"{len(spans)} segments of {problem.segment_s:g} s cannot be divided into {len(folds)} parts to hold out",
+            hint="fewer --folds, a longer recording, or shorter segments",
+        )
+    return folds
+
+
+def masks(problem: Problem, parts: Sequence[Fold]) -> np.ndarray:
+    """Return which fitted segments share time with each part, ``(K, S)``, bool."""
+    spans = [problem.spans[i] for i in problem.train]
+    return np.array([p.touches(spans, problem.segment_s) for p in parts])
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """The loss of K parts of the recordings around a point, as quadratic functions of the parameters' scales.
+
+    Attributes:
+        x: Shape ``(P,)``: the point.
+        value: Shape ``(K,)``: sums of squares there.
+        gradient: Shape ``(K, P)``: half the gradients.
+        information: Shape ``(K, P, P)``: half the second derivatives.
+        prior: Shape ``(P, P)``: information of priors and bounds.
+        count: Shape ``(K,)``: number of measurements of each part.
+    """
+
+    x: np.ndarray
+    value: np.ndarray
+    gradient: np.ndarray
+    information: np.ndarray
+    prior: np.ndarray
+    count: np.ndarray
+
+    def step(
+        self, table: ParameterTable, present: np.ndarray, held_out: np.ndarray | None = None, bounded: bool = False
+    ) -> np.ndarray:
+        """Return the step to the estimate of a smaller model from all parts, or all but some, ``(P,)``.
+
+        Args:
+            present: Shape ``(T,)``, bool: the terms of the model.
+            held_out: Shape ``(K,)``, bool: the held-out parts; None: all parts are used.
+            bounded: Whether parameters stop at their bounds, and the others are optimised with these values.
+        """
+        # Move the parameters of absent terms to their values without effect.
+        step, gone = with_terms(table, self.x, present) - self.x, ~table.of_terms(present)
+        # Sum the quadratic functions of the parts.
+        g, H = self.gradient.sum(axis=0), self.information.sum(axis=0) + self.prior
+        if held_out is not None:
+            g, H = g - self.gradient[held_out].sum(axis=0), H - self.information[held_out].sum(axis=0)
+        # Solve for the other parameters; stop those that leave their bounds, and solve again.
+        for _ in range(len(self.x)):
+            rest = np.flatnonzero(~gone)
+            step[rest] = 0.0
+            step[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], (g + H @ step)[rest])
+            end = self.x + step
+            beyond = ~gone & ((end < table.low) | (end > table.high))
+            if not bounded or not beyond.any():
+                break
+            step[beyond] = (np.clip(end, table.low, table.high) - self.x)[beyond]
+            gone |= beyond
+        return step
+
+
+def statistics(problem: Problem, at: Linearised, parts: np.ndarray) -> Statistics:
+    """Return the loss of parts of the recordings around a point.
+
+    Args:
+        at: The point, for the fitted segments.
+        parts: Shape ``(K, S)``, bool: the fitted segments of each part.
+    """
+    size = len(at.x)
+    rows = [(at.residuals[mask].reshape(-1), at.jacobian[mask].reshape(-1, size)) for mask in parts]
+    variance = float(np.sum(at.residuals**2)) / max(at.count, 1)
+    return Statistics(
+        x=at.x,
+        value=np.array([r @ r for r, _ in rows]),
+        gradient=np.array([J.T @ r for r, J in rows]),
+        information=np.array([J.T @ J for _, J in rows]),
+        prior=at.prior * variance,
+        count=np.array([max(int(at.compared[m].sum()) * len(at.raw[0, 0]), 1) for m in parts], np.float64),
+    )
+
+
+def on_held_out_parts(stats: Statistics, table: ParameterTable, present: np.ndarray) -> np.ndarray:
+    """Return the mean square on each part with that part held out of the fit, ``(K,)``, for a model with some terms."""
+    scores = []
+    parts = np.arange(len(stats.value))
+    for k in parts:
+        step = stats.step(table, present, parts == k, bounded=True)
+        square = stats.value[k] + 2.0 * stats.gradient[k] @ step + step @ stats.information[k] @ step
+        scores.append(square / stats.count[k])
+    return np.array(scores)
+
+
+@dataclass
+class Stored:
+    """The fit of a set of terms, and the estimates without parts.
+
+    Attributes:
+        x: The fit of all parts, ``(P,)``.
+        ends: Part -> the estimate without it, ``(P,)``.
+        tried: What further terms gain beside the set; empty: none was tried.
+    """
+
+    x: list[float]
+    loss: float
+    ends: dict[str, list[float]] = field(default_factory=dict)
+    tried: list[TriedTerm] = field(default_factory=list)
+
+
+@dataclass
+class StoredRefits:
+    """What the file holds: the digest of the inputs, and by set of terms the fits."""
+
+    digest: str
+    sets: dict[str, Stored] = field(default_factory=dict)
+
+
+class Refits:
+    """The finished refits of one identification; without a path they stay in memory.
+
+    Attributes:
+        reused: Number of refits that were used again.
+        source: The file that they are from; None: there is none of the same inputs.
+        stored: Whether the file was written.
+    """
+
+    def __init__(self, path: Path | None = None, digest: str = "", earlier: Iterable[Path] = ()) -> None:
+        self._path, self._document, self.reused = path, StoredRefits(digest), 0
+        self.source: Path | None = None
+        self.stored = False
+        self._lock = threading.Lock()
+        for file in earlier:
+            try:
+                document = read_json(file, StoredRefits)
+            except (Sim2RealError, ValueError, OSError, msgspec.MsgspecError):
+                continue  # an unreadable file costs time only: the refits are computed
+            if document.digest == digest and document.sets:
+                self._document, self.source = document, file
+                return
+
+    def whole(self, terms: Sequence[str], problem: Problem, part: Part) -> tuple[np.ndarray, float] | None:
+        """Return a stored fit of all parts and its loss; None if there is none, or the problem gives another loss."""
+        stored = self._document.sets.get(_key(terms))
+        if stored is None or not self._has_loss(np.array(stored.x), stored.loss, problem, part):
+            self._document.sets.pop(_key(terms), None)
+            return None
+        return np.array(stored.x), stored.loss
+
+    def begin(self, terms: Sequence[str], x: np.ndarray, loss: float) -> None:
+        """Store the fit of all parts. Estimates without parts stay if they were made for the same minimum."""
+        stored = self._document.sets.get(_key(terms))
+        if stored is None or not abs(loss - stored.loss) <= _SAME * abs(stored.loss):
+            self._document.sets[_key(terms)] = Stored(x.tolist(), loss)
+            self._write()
+
+    def end(self, terms: Sequence[str], part: str) -> np.ndarray | None:
+        """Return the stored estimate without a part; None: it was not computed."""
+        stored = self._document.sets.get(_key(terms))
+        if stored is None or part not in stored.ends:
+            return None
+        self.reused += 1
+        return np.array(stored.ends[part])
+
+    def store(self, terms: Sequence[str], part: str, x: np.ndarray) -> np.ndarray:
+        """Store the estimate without a part, and return it."""
+        self._document.sets[_key(terms)].ends[part] = x.tolist()
+        self._write()
+        return x
+
+    def tried(self, terms: Sequence[str], compute: Callable[[], Sequence[TriedTerm]]) -> tuple[TriedTerm, ...]:
+        """Return what further terms gain beside a set whose fit is stored; it is computed once."""
+        stored = self._document.sets[_key(terms)]
+        if not stored.tried:
+            stored.tried = list(compute())
+            self._write()
+        return tuple(stored.tried)
+
+    def _has_loss(self, x: np.ndarray, loss: float, problem: Problem, part: Part) -> bool:
+        if len(x) != len(problem.table):
+            return False
+        return abs(problem.loss(x, part) - loss) <= _SAME * abs(loss)
+
+    def close(self) -> None:
+        """Stop writing: a thread that still computes must not change a file of a stage that has ended."""
+        with self._lock:
+            self._path = None
+
+    def _write(self) -> None:
+        with self._lock:
+            if self._path is not None:
+                self.stored = True
+                write_json(self._path, self._document)
+
+
+def _key(terms: Sequence[str]) -> str:
+    return ",".join(terms)
+
+
+def leave_out(
+    estimate: Fit, parts: Sequence[Fold], settle_s: float, free_run_s: float = 0.0, refits: Refits | None = None
+) -> list[HeldOutPart]:
+    """Identify without each part, and predict that part.
+
+    No descent begins at the estimate of all parts, which includes this part: a refinement may end where it begins. It
+    begins at the linear prediction from the other parts.
+
+    Args:
+        parts: Held out one at a time.
+        settle_s: First part of a prediction, to which its initial state is fitted [s].
+        free_run_s: Longest free run [s]; 0 skips the free runs.
+        refits: Finished refits, which are not computed again.
+    """
+    refits = refits or Refits()
+    refits.begin(estimate.problem.table.terms, estimate.x, estimate.loss)
+    problem, table, (groups, _) = estimate.problem, estimate.problem.table, shared(parts)
+    touched, every = masks(problem, groups), np.ones(len(table.terms), bool)
+    stats = statistics(problem, problem.linearise(estimate.x), touched)
+    ends = []
+    for k, group in enumerate(groups):
+        start = stats.x + stats.step(table, every, np.arange(len(groups)) == k, bounded=True)
+        rest = problem.part(problem.train[touched[k]])
+        ends.append(refitted(refits, table.terms, group, problem, start, rest))
+    return predicted(estimate, parts, stats, every, ends, settle_s, free_run_s)
+
+
+def refitted(
+    refits: Refits, terms: Sequence[str], part: Fold, problem: Problem, start: np.ndarray, rest: Part
+) -> np.ndarray:
+    """Return the estimate without a part, ``(P,)``: a finished refit, or one from a start, which is then stored.
+
+    Args:
+        rest: The segments of the other parts.
+    """
+    name = f"{part.name} {part.parts}"
+    if (stored := refits.end(terms, name)) is not None:
+        return stored
+    return refits.store(terms, name, refine(problem, start[None], rest, settle=False, gain=_GAIN).x)
+
+
+def predicted(
+    estimate: Fit,
+    parts: Sequence[Fold],
+    stats: Statistics,
+    present: np.ndarray,
+    ends: Sequence[np.ndarray],
+    settle_s: float,
+    free_run_s: float,
+) -> list[HeldOutPart]:
+    """Return the errors on each part of the estimate without its group.
+
+    Args:
+        stats: Of the groups of ``shared``.
+        present: Shape ``(T,)``, bool: the terms of the model.
+        ends: Shape ``(G, P)``: the estimates without each group.
+    """
+    problem, table, of = estimate.problem, estimate.problem.table, shared(parts)[1]
+    columns = table.of_terms(present)
+    by_group = [table.decode(x, columns) for x in ends]
+    values = [by_group[g] for g in of]
+    names = [tuple(n for n, there in zip(table.terms, present, strict=True) if there)] * len(parts)
+    stacked = {n: np.stack([v[n] for v in values]) for n in values[0]}
+    # The information of a group is that of its parts, in like shares.
+    own = np.einsum("kpp->kp", stats.information) / np.bincount(of)[:, None]
+    total = np.maximum(own[of].sum(axis=0), 1e-300)
+    shares = [dict(zip(table.names, row.tolist(), strict=True)) for row in own[of] / total]
+    ahead = _ahead(estimate.windows, parts, stacked, settle_s)
+    free, run_s = [{} for _ in parts], 0.0
+    if free_run_s:
+        free, run_s = _free(problem, parts, stacked, settle_s, free_run_s)
+    rows = zip(parts, names, values, shares, ahead, free, strict=True)
+    return [HeldOutPart(part.name, *row, run_s=run_s) for part, *row in rows]
+
+
+def _ahead(
+    windows: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float
+) -> list[dict[str, float | None]]:
+    """Return the errors of the windows of each part, predicted from the first part of each window."""
+    fold, segment = np.nonzero(masks(windows, parts))
+    return _errors(windows, stacked, fold, windows.train[segment], settle_s, len(parts))
+
+
+def _free(
+    problem: Problem, parts: Sequence[Fold], stacked: Mapping[str, Any], settle_s: float, longest_s: float
+) -> tuple[list[dict[str, float | None]], float]:
+    """Return the errors of a free run of each part, and the length of the runs beyond their first part [s]."""
+    fitted = [problem.spans[i] for i in problem.train]
+    where = []
+    for k, part in enumerate(parts):
+        for r, begin, end in part.parts:
+            begins = [s.begin_s for s in fitted if s.recording == r]
+            first, last = max(begin, min(begins)), min(end, max(begins) + problem.segment_s)
+            where.append((k, Span(r, first, False), last - first))
+    # Each run ends with its part; all are simulated for the length of the longest, so that one program serves them.
+    lengths_s = [min(longest_s, w[2]) for w in where]
+    runs = problem.recut([w[1] for w in where], max(lengths_s), ends_s=lengths_s)
+    fold = np.array([w[0] for w in where])
+    return _errors(runs, stacked, fold, np.arange(len(where)), settle_s, len(parts)), max(lengths_s) - settle_s
+
+
+def _errors(
+    problem: Problem, stacked: Mapping[str, Any], fold: np.ndarray, segment: np.ndarray, settle_s: float, parts: int
+) -> list[dict[str, float | None]]:
+    """Return the errors of each part's segments, without the first part of each segment."""
+    errors = problem.predict({n: v[fold] for n, v in stacked.items()}, segment, np.full(len(fold), settle_s))
+    beyond = [e[t > settle_s] for e, t in zip(errors, problem.ts[segment], strict=True)]
+    sigmas = [sigma for _, sigma, _ in problem.fields]
+    rows = []
+    for k in range(parts):
+        whole = np.sqrt(np.mean(np.concatenate([beyond[i] for i in np.flatnonzero(fold == k)]) ** 2, axis=0)) * sigmas
+        each = zip(labels(problem), whole.tolist(), moving(problem, segment[fold == k]), strict=True)
+        rows.append({label: error if moved else None for label, error, moved in each})
+    return rows
+
+
+def moving(problem: Problem, segments: np.ndarray) -> list[bool]:
+    """Return for each column of the residuals whether its joint moves in one of some segments.
+
+    Args:
+        segments: Shape ``(S,)``: numbers of the segments.
+    """
+    measured, column, moves = problem.ts[segments] >= 0.0, 0, list[bool]()
+    for channel in problem.channels:
+        positions = problem.measured(column)[segments]  # the position comes first
+        spread = np.max(positions, axis=1, where=measured, initial=-np.inf) - np.min(
+            positions, axis=1, where=measured, initial=np.inf
+        )
+        moves += [bool(spread.max() > MOVES * channel.position_sigma)] * len(channel.fields)
+        column += len(channel.fields)
+    return moves

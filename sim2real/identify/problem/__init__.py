@@ -1,1 +1,0 @@
-"""Recordings as segments with residuals, and the compiled programs that evaluate them."""

@@ -1,1 +1,0 @@
-"""From a starting point to the minimum of the loss: global search, then local refinement."""

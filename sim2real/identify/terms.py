@@ -1,0 +1,296 @@
+"""Optional terms of a model, chosen by forward selection on held-out parts.
+
+Each round fits the model with one further term, or a pair, that the quadratic approximation around the present model
+proposes, and keeps the one whose errors on held-out parts fall most, until none falls by a tenth. The estimates without
+a part are linear steps for the candidates, and refits for the best of them. What a model lacks is found by one such
+round.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from sim2real.artifacts.identification import HeldOutPart, Outcome, TriedTerm
+from sim2real.identify import held_out
+from sim2real.identify.fit import Fit, refine, with_terms
+from sim2real.identify.held_out import Fold, Refits, Statistics, on_held_out_parts, statistics
+from sim2real.identify.parameters import ParameterTable
+from sim2real.identify.predictions import labels
+from sim2real.identify.problem import MOST_OF_SETS, thinned
+from sim2real.identify.uncertainty import above_noise
+
+ALIKE = 1.1
+"""Largest ratio of two errors that count as equal."""
+_FAR = 1.5
+"""Ratio of the errors in free runs above which a further term harms."""
+_LITTLE = 0.01
+"""Share of the loss below which a further term gains too little."""
+_LEVELS, _ACTS, _LOWER = 16, 1e-4, 2
+"""Levels of a limit that are simulated; relative change of the loss from which it acts; the second start's number of
+levels below the first."""
+_LIMITED = 2.0
+"""Ratio of residuals to noise from which limits are tried: one that acts leaves far more, and its fit takes long."""
+_TRIED = 3
+"""Most candidates that are fitted in a round, beside limits."""
+_SHARES = (1.0, 0.25, 0.06)
+"""Shares of the linear step without a part that are simulated; the best is that estimate."""
+_INSIDE = 0.01
+"""Lowest level of a limit, as a share of its bounds' width."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The fit of one set of optional terms.
+
+    Attributes:
+        present: Shape ``(T,)``, bool: the terms.
+        x: Shape ``(P,)``: the estimate; parameters of absent terms have their values without the term.
+        loss: Loss of the estimate.
+        rows: The estimates without each part, and their errors on it.
+        ahead: Shape ``(K,)``: mean square of the errors up to the horizon on each part, with that part held out.
+        free: Shape ``(K,)``: the same in free runs; zeros without free runs.
+        above: Ratio of the residuals to the noise of the sensor, which no set predicts.
+    """
+
+    present: np.ndarray
+    x: np.ndarray
+    loss: float
+    rows: Sequence[HeldOutPart]
+    ahead: np.ndarray
+    free: np.ndarray
+    above: float = np.inf
+
+    def names(self, table: ParameterTable) -> tuple[str, ...]:
+        """Return the names of the terms."""
+        return tuple(n for n, present in zip(table.terms, self.present, strict=True) if present)
+
+    @property
+    def error(self) -> float:
+        """Root mean square of the errors on held-out parts [deviations of a measurement]."""
+        return float(np.sqrt(np.nan_to_num(self.ahead, nan=np.inf).mean()))
+
+    def is_better_than(self, other: "Trial") -> bool:
+        """Return whether the errors on held-out parts are clearly smaller, and those in free runs not far larger."""
+        free, before = (float(np.sqrt(np.nan_to_num(t.free, nan=np.inf).mean())) for t in (self, other))
+        return self.error * ALIKE < other.error and not free > _FAR * before
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A selection of terms: the chosen set, and all sets that were fitted."""
+
+    chosen: Trial
+    trials: tuple[Trial, ...]
+
+
+class TermSearch:
+    """Fits sets of terms to the problem of a fit.
+
+    Args:
+        estimate: A fit whose table has all terms.
+        parts: Held out one at a time.
+        settle_s: First part of a prediction, to which its initial state is fitted [s].
+        free_run_s: Longest free run [s]; 0 skips the free runs.
+        refits: Finished refits.
+        on_set: Called with the names of each set before it is fitted.
+    """
+
+    def __init__(
+        self,
+        estimate: Fit,
+        parts: Sequence[Fold],
+        settle_s: float,
+        free_run_s: float,
+        refits: Refits | None = None,
+        on_set: Callable[[str], None] = lambda names: None,
+    ) -> None:
+        self._estimate, self._parts, self._times = estimate, parts, (settle_s, free_run_s)
+        self._refits, self._on_set = refits or Refits(), on_set
+        self._groups = held_out.shared(parts)[0]
+        self._problem = thinned(estimate.problem, held_out.masks(estimate.problem, self._groups), MOST_OF_SETS)
+        self._masks = held_out.masks(self._problem, self._groups)
+        self._sigma = dict(zip(labels(self._problem), (s for _, s, _ in self._problem.fields), strict=True))
+
+    @property
+    def segments(self) -> int:
+        """Number of segments that sets are fitted to: fewer than all where these would take long."""
+        return len(self._problem.train)
+
+    def select(self) -> Selection:
+        """Return the terms without which held-out parts are predicted worse."""
+        table = self._problem.table
+        none = np.zeros(len(table.terms), bool)
+        chosen = self._judged(self._attempt(none, [self._estimate.x, *table.starts()], np.inf))
+        trials = [chosen]
+        while True:
+            fitted = self._round(chosen)
+            trials += fitted
+            candidates = sorted((t for t in fitted if t.loss < (1.0 - _LITTLE) * chosen.loss), key=lambda t: t.error)
+            # The linear steps rank the candidates; the best ones are judged by refits.
+            helpful = next((j for t in candidates if t.is_better_than(chosen)
+                            and (j := self._judged(t)).is_better_than(chosen)), None)  # fmt: skip
+            if helpful is None:
+                break
+            trials[next(i for i, t in enumerate(trials) if t.present is helpful.present)] = helpful
+            chosen = helpful
+        return Selection(chosen, tuple(trials))
+
+    def further(self, x: np.ndarray, present: np.ndarray) -> Selection:
+        """Return the fit of a set of terms beside its fits with one further term.
+
+        Args:
+            x: Shape ``(P,)``: an estimate with the set, where its fit begins.
+            present: Shape ``(T,)``, bool: the terms of the set.
+        """
+        base = self._attempt(present, [x], np.inf)
+        return Selection(base, (base, *self._round(base, pairs=False)))
+
+    def _round(self, base: Trial, pairs: bool = True) -> list[Trial]:
+        """Return the fits with one further term, or two, that may help most, and with each limit that may act."""
+        table = self._problem.table
+        stats = statistics(self._problem, self._problem.linearise(base.x), self._masks)
+        trials = []
+        for present in _proposed(stats, table, base.present, pairs):
+            begin = stats.x + stats.step(table, present, bounded=True)
+            trials.append(self._attempt(present, [begin, base.x], base.loss))
+        limits = np.flatnonzero(table.of_limits() & ~base.present) if base.above > _LIMITED else []
+        for i in limits:
+            present = base.present | (np.arange(len(base.present)) == i)
+            if starts := self._limited(base, present):
+                trials.append(self._attempt(present, starts, base.loss))
+        return trials
+
+    def _limited(self, base: Trial, present: np.ndarray) -> list[np.ndarray]:
+        """Return starts for a set with one more limit: the best level that acts, and a lower one; none if none acts."""
+        problem, table = self._problem, self._problem.table
+        new = table.of_terms(present) & ~table.of_terms(base.present)
+        x = np.repeat(base.x[None], _LEVELS + 1, axis=0)
+        shares = np.linspace(1.0, _INSIDE, _LEVELS + 1)[:, None]
+        x[:, new] = (table.low + shares * table.span)[:, new]
+        losses = problem.losses(x, base.x, problem.part(present=table.of_terms(present)))
+        losses = np.nan_to_num(losses, nan=np.inf)
+        acts = np.flatnonzero(np.abs(losses / losses[0] - 1.0) > _ACTS)
+        if not len(acts):
+            return []
+        best = int(acts[np.argmin(losses[acts])])
+        return [x[i] for i in (best, min(best + _LOWER, _LEVELS))]
+
+    def _attempt(self, present: np.ndarray, starts: Sequence[np.ndarray], most: float) -> Trial:
+        """Return the fit of a set of terms ``(T,)`` from the best of some starts, and its errors by linear steps.
+
+        Args:
+            most: Loss of a smaller set; if the descent ends above it, it begins at the other starts, too.
+        """
+        problem, table = self._problem, self._problem.table
+        part, names = problem.part(present=table.of_terms(present)), self._names(present)
+        self._on_set(", ".join(names) or "no term")
+        if stored := self._refits.whole(names, problem, part):
+            return self._trial(present, *stored)
+        starts = [with_terms(table, x, present) for x in starts]
+        order = np.argsort(np.nan_to_num([problem.loss(x, part) for x in starts], nan=np.inf))
+        ended = refine(problem, starts[order[0]][None], part, coarse=True)
+        if len(order) > 1 and ended.loss > (1.0 - _LITTLE) * most:
+            others = refine(problem, np.stack([starts[i] for i in order[1:3]]), part, coarse=True)
+            ended = min(ended, others, key=lambda end: end.loss)
+        return self._trial(present, ended.x, ended.loss)
+
+    def _judged(self, trial: Trial) -> Trial:
+        """Return a trial whose fit ended, with its errors by refits without each part."""
+        problem, names = self._problem, self._names(trial.present)
+        part = problem.part(present=problem.table.of_terms(trial.present))
+        x, loss = trial.x, trial.loss
+        if not self._refits.whole(
+            names, problem, part
+        ):  # to the end, as each refit would have to descend that far, too
+            further = refine(problem, x[None], part, settle=False)
+            x, loss = further.x, further.loss
+        self._refits.begin(names, x, loss)
+        return replace(self._trial(trial.present, x, loss, refit=True), present=trial.present)
+
+    def _trial(self, present: np.ndarray, x: np.ndarray, loss: float, refit: bool = False) -> Trial:
+        """Return the trial of a fit, with errors by refits, or by linear steps."""
+        problem, columns = self._problem, self._problem.table.of_terms(present)
+        at = problem.linearise(x, problem.part(present=columns))
+        stats = statistics(problem, at, self._masks)
+        ends = list(self._without_each(x, stats, present))
+        if refit:
+            names = self._names(present)
+            rest = [problem.part(problem.train[touched], columns) for touched in self._masks]
+            rows = zip(self._groups, ends, rest, strict=True)
+            ends = [held_out.refitted(self._refits, names, group, problem, end, one) for group, end, one in rows]
+        rows = held_out.predicted(self._estimate, self._parts, stats, present, ends, *self._times)
+        ahead, free = (np.array([self._mean_square(errors) for errors in kind]) for kind in (
+            [row.ahead for row in rows], [row.free for row in rows]))  # fmt: skip
+        return Trial(present, x, loss, tuple(rows), ahead, free, above_noise(at))
+
+    def _without_each(self, x: np.ndarray, stats: Statistics, present: np.ndarray) -> np.ndarray:
+        """Return the estimates without each group, ``(G, P)``: linear steps, shorter where a full one does not help."""
+        problem, table, count = self._problem, self._problem.table, len(self._groups)
+        steps = np.array([stats.step(table, present, np.arange(count) == g, bounded=True) for g in range(count)])
+        points = table.within(x + np.concatenate([share * steps for share in _SHARES]))
+        # Simulate all candidates at a time, and compare each on the segments of the other groups.
+        part = problem.part(present=table.of_terms(present))
+        rows = np.where(table.of_terms(present), table.unscale(points), np.nan)
+        residuals = problem.residuals.with_values(x, rows, part)
+        squares = np.nan_to_num(np.sum(residuals**2, axis=(2, 3)), nan=np.inf)
+        best = [
+            min(range(k, len(points), count), key=lambda g, t=touched: float(squares[g][~t].sum()))
+            for k, touched in enumerate(self._masks)
+        ]
+        return points[best]
+
+    def _names(self, present: np.ndarray) -> tuple[str, ...]:
+        return tuple(n for n, there in zip(self._problem.table.terms, present, strict=True) if there)
+
+    def _mean_square(self, errors: Mapping[str, float | None]) -> float:
+        """Return the mean square of errors in deviations of the measurement; 0 if no joint moved."""
+        squares = [(e / self._sigma[name]) ** 2 for name, e in errors.items() if e is not None]
+        return float(np.mean(squares)) if squares else 0.0
+
+
+def _proposed(stats: Statistics, table: ParameterTable, present: np.ndarray, pairs: bool) -> list[np.ndarray]:
+    """Return larger sets in the order in which they are fitted, ``(T,)`` each, by their predicted errors.
+
+    The first has one further term. The others have two, if that is clearly better, or another one.
+    """
+    absent, place = np.flatnonzero(~present & ~table.of_limits()), np.arange(len(present))
+
+    def ordered(count: int) -> list[tuple[float, np.ndarray]]:
+        sets = [present | np.isin(place, more) for more in combinations(absent, count)]
+        errors = [float(np.sqrt(np.maximum(on_held_out_parts(stats, table, one).mean(), 0.0))) for one in sets]
+        return sorted(zip(errors, sets, strict=True), key=lambda pair: pair[0])
+
+    if not (ones := ordered(1)):
+        return []
+    twos = [pair for pair in (ordered(2)[:1] if pairs else []) if pair[0] * ALIKE < ones[0][0]]
+    return [one for _, one in [ones[0], *twos, *ones[1:]]][:_TRIED]
+
+
+def gains(selection: Selection, table: ParameterTable) -> tuple[TriedTerm, ...]:
+    """Return the terms that were tried; the chosen ones come first, then the others by their gain.
+
+    A term's gain is the difference of the errors of two sets that differ by this term. If there are several such pairs,
+    the one closest to the chosen set counts.
+    """
+    rows, chosen, limits = [], selection.chosen, table.of_limits()
+    for i, term in enumerate(table.terms):
+        one = np.arange(len(table.terms)) == i
+        pairs = [
+            (with_it, without)
+            for with_it in selection.trials
+            for without in selection.trials
+            if not without.present[i] and np.array_equal(with_it.present, without.present | one)
+        ]
+        if not pairs:
+            missing: Outcome = "chosen" if chosen.present[i] else "not reached" if limits[i] else "not fitted"
+            rows.append(TriedTerm(term, chosen.error, None, missing))
+            continue
+        off = [int(np.sum((with_it.present ^ chosen.present) & ~one)) for with_it, _ in pairs]
+        with_it, without = pairs[int(np.argmin(off))]
+        # Beside the chosen set; a gain beside a smaller one may be that of a term that was chosen since.
+        mends = np.array_equal(without.present, chosen.present) and with_it.is_better_than(without)
+        outcome: Outcome = "mends" if mends else "no gain"
+        rows.append(TriedTerm(term, without.error, with_it.error, "chosen" if chosen.present[i] else outcome))
+    return tuple(sorted(rows, key=lambda r: (r.outcome != "chosen", -(r.gain or 0.0))))

@@ -1,1 +1,0 @@
-"""How well recordings determine parameters: covariance, intervals, profiles, alternative models, noise."""
