@@ -13,7 +13,7 @@ from sim2real.errors import Sim2RealError, UsageError
 from sim2real.graph.episode import Episode
 from sim2real.graph.node import TICKS_PER_S, BaseNode, to_ticks
 from sim2real.graph.timeline import Timeline
-from sim2real.graph.times import Vertex
+from sim2real.graph.times import Edge, Vertex
 from sim2real.identify.model import ChecksLogs, IdentifiableModel
 from sim2real.later import jnp
 from sim2real.types import Array, PyTree
@@ -127,7 +127,7 @@ def cut(
         check_log(episode, model)
         recorded = Timeline.from_episode(episode, {n: nodes[n] for n in (model.sensor, *model.given)})
         lead = {n: to_ticks(lead_s) for n in model.given}
-        parts, first = recorded.cut([to_ticks(s.begin_s) for s in parts_of], to_ticks(length_s), lead)
+        parts, first = _cut_timeline(recorded, [to_ticks(s.begin_s) for s in parts_of], to_ticks(length_s), lead)
         timelines.append(parts)
         firsts += [(r, {n: int(f[i]) for n, f in first.items()}) for i in range(len(parts_of))]
         ordered += parts_of
@@ -151,6 +151,42 @@ def cut(
         ts=np.where(start < length_s, start, 0.0),
         starts=np.stack([_local_fit(recordings[s.recording], model, s.begin_s) for s in ordered]),
     )
+
+
+def _cut_timeline(
+    timeline: Timeline, begins: Sequence[int], length: int, lead: Mapping[str, int]
+) -> tuple[Timeline, dict[str, np.ndarray]]:
+    """Cut a recorded episode into segments; in each, time starts at 0.
+
+    Args:
+        begins: Starts of the segments [ticks].
+        length: Length of every segment [ticks].
+        lead: Node -> time before the segment's start from which its steps are kept, at negative times [ticks].
+
+    Returns:
+        The segments as E episodes; and for each node, shape ``(E,)``, the number of the original step that is step 0 of
+        each segment.
+    """
+    firsts = {
+        n: np.searchsorted(v.start[0, : v.count[0]], np.asarray(begins) - lead.get(n, 0))
+        for n, v in timeline.vertices.items()
+    }
+    parts = []
+    for i, begin in enumerate(begins):
+        vertices, edges, last = {}, {}, dict[str, int]()
+        for n, v in timeline.vertices.items():
+            first, last[n] = int(firsts[n][i]), int(np.searchsorted(v.start[0, : v.count[0]], begin + length))
+            take = slice(first, last[n])
+            vertices[n] = Vertex(v.start[:, take] - begin, v.end[:, take] - begin, np.array([last[n] - first]))
+        for (n, name), e in timeline.edges.items():
+            take = slice(int(firsts[e.sender][i]), last[e.sender])
+            seq_in = e.seq_in[:, take]
+            # A message that was consumed before the segment's first step is in the window of that step.
+            inside = (seq_in >= 0) & (seq_in < last[n])
+            seq_in = np.where(inside, np.maximum(seq_in - int(firsts[n][i]), 0), -1)
+            edges[n, name] = Edge(e.received[:, take] - begin, seq_in, e.sender)
+        parts.append(Timeline(vertices, edges))
+    return Timeline.stack(parts), firsts
 
 
 def _later(timeline: Timeline, node: str, ticks: int) -> Timeline:
