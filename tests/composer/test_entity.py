@@ -28,24 +28,6 @@ def placed(request):
     return mjcf.Physics.from_mjcf_model(arena.mjcf_model), ball, frame, request.param
 
 
-def test_pose_is_set_normalised_and_read(placed):
-    physics, ball, frame, _ = placed
-    ball.set_pose(physics, position=[1.0, 2.0, 3.0], quaternion=3 * ABOUT_Z)
-    np.testing.assert_allclose(physics.bind(frame).xpos, [1, 2, 3])
-    np.testing.assert_allclose(physics.bind(frame).xquat, ABOUT_Z, atol=1e-12)
-    position, quaternion = ball.get_pose(physics)
-    np.testing.assert_allclose(position, [1, 2, 3])
-    np.testing.assert_allclose(quaternion, ABOUT_Z, atol=1e-12)
-
-
-def test_shift_adds_the_position_and_premultiplies_the_quaternion(placed):
-    physics, ball, frame, _ = placed
-    ball.set_pose(physics, position=[1.0, 0, 0], quaternion=ABOUT_X)
-    ball.shift_pose(physics, position=[0, 1, 0], quaternion=ABOUT_Z)
-    np.testing.assert_allclose(physics.bind(frame).xpos, [1, 1, 0])
-    np.testing.assert_allclose(physics.bind(frame).xquat, [0.5, 0.5, 0.5, 0.5], atol=1e-12)
-
-
 def test_velocity_is_for_free_entities(placed, caplog):
     physics, ball, _, free = placed
     if not free:
@@ -67,27 +49,6 @@ def test_an_entity_that_is_not_attached_has_no_pose():
     physics = mjcf.Physics.from_mjcf_model(ball.mjcf_model)
     with pytest.raises(RuntimeError, match="No attachment frame found"):
         ball.get_pose(physics)
-
-
-def test_vectors_and_rotations_in_the_local_frame():
-    arena, ball = composer.Arena(), Ball()
-    site = arena.mjcf_model.worldbody.add("site", xyaxes=[0, 1, 0, -1, 0, 0])
-    arena.attach(ball, site)
-    physics = mjcf.Physics.from_mjcf_model(arena.mjcf_model)
-    np.testing.assert_allclose(ball.global_vector_to_local_frame(physics, [0, 1, 0]), [1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(
-        ball.global_vector_to_local_frame(physics, [[-1, 0], [0, 1]]), [[0, 1], [1, 0]], atol=1e-12
-    )
-    turn = np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]])
-    local = np.array([[0, 0, -1], [0, -1, 0], [-1, 0, 0]])
-    np.testing.assert_allclose(ball.global_xmat_to_local_frame(physics, turn), local, atol=1e-12)
-    np.testing.assert_allclose(ball.global_xmat_to_local_frame(physics, turn.ravel()), local.ravel(), atol=1e-12)
-    for call, value in (
-        (ball.global_vector_to_local_frame, np.zeros(4)),
-        (ball.global_xmat_to_local_frame, np.zeros((2, 2))),
-    ):
-        with pytest.raises(ValueError, match="should have shape"):
-            call(physics, value)
 
 
 def test_the_tree_is_walked_depth_first_and_survives_detaching():

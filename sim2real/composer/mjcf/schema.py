@@ -102,6 +102,8 @@ def root() -> Spec:
     for tag in ("geom", "joint", "site", "camera", "light", "composite", "flexcomp"):
         body.children[tag].kind = tag
     body.children["freejoint"].kind = "joint"
+    for tag in ("geom", "site", "skin"):
+        body.children["composite"].children[tag].implicit = True
     world_children = {k: v for k, v in body.children.items() if k not in ("inertial", "joint", "freejoint")}
     top.children["worldbody"] = Spec("worldbody", {}, False, True, children=world_children)
     for name, section in top.children.items():

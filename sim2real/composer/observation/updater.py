@@ -9,7 +9,10 @@ import numpy as np
 from dm_env import specs
 
 from sim2real.composer.observation.observable.base import Observable
-from sim2real.composer.observation.schedule import DEFAULT_BUFFER_SIZE, Schedule, draw
+from sim2real.composer.observation.schedule import DEFAULT_BUFFER_SIZE as DEFAULT_BUFFER_SIZE
+from sim2real.composer.observation.schedule import DEFAULT_DELAY as DEFAULT_DELAY
+from sim2real.composer.observation.schedule import DEFAULT_UPDATE_INTERVAL as DEFAULT_UPDATE_INTERVAL
+from sim2real.composer.observation.schedule import Schedule, draw
 from sim2real.errors import UsageError
 
 if TYPE_CHECKING:
