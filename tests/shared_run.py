@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def make(root: Path) -> Path:
             stage.output(name, path)
     run_dir = stage.run_dir
     with pytest.MonkeyPatch.context() as patch, sketched(pictures=1):
-        patch.setattr(episodes, "opened", lambda *_: nullcontext(SimpleNamespace(rig=None)))
+        patch.setattr(episodes, "opened", lambda *_: nullcontext(Mock()))
         patch.setattr(episodes, "announce_following", lambda rig: None)
         patch.setattr(episodes, "_run_one", lambda *given: deployed(run_dir, *given))
         assert cli.main(["run", "pendulum", "--resume", str(run_dir), "--runs", str(root), *TINY]) == 0

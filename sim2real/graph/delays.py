@@ -26,6 +26,12 @@ if TYPE_CHECKING:
     from sim2real.graph.base import Array, Number
 
 
+_CONSTANT_S = 1e-7
+"""Recorded delays with a smaller standard deviation are a constant [s]."""
+_MAX_LAG = 200
+"""Largest lag at which their autocorrelation is computed [delays]."""
+
+
 class DelayDistribution(ABC):
     """A distribution over non-negative delays [s]."""
 
@@ -109,6 +115,26 @@ class EmpiricalDist(DelayDistribution):
             raise UsageError("recorded delays must be a non-empty list of finite times of at least 0 s")
         self.samples = samples
         self.block = max(1, min(block, samples.size))
+
+    @classmethod
+    def fit(cls, samples: np.ndarray) -> EmpiricalDist:
+        """Return the distribution whose blocks are as long as the recorded delays stay correlated.
+
+        The block length is ``1 + 2 * (sum of the autocorrelation over lags 1, 2, ...)``, up to the first lag at which
+        it falls below 0.1: independent delays are drawn one by one, and runs of slow steps stay together.
+        """
+        dist = cls(samples, 1)
+        spread = dist.samples - dist.samples.mean()
+        power = float(spread @ spread)
+        if power < _CONSTANT_S**2 * spread.size:
+            return dist
+        block = 1.0
+        for lag in range(1, min(_MAX_LAG, spread.size // 4)):
+            rho = float(spread[:-lag] @ spread[lag:]) / power
+            if rho < 0.1:
+                break
+            block += 2.0 * rho
+        return cls(samples, round(block))
 
     def __repr__(self) -> str:
         return f"EmpiricalDist({self.samples.size} samples, block={self.block})"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sim2real.commands import flags
-from sim2real.stages.config import IdentifyConfig
+from sim2real.commands.stages import StageFlags
 from sim2real.stages.pipeline.pipeline import load_pipeline, pipeline_of
 from sim2real.stages.shared.identification import command, continuing
 
@@ -18,8 +18,7 @@ def parsed(text):
     """Return what the command line makes of a printed command: the pipeline, and its flags."""
     program, stage, pipeline, *rest = shlex.split(text)
     assert (program, stage) == ("sim2real", "identify")
-    kind = flags.StageFlags[IdentifyConfig]
-    return pipeline, flags.parse(flags.StageFlags(ARM.identify), rest, "sim2real identify", "", kind=kind)
+    return pipeline, flags.parse(StageFlags(ARM.identify), rest, "sim2real identify", "")
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def test_a_truncated_log_works_with_a_warning(tmp_path, log, capsys):
         (["gain", "60", "30"], "no interval"),
         (["gain", "nan", "30"], "no interval"),
         (["gain", "-3", "30"], "positive lower bound"),
-        (["gain", "30"], "Expected 3 values"),
+        (["gain", "30"], "expected 3 arguments"),
         (["actuator_delay", "0", "0.2"], "--max-delay-s"),
     ],
 )
