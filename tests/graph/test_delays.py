@@ -68,6 +68,20 @@ def test_recorded_delays_come_back_in_blocks():
     for bad in ([], [-0.1], [np.nan], [[0.1]]):
         with pytest.raises(UsageError):
             EmpiricalDist(np.array(bad))
+        with pytest.raises(UsageError):
+            EmpiricalDist.fit(np.array(bad))
+
+
+def test_blocks_are_as_long_as_slow_steps_stay_together():
+    rng = np.random.default_rng(0)
+    assert EmpiricalDist.fit(rng.exponential(0.002, 3000)).block == 1
+    assert EmpiricalDist.fit(np.full(98, 0.001)).block == 1
+    slow = np.repeat(rng.random(300) < 0.2, 10)  # ten steps at a time
+    dist = EmpiricalDist.fit(0.002 + 0.008 * slow + rng.uniform(0, 1e-4, slow.size))
+    assert 5 <= dist.block <= 20
+    drawn = dist.sample(rng, (20, 1000)) > 0.006
+    assert drawn[:, 1:][drawn[:, :-1]].mean() > 0.8  # 0.92 in the record, 0.2 without memory
+    assert abs(drawn.mean() - 0.2) < 0.05
 
 
 def test_what_a_trainable_delay_takes():
