@@ -13,90 +13,67 @@ import random
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
+from sim2real.emulation.faults import Emulation, FaultTimes
 from sim2real.emulation.firmware import Firmware, ServoFirmware
 from sim2real.emulation.plant import Plant, PlantClock
 from sim2real.emulation.truth import Kind, TruthLog
-from sim2real.errors import UsageError
 from sim2real.hardware.bus.packets import BROADCAST_ID, Instruction, PacketFormat, Parser
 from sim2real.hardware.bus.registers import Register
 from sim2real.hardware.device import OperatingMode
 
 
 @dataclass(frozen=True)
-class Emulation:
-    """Settings of the emulated bus and servos; times of faults count from the emulator's start, or a signal.
+class BusEmulation(Emulation):
+    """Settings of an emulated bus and its servos; see `Emulation` for the others.
 
     Args:
         baud_rate: Bits per second; a byte takes 10 bits.
-        sensing_latency_s: Age of a measurement when the instruction that reads it is complete [s].
-        sensing_jitter_s: Half-width of the uniform variation of that age [s]; at most the latency.
-        actuation_latency_s: Time from a complete goal instruction to its effect on the motor [s].
-        actuation_jitter_s: Half-width of the uniform variation of that time [s]; at most the latency. Commands take
-            effect in the order in which they were sent.
+        sensing_jitter_s: Half-width of the uniform variation of the sensing latency [s]; at most the latency.
         return_delay_us: The servos' Return Delay Time at power-up [us].
-        reply_loss: Probability that an answer is lost.
-        corrupt: Probability that an answer has a corrupted byte.
         encoder_counts: Resolution of the encoder [counts per revolution].
         plant_step_s: Period of the grid on which the plant is stepped and commands take effect [s]; at most 1 ms.
-        seed: Seed of jitter, loss and corruption.
-        silent_after_s: Time from which no byte is received or answered, as with an unplugged cable [s]; None: never.
-        overload_after_s: Time at which the servos report an overload and switch their torque off [s]; None: never.
-        late: Probability that an answer is delayed, as by a USB adapter; later answers wait for it.
-        late_s: That delay [s].
+        overload_after_s: Time at which the servos report an overload and switch their torque off [s]; None: never. It
+            counts from the emulator's start.
         wild: Probability that a read returns a position out of the motors' reach, with a correct checksum.
         frozen_after_s: Time from which reads return the position of that time, and no velocity [s]; None: never.
         unplugged_after_s: Time at which the port goes away, as with a pulled USB plug [s]; None: never.
         ill_after_s: Time from which answers are late or wild [s].
-        lets_go_after_s: Time from which the motor of the servo `lets_go` has no torque, though it reports torque on,
-            such as one whose gear broke [s]; None: never.
-        lets_go: That servo's id.
-        on_signal: Whether these times, except the overload's, count from SIGUSR1 to the process.
     """
 
+    serve: ClassVar[str] = "sim2real.emulation.process:serve_bus"
+    bus_type: ClassVar[Callable[..., PlannedBus]]
+    """Makes the bus from plant, settings, truth, ``send`` and ``start_ns``."""
+
     baud_rate: int = 1_000_000
-    sensing_latency_s: float = 0.0
     sensing_jitter_s: float = 0.0
-    actuation_latency_s: float = 0.0
-    actuation_jitter_s: float = 0.0
     return_delay_us: int = 500
-    reply_loss: float = 0.0
-    corrupt: float = 0.0
     encoder_counts: int = 4096
     plant_step_s: float = 0.0005
-    seed: int = 0
-    silent_after_s: float | None = None
     overload_after_s: float | None = None
-    late: float = 0.0
-    late_s: float = 0.009
     wild: float = 0.0
     frozen_after_s: float | None = None
     unplugged_after_s: float | None = None
     ill_after_s: float = 0.0
-    lets_go_after_s: float | None = None
-    lets_go: int = 1
-    on_signal: bool = False
 
     def __post_init__(self) -> None:
-        ranges = {
-            "baud_rate": (1, 10_000_000),
-            "sensing_jitter_s": (0.0, self.sensing_latency_s),
-            "actuation_jitter_s": (0.0, self.actuation_latency_s),
-            "return_delay_us": (0, 508),
-            "reply_loss": (0.0, 1.0),
-            "corrupt": (0.0, 1.0),
-            "late": (0.0, 1.0),
-            "late_s": (0.0, 1.0),
-            "wild": (0.0, 1.0),
-            "plant_step_s": (1e-5, 1e-3),
-            "encoder_counts": (2, 1 << 24),
-        }
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise UsageError(f"emulator: {name} = {value} is outside [{low}, {high}]")
+        super().__post_init__()
+        self.require(
+            {
+                "baud_rate": (1, 10_000_000),
+                "sensing_jitter_s": (0.0, self.sensing_latency_s),
+                "return_delay_us": (0, 508),
+                "wild": (0.0, 1.0),
+                "plant_step_s": (1e-5, 1e-3),
+                "encoder_counts": (2, 1 << 24),
+            }
+        )
+
+    def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
+        """Return the emulated bus with these settings; arguments as in `PlannedBus`."""
+        return type(self).bus_type(plant, self, truth, send, start_ns)
 
 
 _STALE_PACKET_NS: Final = 5_000_000  # after a longer pause, an incomplete packet is dropped
@@ -133,7 +110,7 @@ class PacketParser(Protocol):
         ...
 
 
-class PlannedBus(ABC):
+class PlannedBus(FaultTimes, ABC):
     """Emulated servos on a half-duplex bus, driving a plant; without port and threads.
 
     Times are CLOCK_MONOTONIC nanoseconds. A subclass carries out instructions in `execute`, with the help of `measure`,
@@ -148,7 +125,7 @@ class PlannedBus(ABC):
     def __init__(
         self,
         plant: Plant,
-        config: Emulation,
+        config: BusEmulation,
         truth: TruthLog,
         send: Callable[[bytes], bool],
         start_ns: int,
@@ -177,10 +154,10 @@ class PlannedBus(ABC):
         self._last_bytes_ns = start_ns
         self._delivered_ns = start_ns
         self._frozen: dict[int, tuple[float, float, float]] = {}
-        self._fault_ns: int | None = None
         self._events: list[tuple[int, int, Callable[..., None], tuple[Any, ...]]] = []
         self._sequence = 0
-        if not config.on_signal:
+        FaultTimes.__init__(self, config, start_ns)
+        if self.faulty_ns is not None:
             self.begin_faults(start_ns)
         if config.overload_after_s is not None:
             overload_ns = start_ns + round(config.overload_after_s * 1e9)
@@ -238,14 +215,14 @@ class PlannedBus(ABC):
 
     def begin_faults(self, t_ns: int) -> None:
         """Count the times of faults from ``t_ns``."""
-        self._fault_ns = t_ns
+        self.faulty_ns = t_ns
         if self._config.lets_go_after_s is not None:
             ns = t_ns + round(1e9 * self._config.lets_go_after_s)
             self._at(ns, self._stop_motor, self._firmware[self._config.lets_go], ns, OperatingMode.OFF)
 
     def unplugged(self, t_ns: int) -> bool:
         """Return whether the port is gone at a time [ns]."""
-        return self._passed(self._config.unplugged_after_s, t_ns)
+        return self.has(self._config.unplugged_after_s, t_ns)
 
     def happens(self, probability: float) -> bool:
         """Return whether a fault happens; draws no random number if its probability is 0."""
@@ -253,7 +230,7 @@ class PlannedBus(ABC):
 
     def ill(self, probability: float, t_ns: int) -> bool:
         """Return whether the answer to an instruction at a time [ns] is late, or wild, with this probability."""
-        return self._passed(self._config.ill_after_s, t_ns) and self.happens(probability)
+        return self.has(self._config.ill_after_s, t_ns) and self.happens(probability)
 
     def configure(self, servo: Firmware) -> None:
         """Pass a servo's controller settings to the plant if they have changed."""
@@ -272,7 +249,7 @@ class PlannedBus(ABC):
         planned_ns = max(planned_ns, self._last_effect_ns[servo.servo_id])
         self._last_effect_ns[servo.servo_id] = planned_ns
         mode, goal = servo.command()
-        if servo.servo_id == config.lets_go and self._passed(config.lets_go_after_s, request.t_ns):
+        if servo.servo_id == config.lets_go and self.has(config.lets_go_after_s, request.t_ns):
             mode, goal = OperatingMode.OFF, 0.0
         self._clock.schedule(planned_ns, request.t_host_ns, servo.servo_id, mode, goal)
 
@@ -282,7 +259,7 @@ class PlannedBus(ABC):
         sampled_ns = t_ns - self._delay_ns(config.sensing_latency_s, config.sensing_jitter_s)
         values = self._clock.sample(servo.servo_id, sampled_ns)
         reported = values
-        if self._passed(config.frozen_after_s, t_ns):
+        if self.has(config.frozen_after_s, t_ns):
             reported = self._frozen.setdefault(servo.servo_id, (values[0], 0.0, values[2]))
         servo.refresh(*reported, tick_ms=(t_ns - self._start_ns) // 1_000_000)
         return sampled_ns, values
@@ -307,11 +284,7 @@ class PlannedBus(ABC):
         heapq.heappush(self._events, (t_ns, self._sequence, action, arguments))
 
     def _silent(self, t_ns: int) -> bool:
-        return self._passed(self._config.silent_after_s, t_ns)
-
-    def _passed(self, after_s: float | None, t_ns: int) -> bool:
-        """Return whether the time of a fault has come."""
-        return after_s is not None and self._fault_ns is not None and t_ns - self._fault_ns >= after_s * 1e9
+        return self.has(self._config.silent_after_s, t_ns)
 
     def _delay_ns(self, latency_s: float, jitter_s: float) -> int:
         return round(1e9 * (latency_s + self.random.uniform(-jitter_s, jitter_s)))
@@ -345,30 +318,6 @@ class PlannedBus(ABC):
         """Stop the motor by the servo's own firmware: at once, dropping commands that have not taken effect yet."""
         self._clock.cancel(servo.servo_id)
         self._clock.schedule(t_ns, 0, servo.servo_id, mode, 0.0)
-
-
-@dataclass(frozen=True)
-class BusEmulation(Emulation):
-    """Settings of a certain bus; see `Emulation` for their meaning."""
-
-    serve: ClassVar[str] = "sim2real.emulation.process:serve_bus"
-    bus_type: ClassVar[Callable[..., PlannedBus]]
-    """Makes the bus from plant, settings, truth, ``send`` and ``start_ns``."""
-
-    def bus(self, plant: Plant, truth: TruthLog, send: Callable[[bytes], bool], start_ns: int) -> PlannedBus:
-        """Return the emulated bus with these settings; arguments as in `PlannedBus`."""
-        return type(self).bus_type(plant, self, truth, send, start_ns)
-
-
-def truth_header(plant: Plant, config: Emulation, start_ns: int) -> dict[str, Any]:
-    """Return the header of a truth file; ``start_ns`` is time 0 of the plant."""
-    return {
-        "start_ns": start_ns,
-        "config": asdict(config),
-        "servo_ids": list(plant.servo_ids),
-        "state_names": list(plant.state()),
-        "truth": plant.truth(),
-    }
 
 
 S = TypeVar("S", bound=ServoFirmware)

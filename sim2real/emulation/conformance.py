@@ -89,7 +89,7 @@ class DeviceConformance(ABC):
         """Return the device on a port, not opened yet, with a `silence_s` of 0.3 s to 1 s."""
 
     def make_robot(self, truth_path: Path, **settings: Any) -> EmulatedRobot:
-        """Return the emulator, started: latencies and faults have the names of `emulation.settings.Emulation`."""
+        """Return the emulator, started: latencies and faults have the names of `emulation.faults.Emulation`."""
         config = self.emulation(**{**self.settings, **settings})
         return VirtualRobot(self.plant, config, self.plant_args, truth_path)
 

@@ -17,16 +17,17 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
 from sim2real.emulation.body import LAW, Body
+from sim2real.emulation.faults import Emulation, FaultTimes, truth_header
 from sim2real.emulation.plant import STATE_PERIOD_S
 from sim2real.emulation.process import StopFlag, keep_time, plant_arguments
 from sim2real.emulation.truth import Kind, TruthLog
-from sim2real.errors import HardwareLost, UsageError
+from sim2real.errors import HardwareLost
 from sim2real.hardware.registry import load_named
 from sim2real.hardware.unitree.dds import Address
 from sim2real.hardware.unitree.messages import (
@@ -49,14 +50,10 @@ STATE_HZ = 500
 
 
 @dataclass(frozen=True)
-class UnitreeEmulation:
-    """Settings of an emulated robot; times of faults count from its start, or from a signal.
+class UnitreeEmulation(Emulation):
+    """Settings of an emulated robot of Unitree; see `Emulation` for the others.
 
-    Attributes:
-        sensing_latency_s: Age of the measurements in a state when it is sent [s].
-        actuation_latency_s: Time from the writing of a command to its effect on the motors [s].
-        actuation_jitter_s: Half-width of the uniform variation of that time [s]; at most the latency. Commands take
-            effect in the order in which they were written.
+    Args:
         position_noise_rad: Deviation of the noise of encoders [rad].
         velocity_noise_rad_s: Deviation of the noise of the motors' speeds [rad/s].
         gyro_noise_rad_s: Deviation of the noise of the gyro [rad/s].
@@ -65,22 +62,10 @@ class UnitreeEmulation:
         alone_after_s: Time without an intact command after which motors damp their joints [s]; None: they go on as
             commanded last, the worst that is possible: Unitree documents no reaction.
         alone_kd: Damping of the joints then [N m s/rad].
-        reply_loss: Probability that a state is not sent.
-        corrupt: Probability that a state has a wrong CRC.
-        late: Probability that a state is held up; later states wait for it.
-        late_s: Time for which it is held up [s].
-        silent_after_s: Time from which no state is sent and no command received, as with an unplugged cable [s].
-        lets_go_after_s: Time from which the motor `lets_go` has no torque, though it reports that it is on [s].
-        lets_go: That motor's number.
-        on_signal: Whether these times count from SIGUSR1 to the process.
-        seed: Seed of jitter and noise.
     """
 
     serve: ClassVar[str] = "sim2real.emulation.legs:serve_legs"
 
-    sensing_latency_s: float = 0.0
-    actuation_latency_s: float = 0.0
-    actuation_jitter_s: float = 0.0
     position_noise_rad: float = 0.0003
     velocity_noise_rad_s: float = 0.03
     gyro_noise_rad_s: float = 0.01
@@ -88,27 +73,9 @@ class UnitreeEmulation:
     accelerometer_noise_m_s2: float = 0.05
     alone_after_s: float | None = None
     alone_kd: float = 3.0
-    reply_loss: float = 0.0
-    corrupt: float = 0.0
-    late: float = 0.0
-    late_s: float = 0.009
-    silent_after_s: float | None = None
-    lets_go_after_s: float | None = None
-    lets_go: int = 0
-    on_signal: bool = False
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        negative = [name for name, value in asdict(self).items() if value is not None and value < 0]
-        unlikely = [name for name in ("reply_loss", "corrupt", "late") if getattr(self, name) > 1]
-        if unlikely:
-            raise UsageError(f"emulator: {unlikely[0]} = {getattr(self, unlikely[0])} is no probability")
-        if negative or self.actuation_jitter_s > self.actuation_latency_s:
-            name = (negative or ["actuation_jitter_s"])[0]
-            raise UsageError(f"emulator: {name} = {getattr(self, name)} is below 0, or a jitter above its latency")
 
 
-class EmulatedLegs:
+class EmulatedLegs(FaultTimes):
     """Motors and IMU of a body.
 
     Args:
@@ -116,10 +83,10 @@ class EmulatedLegs:
 
     Attributes:
         ignored: Commands whose CRC or head was wrong.
-        faulty_ns: Time from which the times of faults count [ns]; None: they have not begun.
     """
 
     def __init__(self, body: Body, config: UnitreeEmulation, truth: TruthLog, start_ns: int) -> None:
+        super().__init__(config, start_ns)
         self._body, self._config, self._truth, self._start_ns = body, config, truth, start_ns
         self._rng = np.random.default_rng(config.seed)
         self._step_ns = round(1e9 * body.step_s)
@@ -129,17 +96,12 @@ class EmulatedLegs:
         self._heard_ns: int | None = None
         self._damps = False
         self.ignored = 0
-        self.faulty_ns = None if config.on_signal else start_ns
         # Measurements on the grid of the physics, the newest last, as far back as a state reaches.
         self._dtype = body.measure().dtype
         depth = int(1e9 * config.sensing_latency_s) // self._step_ns + 3
         self._history: deque[np.ndarray] = deque(maxlen=depth)
         self._stride = max(1, round(STATE_PERIOD_S / body.step_s))
         self._remember()
-
-    def has(self, after_s: float | None, t_ns: int) -> bool:
-        """Return whether a fault has begun at a time [ns] that begins ``after_s`` [s]; None: it never does."""
-        return after_s is not None and self.faulty_ns is not None and t_ns - self.faulty_ns > 1e9 * after_s
 
     def receive(self, command: LowCmd, t_ns: int) -> None:
         """Schedule a command that was written at ``t_ns``; one with a wrong CRC or head is ignored, as by the robot."""
@@ -231,12 +193,6 @@ class EmulatedLegs:
         if self._index % self._stride == 0:
             now_ns = self._now_ns()
             self._truth.write(Kind.STATE, 0, 0, now_ns, now_ns, 0, tuple(self._body.state().values()))
-
-
-def truth_header(body: Body, config: UnitreeEmulation, start_ns: int) -> dict[str, object]:
-    """Return the header of a truth file; ``start_ns`` is time 0 of the body."""
-    facts = {"servo_ids": [], "state_names": list(body.state()), "truth": body.truth()}
-    return {"start_ns": start_ns, "config": asdict(config), **facts}
 
 
 def _tilted(quaternion: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:

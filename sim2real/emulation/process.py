@@ -28,7 +28,8 @@ from dataclasses import Field, asdict, fields, is_dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, ClassVar, Final, Protocol, Self, cast
 
-from sim2real.emulation.bus import BusEmulation, PlannedBus, truth_header
+from sim2real.emulation.bus import BusEmulation, PlannedBus
+from sim2real.emulation.faults import truth_header
 from sim2real.emulation.plant import load_plant
 from sim2real.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.errors import HardwareLost, Sim2RealError, UsageError

@@ -17,7 +17,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final, Self
 
-from sim2real.emulation.bus import BusEmulation, truth_header
+from sim2real.emulation.bus import BusEmulation
+from sim2real.emulation.faults import truth_header
 from sim2real.emulation.plant import Plant, load_plant
 from sim2real.emulation.truth import Truth, TruthLog, read_truth
 from sim2real.errors import HardwareLost

@@ -6,7 +6,8 @@ from collections import deque
 from pathlib import Path
 
 from sim2real.emulation.body import Body
-from sim2real.emulation.legs import STATE_HZ, EmulatedLegs, Sender, UnitreeEmulation, truth_header
+from sim2real.emulation.faults import truth_header
+from sim2real.emulation.legs import STATE_HZ, EmulatedLegs, Sender, UnitreeEmulation
 from sim2real.emulation.truth import TruthLog
 from sim2real.emulation.virtual import NUMBERS, VirtualChannel, VirtualTime
 from sim2real.errors import HardwareLost

@@ -1,7 +1,7 @@
 from functools import cached_property
 from pathlib import Path
 
-from sim2real.emulation.bus import truth_header
+from sim2real.emulation.faults import truth_header
 from sim2real.emulation.plant import load_plant
 from sim2real.emulation.truth import TruthLog, read_truth
 from sim2real.emulation.virtual import VirtualTime
