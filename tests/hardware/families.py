@@ -137,7 +137,8 @@ def _leg_gate():
 
     device = UnitreeLegs("lo:0")
     low, high = device.reach()
-    return {"limit": (low.tolist(), high.tolist()), "stale": device.commanded.stale}
+    # After a long wait the legs hang far away from where they are commanded first.
+    return {"limit": (low.tolist(), high.tolist()), "stale": device.commanded.stale, "first_step_rad": np.inf}
 
 
 _ANGLE_GATE = {"limit": 1.0, "slew_per_s": 5.0, "stale": "hold"}
