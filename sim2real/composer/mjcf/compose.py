@@ -47,13 +47,13 @@ def element_text(element: Element, top: RootElement, self_only: bool, pretty: bo
         attributes = writer.attributes(element)
         if not element._given.get("name") and not element.is_frame:
             attributes.pop("name", None)
-        inner = "...</" + element.tag + ">" if element._with_attached() else ""
-        return _tag(element.tag, attributes, bool(inner)) + inner + "\n" * pretty
-    if element.tag == "default":
+        inner = "...</" + element._tag + ">" if element._with_attached() else ""
+        return _tag(element._tag, attributes, bool(inner)) + inner + "\n" * pretty
+    if element._tag == "default":
         writer.defaults(element)
     elif element._is_setting:
         writer.setting(element._in(element.root.root_model), 0)
-        writer.lines = writer.lines or [_tag(element.tag, {})]
+        writer.lines = writer.lines or [_tag(element._tag, {})]
     else:
         writer.element(element)
     return "\n".join(writer.lines) + "\n" if pretty else "".join(line.strip() for line in writer.lines)
@@ -72,7 +72,7 @@ def assets(model: RootElement) -> dict[str, bytes]:
 
 def _asset(element: Element, asset: files.Asset, top: RootElement) -> files.Asset:
     prefix = element.root.prefix(top)
-    if element.tag != "skin" or not prefix:
+    if element._tag != "skin" or not prefix:
         return asset
     # A file names bones by the names in its own model, which may have changed since.
     return files.renamed_skin(asset, lambda bone: prefix + bone)
@@ -124,7 +124,7 @@ class _Writer:
         for child in element._children:
             self.setting(child, depth + 1)
         if attributes or len(self.lines) > at:
-            self._around(element.tag, attributes, at, depth)
+            self._around(element._tag, attributes, at, depth)
 
     def defaults(self, element: Element, depth: int = 0) -> None:
         """Write a class of defaults; the classes of attached models stand beside those at the top."""
@@ -140,7 +140,7 @@ class _Writer:
         """Write a class of defaults."""
         at = len(self.lines)
         for child in element._children:
-            if child.tag == "default":
+            if child._tag == "default":
                 self.default(child, depth + 1)
             elif child._given or child._children:
                 self.element(child, depth + 1)
@@ -157,7 +157,7 @@ class _Writer:
 
     def element(self, element: Element, depth: int = 0) -> None:
         """Write an element and all below it."""
-        space, tag = "  " * depth, element.tag
+        space, tag = "  " * depth, element._tag
         children = element._with_attached()
         attributes = self.attributes(element)
         attached = element._attached
@@ -188,13 +188,13 @@ class _Writer:
             made[named_by] = self._name(element)
             if not made[named_by]:  # a composite at the top, whose elements are called as MuJoCo calls them
                 del made[named_by]
-        if "class" in spec.attributes and "class" not in given and element.tag != "default":
+        if "class" in spec.attributes and "class" not in given and element._tag != "default":
             by_model = self._class(element)
             if by_model:
                 made["class"] = by_model
         for name in sorted(given, key=spec.attributes.__getitem__):
             value = given[name]
-            if name == named_by or name in _FOLDERS or (element.tag == "key" and name in element._key_order):
+            if name == named_by or name in _FOLDERS or (element._tag == "key" and name in element._key_order):
                 continue
             written = self._text(element, name, value)
             if written is not None:
@@ -209,7 +209,7 @@ class _Writer:
     def _name(self, element: Element) -> str:
         model = element.root
         parent: Any = element._parent
-        if element._given.get("name") or element.is_frame or parent.is_frame or element.tag == "composite":
+        if element._given.get("name") or element.is_frame or parent.is_frame or element._tag == "composite":
             return model.identify(element, self.top) or ""
         numbers = self._unnamed.get(model)
         if numbers is None:
@@ -238,12 +238,12 @@ class _Writer:
             return _asset(element, value, self.top).get_vfs_filename()
         if hasattr(value, "_given"):
             return self._named(element, name, value)
-        target = schema.reference(element._path, element.tag, name)
+        target = schema.reference(element._path, element._tag, name)
         if target == "default" and value == (model._child("default")._given.get("class") or "main"):
             return model.identify(model._child("default"), self.top)
         if target is not None:
             return model.prefix(self.top) + value
-        if element.tag == "flex" and name in ("body", "node"):
+        if element._tag == "flex" and name in ("body", "node"):
             return " ".join(model.prefix(self.top) + word for word in str(value).split())
         return value if isinstance(value, str) else self._digits(value)
 
@@ -278,17 +278,17 @@ class _Writer:
     def _turned(self, element: Element, factor: float) -> dict[str, str]:
         """Return the attributes of an element that are angles, in the unit of the model at the top."""
         made, given = {}, element._given
-        if "euler" in given and element.tag != "compiler":
+        if "euler" in given and element._tag != "compiler":
             made["euler"] = self._digits(factor * given["euler"])
         if "axisangle" in given:
             made["axisangle"] = self._digits(given["axisangle"] * [1.0, 1.0, 1.0, factor])
-        if element.tag == "joint" and "range" in element._spec.attributes:
+        if element._tag == "joint" and "range" in element._spec.attributes:
             scale = factor if turns(element) else 1.0
             for name in _ANGLES:  # those of its classes too: a class may be for hinges and for slides
                 value = inherited(element, name)
                 if value is not None:
                     made[name] = self._digits(scale * np.asarray(value))
-        if element.tag == "compiler":
+        if element._tag == "compiler":
             made.pop("angle", None)
         return made
 
@@ -381,7 +381,7 @@ def classes(element: Element) -> Iterator[Element]:
         name, above = above._given.get("childclass"), above._parent
     found = model.look_up("default", name) if isinstance(name, str) else name
     found = model._child("default") if found is None else found
-    while found is not None and found.tag == "default":
+    while found is not None and found._tag == "default":
         yield found
         found = found._parent
 
@@ -391,31 +391,31 @@ def inherited(element: Element, name: str) -> Any:
     if name in element._given:
         return element._given[name]
     holders: Iterator[Element | None]
-    if element._parent is not None and element._parent.tag == "default":
-        holders = (c._present(element.tag) for c in _upwards(element._parent))
+    if element._parent is not None and element._parent._tag == "default":
+        holders = (c._present(element._tag) for c in _upwards(element._parent))
     else:
-        holders = (c._present(element.tag) for c in classes(element))
+        holders = (c._present(element._tag) for c in classes(element))
     return next((h._given[name] for h in holders if h is not None and name in h._given), None)
 
 
 def _upwards(default: Element | None) -> Iterator[Element]:
-    while default is not None and default.tag == "default":
+    while default is not None and default._tag == "default":
         yield default
         default = default._parent
 
 
 def turns(joint: Element) -> bool:
     """Return whether the range of a joint is one of angles."""
-    return joint.tag == "joint" and inherited(joint, "type") not in ("slide", "free")
+    return joint._tag == "joint" and inherited(joint, "type") not in ("slide", "free")
 
 
 def width_of(element: Element, name: str) -> int:
     """Return how many numbers of a keyframe an element has, as far as its model tells."""
     if name in ("qpos", "qvel"):
-        kind = "free" if element.tag == "freejoint" else inherited(element, "type")
+        kind = "free" if element._tag == "freejoint" else inherited(element, "type")
         return {"free": 7, "ball": 4}.get(kind, 1) - (name == "qvel" and kind in ("free", "ball"))
     if name == "act":
-        stateful = element.tag in ("intvelocity", "cylinder", "muscle") or inherited(element, "timeconst") is not None
+        stateful = element._tag in ("intvelocity", "cylinder", "muscle") or inherited(element, "timeconst") is not None
         return int(stateful or (inherited(element, "dyntype") or "none") != "none")
     return {"ctrl": 1, "mpos": 3, "mquat": 4}[name]
 
@@ -423,8 +423,8 @@ def width_of(element: Element, name: str) -> int:
 def free_body(model: RootElement) -> Element | None:
     """Return the first body of a model's own world that has a free joint, or None."""
     for body in model._child("worldbody")._children:
-        if body.tag == "body" and not body.is_frame:
+        if body._tag == "body" and not body.is_frame:
             for joint in body._children:
-                if joint.tag == "freejoint" or (joint.tag == "joint" and inherited(joint, "type") == "free"):
+                if joint._tag == "freejoint" or (joint._tag == "joint" and inherited(joint, "type") == "free"):
                     return body
     return None

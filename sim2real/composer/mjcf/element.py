@@ -29,17 +29,18 @@ class Element:
     An attribute that is not explicit reads as None. Children are attributes too: ``body.geom``, ``option.flag``.
     """
 
-    __slots__ = ("_attached", "_children", "_given", "_key_order", "_parent", "_root", "_spec", "is_removed")
+    __slots__ = ("_attached", "_children", "_given", "_key_order", "_parent", "_root", "_spec", "_tag", "is_removed")
     _attached: RootElement | None
     """The model that an attachment frame holds."""
     _given: dict[str, Any]
     _key_order: dict[str, list[Any]]
     """Of a keyframe: attribute -> the elements that its numbers belong to."""
     _root: RootElement
+    _tag: str
     is_removed: bool
 
     def __init__(self, spec: schema.Spec, parent: Element | None, root: RootElement | None = None) -> None:
-        made = (None, [], {}, {}, parent, root or getattr(parent, "_root", None), spec, False)
+        made = (None, [], {}, {}, parent, root or getattr(parent, "_root", None), spec, spec.name, False)
         for name, value in zip(Element.__slots__, made, strict=True):
             object.__setattr__(self, name, value)
 
@@ -106,7 +107,7 @@ class Element:
     @property
     def _path(self) -> str:
         parent = self._parent
-        return self.tag if parent is None or parent is self._root else f"{parent.tag}.{self.tag}"
+        return self._tag if parent is None or parent is self._root else f"{parent._tag}.{self._tag}"
 
     # -- attributes
 
@@ -121,13 +122,13 @@ class Element:
     def _is_setting(self) -> bool:
         parent = self._parent
         section = self if parent is self._root else parent
-        return section is not None and section.tag in ("compiler", "option", "size", "statistic", "visual")
+        return section is not None and section._tag in ("compiler", "option", "size", "statistic", "visual")
 
     def _in(self, model: RootElement) -> Element:
         """Return the same setting of another model."""
         parent = self._parent
         holder = model if parent is self._root or parent is None else parent._in(model)
-        return holder._child(self.tag)
+        return holder._child(self._tag)
 
     def _checked(self, name: str, problem: str = "") -> str:
         if self.is_removed:
@@ -135,7 +136,9 @@ class Element:
         name = "class" if name == "dclass" else name
         if name not in self._spec.attributes:
             available = ", ".join(sorted(map(_public, self._spec.attributes)))
-            raise AttributeError(f"{problem}{name!r} is not a valid attribute for <{self.tag}>. Available: {available}")
+            raise AttributeError(
+                f"{problem}{name!r} is not a valid attribute for <{self._tag}>. Available: {available}"
+            )
         return name
 
     def _get(self, name: str) -> Any:
@@ -157,7 +160,7 @@ class Element:
         if name not in spec.attributes and name != "dclass" and spec.children:
             children = f"; children: {', '.join(sorted(spec.children))}"
             attributes = ", ".join(sorted(spec.attributes))
-            raise AttributeError(f"<{self.tag}> object has no attribute {name!r}. Available: {attributes}{children}")
+            raise AttributeError(f"<{self._tag}> object has no attribute {name!r}. Available: {attributes}{children}")
         return self._get(self._checked(name, "object has no attribute: "))
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -183,23 +186,23 @@ class Element:
             self._root.rename(self, values.get(name), value)
         if value is None:
             values.pop(name, None)
-            if self.tag == "key":
+            if self._tag == "key":
                 self._key_order.pop(name, None)
             return
         values[name] = self._converted(name, value)
-        if self.tag == "key" and name in KEYED:
+        if self._tag == "key" and name in KEYED:
             self._key_order[name] = self._root.keyed_elements(name)
 
     def _converted(self, name: str, value: Any) -> Any:
         """Return the value of an attribute as it is kept."""
-        target = schema.reference(self._path, self.tag, name)
+        target = schema.reference(self._path, self._tag, name)
         if target is not None:
             return self._converted_reference(name, target, value)
         if isinstance(value, Element):
-            raise UsageError(f"{name} of <{self.tag}> names no element")
-        if name.startswith("file") and self.tag in files.TAGS:
+            raise UsageError(f"{name} of <{self._tag}> names no element")
+        if name.startswith("file") and self._tag in files.TAGS:
             return value if isinstance(value, files.Asset) else files.read(self, str(value))
-        form = schema.form(self._path, self.tag, name)
+        form = schema.form(self._path, self._tag, name)
         try:
             if form in ("array", "ints"):
                 numbers = value.split() if isinstance(value, str) else value
@@ -216,7 +219,7 @@ class Element:
             if form == "float":
                 return float(np.asarray(value, float).item())
         except (TypeError, ValueError) as error:
-            raise UsageError(f"{name}={value!r} of <{self.tag}> is not valid: {error}") from None
+            raise UsageError(f"{name}={value!r} of <{self._tag}> is not valid: {error}") from None
         if isinstance(value, bool | np.bool_):
             return str(bool(value)).lower()
         if isinstance(value, str):
@@ -229,13 +232,13 @@ class Element:
         by = self._given.get(target) if target in ("objtype", "reftype") else target
         if not isinstance(value, Element):
             if not isinstance(value, str | np.str_):
-                raise UsageError(f"{name} of <{self.tag}> names an element, got {value!r}")
+                raise UsageError(f"{name} of <{self._tag}> names an element, got {value!r}")
             return str(value)
         if by is None:
             self._given[target] = by = value.kind
         by = KIND_OF_TAG.get(by, by)
         if value.kind != by:
-            raise UsageError(f"{name} of <{self.tag}> names an element of kind {by}, got one of kind {value.kind}")
+            raise UsageError(f"{name} of <{self._tag}> names an element of kind {by}, got one of kind {value.kind}")
         return value
 
     @property
@@ -269,7 +272,10 @@ class Element:
     # -- children
 
     def _present(self, tag: str) -> Element | None:
-        return next((c for c in self._children if c.tag == tag), None)
+        for child in self._children:
+            if child._tag == tag:
+                return child
+        return None
 
     def _child(self, tag: str) -> Element:
         """Return a child that is there without being added."""
@@ -277,17 +283,17 @@ class Element:
         if child is None:
             child = Element(self._spec.children[tag], self)
             place = len(self._children)
-            if self.tag == "default":  # in MJCF's order, whenever it is first used: classes of actuators share values
+            if self._tag == "default":  # in MJCF's order, whenever it is first used: classes of actuators share values
                 order = list(self._spec.children)
                 later = order[order.index(tag) :]
-                place = next((i for i, c in enumerate(self._children) if c.tag in later), place)
+                place = next((i for i, c in enumerate(self._children) if c._tag in later), place)
             self._children.insert(place, child)
         return child
 
     def get_children(self, tag: str) -> Any:
         """Return the children with a tag: a list, or the one child."""
         if tag not in self._spec.children:
-            raise NoSuchChildError(f"<{tag}> is not a valid child of <{self.tag}>")
+            raise NoSuchChildError(f"<{tag}> is not a valid child of <{self._tag}>")
         return getattr(self, tag)
 
     def add(self, tag: str, **attrs: Any) -> Element:
@@ -303,10 +309,10 @@ class Element:
         spec = self._spec.children.get(tag)
         if spec is None or (self.is_frame and tag not in schema.FRAME_CHILDREN):
             available = ", ".join(schema.FRAME_CHILDREN if self.is_frame else sorted(self._spec.children))
-            where = f"the attachment frame {self.full_identifier!r}" if self.is_frame else f"<{self.tag}>"
+            where = f"the attachment frame {self.full_identifier!r}" if self.is_frame else f"<{self._tag}>"
             raise NoSuchChildError(f"<{tag}> is not a valid child of {where}. Available: {available or 'nothing'}")
         if not spec.repeated and (spec.implicit or self._present(tag) is not None):
-            raise UsageError(f"A <{tag}> child already exists in <{self.tag}>, please access it directly.")
+            raise UsageError(f"A <{tag}> child already exists in <{self._tag}>, please access it directly.")
         if tag == "freejoint" and not self._stands_in_the_world:
             raise NoSuchChildError(
                 f"<freejoint> is not a valid child of {self.full_identifier!r}, which does not stand in the world",
@@ -369,24 +375,27 @@ class Element:
         for tag, spec in self._spec.children.items():
             if spec.implicit:
                 self._child(tag)
-        return self._with_attached()
+        return list(self._with_attached())
 
     def _with_attached(self) -> list[Element]:
-        return [*self._children, *self.attached_children()]
+        attached = self.attached_children()
+        return [*self._children, *attached] if attached else self._children
 
     def attached_children(self) -> list[Element]:
         """Return the children that belong to attached models."""
         if self._attached is not None:
             return self._attached.worldbody._with_attached()
-        if self._parent is self._root and self.tag not in ("worldbody", "default") and not self._is_setting:
-            return [c for m in self._root.attached_models() for c in m._child(self.tag)._with_attached()]
+        if self._parent is self._root and self._tag not in ("worldbody", "default") and not self._is_setting:
+            return [c for m in self._root.attached_models() for c in m._child(self._tag)._with_attached()]
         return []
 
     def walk(self, own: bool = False) -> Iterator[Element]:
         """Yield this element and all below it, in the order of the document; ``own``: without attached models."""
-        yield self
-        for child in self._children if own else self._with_attached():
-            yield from child.walk(own)
+        waiting: list[Element] = [self]
+        while waiting:
+            element = waiting.pop()
+            yield element
+            waiting.extend(reversed(element._children if own else element._with_attached()))
 
     def find(self, kind: str, identifier: str | None = None, *, name: str | None = None) -> Any:
         """Return the element of a kind with a name such as ``finger`` or ``hand/finger`` below this one, or None."""
@@ -415,7 +424,7 @@ class Element:
 
     def attach(self, attachment: RootElement) -> Element:
         """Attach a model at this site, or at the world; return the frame, an empty body to which joints are added."""
-        if self.tag not in ("site", "worldbody"):
+        if self._tag not in ("site", "worldbody"):
             raise UsageError(
                 f"a model is attached to a site or the world, not to the {self.kind} {self.full_identifier!r}"
             )
@@ -435,7 +444,7 @@ class Element:
 
     def is_same_as(self, other: Element | None) -> bool:
         """Return whether another element has the same tag, attributes and children."""
-        if other is None or other.tag != self.tag:
+        if other is None or other.tag != self._tag:
             return False
         mine, theirs = (
             {k: v.full_identifier if isinstance(v, Element) else v for k, v in Element.get_attributes(e).items()}
@@ -447,7 +456,7 @@ class Element:
             return False
         ordered = self.kind == "tendon"  # the order of a path counts
         for tag in (None,) if ordered else self._spec.children:
-            one, two = ([c for c in e._with_attached() if tag in (None, c.tag)] for e in (self, other))
+            one, two = ([c for c in e._with_attached() if tag in (None, c._tag)] for e in (self, other))
             if len(one) != len(two) or not all(a.is_same_as(b) for a, b in zip(one, two, strict=True)):
                 return False
         return True
@@ -456,7 +465,7 @@ class Element:
         """Let attributes that name elements by text hold the elements."""
         for element in self.walk():
             for name, value in element._given.items():
-                target = schema.reference(element._path, element.tag, name) if isinstance(value, str) else None
+                target = schema.reference(element._path, element._tag, name) if isinstance(value, str) else None
                 target = element._given.get(target) if target in ("objtype", "reftype") else target
                 target = KIND_OF_TAG.get(target or "", target)
                 if target is not None and target in schema.KINDS:
@@ -503,15 +512,15 @@ class ElementList(Sequence[Element]):
     """Children with one tag, such as ``body.geom`` and ``sensor.gyro``; always those that are there now."""
 
     def __init__(self, parent: Element, tag: str) -> None:
-        self._parent, self.tag = parent, tag
+        self._parent, self._tag = parent, tag
 
     def _find(self) -> list[Element]:
         wanted = (
-            (self.tag,)
-            if self.tag != self._parent.tag or self.tag not in schema.GROUPS
+            (self._tag,)
+            if self._tag != self._parent.tag or self._tag not in schema.GROUPS
             else self._parent._spec.children
         )
-        return [c for c in self._parent._with_attached() if c.tag in wanted]
+        return [c for c in self._parent._with_attached() if c._tag in wanted]
 
     def __len__(self) -> int:
         return len(self._find())
@@ -523,10 +532,10 @@ class ElementList(Sequence[Element]):
             return elements[key]
         top = self._parent._root
         for element in elements:
-            if key in (element.dclass if self.tag == "default" else element.name, top.identify(element, top)):
+            if key in (element.dclass if self._tag == "default" else element.name, top.identify(element, top)):
                 return element
         raise KeyError(
-            f"there is no <{self.tag}> {key!r}. Available: {', '.join(filter(None, (e.name for e in elements)))}"
+            f"there is no <{self._tag}> {key!r}. Available: {', '.join(filter(None, (e.name for e in elements)))}"
         )
 
     def __delitem__(self, key: int | str | slice) -> None:

@@ -48,8 +48,7 @@ class RootElement(Element):
         for name, value in (made | {"model_dir": os.fspath(model_dir), "parent_model": None}).items():
             object.__setattr__(self, name, value)
         self.model = model or "unnamed_model"
-        for tag in self._spec.children:
-            self._child(tag)
+        self._children.extend(Element(spec, self) for spec in self._spec.children.values())
 
     @classmethod
     def from_xml_string(
