@@ -12,7 +12,6 @@ import numpy as np
 
 from sim2real.artifacts.run.run_folder import finished_stages, pipeline_of
 from sim2real.graph.episode import TICKS_PER_S, Episode
-from sim2real.log.session import input_ages
 from sim2real.view.node_looks import color_of, in_order, slowest_period_s
 from sim2real.view.rerun_content import IDLE, Curve, Tab, readable, states_of, tabs_of
 from sim2real.view.rerun_viewer import open_viewer, rerun_module
@@ -111,7 +110,7 @@ def send_values(recording: Any, curve: Curve, time: Any) -> None:
 
 
 def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
-    """Send each node's states as lanes, and its lateness and age of inputs as curves."""
+    """Send each node's states as lanes, and its lateness as a curve; the page has the ages of inputs in a table."""
     rr = rerun_module()
     for node in in_order(episode):
         steps = episode.steps[node]
@@ -130,14 +129,11 @@ def _send_timing(recording: Any, folder: str, episode: Episode) -> None:
         recording.log(lane, named, static=True)
         times, states = states_of(steps)
         recording.send_columns(lane, [time_column(times)], rr.StateChange.columns(state=states))
-        lines = {f"lateness/{node}": (node, (steps.woken - steps.start) / 1e3)}
-        for name, age_s in input_ages(episode, node).items():
-            lines[f"age/{node}/{name}"] = f"{name} in {node}", 1e3 * age_s
-        for entity, (label, values) in lines.items():
-            looks = rr.SeriesLines(names=label, widths=1.2, colors=color)
-            recording.log(f"{folder}/{entity}", looks, static=True)
-            times = time_column(steps.woken / TICKS_PER_S)
-            recording.send_columns(f"{folder}/{entity}", [times], rr.Scalars.columns(scalars=values))
+        lateness = f"{folder}/lateness/{node}"
+        recording.log(lateness, rr.SeriesLines(names=node, widths=1.2, colors=color), static=True)
+        late_ms = (steps.woken - steps.start) / 1e3
+        times = time_column(steps.woken / TICKS_PER_S)
+        recording.send_columns(lateness, [times], rr.Scalars.columns(scalars=late_ms))
 
 
 def _own_color(episode: Episode, node: str) -> tuple[int, int, int] | None:
@@ -166,7 +162,7 @@ def blueprint_of(tabs: Sequence[Tab], with_scene: bool) -> Any:
 
 
 def _page(tab: Tab, with_scene: bool) -> Any:
-    """Return a tab's arrangement: plots on the left; scene, schedule, lateness and age of inputs on the right."""
+    """Return a tab's arrangement: plots on the left; scene, schedule and lateness on the right."""
     import rerun.blueprint as rrb
 
     legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop)
@@ -199,9 +195,6 @@ def _page(tab: Tab, with_scene: bool) -> Any:
             rrb.TimeSeriesView(
                 name="Lateness [ms]", origin=f"/{tab.entity}/lateness", plot_legend=legend, axis_x=whole
             ),
-            rrb.TimeSeriesView(
-                name="Age of inputs [ms]", origin=f"/{tab.entity}/age", plot_legend=legend, axis_x=whole
-            ),
         ]
     # Many plots, such as those of several joints, stand in columns.
     columns = -(-len(plots) // _ROWS)
@@ -210,7 +203,7 @@ def _page(tab: Tab, with_scene: bool) -> Any:
     )
     if not side:
         return left
-    shares = [3, *([2, 2, 2] if len(side) > 1 else [])][-len(side) :] if with_scene else None
+    shares = [3, *([2, 2] if len(side) > 1 else [])][-len(side) :] if with_scene else None
     return rrb.Horizontal(left, rrb.Vertical(*side, row_shares=shares), column_shares=[3, 2], name=tab.title)
 
 

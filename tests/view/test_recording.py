@@ -64,7 +64,6 @@ def test_every_curve_stands_on_the_one_timeline(saved, finished_run):
             assert rows[f"/{curve.entity}"] == len(curve.t_s), curve.entity
     for folder in ("record", "deploy/0", "deploy/1"):
         assert rows[f"/{folder}/lateness/agent"] == synthetic_run.STEPS
-        assert rows[f"/{folder}/age/actuator/agent"] == synthetic_run.STEPS
         assert rows[f"/{folder}/schedule/agent"] >= 3 * synthetic_run.STEPS
         assert rows[f"/{folder}/scene/robot/turning"] == synthetic_run.STEPS
     assert rows["/deploy/0/scene/simulation/turning"] == 400
