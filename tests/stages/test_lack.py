@@ -43,7 +43,7 @@ def lacked(found, monkeypatch, tried=None, again=None, terms="own"):
     monkeypatch.setattr(judgement, "_tried", fitted)
     monkeypatch.setattr(judgement, "_free_runs_with", ran)
     monkeypatch.setattr(judgement, "positions", lambda *_: [AXIS, ARM])
-    monkeypatch.setattr(judgement.noise, "noises", lambda *_: NOISE)
+    monkeypatch.setattr(judgement, "noises", lambda *_: NOISE)
     refits = Refits()
     refits.begin(("drag",), np.zeros(1), 1.0)
     inputs = SimpleNamespace(

@@ -82,7 +82,7 @@ def fitted(monkeypatch, before_judging, judged):
         z = best.table.encode({p.name: 21.0 if p.name == "gain" else p.high / 2 for p in best.table})
         best.begin(None)
         before_judging()
-        return SimpleNamespace(estimate=SimpleNamespace(z=z, loss=1.0))
+        return SimpleNamespace(estimate=SimpleNamespace(x=z, loss=1.0))
 
     monkeypatch.setattr(identify_stage, "fit_model", fit)
     monkeypatch.setattr(identify_stage, "judge", judged)
