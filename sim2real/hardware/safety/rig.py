@@ -363,10 +363,15 @@ class Rig:
             return None
         return replace(following, limit=limit, source="following_rad") if following.unit == "rad" else following
 
+    def _name(self, index: int) -> str:
+        """Return a joint's name for errors; without one, its motor's."""
+        named = index < len(self.gate.config.joints)
+        return self.gate.config.joint(index) if named else self.device.motors[index]
+
     def _begin_following(self) -> None:
         self._follow_check = None
         if self.following is not None and self._sent is not None and not self.torque_withheld:
-            self._follow_check = FollowingCheck(self.following, self._sent, self._now_s(), self.gate.config.joint)
+            self._follow_check = FollowingCheck(self.following, self._sent, self._now_s(), self._name)
 
     def _require_near(self, command: np.ndarray) -> None:
         """Refuse a sender whose first goals are far away from the measured pose."""
@@ -384,7 +389,7 @@ class Rig:
         if np.any(away > most):  # the gate refuses a command that is no number
             worst = int(np.nanargmax(away - most))
             raise SafetyStop(
-                f"the first command puts {self.gate.config.joint(worst)} at {wanted[worst]:.3g} rad, measured are "
+                f"the first command puts {self._name(worst)} at {wanted[worst]:.3g} rad, measured are "
                 f"{here[worst]:.3g} rad: {away[worst]:.2g} rad away, {most[worst]:.2g} rad are allowed",
                 hint="bring the robot to the pose in which the policy starts; first_step_rad sets the limit",
             )
