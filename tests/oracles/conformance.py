@@ -157,7 +157,8 @@ class RuntimeConformance(ABC):
             else:
                 sent = [reference.message(name, h) for h in states]
                 assert got == sent[: len(got)], f"{where} read other messages"
-            assert len(got) >= 0.6 * len(states) - 3, f"{where} made {len(got)} steps"
+            # A compiled graph computes steps that reach no world up to two periods of the supervisor late.
+            assert len(got) >= 0.4 * len(states) - 3, f"{where} made {len(got)} steps"
 
 
 def _without_keys(tree: T) -> T:
