@@ -1,7 +1,7 @@
 """Pages for a browser: one self-contained HTML file, without scripts and without a network."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -40,7 +40,7 @@ def report(run_dir: Path, out: Path | None = None) -> Path:
         run=run_dir.resolve().name,
         started=started.replace("T", " ")[:19] + (" UTC" if started.endswith("+00:00") else ""),
         version=next((m["versions"].get("sim2real") for m in manifests if "versions" in m), ""),
-        absent=[stage for stage in STAGES if stage not in artifacts],
+        absent={stage: _tried(run_dir, stage) for stage in STAGES if stage not in artifacts},
         notes=_about_others(run_dir, artifacts),
     )
 
@@ -53,13 +53,13 @@ def write_page(
     run: str = "",
     started: str = "",
     version: str = "",
-    absent: Sequence[str] = (),
+    absent: Mapping[str, str] | None = None,
     notes: Sequence[NoteBlock] = (),
 ) -> Path:
     """Render sections as a page and write it at once, so that no browser reads a half of it.
 
     Args:
-        absent: Stages without a section, for the head of a page with several sections.
+        absent: Stage without a section -> what became of it, for the head of a page with several sections.
     """
     environment = Environment(
         loader=PackageLoader("sim2real.view"),
@@ -74,7 +74,7 @@ def write_page(
         started=started,
         version=version,
         sections=sections,
-        absent=absent,
+        absent=absent or {},
         most_reasons=_MOST_REASONS,
         notes=notes,
     )
@@ -83,6 +83,12 @@ def write_page(
     draft.write_text(text, encoding="utf-8", errors="replace")  # such as half a surrogate pair in the name of a file
     os.replace(draft, path)
     return path
+
+
+def _tried(run_dir: Path, stage: str) -> str:
+    """Return what became of a stage that is not finished: its newest attempt's status, or ``not yet``."""
+    tried = attempts(run_dir, stage)
+    return str(tried[0].manifest.get("status", "not yet")) if tried else "not yet"
 
 
 def _about_others(run_dir: Path, artifacts: dict[str, StageFolder]) -> list[NoteBlock]:

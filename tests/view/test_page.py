@@ -184,6 +184,14 @@ def test_the_success_shown_is_that_of_the_policy_in_the_bundle(only):
     assert "87%" in Page(report(run).read_text(encoding="utf-8")).words
 
 
+def test_a_failed_stage_is_no_stage_that_is_yet_to_come(run):
+    path = run / "deploy" / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"status": "failed"}))
+    words = Page(report(run).read_text(encoding="utf-8")).words
+    assert "failed" in words
+    assert "not yet" not in words
+
+
 def test_one_seed_and_missing_numbers_are_shown(only):
     run = only("identify", "train")
     (run / "train" / "history.json").write_text(json.dumps({**synthetic_run.history(1), "best_seed": 0}))
