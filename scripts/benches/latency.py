@@ -27,7 +27,8 @@ from benches import jobs
 from benches.recorded import rigs
 from benches.recorded.sets import Recording
 from benches.rows import Report, Row, four_digits, markdown, row, share
-from sim2real.identify.delays import Evidence, find, lost_share
+from sim2real.identify.delay_likelihood import DelayEvidence
+from sim2real.identify.delays import find, lost_share
 
 KINDS = {
     "fixed": "8 ms",
@@ -175,19 +176,19 @@ def ours(log: Log, seed: int) -> Estimate:
     limits = (begin - np.append(np.full(4, 2.5), 0.01), begin + np.append(np.full(4, 2.5), LONGEST_S - 0.03))
     first = least_squares(constant, begin, bounds=limits, diff_step=_DIFFERENCE, x_scale=np.append(np.ones(4), 0.01))
 
-    def evidence(move: np.ndarray, about_s: float | None) -> Evidence:
-        x = first.x[:-1] + (move if move.size else 0.0)
-        simulated, stamps = angles(x), log.t - (first.x[-1] if about_s is None else about_s)
+    def linearise(x: np.ndarray, delay_s: float) -> DelayEvidence:
+        simulated, stamps = angles(x), log.t - delay_s
         errors = at(log.t[:, None] - grid, simulated) - log.position[:, None]
         slopes = [at(stamps, angles(x + s) - simulated) / _DIFFERENCE for s in _DIFFERENCE * np.eye(len(x))]
         J = np.stack(slopes, axis=1)[:, None] / NOISE_RAD
-        return Evidence(grid, errors[:, None] / NOISE_RAD, J, 1e-2 * np.eye(len(x)))
+        return DelayEvidence(log.t - log.t.mean(), grid, errors[:, None] / NOISE_RAD, J, 1e-2 * np.eye(len(x)))
 
     again = np.concatenate([[False], np.diff(log.position) == 0.0])
-    estimate, low, high = find(evidence, again)
-    mean, _, p95 = estimate.numbers
-    ends = [(float(a), float(b)) for a, b in zip(low[[0, 2]], high[[0, 2]], strict=True)]
-    return Estimate(float(mean), float(p95), float(lost_share(estimate.lost).value or 0.0), *ends)
+    estimate = find(linearise, first.x[:-1], float(first.x[-1]), again)
+    mean, _, p95 = estimate.ranged()
+    ends = [(float(r.low95 or 0.0), float(r.high95 or 0.0)) for r in (mean, p95)]
+    lost = float(lost_share(estimate.lost).value or 0.0)
+    return Estimate(float(mean.value or 0.0), float(p95.value or 0.0), lost, *ends)
 
 
 def _put_friction(spec: mujoco.MjSpec, value: float) -> None:
