@@ -29,7 +29,7 @@ def document(times_noise, *runs, tried=(), terms=()):
     )
 
 
-def lacked(found, monkeypatch, tried=None, again=None, terms="own"):
+def lacked(found, monkeypatch, tried=None, again=None, terms="own", leaning=None):
     """Return what a document lacks; ``tried`` and ``again``: what fits with further terms give; None: no fit."""
 
     def fitted(*_):
@@ -44,6 +44,7 @@ def lacked(found, monkeypatch, tried=None, again=None, terms="own"):
     monkeypatch.setattr(judgement, "_free_runs_with", ran)
     monkeypatch.setattr(judgement, "positions", lambda *_: [AXIS, ARM])
     monkeypatch.setattr(judgement, "noises", lambda *_: NOISE)
+    monkeypatch.setattr(judgement, "inclined", lambda *_: leaning)
     refits = Refits()
     refits.begin(("drag",), np.zeros(1), 1.0)
     inputs = SimpleNamespace(
@@ -63,18 +64,27 @@ def lacked(found, monkeypatch, tried=None, again=None, terms="own"):
     [
         (3.0, None, "own", (), ""),
         (3.1, (), "own", ("no optional term was tried",), ""),
-        (75.0, (TriedTerm("load", 8.0, 0.4, "mends"),), "own", ("75 times", "load", "95%"), "--terms drag,load"),
-        (75.0, (TriedTerm("load", 8.0, 5.0, "mends"),), "own", ("load", "--terms drag,load"), ""),
-        (75.0, (TriedTerm("load", 8.0, 7.9, "no gain"),), "own", ("none of the terms",), ""),
-        (75.0, None, "auto", ("no further term",), ""),
+        (25.0, (TriedTerm("load", 8.0, 0.4, "mends"),), "own", ("25 times", "load", "95%"), "--terms drag,load"),
+        (75.0, (TriedTerm("load", 8.0, 5.0, "mends"),), "own", ("load", "--terms drag,load", "gravity"), ""),
+        (75.0, (TriedTerm("load", 8.0, 7.9, "no gain"),), "own", ("none of the terms", "gravity"), ""),
+        (75.0, None, "auto", ("no further term", "gravity"), ""),
     ],
 )
 def test_a_model_lacks_the_term_that_halves_its_errors(times_noise, tried, terms, named, flags, monkeypatch):
     before = (TriedTerm("load", 8.0, 0.4, "mends"),) if terms == "auto" else ()
     found = lacked(document(times_noise, tried=before, terms=("drag",)), monkeypatch, tried, terms=terms)
     assert found.flags == flags
+    assert found.unexplained == (times_noise > 50.0)
     assert len(found.reasons) == bool(named)
     assert all(word in found.reasons[0] for word in named)
+
+
+@pytest.mark.parametrize(("times_noise", "named"), [(9.0, False), (25.0, True)])
+def test_gravity_of_another_direction_is_named_first_with_its_command(times_noise, named, monkeypatch):
+    leaning = 0.99, {"tilt_x": 0.0, "tilt_y": 0.7}, "--terms tilt"
+    found = lacked(document(times_noise, terms=("drag",)), monkeypatch, (), leaning=leaning)
+    assert ("+0.70 rad (tilt_y)" in found.reasons[0]) == named
+    assert found.flags == ("--terms tilt" if named else "")
 
 
 @pytest.mark.parametrize(

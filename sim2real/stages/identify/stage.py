@@ -25,7 +25,7 @@ from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import Pipeline, pipeline_of
 from sim2real.stages.pipeline.python_arguments import AnyRecording, config_of, recordings_of
 from sim2real.stages.shared.identification import command, continuing
-from sim2real.stages.terminal.console import shown
+from sim2real.stages.terminal.console import progress, shown
 
 
 def identify(
@@ -88,13 +88,14 @@ def run(pipeline: Pipeline, config: IdentifyConfig, root: Path, run_dir: Path | 
     """
     robot = robot_of(pipeline, config)
     paths, run_dir = find_logs(pipeline, config, root, run_dir)
-    logs = [open_recording(path, pipeline, robot) for path in paths]
-    fitted = len(logs) - len(config.hold_out)
     # Refuse wrong flags, logs that are given twice and logs that are too short before a folder is made.
     begin = _begin(config.begin, pipeline) if config.begin else None
     standing = Path(config.standing) if config.standing else None
-    stands = open_recording(standing, pipeline, robot) if standing else None
-    inputs = prepare(pipeline, config, logs[:fitted], logs[fitted:], begin, stands)
+    with progress(None, "identify: read the logs"):
+        logs = [open_recording(path, pipeline, robot) for path in paths]
+        fitted = len(logs) - len(config.hold_out)
+        stands = open_recording(standing, pipeline, robot) if standing else None
+        inputs = prepare(pipeline, config, logs[:fitted], logs[fitted:], begin, stands)
     files = {"log" if i == 0 else f"log_{i}": path for i, path in enumerate(paths)}
     files |= {"standing": standing} if standing else {}
     with (
