@@ -649,12 +649,6 @@ class Identification(Shown):
         ]
         return ArtifactTable(("over recordings", "mean", "s.e.", "95 % of the next", "unit", "spread", "agree"), rows)
 
-    def alternatives_table(self) -> ArtifactTable:
-        """Return a row for each other model that fits the recordings as well."""
-        others = () if self.posterior is None else self.posterior.others
-        rows = [[other.about, f"{100 * other.weight:.0f} %"] for other in others]
-        return ArtifactTable(("explains the recordings as well", "share of the draws"), rows)
-
     def held_out_table(self) -> ArtifactTable:
         """Return the errors on held-out data: a row for each position, a column for each model."""
         models = list(dict.fromkeys(model for row in self.held_out for model in row.rmse))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -33,28 +32,8 @@ def from_scale(transform: str, x: Any, numpy: ModuleType = np) -> Any:
 
 
 @dataclass(frozen=True)
-class Alternative:
-    """Another model that fits the recordings as well as the estimate.
-
-    Attributes:
-        weight: Share of the draws that come from this model, in [0, 1].
-        posterior: Parameters of the model; has no alternatives.
-    """
-
-    about: str
-    weight: float
-    posterior: Posterior
-
-    def __post_init__(self) -> None:
-        """Check the share, which can come from a file."""
-        check(
-            0.0 <= self.weight <= 1.0 and not self.posterior.others, f"{self.about!r} is no single model with a share"
-        )
-
-
-@dataclass(frozen=True)
 class Posterior:
-    """A Normal distribution on the parameters' scales, folded back at their bounds; with alternatives, a mixture.
+    """A Normal distribution on the parameters' scales, folded back at their bounds.
 
     Attributes:
         names: Names of P parameters; ``NAME@recording`` if each recording has a value of its own.
@@ -62,11 +41,9 @@ class Posterior:
         mean: Shape ``(P,)``, on the scales.
         covariance: Shape ``(P, P)``, on the scales.
         low: Shape ``(P,)``: lower bounds on the scales.
-        without: Parameter of an alternative that this model lacks -> the value that it stands for here.
-        others: The alternatives; this model gets the rest of the draws.
 
     Raises:
-        ValueError: When the sizes differ, an entry is no number, or an alternative has other parameters.
+        ValueError: When the sizes differ, or an entry is no number.
     """
 
     names: tuple[str, ...]
@@ -75,8 +52,6 @@ class Posterior:
     covariance: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    without: Mapping[str, float] = field(default_factory=dict)
-    others: tuple[Alternative, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the distribution, which can come from a file."""
@@ -86,25 +61,13 @@ class Posterior:
         check(fits, "the posterior has mixed sizes")
         finite = all(np.isfinite(a).all() for a in (self.mean, self.covariance, self.low, self.high))
         check(finite, "an entry of the posterior is no number")
-        check(sum(o.weight for o in self.others) < 1.0 + 1e-9, "shares of alternatives beyond all draws")
-        parameter_sets = {frozenset((*p.names, *p.without)) for p in (self, *(o.posterior for o in self.others))}
-        check(len(parameter_sets) == 1, "alternatives are of other parameters")
 
     def sample(self, rng: np.random.Generator, count: int, widen: float = 1.0) -> dict[str, np.ndarray]:
-        """Draw parameter sets from this model and its alternatives by their shares: name -> ``(count,)``.
+        """Draw parameter sets: name -> ``(count,)``.
 
         Args:
             widen: Factor on the standard deviations.
         """
-        if not self.others:
-            return {**self._draw(rng, count, widen), **{n: np.full(count, v) for n, v in self.without.items()}}
-        parts = [replace(self, others=()), *(o.posterior for o in self.others)]
-        shares = np.array([1.0 - sum(o.weight for o in self.others), *(o.weight for o in self.others)])
-        which = rng.choice(len(parts), size=count, p=np.maximum(shares, 0.0) / np.maximum(shares, 0.0).sum())
-        drawn = [part.sample(rng, count, widen) for part in parts]
-        return {n: np.stack([draws[n] for draws in drawn])[which, np.arange(count)] for n in drawn[0]}
-
-    def _draw(self, rng: np.random.Generator, count: int, widen: float) -> dict[str, np.ndarray]:
         values, axes = np.linalg.eigh(self.covariance)
         root = axes * np.sqrt(np.maximum(values, 0.0))
         x = self.mean + widen * rng.standard_normal((count, len(self.mean))) @ root.T

@@ -70,7 +70,7 @@ def identify_section(artifact: StageFolder) -> PageSection:
         *_parameters(result),
         *_recordings(result),
         *_held_out_parts(result),
-        *alternative_blocks(result),
+        *tried_blocks(result),
         *link_blocks(result.links),
         *_predictions(result),
         *_correlation(result),
@@ -309,16 +309,10 @@ def _recordings(result: Identification) -> list[Block]:
     return [TableBlock.of(caption, result.recordings_table())]
 
 
-def alternative_blocks(result: Identification) -> list[Block]:
-    """Return the tried terms, and the models that fit the recordings as well as the estimate, with their shares."""
-    blocks: list[Block] = []
-    if result.tried:
-        caption = "Optional terms: root mean square error on held-out parts, in deviations of a measurement"
-        blocks.append(TableBlock.of(caption, tried_table(result.tried)))
-    if result.posterior is not None and result.posterior.others:
-        caption = "Models that fit the recordings equally well; training draws robots from all of them"
-        blocks.append(TableBlock.of(caption, result.alternatives_table()))
-    return blocks
+def tried_blocks(result: Identification) -> list[Block]:
+    """Return the table of the tried terms; nothing if none was tried."""
+    caption = "Optional terms: root mean square error on held-out parts, in deviations of a measurement"
+    return [TableBlock.of(caption, tried_table(result.tried))] if result.tried else []
 
 
 def _correlation(result: Identification) -> list[Block]:

@@ -13,7 +13,7 @@ from benches.hidden import legs
 
 from pipelines.go2.robot import ROBOT
 from sim2real.artifacts.identification import Estimate, Identification, Judgement
-from sim2real.artifacts.posterior import Alternative, Posterior
+from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.recording import Recording
 from sim2real.emulation.truth import read_truth
 from sim2real.errors import OtherMotion, UsageError
@@ -116,15 +116,6 @@ def test_a_load_near_the_end_of_its_range_is_accepted_though_its_error_puts_it_o
     drawn = weighing.weighed(ROBOT, identified(heavier), episode, {}).posterior.sample(np.random.default_rng(0), 500)
     assert drawn["payload"].max() <= row.high
     assert drawn["payload"].mean() > row.high - 0.3
-
-
-def test_alternatives_have_the_load_too(standing):
-    episode, values, load = standing
-    one = identified(values).posterior
-    document = replace(identified(values), posterior=replace(one, others=(Alternative("another", 0.5, one),)))
-    found = weighing.weighed(ROBOT, document, episode, {}).posterior
-    assert found.others[0].posterior.names[-1] == "payload"
-    assert found.sample(np.random.default_rng(0), 50)["payload"].mean() == pytest.approx(load, abs=0.2)
 
 
 def changed(episode, node, **fields):

@@ -34,8 +34,6 @@ def show(identification: Identification, following: str = "") -> None:
     print(artifact_table(identification.rows()))
     if identification.aggregate:
         print(artifact_table(identification.recordings_table().without("s.e.")))
-    if identification.posterior is not None and identification.posterior.others:
-        print(artifact_table(identification.alternatives_table()))
     if identification.tried:
         print(artifact_table(tried_table(identification.tried)))
     if identification.held_out:

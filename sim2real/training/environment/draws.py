@@ -61,15 +61,10 @@ def without_default_ranges(
 
 
 def widen_posterior(identification: Identification, posterior: Posterior, factor: float) -> Posterior:
-    """Return the identification's posterior, and its alternatives, with deviations times a factor.
+    """Return the identification's posterior with deviations times a factor.
 
     The variance between recordings is added after that.
     """
-    others = tuple(replace(o, posterior=_widen(o.posterior, identification, factor)) for o in posterior.others)
-    return replace(_widen(posterior, identification, factor), others=others)
-
-
-def _widen(posterior: Posterior, identification: Identification, factor: float) -> Posterior:
     covariance = posterior.covariance * factor**2
     names = list(posterior.names)
 

@@ -182,12 +182,11 @@ def _with_load(
 
     def load_at(x: np.ndarray) -> float:
         values = {n: float(from_scale(t, v)) for n, t, v in zip(posterior.names, posterior.transform, x, strict=True)}
-        return load_of({**posterior.without, **values})
+        return load_of(values)
 
     load, covariance = load_at(posterior.mean), posterior.covariance
     slope = np.array([load_at(posterior.mean + step) - load for step in _STEP * np.eye(len(posterior.mean))]) / _STEP
     cross = covariance @ slope
-    others = (replace(o, posterior=_with_load(o.posterior, load_of, scatter, ends)) for o in posterior.others)
     return replace(
         posterior,
         names=(*posterior.names, PAYLOAD),
@@ -196,5 +195,4 @@ def _with_load(
         covariance=np.block([[covariance, cross[:, None]], [cross[None], slope @ cross + scatter**2]]),
         low=np.append(posterior.low, ends[0]),
         high=np.append(posterior.high, ends[1]),
-        others=tuple(others),
     )
