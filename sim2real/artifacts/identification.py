@@ -575,7 +575,6 @@ class Identification(Shown):
         terms: Optional terms of the model in the fit; None if the model has no optional terms.
         noise: Noise of the sensor; empty in older files.
         widening: Factor on the posterior's deviations that covers errors of the model; None in older files.
-        held_out_from_s: Start of the first held-out segment [s].
         settle_s: Length of the first part of a held-out segment, to which its initial state is fitted [s].
         sigma: Field -> assumed deviation of a measurement.
         world: Name of the simulated world; None for the robot's own.
@@ -611,7 +610,6 @@ class Identification(Shown):
     noise: tuple[Noise, ...] = ()
     widening: float | None = None
     segments: int | None = None
-    held_out_from_s: float | None = None
     settle_s: float = 0.0
     sigma: Mapping[str, float] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)

@@ -143,7 +143,6 @@ def parameters(truth: bool = True) -> dict[str, Any]:
         ],
         "aggregate": [],
         "segments": 6,
-        "held_out_from_s": 3.0,
         "units": UNITS,
     }  # fmt: skip
 

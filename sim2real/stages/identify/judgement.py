@@ -277,7 +277,6 @@ def _predicted(document: Identification, inputs: Inputs, fit: Fit) -> Identifica
         prediction=tuple(prediction.errors(problem, samples, list(models), config.settle_s, horizons)),
         free_run=tuple(runs),
         segments=problem.segments,
-        held_out_from_s=float(np.delete(problem.begins_s, problem.train).min(initial=np.inf)),
         sigma=dict(zip(prediction.labels(problem), (s for _, s, _ in problem.fields), strict=True)),
     )
 
