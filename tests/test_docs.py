@@ -130,6 +130,8 @@ def test_the_python_of_a_page_runs(page, tmp_path, monkeypatch, request, virtual
         shutil.copy(ROOT / "pipelines" / "go2" / "go2.xml", tmp_path / "pipelines" / "walker" / "walker.xml")
         assert cli.main(["info", "walker"]) == 0
         assert load_pipeline("walker").load().model.needs_gpu
+    if page == "docs/tutorial.md":
+        (tmp_path / "pipelines" / "head" / "head.xml").write_text((ROOT / page).read_text().split("```")[3][4:])
     names = {"__name__": "page", "folder": tmp_path}
     for number, block in blocks:
         for large, small in SMALLER.get(page, {}).items():

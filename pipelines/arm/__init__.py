@@ -11,7 +11,6 @@ PIPELINE = Pipeline(
     name="arm",
     summary="three-joint arm of position-controlled servos: reach for a target",
     package=__name__,
-    scene="scene",
     record=RecordConfig(amplitude=0.8, low_hz=0.2, high_hz=2.5, gate=GATE),
     # Servos forget where they started within 0.3 s: so does what their profiles were up to, which no sensor measures.
     identify=IdentifyConfig(initial_state="measured", skip_s=0.3, population=24, generations=30),

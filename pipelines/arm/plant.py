@@ -1,16 +1,18 @@
 """The embedded arm's physics: C MuJoCo, with parameters that no stage of the pipeline reads.
 
-Run by the emulator's process; imports neither JAX nor the pipeline's model, so nothing here can leak into it. The
-geometry is therefore written down a second time.
+Run by the emulator's process; imports neither JAX nor the pipeline's robot, so nothing here can leak into it. The
+geometry alone is the same: arm.xml.
 """
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any, Final
 
-from mujoco import MjData, MjModel, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+from mujoco import MjData, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
+from sim2real.emulation.servo_plant import plain_model
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.dynamixel.registers import PWM_FULL_SCALE, RAD_PER_COUNT
 
@@ -23,38 +25,6 @@ NOMINAL_P_GAIN: Final = 800
 _STALL, _BACK_EMF, _ARMATURE, _VISCOUS, _COULOMB = 1.4, 0.22, 0.0045, 0.01, 0.03  # data sheet, at 12 V
 _P_GAIN_UNIT = 256  # counts of PWM per count of error, as the recordings in pipelines/xl330 show; 128 in the e-Manual
 _STRIBECK_RAD_S = 0.1
-
-_MODEL = """
-<mujoco model="arm">
-  <compiler angle="radian"/>
-  <option timestep="{step_s}" gravity="0 0 -9.81" integrator="implicitfast">
-    <flag contact="disable"/>
-  </option>
-  <default>
-    <joint type="hinge" limited="true" armature="{armature}" damping="{viscous}"
-           solreffriction="{time_constant} 1" solimpfriction="0.999 0.999 0.001"/>
-  </default>
-  <worldbody>
-    <body name="pan" pos="0 0 0.40">
-      <joint name="pan" axis="0 0 1" range="-1.6 1.6"/>
-      <inertial pos="0.02 0 -0.02" mass="0.082" diaginertia="4e-5 6e-5 5e-5"/>
-      <body name="upper" pos="0.04 0 -0.03">
-        <joint name="shoulder" axis="0 -1 0" range="-1.6 1.6"/>
-        <inertial pos="0 0 -0.085" mass="0.097" diaginertia="1.6e-4 1.6e-4 2e-5"/>
-        <body name="fore" pos="0 0 -0.12">
-          <joint name="elbow" axis="0 -1 0" range="-1.9 1.9"/>
-          <inertial pos="0 0 -0.07" mass="0.055" diaginertia="9e-5 9e-5 8e-6"/>
-          <site name="tip" pos="0 0 -0.12"/>
-          {carried}
-        </body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-
-_CARRIED = '<body name="carried" pos="0 0 -0.12"><inertial pos="0 0 0" mass="{}" diaginertia="1e-8 1e-8 1e-8"/></body>'
 
 
 class _Firmware:
@@ -125,10 +95,9 @@ class ArmPlant:
         self._coulomb = [factor * _COULOMB for factor in coulomb]
         self._bump, self._carried_kg = bump, carried_kg
         # The stiffest impedance of the solver: at the default, an arm that friction should hold creeps.
-        carried = _CARRIED.format(carried_kg) if carried_kg else ""
-        sizes = {"armature": self._armature, "viscous": _VISCOUS, "carried": carried}
-        text = _MODEL.format(step_s=step_s, time_constant=4 * step_s, **sizes)
-        self.model = MjModel.from_xml_string(text)
+        self.model = plain_model(
+            Path(__file__).with_name("arm.xml"), step_s, self._armature, _VISCOUS, carried_kg, "tip"
+        )
         self.data = MjData(self.model)
         self._servos = [_Firmware() for _ in self.servo_ids]
         # Kept, as looking an array up in MuJoCo's structures costs as much as reading it.

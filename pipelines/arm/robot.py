@@ -1,4 +1,4 @@
-"""The arm for the stages: its servos, its aim, its observation, its parts and its score."""
+"""The arm for the stages: its servos, its aim, its observation, its reward and its score."""
 
 from __future__ import annotations
 
@@ -13,21 +13,38 @@ from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Robot
-from sim2real.robots.servo import parameters
+from sim2real.robots.servo.datasheet import DataSheet
 from sim2real.robots.servo.drive import JointSensor, ServoDrive
-from sim2real.robots.servo.model import ComposedModel
+from sim2real.robots.servo.model import Hand, ServoModel, friction_causes
 from sim2real.robots.servo.observation import ServoAgent
-from sim2real.robots.servo.payload import Hand
 from sim2real.robots.servo.servos import Servos
-from sim2real.robots.servo.task import Aim, AimTask, uniform
+from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
 
-from .parts import JOINTS, LINK_M, SHEET, Arm
-from .task import CLOSE_M, HIGH, LOW, Reach, tip_of
-
-SERVOS = Servos(joints=JOINTS, ids=(1, 2, 3), low=Arm.low, high=Arm.high, sheet=SHEET, speed=2.0)
+SERVOS = Servos(
+    joints=("pan", "shoulder", "elbow"),
+    ids=(1, 2, 3),
+    low=(-1.4, -1.4, -1.6),
+    high=(1.4, 1.4, 1.6),
+    sheet=DataSheet(stall=1.4, damping=0.23, armature=0.0045, friction=0.03, p_gain=800, profile_rad_s=5.0),
+    speed=2.0,
+)
+"""XL430-W250 at 12 V."""
+MJCF = Path(__file__).with_name("arm.xml")
+GANTRY_M, SHOULDER_M, LINK_M = 0.40, (0.04, -0.03), 0.12
+"""Height of the pan axis over the table; where the shoulder sits in front of it and below; each link [m]."""
 HAND = Hand("elbow", (0.0, 0.0, -LINK_M), most_kg=0.3, least_kg=-0.044)  # the tip; the link has 55 g
+CLOSE_M = 0.02
+"""How near the tip must come [m]."""
+LOW, HIGH = (-1.2, -0.3, -0.2), (1.2, 1.2, 1.4)
+"""Joint angles between which targets are drawn [rad]: every target can be reached."""
+FEATURES = (
+    ("position", ("rad",) * 3, 5.0),
+    ("velocity / 5", ("rad/s",) * 3, 6.0),
+    ("goal less position", ("rad",) * 3, 6.0),
+    ("10 x target less tip: outwards, sideways, up", ("m",) * 3, 10.0),
+)
 
 
 def embedded() -> Embedded:
@@ -44,39 +61,48 @@ def embedded() -> Embedded:
     return Embedded(f"{Path(__file__).with_name('plant.py')}:ArmPlant", emulator)
 
 
+def tip_of(position: Array) -> Any:
+    """Return where the tip is ``(..., 3)`` [m] for joint angles ``(..., 3)`` [rad]; all 0: straight down."""
+    xp = namespace(position)
+    pan, upper = position[..., 0], position[..., 1]
+    fore = upper + position[..., 2]
+    out = SHOULDER_M[0] + LINK_M * (xp.sin(upper) + xp.sin(fore))
+    height = GANTRY_M + SHOULDER_M[1] - LINK_M * (xp.cos(upper) + xp.cos(fore))
+    return xp.stack([out * xp.cos(pan), out * xp.sin(pan), height], axis=-1)
+
+
 def draw_target(key: Key | int) -> Array:
     """Return a target ``(3,)`` [m]."""
-    angles = uniform(key, LOW, HIGH)
-    return tip_of(namespace(angles), angles)
+    return tip_of(uniform(key, LOW, HIGH))
 
 
-TARGET = Aim(
-    entries=(("target x", "m"), ("target y", "m"), ("target z", "m")),
-    draw=draw_target,
-    elements=lambda task: {"target": (task.gantry.target, "pos")},
-    place=lambda aim: {"target": jnp.asarray(aim, jnp.float32)},
-)
-
-FEATURES = (
-    ("position", ("rad",) * 3, 5.0),
-    ("velocity / 5", ("rad/s",) * 3, 6.0),
-    ("goal less position", ("rad",) * 3, 6.0),
-    ("10 x target less tip: outwards, sideways, up", ("m",) * 3, 10.0),
-)
+TARGET = Aim((("target x", "m"), ("target y", "m"), ("target z", "m")), draw_target)
 
 
 def observe(reading: JointReading, goal: Array, aim: Array) -> Array:
     """Return ``FEATURES``: the joints, and the way to the target in the frame of the arm."""
     q, xp = reading.position, namespace(reading.position, goal)
-    gap = aim - tip_of(xp, q)
+    gap = aim - tip_of(q)
     c, s = xp.cos(q[0]), xp.sin(q[0])
     way = xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
     return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way])
 
 
-def success(state: Any) -> jax.Array:
+def distance_m(now: ServoMoment) -> jax.Array:
+    """Return how far the tip is from the target [m]."""
+    # The square root has no derivative at 0.
+    return jnp.sqrt(jnp.sum((tip_of(now.position) - now.aim) ** 2) + 1e-12)
+
+
+def reward(now: ServoMoment) -> jax.Array:
+    """Return up to 2 at the target, less than 0 far away."""
+    distance = distance_m(now)
+    return jnp.exp(-((distance / 0.1) ** 2)) + jnp.exp(-((distance / CLOSE_M) ** 2)) - 2.0 * distance
+
+
+def success(now: ServoMoment) -> jax.Array:
     """Return whether the tip is at the target."""
-    return state.variables["distance"] < CLOSE_M
+    return distance_m(now) < CLOSE_M
 
 
 def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -86,7 +112,7 @@ def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]
     """
     position = np.stack([states[f"position[{i}]"] for i in range(3)], axis=-1)
     target = np.array([states[f"aim[{i}]"][-1] for i in range(3)])
-    distance = np.linalg.norm(tip_of(np, position) - target, axis=-1)
+    distance = np.linalg.norm(tip_of(position) - target, axis=-1)
     second_half, end = t_s >= (t_s[0] + t_s[-1]) / 2, t_s >= t_s[-1] - 0.5
     there = np.flatnonzero(distance < CLOSE_M)
     return {
@@ -102,14 +128,10 @@ class ArmRobot(Robot):
 
     def __init__(self, servos: Servos = SERVOS) -> None:
         self.sensor = JointSensor(servos)
-        self.drive = ServoDrive(servos, probe=Probe(step=0.12, lag_s=0.0115), embedded=embedded)
+        self.drive = ServoDrive(servos, probe=Probe(step=0.12, lag_s=(0.008, 0.0115)), embedded=embedded)
         self.agent = ServoAgent(servos, TARGET, FEATURES, observe)
-        self.model = ComposedModel(servos, self.make_task, TARGET, HAND, causes=parameters.causes(JOINTS))
-        self.task = AimTask(servos, TARGET, success, score)
-
-    def make_task(self) -> Reach:
-        """Return the task; the graph's parameters set the target."""
-        return Reach(draw_target=False)
+        self.model = ServoModel(servos, MJCF, HAND, causes=friction_causes(servos.joints))
+        self.task = AimTask(servos, TARGET, reward, success, score)
 
 
 ROBOT = ArmRobot()

@@ -15,11 +15,11 @@ from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter
 from sim2real.later import jax, jnp
 from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.robots.agent import AgentParams
 from sim2real.robots.loop import Draw
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
-from sim2real.robots.servo.agent import AgentParams
 from sim2real.robots.session import Embedded, Session
 from sim2real.types import Key, Scalar
 
@@ -71,7 +71,7 @@ class HingeDrive(RobotDrive):
     rate_hz = 50.0
     command, message = "action", Command
     units = {"action": "V", "voltage": "V", "command": "V"}
-    probe = Probe(step=1.5, lag_s=0.0015)
+    probe = Probe(step=1.5, lag_s=(0.0, 0.0015))
 
     def __init__(self, mounting: tuple[Joint, ...] = ()) -> None:
         self._mounting = mounting

@@ -7,8 +7,7 @@ from pathlib import Path
 from sim2real.hardware.feetech.calibration import CalibratedJoint
 from sim2real.hardware.feetech.hand_motion import Nudge
 
-from .parts import JOINTS, TRAVEL_RAD
-from .robot import SERVOS, SO101Robot, calibrations, read
+from .robot import JOINTS, SERVOS, TRAVEL_RAD, SO101Robot, calibrations, read
 
 MIDDLE = "upper arm upright, forearm and hand level and forward, jaw half open"
 """The pose in which every joint is in the middle of its travel."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .guide import NUDGES
-from .parts import JOINTS
+from .robot import JOINTS
 
 STOPS_RAD = (1.92, 1.745, 1.69, 1.658, 2.7, 0.96)
 """Half of the travel of the embedded arm's joints [rad]."""

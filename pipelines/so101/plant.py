@@ -1,7 +1,7 @@
 """The embedded SO-101's physics: C MuJoCo, with parameters that no stage of the pipeline reads.
 
-Run by the emulator's process; imports neither JAX nor the pipeline's model, so nothing here can leak into it. The
-geometry is therefore written down a second time (source: see parts.py).
+Run by the emulator's process; imports neither JAX nor the pipeline's robot, so nothing here can leak into it. The
+geometry alone is the same: so101.xml.
 
 The parameters are those that were identified on recordings of a real SO-101, isaac-sim2real/sage @ 4ffd2627
 (Apache-2.0), by `sim2real identify so101_log`. There they are
@@ -20,11 +20,13 @@ The same recordings have the hand on the table from elbow 0.934 rad on; by the p
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from mujoco import MjData, MjModel, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+from mujoco import MjData, mj_kinematics, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
+from sim2real.emulation.servo_plant import plain_model
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.feetech.registers import RAD_PER_COUNT
 
@@ -41,55 +43,6 @@ _SATURATION_RAD = (0.450, 0.450, 0.450, 0.450, 0.170, 0.0615)  # of those that w
 _BIAS_RAD = (-0.0008, 0.0098, 0.0061, 0.0070, -0.0011, -0.0002)
 _OFF_DAMPING: Final = 0.1  # assumed: what brakes an open winding [N m s/rad]
 _HAND_NM_RAD, _HAND_DAMPING, _HAND_MOST_NM = 12.0, 0.5, 4.0  # assumed: a person's hand [N m/rad, N m s/rad, N m]
-
-_MODEL = """
-<mujoco model="so101">
-  <compiler angle="radian"/>
-  <option timestep="{step_s}" gravity="0 0 -9.81" integrator="implicitfast"/>
-  <default>
-    <joint type="hinge" limited="true" armature="{armature}" damping="{damping}"
-           solreffriction="{time_constant} 1" solimpfriction="0.999 0.999 0.001"/>
-    <geom type="sphere" contype="1" conaffinity="0" mass="0" friction="0.6"/>
-  </default>
-  <worldbody>
-    <geom name="table" type="plane" size="1 1 0.1" contype="0" conaffinity="1"/>
-    <body name="shoulder" pos="0.0388 0 0.0624">
-      <joint name="shoulder_pan" axis="0 0 -1" range="-1.92 1.92"/>
-      <inertial pos="0.0308 0 0.0253" mass="0.100" fullinertia="83.8e-6 81.0e-6 24.0e-6 -0.1e-6 -1.2e-6 -0.2e-6"/>
-      <body name="upper_arm" pos="0.0304 0 0.0542">
-        <joint name="shoulder_lift" axis="0 1 0" range="-1.745 1.745"/>
-        <inertial pos="0.0084 0.0001 0.0898" mass="0.103" fullinertia="147.3e-6 142.5e-6 40.8e-6 0 -19.8e-6 0"/>
-        <body name="lower_arm" pos="0.0280 0 0.1126">
-          <joint name="elbow_flex" axis="0 1 0" range="-1.69 1.69"/>
-          <inertial pos="0.0981 0 0.0032" mass="0.104" fullinertia="28.7e-6 145.3e-6 159.8e-6 -1.3e-6 -7.4e-6 0"/>
-          <geom name="elbow" size="0.025"/>
-          <body name="wrist" pos="0.1349 0 0.0052">
-            <joint name="wrist_flex" axis="0 1 0" range="-1.658 1.658"/>
-            <inertial pos="0.0386 0.0098 0.0001" mass="0.079" fullinertia="25.4e-6 21.0e-6 36.8e-6 -3.6e-6 0 0.1e-6"/>
-            <geom name="wrist" size="0.025"/>
-            <body name="hand" pos="0.0611 0 0">
-              <joint name="wrist_roll" axis="-1 0 0" range="-2.74 2.84"/>
-              <inertial pos="0.0252 0.0004 0.0002" mass="0.087"
-                        fullinertia="34.5e-6 43.4e-6 27.5e-6 -0.2e-6 5.7e-6 0.4e-6"/>
-              <geom name="hand" pos="0.03 0 0" size="0.025"/>
-              <geom name="finger" type="capsule" fromto="0.03 0 0 0.0981 0 0" size="0.008"/>
-              <site name="tip" pos="0.0981 0 0"/>
-              {carried}
-              <body name="jaw" pos="0.0234 0.0178 0.0211">
-                <joint name="gripper" axis="0 -1 0" range="-0.96 0.96"/>
-                <inertial pos="0.0224 -0.0202 0.0191" mass="0.012" fullinertia="3.9e-6 5.3e-6 4.6e-6 0 -2.4e-6 0"/>
-              </body>
-            </body>
-          </body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-
-
-_CARRIED = '<body name="carried" pos="0.0981 0 0"><inertial pos="0 0 0" mass="{}" diaginertia="1e-8 1e-8 1e-8"/></body>'
 
 
 class SO101Plant:
@@ -120,12 +73,10 @@ class SO101Plant:
     ) -> None:
         self._hand = None if hand is None else dict(np.load(hand))
         # Friction with the stiffest impedance of the solver: at the default, a joint that should stick creeps.
-        carried = _CARRIED.format(carried_kg) if carried_kg else ""
-        sizes = {"armature": _ARMATURE, "damping": _OFF_DAMPING, "carried": carried}
-        text = _MODEL.format(step_s=step_s, time_constant=4 * step_s, **sizes)
         self._carried_kg = carried_kg
         self._gain, self._levels = gain * _GAIN, [friction * level for level in _FRICTION]
-        self.model = MjModel.from_xml_string(text)
+        mjcf = Path(__file__).with_name("so101.xml")
+        self.model = plain_model(mjcf, step_s, _ARMATURE, _OFF_DAMPING, carried_kg, "tip")
         self.data = MjData(self.model)
         self.data.qpos[:] = start
         n = len(self.servo_ids)

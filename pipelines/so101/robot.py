@@ -1,4 +1,4 @@
-"""The SO-101 for the stages: its servos and their calibration, its aim, its observation, its parts and its score."""
+"""The SO-101 for the stages: its servos and their calibration, its aim, its observation, its reward and its score."""
 
 from __future__ import annotations
 
@@ -19,28 +19,48 @@ from sim2real.later import jax, jnp
 from sim2real.robots.messages import JointReading
 from sim2real.robots.probe import Probe
 from sim2real.robots.robot import Robot
-from sim2real.robots.servo import parameters
+from sim2real.robots.servo.datasheet import StsSheet
 from sim2real.robots.servo.drive import JointSensor, ServoDrive
-from sim2real.robots.servo.model import ComposedModel
+from sim2real.robots.servo.model import Hand, ServoModel, friction_causes, goal_offsets, servo_parameters
 from sim2real.robots.servo.observation import ServoAgent
-from sim2real.robots.servo.payload import Hand
 from sim2real.robots.servo.servos import Servos
-from sim2real.robots.servo.task import Aim, AimTask, uniform
+from sim2real.robots.servo.task import Aim, AimTask, ServoMoment, uniform
 from sim2real.robots.session import Embedded
 from sim2real.types import Array, Key
-
-from .parts import JOINTS, SHEET, TIP_M, TRAVEL_RAD, Arm
-from .task import CLOSE_M, CLOSE_RAD, Reach, tip_of
 
 if TYPE_CHECKING:
     from sim2real.hardware.feetech.calibration import CalibratedJoint
     from sim2real.hardware.feetech.drive import StsDrive
 
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+"""LeRobot's names, in the order of the servos' ids."""
+SHEET = StsSheet(stall=2.94, damping=0.60, armature=0.005, friction=0.06, stribeck_rad_s=0.5)
+"""An STS3215 at 12 V: 30 kg cm at standstill, 0.222 s/60 deg without load; LeRobot's P gain of 16.
+
+Friction is a guess, and so is where it wears off. That it does, recordings of real ones show (plant.py). Of an
+embedded arm a model without it, identified on fast motions, was up to five times as far off in slow ones.
+"""
+MJCF = Path(__file__).with_name("so101.xml")
+STEP_S = 0.01 / 3
+"""Time step of the physics [s]. At 5 ms an identification of the embedded arm finds rotors 44 % too heavy and a delay
+1.8 ms too short, at this step 15 to 28 % and 0.7 to 1.0 ms, at 2.5 ms 5 % and 0.2 ms, in a third more steps.
+"""
+BASE_M, TIP_M = (0.0388, 0.0624 + 0.0542), 0.0981
+"""The shoulder's pan axis and the height of its lift axis over the table; the point between the jaws from the wrist's
+roll joint, along its axis [m]."""
+LINKS_M = ((0.0280, 0.1126), (0.1349, 0.0052), (0.0611 + TIP_M, 0.0))
+"""Upper arm, forearm and hand in so101.xml: forwards and up from joint to joint [m]."""
+LIFT_M = 0.0304
+"""The lift axis in front of the pan axis [m]."""
+TRAVEL_RAD = {"shoulder_pan": 3.84, "shoulder_lift": 3.49, "elbow_flex": 3.38, "wrist_flex": 3.32, "gripper": 1.92}
+"""From stop to stop [rad]. The wrist's roll is not among them: LeRobot gives it a whole turn."""
+CLOSE_M, CLOSE_RAD = 0.02, 0.1
+"""How near tip and jaw must come [m], [rad]."""
 SERVOS = Servos(
     joints=JOINTS,
     ids=(1, 2, 3, 4, 5, 6),
-    low=Arm.low,
-    high=Arm.high,
+    low=(-1.4, -1.65, 0.2, -1.6, -1.5, -0.8),
+    high=(1.4, -0.3, 1.6, -1.0, 1.5, 0.8),
     sheet=SHEET,
     speed=1.5,
     rest=(0.0, -1.65, 1.6, -1.4, 0.0, -0.6),
@@ -77,12 +97,13 @@ class SO101Robot(Robot):
 
     def __init__(self, servos: Servos = SERVOS, calibration: Path | None = None) -> None:
         settings = partial(calibrated, calibration=calibration)
-        probe = Probe(step=0.12, lag_s=-0.004)
+        probe = Probe(step=0.12, lag_s=(-0.009, -0.004))
         self.sensor = JointSensor(servos)
         self.drive = ServoDrive(servos, probe=probe, embedded=embedded, settings=settings)
         self.agent = ServoAgent(servos, TARGET, FEATURES, observe)
-        self.model = ComposedModel(servos, Reach, TARGET, HAND, dynamics, parameters.causes(JOINTS))
-        self.task = AimTask(servos, TARGET, success, score)
+        more: dict[str, Any] = {"dynamics": dynamics, "causes": friction_causes(JOINTS)}
+        self.model = ServoModel(servos, MJCF, HAND, step_s=STEP_S, **more)
+        self.task = AimTask(servos, TARGET, reward, success, score)
 
 
 def embedded() -> Embedded:
@@ -110,7 +131,7 @@ def calibrated(port: str, calibration: Path | None = None) -> StsDrive:
 def dynamics() -> list[Parameter]:
     """Return the parameters: servos of one model, each with its own friction and damping."""
     own = ("damping", "friction", "stribeck")
-    of_servos = parameters.parameters(SHEET, JOINTS, own=own) + parameters.offsets(JOINTS)
+    of_servos = servo_parameters(SHEET, JOINTS, own=own) + goal_offsets(JOINTS)
     # The jaw has so little friction that no recording shows at which speed it wears off: it keeps it at all speeds. Its
     # mean over the speeds of a recording is near the usual lower bound, 0.0075 N m.
     of_servos = [p for p in of_servos if p.name != "stribeck_gripper"]
@@ -122,39 +143,54 @@ def dynamics() -> list[Parameter]:
     return [*of_servos, *limits, HAND.parameter()]
 
 
+def tip_of(position: Array) -> Any:
+    """Return where the point between the jaws is ``(..., 3)`` [m] for joint angles ``(..., 6)`` [rad]."""
+    xp = namespace(position)
+    pan, pitch = position[..., 0], position[..., 1]
+    out, height = LIFT_M, BASE_M[1]
+    for joint, (x, z) in enumerate(LINKS_M, 2):
+        c, s = xp.cos(pitch), xp.sin(pitch)
+        out, height = out + c * x + s * z, height - s * x + c * z
+        pitch = pitch + position[..., joint]
+    return xp.stack([BASE_M[0] + out * xp.cos(pan), -out * xp.sin(pan), height], axis=-1)
+
+
 def draw_target(key: Key | int) -> Array:
     """Return a target [m] and an opening [rad], ``(4,)``."""
     angles = uniform(key, LOW, HIGH)
-    xp = namespace(angles)
-    return xp.append(tip_of(xp, angles), angles[5])
+    return namespace(angles).append(tip_of(angles), angles[5])
 
 
-def place_target(aim: Array) -> dict[str, Array]:
-    """Return the target's position ``(3,)`` [m], and the opening [rad] as the first of ``(3,)``."""
-    aim = jnp.asarray(aim, jnp.float32)
-    return {"target": aim[:3], "opening": aim[3] * np.eye(3, dtype=np.float32)[0]}
-
-
-TARGET = Aim(
-    entries=(("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad")),
-    draw=draw_target,
-    elements=lambda task: {"target": (task.table.target, "pos"), "opening": (task.table.opening, "pos")},
-    place=place_target,
-)
+TARGET = Aim((("target x", "m"), ("target y", "m"), ("target z", "m"), ("opening", "rad")), draw_target)
 
 
 def observe(reading: JointReading, goal: Array, aim: Array) -> Array:
     """Return ``FEATURES``: the joints, and the way to the target in the frame of the arm."""
     q, xp = reading.position, namespace(reading.position, goal)
-    gap = aim[:3] - tip_of(xp, q)
+    gap = aim[:3] - tip_of(q)
     c, s = xp.cos(q[0]), -xp.sin(q[0])  # pan turns clockwise
     way = xp.stack([c * gap[0] + s * gap[1], c * gap[1] - s * gap[0], gap[2]])
     return xp.concatenate([q, reading.velocity / 5.0, goal - q, 10.0 * way, aim[3:] - q[5:]])
 
 
-def success(state: Any) -> jax.Array:
+def errors(now: ServoMoment) -> tuple[jax.Array, jax.Array]:
+    """Return how far the tip is from its target [m], and the jaw from its opening [rad]."""
+    gap = tip_of(now.position) - now.aim[:3]
+    # The square root has no derivative at 0.
+    return jnp.sqrt(jnp.sum(gap**2) + 1e-12), jnp.abs(now.position[5] - now.aim[3])
+
+
+def reward(now: ServoMoment) -> jax.Array:
+    """Return up to 2.5 at the target with the jaw open as commanded, less than 0 far away."""
+    distance, ajar = errors(now)
+    near, nearer = (jnp.exp(-((distance / size) ** 2)) for size in (0.1, CLOSE_M))
+    return near + nearer - 2.0 * distance + 0.5 * jnp.exp(-((ajar / CLOSE_RAD) ** 2)) - 0.3 * ajar
+
+
+def success(now: ServoMoment) -> jax.Array:
     """Return whether the tip is at the target, and the jaw at its commanded opening."""
-    return (state.variables["distance"] < CLOSE_M) & (state.variables["ajar"] < CLOSE_RAD)
+    distance, ajar = errors(now)
+    return (distance < CLOSE_M) & (ajar < CLOSE_RAD)
 
 
 def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -164,7 +200,7 @@ def score(t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]
     """
     position = np.stack([states[f"position[{i}]"] for i in range(6)], axis=-1)
     aim = np.array([states[f"aim[{i}]"][-1] for i in range(4)])
-    distance = np.linalg.norm(tip_of(np, position) - aim[:3], axis=-1)
+    distance = np.linalg.norm(tip_of(position) - aim[:3], axis=-1)
     ajar = np.abs(position[:, 5] - aim[3])
     there = (distance < CLOSE_M) & (ajar < CLOSE_RAD)
     second_half, end = t_s >= (t_s[0] + t_s[-1]) / 2, t_s >= t_s[-1] - 0.5

@@ -21,10 +21,10 @@ from sim2real.hardware.safety.gate import GateConfig
 from sim2real.hardware.safety.rig import Rig
 from sim2real.policy import ActionTerm, ObservationTerm, PolicyContract, PolicyRunner
 from sim2real.policy.bundle import make_runner
+from sim2real.robots.agent import DirectAgent
 from sim2real.robots.loop import control_nodes
 from sim2real.robots.messages import Goals, JointReading
 from sim2real.robots.nodes import PolicyNode, ServoActuator, ServoSensor
-from sim2real.robots.servo.agent import DirectAgent
 from sim2real.robots.walking.messages import LegCommand
 from sim2real.runtime.asynchronous import AsyncGraph
 from sim2real.runtime.clock import realtime

@@ -20,7 +20,7 @@ from sim2real.stages.pipeline.robot_flags import RobotFlags
 
 if TYPE_CHECKING:
     from sim2real.log.importing.mapping import ImportMapping
-    from sim2real.robots.from_model.mjcf_robot import RobotConfig
+    from sim2real.robots.model.robot import RobotConfig
 
 _COMMANDS = {
     "position": ("goal",),
@@ -48,7 +48,7 @@ _ROBOT = '''"""The robot: robot.toml has the recorded joints, their drives, and 
 
 from pathlib import Path
 
-from sim2real.robots.from_model.mjcf_robot import ROBOT_FILE, MjcfRobot, RobotConfig
+from sim2real.robots.model.robot import MjcfRobot, ROBOT_FILE, RobotConfig
 
 ROBOT = MjcfRobot(RobotConfig.load(Path(__file__).with_name(ROBOT_FILE)))
 '''
@@ -124,8 +124,8 @@ def run(config: NewConfig) -> bool:
     if config.like is not None:
         return _run_like(config)
     from sim2real.log.importing.mapping import MAPPING, to_toml
-    from sim2real.robots.from_model.mjcf import read_model
-    from sim2real.robots.from_model.mjcf_parameters import expand
+    from sim2real.robots.model.file import read_model
+    from sim2real.robots.model.parameters import expand
     from sim2real.stages.config import MODEL_IDENTIFY
     from sim2real.stages.pipeline.from_model import files_of, note_held
     from sim2real.stages.terminal.console import note, wrote
@@ -165,8 +165,9 @@ def _described(config: NewConfig) -> "tuple[RobotConfig, ImportMapping | None]":
     """Return the robot's description and the mapping of its log; without a log, by the flags alone."""
     import msgspec
 
-    from sim2real.robots.from_model.mjcf import joints_of, read_model
-    from sim2real.robots.from_model.mjcf_robot import RobotConfig
+    from sim2real.robots.model.drives import joints_of
+    from sim2real.robots.model.file import read_model
+    from sim2real.robots.model.robot import RobotConfig
     from sim2real.stages.pipeline.from_model import describe, describe_robot
 
     if config.log is not None:

@@ -4,17 +4,43 @@ Its parameters differ from the model's by factors, so that an identification has
 structure: an error of the MJCF is also in its twin.
 """
 
+import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import mujoco
 from mujoco import MjData, MjModel, mj_step  # pyright: ignore[reportAttributeAccessIssue]
 
 from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
-from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
 
-_CENTRE_RAD = 2048 * RAD_PER_COUNT  # Feetech STS servos have the same encoders
+mj: Any = mujoco
+_RAD_PER_COUNT = 2.0 * math.pi / 4096  # of the encoders of DYNAMIXEL X and Feetech STS servos
+_CENTRE_RAD = 2048 * _RAD_PER_COUNT
 _FACTORS = ("gain", "damping", "armature", "friction")
+
+
+def plain_model(mjcf: Path, step_s: float, armature: float, damping: float, carried_kg: float, carrier: str) -> Any:
+    """Return an MJCF's model for a plant: hinges with rotors and friction, and a mass at a site.
+
+    Friction constraints are as stiff as the solver allows: with the defaults, a joint held by friction creeps.
+
+    Args:
+        damping: Of each joint [N m s/rad].
+        carried_kg: Mass at the site ``carrier``; 0: none.
+    """
+    spec = mj.MjSpec.from_file(str(mjcf))
+    spec.option.timestep, spec.option.integrator = step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
+    if carried_kg:
+        site = spec.site(carrier)
+        body = site.parent.add_body(name="carried", pos=site.pos)
+        body.explicitinertial, body.mass, body.inertia = True, carried_kg, [1e-8] * 3
+    # Before it compiles: MuJoCo derives the stiffness of stops and friction from the rotors.
+    for joint in spec.joints:
+        joint.armature, joint.damping = armature, [damping, 0.0, 0.0]
+        joint.solref_friction, joint.solimp_friction[:3] = [4 * step_s, 1.0], [0.999, 0.999, 0.001]
+    return spec.compile()
 
 
 class TwinPlant:
@@ -95,7 +121,7 @@ class TwinPlant:
                 # Move the setpoint along its profile, and round the error to counts as the firmware does.
                 reach = self._profiles[i] * step_s
                 self._references[i] += min(max(goal - self._references[i], -reach), reach)
-                count_rad = RAD_PER_COUNT / self._gears[i]
+                count_rad = _RAD_PER_COUNT / self._gears[i]
                 counts = round(self._references[i] / count_rad) - round(angle / count_rad)
                 data.ctrl[motor] = angle + counts * count_rad
             mj_step(model, data)
@@ -140,7 +166,7 @@ class TwinPlant:
         return position | {f"velocity[{i}]": float(self.data.qvel[a]) for i, a in enumerate(self._dofs)}
 
     def truth(self) -> dict[str, Any]:
-        """Return the parameters that can be identified from a log, named as in ``sim2real.robots.servo.parameters``.
+        """Return the parameters that can be identified from a log, named as in ``sim2real.robots.servo.model``.
 
         Parameters that the joints share are those of the first servo; ``gain`` belongs to ``p_gain``.
         """

@@ -111,6 +111,8 @@ class PolicyContract:
             delays, or they are unknown.
         limits: Name -> limit that must hold while it runs, e.g. ``{"thdot_rad_s": 40.0}``.
         hashes: Name -> sha256 of the input files of the training, e.g. the log and the identified parameters.
+        robot: Name of the pipeline that it was trained for; "": unknown.
+        port: Port of the robot whose recording was identified, such as ``embedded``; "": none, or unknown.
     """
 
     observation: tuple[ObservationTerm, ...]
@@ -120,6 +122,8 @@ class PolicyContract:
     trained_s: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
     hashes: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    robot: str = ""
+    port: str = ""
 
     def __post_init__(self) -> None:
         if not self.observation or not self.action:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,15 +36,24 @@ class StepAnswers:
     """Delays of the answers to some steps.
 
     Attributes:
-        delays_s: From each command's departure to the motion, in time stamps of measurements ``(N,)`` [s].
+        delays_s: From each command's departure to where the fit lets the motion begin, in time stamps of measurements
+            ``(N,)`` [s].
+        lag_s: See ``Probe``.
     """
 
     delays_s: np.ndarray
+    lag_s: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def between_s(self) -> tuple[float, float]:
+        """The shortest and the longest delay that explain the median of the answers [s]."""
+        seen = float(np.median(self.delays_s))
+        return seen - self.lag_s[1], seen - self.lag_s[0]
 
     @property
     def delay_s(self) -> float:
-        """Their median [s]."""
-        return float(np.median(self.delays_s))
+        """The middle of these [s]."""
+        return float(np.mean(self.between_s))
 
     @property
     def jitter_s(self) -> float:
@@ -58,12 +67,12 @@ class Probe:
 
     Attributes:
         step: Size of a step [the command's unit].
-        lag_s: Time by which an answer seems to begin too late, because motion starts softly [s]; measured on the
-            embedded robot with its configured delay.
+        lag_s: Least and largest time by which an answer seems to begin too late [s], because motion starts softly: at
+            half to twice the robot's friction. A policy is refused only if no time between them explains the answers.
     """
 
     step: float
-    lag_s: float = 0.0
+    lag_s: tuple[float, float] = (0.0, 0.0)
     joint: int = 0
     steps: int = 8
 
@@ -119,8 +128,7 @@ def measure_delay(witness: Witness, probe: Probe) -> StepAnswers:
         witness.rig.stop_quietly()  # a failure here must not replace the reason
         raise
     witness.rig.stop()
-    estimates = delays_of(answers)
-    return StepAnswers(estimates.delays_s - probe.lag_s)
+    return replace(delays_of(answers), lag_s=probe.lag_s)
 
 
 def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
@@ -139,8 +147,10 @@ def delays_of(answers: Sequence[np.ndarray]) -> StepAnswers:
             hint="is it blocked, or its supply off? without this check: --no-measure-delay",
         )
     end_s = float(np.median([a[np.argmax(a[:, 1] >= _RISE_RAD), 0] for a in answers if a[:, 1].max() >= _RISE_RAD]))
-    grid = np.arange(0.0, end_s - 4 * _PERIOD_S, _GRID_S)
-    answers = [a[a[:, 0] <= end_s] for a in answers]  # the same samples for every delay: otherwise no samples fit best
+    # A fast joint is there within a few samples: the answer began in the first of them.
+    grid = np.arange(0.0, max(end_s - 4 * _PERIOD_S, _PERIOD_S), _GRID_S)
+    # The same samples for every delay: otherwise no samples fit best.
+    answers = [a[: max(2, int(np.sum(a[:, 0] <= end_s)))] for a in answers]
     samples = np.concatenate(answers)
     residual = [np.linalg.lstsq(_powers(samples[:, 0], d), samples[:, 1], rcond=None)[1].sum() for d in grid]
     delays, factors = [grid[np.argmin(residual)]] * len(answers), [1.0] * len(answers)

@@ -85,7 +85,7 @@ class DriveParams(MjxParams):
 class DrivenWorld(MjxWorld):
     """A model with a drive on each joint that was recorded.
 
-    A drive is three actuators, as ``sim2real.robots.from_model.mjcf.driven`` makes them: a force, a stiffness and a
+    A drive is three actuators, as ``sim2real.robots.model.drives.driven`` makes them: a force, a stiffness and a
     damping, which are its controls. So gains may differ from tick to tick and act at every time step, and damping is
     implicit.
 

@@ -18,8 +18,8 @@ from sim2real.log.importing.mapping import (
     to_toml,
     toml_value,
 )
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import RobotConfig
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import RobotConfig
 
 ODD = [
     "\U0001f600",

@@ -11,11 +11,11 @@ import pytest
 from sim2real.errors import UsageError
 from sim2real.graph.episode import Episode
 from sim2real.log.importing.readers import open_tables
-from sim2real.robots.from_model import model_file
-from sim2real.robots.from_model.mjcf import driven, read_model
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.robots.from_model.usual_parameters import usual_terms
+from sim2real.robots.model import file as model_file
+from sim2real.robots.model.drives import driven
+from sim2real.robots.model.file import read_model
+from sim2real.robots.model.parameters import ParameterPattern, usual_patterns
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.import_logs import stage as import_logs_stage
 from sim2real.stages.pipeline import from_model
 
@@ -143,7 +143,7 @@ def test_packages_are_found(tmp_path, monkeypatch, variable):
 def test_all_that_mujoco_reports_is_printed(tmp_path, text, contacts, causes):
     (tmp_path / "robot.xml").write_text(text)
     with pytest.raises(UsageError) as raised:
-        model_file.read(tmp_path / "robot.xml", contacts)
+        model_file.read_file(tmp_path / "robot.xml", contacts)
     for cause in causes:
         assert cause in str(raised.value)
 
@@ -155,7 +155,7 @@ def model(extra: str = "", body: str = "", option: str = "", joint: str = "j1") 
 
 def test_a_name_with_a_line_break_matches_a_pattern(tmp_path):
     (tmp_path / "robot.xml").write_text(model(joint="a&#10;[[terms]]"))
-    config = RobotConfig(tmp_path / "robot.xml", ("a\n[[terms]]",), ("goal",), terms=usual_terms(("goal",)))
+    config = RobotConfig(tmp_path / "robot.xml", ("a\n[[terms]]",), ("goal",), terms=usual_patterns(("goal",)))
     assert len(MjcfRobot(config).dynamics()) == 4
 
 

@@ -17,7 +17,7 @@ from sim2real.errors import SafetyStop, UsageError
 from sim2real.hardware.clock import SYSTEM_CLOCK
 from sim2real.hardware.safety.limits import GateLimits
 from sim2real.robots.walking.drive import StandUp
-from sim2real.robots.walking.plain.episodes import twin_of
+from sim2real.robots.walking.twin import twin_of
 
 pytest.importorskip("cyclonedds")
 

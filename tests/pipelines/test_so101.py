@@ -3,13 +3,10 @@
 import itertools
 import json
 
-import jax
 import mujoco
 import numpy as np
 import pytest
-from arm_conformance import ArmConformance, task_on_c
 
-from sim2real import composer
 from sim2real.errors import UsageError
 from sim2real.hardware.feetech import registers
 from sim2real.hardware.safety.limits import GateLimits
@@ -17,16 +14,9 @@ from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 PIPELINE = load_pipeline("so101")
-ROBOT, TASK, PLANT = PIPELINE.load(), PIPELINE.load("task"), PIPELINE.load("plant")
+ROBOT, PLANT = PIPELINE.load(), PIPELINE.load("plant")
 MODULE = PIPELINE.load("robot")
 LOW, HIGH = np.array(ROBOT.drive.servos.low), np.array(ROBOT.drive.servos.high)
-STEP_S = 0.01 / 3
-
-
-@pytest.fixture(scope="module")
-def env():
-    """The task on C."""
-    return task_on_c(PIPELINE)
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +27,10 @@ def plant():
 
 def test_the_arm_is_as_long_as_the_public_description_says():
     """Stretched forward and level, and upright: sums of its lengths, written down by hand."""
-    np.testing.assert_allclose(TASK.tip_of(np, np.zeros(6)), [0.3914, 0, 0.2344], atol=2e-4)
-    up = TASK.tip_of(np, np.array([0, 0, -np.pi / 2, 0, 0, 0]))
+    np.testing.assert_allclose(MODULE.tip_of(np.zeros(6)), [0.3914, 0, 0.2344], atol=2e-4)
+    up = MODULE.tip_of(np.array([0, 0, -np.pi / 2, 0, 0, 0]))
     np.testing.assert_allclose(up, [0.0388 + 0.0304 + 0.0280 - 0.0052, 0, 0.2292 + 0.2941], atol=2e-4)
-    turned = TASK.tip_of(np, np.array([np.pi / 2, 0, 0, 0, 0, 0]))
+    turned = MODULE.tip_of(np.array([np.pi / 2, 0, 0, 0, 0, 0]))
     np.testing.assert_allclose(turned, [0.0388, -0.3526, 0.2344], atol=2e-4)
 
 
@@ -71,33 +61,15 @@ def test_excitations_aims_and_rest_are_within_the_limits(plant):
     assert inside.mean(axis=0).min() > 0.85, "the gate cuts little"
     assert np.ptp(np.clip(signal, LOW, HIGH), axis=0).min() > 0.5
     assert np.all((ROBOT.drive.servos.at_rest >= LOW) & (ROBOT.drive.servos.at_rest <= HIGH))
-    targets = np.array([ROBOT.task.aim.draw(jax.random.key(i)) for i in range(60)])
-    assert targets[:, 2].min() > 0.1
-    assert np.ptp(targets, axis=0).min() > 0.2
-    assert np.all(np.array(MODULE.LOW) > LOW)
-    assert np.all(np.array(MODULE.HIGH) < HIGH)
 
 
-def test_parameters_stand_where_c_keeps_them(env):
-    physics = env.physics
+def test_each_joint_has_its_own_damping_friction_and_limit():
     values = {**ROBOT.nominal(), "damping_elbow_flex": 0.3, "friction_gripper": 0.02, "saturation_gripper": 0.1}
-    aim = np.array([0.1, -0.05, 0.3, 0.4])
-    placed = ROBOT.model.place(values, aim)
-    before = {n: np.array(getattr(physics.bind(e), a)) for n, (e, a) in ROBOT.model.fields(env.task).items()}
-    for name, (elements, attribute) in ROBOT.model.fields(env.task).items():
-        assert np.shape(placed[name]) == before[name].shape, name
-        setattr(physics.bind(elements), attribute, np.asarray(placed[name]))
-    model, gain = physics.model.ptr, values["gain"]
-    np.testing.assert_allclose(model.dof_damping, [0.6, 0.6, 0.3, 0.6, 0.6, 0.6], rtol=1e-6)
-    np.testing.assert_allclose(model.dof_armature[2], 0.005 - 0.5 * STEP_S * 0.3, rtol=1e-5)
-    np.testing.assert_allclose(model.dof_frictionloss, [0.06] * 5 + [0.02], rtol=1e-6)
-    np.testing.assert_allclose(
-        model.actuator_forcerange[:, 1], [2.94] * 4 + [gain * values["saturation_wrist_roll"], gain * 0.1], rtol=1e-5
-    )
-    np.testing.assert_allclose(physics.bind(env.task.table.target).pos, aim[:3], rtol=1e-6)
-    assert physics.bind(env.task.table.opening).pos[0] == pytest.approx(0.4)
-    for name, (elements, attribute) in ROBOT.model.fields(env.task).items():
-        setattr(physics.bind(elements), attribute, before[name])
+    model, gain = ROBOT.model.fields(values), values["gain"]
+    np.testing.assert_allclose(model["dof_damping"], [0.6, 0.6, 0.3, 0.6, 0.6, 0.6], rtol=1e-6)
+    np.testing.assert_allclose(model["dof_frictionloss"], [0.06] * 5 + [0.02], rtol=1e-6)
+    most = [2.94] * 4 + [gain * values["saturation_wrist_roll"], gain * 0.1]
+    np.testing.assert_allclose(model["actuator_forcerange"][:, 1], most, rtol=1e-5)
 
 
 def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
@@ -107,35 +79,6 @@ def test_the_data_sheets_torque_is_reached_at_an_error_of_a_third_of_a_radian():
     assert sheet.gain == pytest.approx(7.81, abs=0.01)
     assert sheet.drive.p_gain == 16
     assert sheet.drive.registers(0x0C)[registers.ACCELERATION] == 0, "as fast as it can"
-
-
-def test_what_is_true_goes_by_the_same_names_and_lies_within_the_bounds():
-    truth = PLANT.SO101Plant().truth()
-    assert set(truth) == {p.name for p in ROBOT.model.dynamics()} == set(ROBOT.nominal())
-    for p in ROBOT.model.dynamics():
-        assert p.low < truth[p.name] < p.high, p.name
-
-
-class TestSO101(ArmConformance):
-    pipeline, there, aim = PIPELINE, (0.5, -0.8, 1.0, -1.2, 0.3, 0.2), (0.25,)
-    scores = (("opening_off_rad", pytest.approx(0.05)),)
-
-    def test_a_jaw_that_is_not_as_it_was_commanded_is_no_success(self):
-        score = self.score(np.tile(self.there, (401, 1)), [*TASK.tip_of(np, np.array(self.there)), -0.2])
-        assert (score["success"], score["reached"]) == (0.0, 0.0)
-        assert score["distance_m"] < 0.001
-
-
-def test_tip_and_jaw_count_in_the_reward():
-    env = composer.Environment(TASK.Reach(), random_state=0)
-    env.reset()
-    physics, task = env.physics, env.task
-    reward = env.step(np.zeros(6)).reward
-    distance, ajar = physics.variables["distance"], physics.variables["ajar"]
-    assert distance == pytest.approx(np.linalg.norm(physics.bind(task.robot.tip).xpos - [0.2, 0, 0.2]), abs=1e-5)
-    assert ajar == pytest.approx(abs(physics.bind(task.joints).qpos[5]))
-    expected = np.exp(-((distance / 0.1) ** 2)) + np.exp(-((distance / 0.02) ** 2)) - 2 * distance
-    assert reward == pytest.approx(expected + 0.5 * np.exp(-((ajar / 0.1) ** 2)) - 0.3 * ajar)
 
 
 @pytest.fixture

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
 from oracles.conformance import NodeConformance
 
+from sim2real import pytree
 from sim2real.graph import BaseNode
 from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.robots.agent import AgentParams, DirectAgent, GoalAgent
 from sim2real.robots.messages import Goals, JointReading
-from sim2real.robots.servo.agent import AgentParams, DirectAgent, GoalAgent
 
 LOW, HIGH, RATE_HZ = np.array([-1.0, -0.5]), np.array([0.8, 1.2]), 50.0
 AIM, START = np.array([0.25, -0.5, 2.0]), np.array([0.1, -0.2])
@@ -75,7 +75,7 @@ def test_an_action_is_the_speed_of_the_goals_and_they_stay_within_their_limits()
         clipped |= bool(np.any(np.abs(expected + action / RATE_HZ - 0.1) > 1.0))
         expected = np.clip(expected + action / RATE_HZ, LOW, HIGH)
         np.testing.assert_allclose(decision.goal, expected, atol=1e-5)
-        np.testing.assert_array_equal(step_state.state.goal, decision.goal)
+        np.testing.assert_array_equal(step_state.state.command, decision.goal)
     assert expected[0] > 0.7, "it was pushed to a limit"
     assert expected[1] < -0.4
 
@@ -95,7 +95,7 @@ def test_history_is_what_was_seen_and_told_newest_first():
         position, velocity = np.array([0.01 * k, -0.02 * k]), np.array([k, 10.0 * k])
         step_state = seeing(step_state, position, velocity)
         shown = np.asarray(agent.observe(step_state))
-        features = np.concatenate([position - np.asarray(step_state.state.goal), AIM])
+        features = np.concatenate([position - np.asarray(step_state.state.command), AIM])
         np.testing.assert_allclose(shown, np.concatenate([features, *rows]), atol=1e-6)
         assert shown.dtype == np.float32
         step_state, decision = agent.act(step_state, np.array([0.5, -0.5]))
@@ -131,7 +131,7 @@ def test_a_direct_agent_sends_actions_as_they_are_and_shows_what_it_saw_and_did_
     np.testing.assert_array_equal(agent.init_output().goal, [0.0])
 
 
-@struct.dataclass
+@pytree.dataclass
 class Counting:
     """A policy that remembers in how many steps it was asked."""
 

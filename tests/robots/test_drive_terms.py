@@ -15,19 +15,18 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import refine
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span
-from sim2real.robots.from_model.mjcf import driven
-from sim2real.robots.from_model.mjcf_parameters import (
-    LAWS,
+from sim2real.robots.model.drives import driven
+from sim2real.robots.model.parameters import (
     LIMITS,
-    ONLY_NAMED,
-    OPTIONAL,
+    QUANTITIES,
+    TERMS,
     ParameterPattern,
     expand,
-    optional,
     tilted,
-)  # fmt: skip
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.robots.from_model.usual_parameters import usual_terms
+    usual_patterns,
+    with_optional,
+)
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.shared.identification import offering, with_wanted_terms
 from sim2real.worlds.drive_terms import NO_LIMIT, DriveLaw, DriveTerms
 from sim2real.worlds.rollouts import Rollouts, Start
@@ -43,7 +42,9 @@ ON = {"load": 0.25, "static": 0.25, "stribeck_rad_s": 0.3, "drag": 0.02, "bias":
       "damping_bias": -0.015, "tilt_x": 0.25, "tilt_y": -0.2, "gravcomp": 0.7,
       "torque": 1.2, "top_speed": 1.5}  # fmt: skip
 OFF = dict.fromkeys(ON, 0.0) | {"stribeck_rad_s": 0.1, "cogging_per_turn": 9.0} | dict.fromkeys(LIMITS, NO_LIMIT)
-MECHANICAL = [name for name in OPTIONAL if name != "voltage"]
+LAWS = [name for name, quantity in QUANTITIES.items() if quantity.place == "law"]
+ONLY_NAMED = [term for term, (first, *_) in TERMS.items() if QUANTITIES[first].named]
+MECHANICAL = [name for name in TERMS if name != "voltage"]
 """Those that need no column of the log."""
 PER_TURN = ParameterPattern("cogging_per_turn", nominal=9.0, free=False)
 
@@ -110,7 +111,7 @@ def in_c(model_file, terms, goals, on, start, kind=DriveLaw):
 @pytest.mark.parametrize("one", [*MECHANICAL, "all"])
 def test_terms_move_a_joint_as_a_simulation_by_hand(model_file, one):
     goals, on = commands(1500)
-    own = ON if one == "all" else OFF | {what: ON[what] for what in OPTIONAL[one]}
+    own = ON if one == "all" else OFF | {what: ON[what] for what in TERMS[one]}
     found, expected, without = (
         play(terms, goals, on, (0.4, -2.0))
         for play, terms in ((lambda *a: in_c(model_file, *a), own), (by_hand, own), (by_hand, OFF))
@@ -124,7 +125,7 @@ def test_terms_move_a_joint_as_a_simulation_by_hand(model_file, one):
 @pytest.mark.parametrize("one", [*MECHANICAL, "all", "none"])
 def test_a_law_without_absent_terms_returns_what_the_whole_law_does(one):
     law, rng = DriveLaw(np.array([1, 0]), np.array([1, 0]), np.array([2])), np.random.default_rng(0)
-    own = {"all": ON, "none": OFF}.get(one) or OFF | {what: ON[what] for what in OPTIONAL[one]}
+    own = {"all": ON, "none": OFF}.get(one) or OFF | {what: ON[what] for what in TERMS[one]}
     values = {n: np.full((4, 2), v) for n, v in {**OWN, **own}.items()}
     values |= {"other_damping": np.full((4, 1), 0.3), "other_frictionloss": np.full((4, 1), 0.2)}
     control, qpos, qvel = (rng.uniform(-1.0, 1.0, (4, n)) for n in (10, 3, 3))
@@ -165,7 +166,7 @@ def played(problem, terms):
 @pytest.mark.night
 @pytest.mark.parametrize("one", [*MECHANICAL, "all"])
 def test_both_engines_say_the_same(engines, one):
-    own = ON if one == "all" else OFF | {what: ON[what] for what in OPTIONAL[one]}
+    own = ON if one == "all" else OFF | {what: ON[what] for what in TERMS[one]}
     found = played(engines.c, own)
     np.testing.assert_allclose(found, played(engines.compiled, own), rtol=0, atol=1e-6)
     assert np.abs(found - played(engines.c, OFF)).max() > 1e-3
@@ -223,7 +224,7 @@ def test_what_a_delay_of_nothing_would_change_is_known(by_hands_log, share):
 
 
 def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
-    terms = (*usual_terms(("goal",)), PER_TURN)
+    terms = (*usual_patterns(("goal",)), PER_TURN)
     robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=terms[:-1]))
     assert offering(robot, "own") is robot
     assert robot.make_nodes()[2].law is None
@@ -244,16 +245,16 @@ def test_terms_are_offered_and_off_unless_they_are_chosen(model_file):
 
 @pytest.mark.parametrize("one", ONLY_NAMED)
 def test_terms_that_few_robots_tell_are_offered_where_they_are_asked_for(model_file, one):
-    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=(*usual_terms(("goal",)), PER_TURN)))
+    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=(*usual_patterns(("goal",)), PER_TURN)))
     table = offering(robot, f"load,{one}").identifiable(0.02).parameters
     assert with_wanted_terms(table, f"load,{one}").terms == ("load", one)
-    own = optional((ParameterPattern(OPTIONAL[one][0]),), "auto")
-    assert {t.term for t in own} == set(OPTIONAL) - set(ONLY_NAMED) | {one}
-    assert [t.what for t in own if t.term == one] == [OPTIONAL[one][0]], "a robot may feel tilt_y and not tilt_x"
+    own = with_optional((ParameterPattern(TERMS[one][0]),), "auto")
+    assert {t.term for t in own} == set(TERMS) - set(ONLY_NAMED) | {one}
+    assert [t.what for t in own if t.term == one] == [TERMS[one][0]], "a robot may feel tilt_y and not tilt_x"
 
 
 def test_cogging_is_refused_without_how_often_it_repeats(model_file):
-    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_terms(("goal",))))
+    robot = MjcfRobot(RobotConfig(model_file, ("servo",), ("goal",), terms=usual_patterns(("goal",))))
     with pytest.raises(UsageError, match="number of repeats"):
         offering(robot, "cogging")
     with pytest.raises(UsageError, match="counted"):
@@ -271,7 +272,7 @@ def test_an_encoder_off_its_axis_is_read_back():
 
 
 def test_a_term_of_the_users_own_is_one_of_those_to_choose_from():
-    own = optional((ParameterPattern("load", each=True, high=0.5),))
+    own = with_optional((ParameterPattern("load", each=True, high=0.5),))
     assert own[0] == ParameterPattern("load", each=True, high=0.5, term="load")
     assert sorted(t.what for t in own) == sorted(
         {*LAWS, "torque", "voltage", "tilt_x", "tilt_y", "gravcomp"} - {w for w in LAWS if "cogging" in w}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_robot import SERVOS, SHEET, VALUES, PairRobot, PairTask
+from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
@@ -20,21 +20,13 @@ LIMITS = {"gain": (2.0, 8.0), "damping": (0.05, 0.4), "armature": (0.003, 0.03),
 LIMITS |= {"stribeck": (0.05, 2.0)}
 
 
-def converged_task():
-    """Return a task whose solver ends where the solution is, on either engine."""
-    task = PairTask()
-    option = task.root_entity.mjcf_model.option
-    option.iterations, option.ls_iterations, option.tolerance = 20, 50, 0
-    return task
-
-
 def converged_robot():
-    return PairRobot(make_task=converged_task)
+    return PairRobot(converged=True)
 
 
 def worn_robot():
     """Its friction wears off with speed."""
-    return PairRobot(replace(SERVOS, sheet=replace(SHEET, stribeck_rad_s=0.5)), converged_task)
+    return PairRobot(replace(SERVOS, sheet=replace(SHEET, stribeck_rad_s=0.5)), converged=True)
 
 
 def steps(start, stamp, end):

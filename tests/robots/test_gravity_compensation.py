@@ -13,8 +13,8 @@ from sim2real.identify.fit import fit
 from sim2real.identify.held_out import Refits, folds_of
 from sim2real.identify.segments import Span
 from sim2real.identify.terms import TermSearch
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.shared.identification import offering
 

@@ -160,7 +160,6 @@ def test_the_log_says_what_the_episode_was_about_and_the_simulations_trial_is_th
     np.testing.assert_allclose(aims, np.tile(expected, (len(aims), 1)), atol=1e-6)
     simulated = robot.simulation_params(robot.nominal(), None, trial=2)
     np.testing.assert_array_equal(simulated["agent"].aim, expected)
-    np.testing.assert_array_equal(simulated["world"].values["target"], expected)
 
 
 def test_torque_is_on_during_episodes_and_off_at_the_end(episodes):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.robots.from_model.holding import apply, plan
-from sim2real.robots.from_model.mjcf import driven, joints_of
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.model.drives import driven, joints_of
+from sim2real.robots.model.held import apply, plan
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.worlds.closing import Closing
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_robot import VALUES, play_on_c, world_params
+from small_robot import VALUES, play_on_c
 
 from sim2real.graph.episode import Episode, Steps
 from sim2real.identify.config import FitConfig
@@ -32,8 +32,7 @@ def episode(pair):
     count = 110
     t = PERIOD_S * np.arange(count)
     goals = np.stack([0.6 * np.sin(4 * t), np.where(t % 1.0 < 0.5, 0.2, -0.1)], axis=1)
-    params = world_params(pair, VALUES, [0.0, 0.0], [0.0, 0.0], jnp.zeros(1))
-    _, positions, speeds, _ = play_on_c(pair, params, np.repeat(goals, 2, axis=0))
+    _, positions, speeds = play_on_c(pair, VALUES, [0.0, 0.0], [0.0, 0.0], np.repeat(goals, 2, axis=0))
     ticks = pair.model.tick_s * np.arange(2 * count + 1)
     shown, fast = (
         np.stack([np.interp(t + SAMPLE_S, ticks, np.append(0.0, rows[:, j])) for j in range(2)], axis=1)

@@ -14,8 +14,8 @@ from sim2real.identify.held_out import folds_of
 from sim2real.identify.segments import Span
 from sim2real.identify.terms import TermSearch
 from sim2real.identify.uncertainty import NOT_REACHED
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.identify.judgement import Findings
 from sim2real.stages.shared.identification import offering, with_wanted_terms
 from sim2real.worlds.drive_terms import NO_LIMIT

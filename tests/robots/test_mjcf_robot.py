@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.robots.from_model.mjcf import driven, force_of, gains_of, joints_of, limit_of, read_model
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.robots.from_model.usual_parameters import usual_terms
+from sim2real.robots.model.drives import driven, force_of, gains_of, joints_of, limit_of
+from sim2real.robots.model.file import read_model
+from sim2real.robots.model.parameters import ParameterPattern, usual_patterns
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.worlds.driven import DriveCommand
 
 XML = """<mujoco>
@@ -195,7 +195,7 @@ def test_the_start_is_where_the_encoders_say(model_file):
 
 
 def test_a_description_survives_its_file(tmp_path, model_file):
-    wanted = config(model_file, velocity=True, rate_hz=123.0, terms=(*usual_terms(("goal", "enabled")),
+    wanted = config(model_file, velocity=True, rate_hz=123.0, terms=(*usual_patterns(("goal", "enabled")),
                     ParameterPattern("frictionloss", "left_.*", True, 0.1, 0.01, 1.0, "dry", False)))  # fmt: skip
     (tmp_path / "robot.toml").write_text(wanted.to_toml("robot.xml"))
     assert RobotConfig.load(tmp_path / "robot.toml") == wanted

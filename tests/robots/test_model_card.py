@@ -21,8 +21,8 @@ from sim2real.identify.predictions import replays
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span
 from sim2real.log import read_log
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import RecordConfig
 from sim2real.stages.excitation.signals import excitation
 from sim2real.stages.excitation.simulated_log import simulate

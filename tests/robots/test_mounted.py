@@ -2,16 +2,13 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from mujoco import MjModel
-from small_robot import SERVOS, PairRobot, PairTask
+from small_robot import SERVOS, PairRobot
 
 from sim2real.emulation.dynamixel import EmulatorConfig
 from sim2real.emulation.servo_plant import TwinPlant
 from sim2real.emulation.truth import Kind, read_truth
-from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.joint import Joint
 from sim2real.hardware.safety.limits import GateLimits
@@ -30,50 +27,18 @@ GEARS = (2.0, 0.5)
 GEARED = replace(SERVOS, joints=(Joint("left", 0.3, -1, GEARS[0]), Joint("right", gear=GEARS[1])))
 
 
-def geared():
-    return PairRobot(GEARED, lambda: PairTask(GEARED.joints))
-
-
 def test_a_robots_joints_are_called_as_before(pair):
-    robot = geared()
+    robot = PairRobot(GEARED)
     assert (robot.drive.servos.names, pair.drive.servos.names) == (("left", "right"),) * 2
     assert robot.sensor.joints == pair.sensor.joints
     assert [p.name for p in robot.model.dynamics()] == [p.name for p in pair.model.dynamics()]
-    assert robot.nominal() == pair.nominal()
     assert robot.agent.action == pair.agent.action
     assert robot.drive.gate(PATIENT).joints == ("left", "right")
 
 
-def test_a_gear_is_in_the_model_and_not_in_the_servos_parameters(pair):
-    """Torque and friction grow by the gear, gain, damping and inertia by its square."""
-    gears = np.array(GEARS)
-    robot = geared()
-    placed, plain = (r.model.place(r.nominal(), jnp.zeros(1)) for r in (robot, pair))
-    model = MjModel.from_xml_string(robot.identified_mjcf(robot.nominal()))
-    built = MjModel.from_xml_string(robot.model.task.root_entity.mjcf_model.root_model.to_xml_string())
-    rows = {"gain": "actuator_gainprm", "bias": "actuator_biasprm", "most": "actuator_forcerange"}
-    rows |= {"damping": "dof_damping", "armature": "dof_armature", "friction": "dof_frictionloss"}
-    lost = 0.5 * robot.model.task.physics_timestep * np.asarray(placed["damping"])  # see `standard.place`
-    for name, power in {"gain": 2, "bias": 2, "most": 1, "damping": 2, "armature": 2, "friction": 1}.items():
-        own = np.asarray(placed[name])
-        np.testing.assert_allclose(own.T, np.asarray(plain[name]).T * gears**power, rtol=1e-6, err_msg=name)
-        for compiled in (model, built):
-            # What is written for other tools is as the graph has it; what is composed is the data sheet's.
-            found = getattr(compiled, rows[name]) - (lost if name == "armature" and compiled is built else 0.0)
-            np.testing.assert_allclose(own, found, rtol=2e-5, err_msg=name)
-    np.testing.assert_allclose([s.profile_rad_s for s in robot.model.task.robot.servos], 2.0 / gears)
-
-
-def test_a_model_without_the_joints_gears_is_refused():
-    robot = PairRobot(GEARED)
-    with pytest.raises(UsageError, match=r"servos have the gears \[1\.0, 1\.0\], the joints \[2\.0, 0\.5\]") as caught:
-        robot.model.make_world()
-    assert "Servo(joint" in caught.value.hint
-
-
 def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
     factors = {"gain": 0.9, "damping": 1.1, "armature": 1.2, "friction": 1.5}
-    one, other = (TwinPlant(**r.model.twin(EmulatorConfig(), **factors).plant_args) for r in (pair, geared()))
+    one, other = (TwinPlant(**r.model.twin(EmulatorConfig(), **factors).plant_args) for r in (pair, PairRobot(GEARED)))
     assert other.truth() == pytest.approx(one.truth(), rel=1e-5)
     assert one.truth() == pytest.approx({n: v * factors[n.split("_")[0]] for n, v in pair.nominal().items()}, rel=1e-5)
 

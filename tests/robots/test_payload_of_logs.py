@@ -12,8 +12,8 @@ from sim2real.identify.fit import fit
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span
 from sim2real.log.importing.names import meaning
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 
 STEP_S, PERIOD, DELAY, SECONDS, NOISE, KP, DAMPING = 0.002, 5, 2, 4.0, 2e-4, 12.0, 0.4
 RIG = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="rod">

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim2real.errors import UsageError
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 
 ARM = """<mujoco><compiler {}/><worldbody><body><joint name="elbow" axis="0 1 0" range="-1.5 1.5"/>
 <geom size="0.02 0.1" type="capsule" pos="0 0 -0.1"/></body></worldbody></mujoco>"""

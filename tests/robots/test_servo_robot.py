@@ -10,7 +10,6 @@ from small_robot import SERVOS, SHEET, VALUES, PairRobot
 
 from sim2real.graph.episode import named_leaves
 from sim2real.robots.messages import Decision, EpisodeStart
-from sim2real.robots.servo import parameters
 from sim2real.robots.servo.datasheet import DataSheet
 
 
@@ -77,20 +76,6 @@ def test_parameters_land_in_the_nodes_that_need_them(pair):
     assert (agent.policy, float(agent.aim[0])) == ("policy", pytest.approx(0.4))
     for name in ("sensor", "actuator"):
         assert pair.node_parameters(VALUES, EpisodeStart([0, 0], [0, 0], jnp.zeros(1)))[name].delay is None
-    compiled = pair.model.make_world().init_params()
-    shapes = {k: (v.shape, v.dtype) for k, v in compiled.values.items()}
-    assert {k: (v.shape, v.dtype) for k, v in world.values.items()} == shapes
-
-
-def test_numbers_of_the_data_sheet_are_those_of_the_compiled_model(pair):
-    """But for the inertia, which MuJoCo's implicit step adds to by half a step of damping."""
-    compiled = pair.model.make_world().init_params().values
-    placed = pair.model.place(pair.nominal(), jnp.zeros(1))
-    for name in set(compiled) - {"armature"}:
-        np.testing.assert_allclose(placed[name], compiled[name], rtol=1e-6, err_msg=name)
-    np.testing.assert_allclose(placed["armature"], compiled["armature"] - 0.5 * 0.005 * 0.2, rtol=1e-5)
-    light = pair.model.place({**pair.nominal(), "armature": 1e-4}, jnp.zeros(1))["armature"]
-    np.testing.assert_array_equal(light, [0.0, 0.0])
 
 
 def test_a_simulation_starts_from_rest_and_each_trial_has_its_own_aim():
@@ -134,17 +119,3 @@ def test_an_excitation_is_around_the_middle_and_waits_where_it_ends():
     np.testing.assert_allclose(played[:40], signal + np.array([0.3, -0.2]))
     np.testing.assert_allclose(played[40:], np.tile(played[39], (20, 1)))
     np.testing.assert_allclose(robot.drive.around(signal), signal + np.array([0.3, -0.2]))
-
-
-def test_joints_may_have_any_of_the_servos_parameters_for_themselves():
-    joints = ("left", "right")
-    found = parameters.parameters(SHEET, joints, own=("damping", "friction"))
-    own = ["damping_left", "damping_right", "friction_left", "friction_right"]
-    assert [p.name for p in found] == ["gain", *own[:2], "armature", *own[2:]]
-    values = {p.name: p.nominal for p in found} | {"damping_right": 0.5, "saturation_left": 0.1}
-    placed = parameters.place(values, SHEET, joints, 0.002)
-    np.testing.assert_allclose(placed["damping"], [SHEET.damping, 0.5], rtol=1e-6)
-    np.testing.assert_allclose(placed["most"][:, 1], SHEET.gain * np.array([0.1, SHEET.full_rad]), rtol=1e-6)
-    del values["damping_left"]
-    with pytest.raises(KeyError, match="damping_left"):
-        parameters.place(values, SHEET, joints, 0.002)

@@ -8,10 +8,8 @@ from recorded_on_c import play
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit, refine
 from sim2real.identify.segments import Span
-from sim2real.robots.from_model.joints.sharing import like_joints, sharing
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.robots.from_model.usual_parameters import usual_terms
+from sim2real.robots.model.parameters import ParameterPattern, like_joints, sharing, usual_patterns
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.shared.identification import offering, with_wanted_terms
 
 GO2 = [f"{leg}_{part}_joint" for leg in ("FL", "FR", "RL", "RR") for part in ("hip", "thigh", "calf")]
@@ -32,7 +30,7 @@ def test_joints_with_like_names_form_a_group():
 
 
 def test_groups_are_offered_where_there_are_some_and_single_joints_where_there_are_few():
-    usual = (*usual_terms(("goal",)), ParameterPattern("kd", free=False))
+    usual = (*usual_patterns(("goal",)), ParameterPattern("kd", free=False))
     names = {t.term for t in sharing(usual, GO2, "auto")}
     assert names == {"kp_by_group", "damping_by_group", "armature_by_group"}
     calves = next(t for t in sharing(usual, GO2, "auto") if t.name == "kp_of_calf_joint")

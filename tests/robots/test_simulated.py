@@ -9,33 +9,18 @@ import numpy as np
 import pytest
 
 from sim2real.artifacts.identification import Noise
-from sim2real.composer.physics.mjx.environment import State
 from sim2real.errors import UsageError
 from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.robots.agent import AgentParams
 from sim2real.robots.loop import DelayParams
 from sim2real.robots.messages import Decision, JointReading
-from sim2real.robots.servo.agent import AgentParams
-from sim2real.robots.servo.simulated_world import SimActuator, SimSensor
+from sim2real.robots.nodes import SimActuator, SimSensor
 
 
 def heard(sender, message):
     one = jnp.zeros(1)
     row = jax.tree_util.tree_map(lambda x: jnp.asarray(x)[None], message)
     return {sender: InputState(jnp.zeros(1, jnp.int32), one, one, row)}
-
-
-def test_in_the_middle_of_a_recording_references_begin_at_the_goals(pair):
-    """What nobody measures is where profiles were up to; later ticks leave references alone."""
-    goal, before = jnp.array([0.7, -0.4]), jnp.array([0.1, 0.2])
-    for resumed, tick, expected in ((True, 0, goal), (True, 1, before), (False, 0, before)):
-        world = pair.model.make_world(resumed)
-        state = State(*[None] * len(dataclasses.fields(State))).replace(
-            steps=jnp.int32(tick), variables={"goal": before, "reference": before, "other": before}
-        )
-        after = world.entered(state, goal)
-        np.testing.assert_array_equal(after.variables["reference"], expected)
-        np.testing.assert_array_equal(after.variables["goal"], before)
-        np.testing.assert_array_equal(after.variables["other"], before)
 
 
 def test_the_world_is_half_a_step_behind_its_commands(pair):

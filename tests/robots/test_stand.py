@@ -19,7 +19,7 @@ from sim2real.identify.config import FitConfig
 from sim2real.identify.predictions import labels
 from sim2real.identify.problem import Problem
 from sim2real.identify.segments import Span
-from sim2real.robots.walking.plain.episodes import twin_of
+from sim2real.robots.walking.twin import twin_of
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.stages.shared.identification import spans
 

@@ -1,17 +1,20 @@
 """Dry friction holds a joint; MuJoCo's default impedance lets it creep, and too few iterations let it shiver."""
 
+from copy import copy
+
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from pipelines.arm import task as arm_task
-from pipelines.so101.task import Reach
-from sim2real import composer
-from sim2real.robots.from_model.mjcf import driven, read_model
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
-from sim2real.robots.from_model.usual_parameters import usual_terms
-from sim2real.stages.deploy.simulations import resting
+from sim2real.graph.base import GraphState, InputState, StepState
+from sim2real.robots.messages import Goals
+from sim2real.robots.model.drives import driven
+from sim2real.robots.model.file import read_model
+from sim2real.robots.model.parameters import usual_patterns
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
+from sim2real.robots.servo.world import ServoParams, ServoWorld
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 XML = """<mujoco><worldbody><body><joint name="lift" axis="0 1 0" frictionloss="1" {own}/>
@@ -50,21 +53,14 @@ def test_an_impedance_of_the_file_is_kept(model_file):
 
 
 def test_the_identified_model_holds_its_joints_as_the_identification_did(model_file):
-    robot = MjcfRobot(RobotConfig(model_file(), ("lift",), ("torque",), step_s=STEP_S, terms=usual_terms(("torque",))))
+    robot = MjcfRobot(
+        RobotConfig(model_file(), ("lift",), ("torque",), step_s=STEP_S, terms=usual_patterns(("torque",)))
+    )
     values = {p.name: 1.0 if p.name.startswith("frictionloss") else p.nominal for p in robot.dynamics()}
     exported = mujoco.MjModel.from_xml_string(robot.identified_mjcf(values))
     np.testing.assert_allclose(exported.dof_solref, robot.model.dof_solref)
     np.testing.assert_allclose(exported.dof_solimp, robot.model.dof_solimp)
     assert crept(exported) < 1e-3
-
-
-def pulled(task):
-    """Return a composed servo robot at its middle, without gravity: friction holds it at 0.8 of what would move it."""
-    task.root_entity.mjcf_model.option.gravity = (0.0, 0.0, 0.0)
-    for joint in task.joints:
-        joint.frictionloss = 0.2
-    stiffness = np.array([servo.actuator.kp for servo in task.robot.servos])
-    return np.array(0.16 / stiffness)
 
 
 @pytest.mark.parametrize("name", ["so101", "arm"])
@@ -89,23 +85,24 @@ def test_an_exported_servo_robot_rests_where_friction_holds_it(name):
 
 
 @pytest.mark.night
-@pytest.mark.parametrize("task", [Reach, arm_task.Reach])
-def test_in_single_precision_too(task):
+@pytest.mark.parametrize("name", ["so101", "arm"])
+def test_in_single_precision_too(name):
     """On MJX, as beside a deployment; at an impedance of 0.999 single precision does not find the holding force."""
-    task = task()
-    off = pulled(task)
-    environment = composer.MjxEnvironment(task)
-    environment.mjx_model = resting(environment.mjx_model)
+    robot = load_pipeline(name).load()
+    model = copy(robot.model.model)
+    model.opt.gravity[:] = 0.0
+    profiles = [robot.model.profile_rad_s] * model.nq
+    world = ServoWorld(model, robot.drive.servos.names, robot.model.tick_s, profiles)
+    world.solve_to_rest()
+    fields = robot.model.fields(robot.nominal()) | {"dof_frictionloss": jnp.full(model.nv, 0.2)}
+    params = ServoParams(fields, jnp.zeros(model.nq), jnp.zeros(model.nv))
+    goal = Goals((0.16 / fields["actuator_gainprm"][:, 0])[None])
+    heard = {"actuator": InputState(jnp.zeros(1, jnp.int32), jnp.zeros(1), jnp.zeros(1), goal)}
 
-    def moved(key):
-        start = environment.reset(key)
-        goal = start.data.qpos + off
+    def step(state, seq):
+        after = world.step(StepState(state=state, params=params, inputs=heard, seq=seq))[0].state
+        return after, after.data.qvel
 
-        def step(state, _):
-            after = environment.step(state, goal)
-            return after, after.data.qvel
-
-        return jax.lax.scan(step, start, None, length=200)[1]
-
-    speeds = np.asarray(jax.jit(jax.vmap(moved))(jax.random.split(jax.random.key(0), 8)))
-    assert np.abs(speeds[:, 100:]).max() < 5e-3
+    start = world.init_state(None, GraphState(params={"world": params}))
+    speeds = np.asarray(jax.jit(lambda s: jax.lax.scan(step, s, jnp.arange(200))[1])(start))
+    assert np.abs(speeds[100:]).max() < 5e-3

@@ -10,8 +10,8 @@ from recorded_on_c import play
 from sim2real.identify.config import FitConfig
 from sim2real.identify.fit import fit
 from sim2real.identify.segments import Span
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.shared.identification import offering
 
 STEP_S, PERIOD, SECONDS, NOISE, KP, VOLTS = 0.002, 5, 4.0, 2e-4, 12.0, 7.4

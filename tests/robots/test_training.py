@@ -40,8 +40,8 @@ def trained(pair, loop):
         def step(state, _):
             made = env.step(state, SPEEDS, key)
             world = made.state.graph.state["world"]
-            kept = {"reward": made.reward, "seen": made.observation, "goal": made.state.graph.state["agent"].goal}
-            return made.state, {**kept, "joints": world.data.qpos, "of_task": world.reward}
+            kept = {"reward": made.reward, "seen": made.observation, "goal": made.state.graph.state["agent"].command}
+            return made.state, {**kept, "joints": world.data.qpos}
 
         first, seen = env.reset(key)
         last, rows = jax.lax.scan(step, first, length=env.length)
@@ -89,7 +89,8 @@ def test_half_of_the_episodes_start_from_rest_and_half_from_anywhere(pair, drawn
 
 
 def test_dynamics_and_delays_are_drawn_together_and_aims_vary(drawn):
-    gain, damping = drawn["world"].values["gain"][:, 0, 0], drawn["world"].values["damping"][:, 0]
+    fields = drawn["world"].fields
+    gain, damping = fields["actuator_gainprm"][:, 0, 0], fields["dof_damping"][:, 0]
     assert set(np.round(gain, 3).tolist()) == {3.0, 4.0, 5.0}
     np.testing.assert_allclose(damping, 0.1 * (gain - 2.0), rtol=1e-5)
     row = np.round(gain - 3.0).astype(int)
@@ -119,11 +120,11 @@ def test_the_joints_follow_and_the_policy_sees_them_late(trained):
 def test_a_value_function_may_see_where_the_joints_are_and_what_they_are_like(trained):
     true = np.asarray(trained.true)
     np.testing.assert_allclose(true[:2], trained.params["agent"].start, atol=1e-6)
-    for name in ("gain", "damping"):
-        assert np.isin(np.asarray(trained.params["world"].values[name]).ravel(), true).all()
+    for field in ("actuator_gainprm", "dof_damping"):
+        assert np.isin(np.asarray(trained.params["world"].fields[field]).ravel(), true).all()
 
 
 @pytest.mark.night
 def test_the_reward_is_the_tasks_less_a_little_for_speed(pair, trained):
     price = 0.01 * np.mean((np.asarray(SPEEDS) / pair.drive.servos.speed) ** 2)
-    np.testing.assert_allclose(trained.rows["reward"], trained.rows["of_task"] - price, atol=1e-6)
+    np.testing.assert_allclose(trained.rows["reward"], -np.sum(trained.rows["joints"] ** 2, axis=1) - price, atol=1e-6)

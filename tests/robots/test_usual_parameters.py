@@ -3,8 +3,7 @@
 import mujoco as mj
 import pytest
 
-from sim2real.robots.from_model.mjcf_parameters import expand
-from sim2real.robots.from_model.usual_parameters import usual_terms
+from sim2real.robots.model.parameters import expand, usual_patterns
 
 
 def arm(names, gains, dampings):
@@ -21,7 +20,7 @@ def arm(names, gains, dampings):
 
 
 def placed(model, joints, commands=("goal",), physical=False):
-    terms = usual_terms(commands, physical, model, joints)
+    terms = usual_patterns(commands, physical, model, joints)
     return {p.parameter.name: (p.parameter.nominal, p.at) for p in expand(terms, joints, model, model)}
 
 

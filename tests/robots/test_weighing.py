@@ -17,7 +17,7 @@ from sim2real.artifacts.posterior import Posterior
 from sim2real.artifacts.recording import Recording
 from sim2real.emulation.truth import read_truth
 from sim2real.errors import OtherMotion, UsageError
-from sim2real.robots.walking.plain import weighing
+from sim2real.robots.walking import weighing
 from sim2real.stages.identify.inputs import with_load
 from sim2real.stages.pipeline.pipeline import load_pipeline
 from sim2real.training.environment.draws import draw_robots

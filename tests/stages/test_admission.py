@@ -14,7 +14,7 @@ from sim2real.errors import DelayChanged, Sim2RealError
 from sim2real.policy import PolicyContract, save_bundle
 from sim2real.robots.probe import StepAnswers, Witness
 from sim2real.stages.config import DeployConfig
-from sim2real.stages.deploy import preflight
+from sim2real.stages.deploy import episodes, preflight
 from sim2real.stages.pipeline.pipeline import load_pipeline
 
 TRAINED = (0.044, 0.046)
@@ -28,7 +28,7 @@ def still(contract):
     return {"mean": zeros, "std": zeros + 1, "low": low, "high": high, "log_std": np.zeros(n), **last}
 
 
-def contract_of(robot, **changes):
+def contract_of(robot, /, **changes):
     """Return the contract of a policy that fits, but for some changes."""
     bounds = [(float(np.float32(a.low)), float(np.float32(a.high))) for a in robot.agent.action]
     actions = tuple(replace(a, low=low, high=high) for a, (low, high) in zip(robot.agent.action, bounds, strict=True))
@@ -41,6 +41,11 @@ def contract_of(robot, **changes):
     return PolicyContract(**{**fits, **changes})
 
 
+def admit(robot, contract, name="arm", **config):
+    pipeline = replace(load_pipeline("arm"), name=name)
+    preflight.require_fit(pipeline, robot, Bundle(contract, still(contract)), DeployConfig(**config))
+
+
 @pytest.fixture(scope="module")
 def arm():
     return load_pipeline("arm").load()
@@ -48,7 +53,7 @@ def arm():
 
 def test_a_policy_for_the_robot_is_let_in(arm):
     contract = contract_of(arm)
-    preflight.require_fit(arm, Bundle(contract, still(contract)))
+    admit(arm, contract)
 
 
 CHANGES = {
@@ -77,14 +82,39 @@ def test_a_policy_for_another_robot_is_refused(arm, what):
     contract = contract_of(arm)
     contract = replace(contract, **{field: change(getattr(contract, field))})
     with pytest.raises(Sim2RealError, match=rf"(?s){said}.*hint: train a policy"):
-        preflight.require_fit(arm, Bundle(contract, still(contract)))
+        admit(arm, contract)
 
 
 def test_a_pendulum_policy_may_not_ask_for_100_volts():
     robot = load_pipeline("pendulum").load()
     contract = contract_of(robot, action=(replace(robot.agent.action[0], low=-100.0, high=100.0),))
     with pytest.raises(Sim2RealError, match="this robot allows -2 to 2"):
-        preflight.require_fit(robot, Bundle(contract, still(contract)))
+        admit(robot, contract)
+
+
+@pytest.mark.parametrize(
+    ("of", "name", "port", "said"),
+    [
+        ({"robot": "arm", "port": "embedded"}, "arm", "embedded", None),
+        ({"robot": "arm"}, "arm", "/dev/ttyUSB0", None),
+        ({}, "wing", "/dev/ttyUSB0", None),
+        ({"robot": "arm", "port": "/dev/ttyUSB0"}, "arm", "/dev/ttyUSB1", None),
+        ({"robot": "arm"}, "wing", "embedded", "was trained for 'arm', this is 'wing'"),
+        ({"robot": "arm", "port": "embedded"}, "arm", "/dev/ttyUSB0", r"of the emulated robot \(port embedded\)"),
+        ({"robot": "arm", "port": "/dev/ttyUSB0"}, "arm", "embedded", "port embedded has the emulated robot"),
+    ],
+)
+def test_a_policy_of_another_robots_port_is_refused_unless_it_is_forced(arm, capsys, of, name, port, said):
+    contract = contract_of(arm, **of)
+    assert PolicyContract.from_dict(json.loads(json.dumps(contract.to_dict()))) == contract
+    if said is None:
+        admit(arm, contract, name, port=port)
+        return
+    with pytest.raises(Sim2RealError, match=said):
+        admit(arm, contract, name, port=port)
+    if "port" in said:
+        admit(arm, contract, name, port=port, force=True)
+        assert "warning: the policy" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("value", "said"), [(np.nan, "not finite"), (1e9, "values up to 1e")])
@@ -120,20 +150,20 @@ def test_a_bundle_that_its_training_did_not_write_is_refused(arm, tmp_path):
 )
 def test_delay_and_jitter_must_be_those_of_the_training(delay_s, varies_s, said):
     found = StepAnswers(delay_s + varies_s * np.array([-1.0, -0.8, 0.0, 0.0, 0.8, 1.0]))
-    reason = preflight.misfit(found, TRAINED, 0.008)
+    reason = episodes.misfit(found, TRAINED, 0.008)
     assert reason is None if said is None else said in str(reason)
 
 
 @pytest.mark.parametrize("force", [False, True])
 def test_a_delay_that_was_not_trained_is_refused_or_with_force_told(arm, monkeypatch, capsys, force):
-    monkeypatch.setattr(preflight, "measure_delay", lambda witness, probe: StepAnswers(np.full(8, 0.060)))
+    monkeypatch.setattr(episodes, "measure_delay", lambda witness, probe: StepAnswers(np.full(8, 0.060)))
     witness = Witness(SimpleNamespace(wait_until_still=lambda timeout_s: None))
     pendulum = load_pipeline("pendulum").load()
     contract = contract_of(pendulum, trained_s={"round_trip_delay": TRAINED})
     if force:
-        found = preflight.check_delay(pendulum, witness, contract, DeployConfig(force=True))
+        found = episodes.check_delay(pendulum, witness, contract, DeployConfig(force=True))
         assert found["measured delay"].startswith("60 ms")
         assert "warning: the delay is 60 ms" in capsys.readouterr().err
     else:
         with pytest.raises(DelayChanged, match=r"(?s)the delay is 60 ms.*hint: .*--force"):
-            preflight.check_delay(pendulum, witness, contract, DeployConfig())
+            episodes.check_delay(pendulum, witness, contract, DeployConfig())

@@ -8,8 +8,8 @@ import pytest
 from sim2real import cli
 from sim2real.errors import UsageError
 from sim2real.log import read_log
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import RobotConfig
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import RobotConfig
 from sim2real.stages.pipeline.from_model import describe_robot, files_of
 from sim2real.stages.pipeline.open_log import open_recording
 from sim2real.stages.pipeline.pipeline import load_pipeline

@@ -1,7 +1,5 @@
 """What a deployment's states are called, for scores and for pages."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,7 +58,6 @@ def test_the_arms_score_reads_them(states):
 
 def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
     """One message of the recording is used 80 ms late; simulated timelines have 2 ms everywhere."""
-    robot = SimpleNamespace()
     recorder = MemoryRecorder()
     for k in range(50):
         begin = 20_000 * k + (80_000 if k == 30 else 0)
@@ -69,12 +66,12 @@ def test_the_gap_report_tells_how_old_the_data_were_that_the_policy_acted_on():
         recorder.message(MessageRecord("agent", "sensor", k, k, 20_000 * k, 20_000 * k))
         recorder.message(MessageRecord("actuator", "agent", k, k, begin + 1000, begin + 1000))
     nodes = control_nodes(*(BaseNode(name, 50.0, delay=0.002) for name in ("sensor", "agent", "actuator")))
-    rows = {row.quantity: row for row in simulation_gap._age_rows(robot, [recorder.episode()], draw(nodes, 1.0, 3))}
+    rows = {row.quantity: row for row in simulation_gap._age_rows([recorder.episode()], draw(nodes, 1.0, 3))}
     worst = rows["age_of_sensor_in_agent_max_s"]
     assert [worst.real, worst.simulation, worst.gap] == pytest.approx([0.08, 0.002, 0.078])
     assert rows["age_of_sensor_in_agent_p50_s"].real == pytest.approx(0.0)
     assert len(rows) == 4
-    alone = simulation_gap._age_rows(robot, [recorder.episode()], None)
+    alone = simulation_gap._age_rows([recorder.episode()], None)
     assert [row.simulation for row in alone] == [None] * 4
 
 

@@ -204,6 +204,21 @@ def excited(seconds: float, seed: int, volts: float = 1.8) -> Controller:
     return lambda angle, speed: float(next(rows))
 
 
+def probed(volts: float = 1.5, steps: int = 8) -> Controller:
+    """Return the small steps that measure the delay before a deployment: to both sides, each from rest."""
+    count, left, still = 0, 0, 0
+
+    def act(angle: float, speed: float) -> float:
+        nonlocal count, left, still
+        del angle
+        left, still = max(left - 1, 0), 0 if left or abs(speed) > 0.05 else still + 1
+        if still >= 5 and count < steps:
+            count, left, still = count + 1, 8, 0
+        return volts * (-1) ** count if left else 0.0
+
+    return act
+
+
 def write(path: Path, session: Played) -> None:
     """Write a session's log."""
     readings = [{"th": np.float32(th), "thdot": np.float32(thdot)} for th, thdot in session.measured]

@@ -352,6 +352,13 @@ def table(report: Report) -> str:
     return markdown(head, lines) + f"\n{about_budget(report)}{about_exceptions(report)}{lost}"
 
 
+def worst_joint(report: Report) -> str:
+    """Return the range over all entrants of the worst joint of the SO-101."""
+    rows = values(report, "league/so101/").items()
+    joints = [value for name, value in rows if name.endswith("/worst_joint") and value is not None]
+    return f"The worst joint of the SO-101 is off by {min(joints):.0f} to {max(joints):.0f} mrad with every tool.\n"
+
+
 def evidence(ideal: Report, report: Report) -> str:
     """Return README's evidence: the success of policies, our errors beside the best of the others, the lost sets.
 

@@ -1,7 +1,7 @@
 """Parameter sets that others have published, simulated in C MuJoCo without a fit.
 
 Each joint of the SO-101 is a hinge with a position actuator, the published armature, friction and damping, and the
-inertia of the arm at that joint with all joints in the middle of their ranges (pipelines/so101/parts.py). Weight is
+inertia of the arm at that joint with all joints in the middle of their ranges (pipelines/so101/so101.xml). Weight is
 absent, as the recordings' zero is not that of the models, and so is delay, which none of the sets has. The EMPS is a
 slide that forces push.
 """

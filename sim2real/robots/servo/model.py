@@ -1,173 +1,192 @@
-"""A composed task as the model of a robot of servos: its world, its parameters, and its MJCF."""
+"""An MJCF with a position servo on each joint, as the model of a robot: its world, its parameters, and its export.
+
+The parameters are at a servo's shaft, as in its data sheet. At a joint with a gear, torque and friction are multiplied
+by the gear, and gain, damping and inertia by its square.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 
+from sim2real.arrays import beside_damping
 from sim2real.errors import UsageError
 from sim2real.identify.export.plain import PlainSimulation, converged
 from sim2real.identify.parameters import Parameter
-from sim2real.later import at_once, jnp
-from sim2real.robots.loop import ACTUATOR, WORLD
+from sim2real.later import jnp
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotModel
-from sim2real.robots.servo import parameters
+from sim2real.robots.servo.datasheet import DataSheet
 from sim2real.robots.servo.following import identified_following
-from sim2real.robots.servo.parts import REFERENCE, GoalTask
-from sim2real.robots.servo.payload import PAYLOAD, Hand
-from sim2real.robots.servo.servos import Servos, gear_of
-from sim2real.robots.servo.task import NO_AIM, Aim
+from sim2real.robots.servo.servos import Servos, name_of
 from sim2real.robots.session import Embedded
-from sim2real.types import Array, PyTree, Scalar
+from sim2real.types import MjModel, MjSpec, PyTree, Scalar
 
 if TYPE_CHECKING:
     from sim2real.emulation.bus import BusEmulation
+    from sim2real.hardware.joint import Joint
     from sim2real.hardware.safety.following import Following
-    from sim2real.worlds.rollouts import WorldParams
+    from sim2real.robots.servo.world import ServoParams, ServoState, ServoWorld
 
 mj: Any = mujoco
 
-_AT_ONCE = 1e9
-"""Speed that stands for an infinite one in a document [rad/s]."""
+PAYLOAD = "payload"
+"""Name of the parameter, and of its term."""
+OFFSET = "goal_offset"
+"""Constant difference between a servo's position and its goal [rad]: of the zeros, or of worn gears."""
+_NAMES = ("gain", "damping", "armature", "friction")
+_NEVER = 1e9
+"""Speed that stands for an infinite one [rad/s]."""
+_MOST_OFFSET_RAD = 0.05
+_SOON, _STOPS = [1e-4, 1.0], [0.995, 0.995, 0.001, 0.5, 2.0]
+"""Friction stops a joint within two time steps, to which MuJoCo lengthens the time constant. At the default impedance
+joints creep as slow motions go; at 0.999 the solver's single precision does not find the force that holds a joint."""
 
 
-class ComposedModel(RobotModel):
-    """A composed task on MJX, whose control step is the world's tick.
+@dataclass(frozen=True)
+class Hand:
+    """The hand of a robot, which may hold a payload.
+
+    The payload's inertia about its centre is neglected: the rotors' inertia behind gears is far larger.
+
+    Attributes:
+        joint: The joint that moves the link which holds it.
+        at_m: Position of a payload in the frame of this link [m].
+        most_kg: Largest mass that it can bear [kg].
+        least_kg: Smallest change since the identification [kg], a negative number; the link weighs more.
+    """
+
+    joint: str
+    at_m: tuple[float, float, float]
+    most_kg: float
+    least_kg: float = 0.0
+
+    def parameter(self) -> Parameter:
+        """Return the payload: 0 without the optional term, as a gain and a mass are hard to separate."""
+        about = "mass in the hand, beyond that of the model"
+        more: dict[str, Any] = {"about": about, "free": False, "term": PAYLOAD, "off": 0.0}
+        return Parameter(PAYLOAD, "kg", 0.0, self.least_kg, self.most_kg, "linear", **more)
+
+
+class ServoModel(RobotModel):
+    """An MJCF on MJX with a position servo on each joint.
 
     Args:
+        mjcf: The model, whose hinges have the names of the servos' joints. Drives, friction and rotors are added.
+        step_s: Time step of the physics [s].
         dynamics: Returns the parameters; default: those of the servos, and the payload.
     """
 
     def __init__(
         self,
         servos: Servos,
-        make_task: Callable[[], GoalTask],
-        aim: Aim = NO_AIM,
+        mjcf: Path,
         hand: Hand | None = None,
+        *,
+        step_s: float = 0.0025,
+        tick_s: float = 0.01,
         dynamics: Callable[[], list[Parameter]] | None = None,
         causes: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
     ) -> None:
-        self.servos, self.make_task, self.aim, self.hand, self.causes = servos, make_task, aim, hand, causes
-        self._dynamics = dynamics
+        self.servos, self.mjcf, self.hand, self.causes = servos, mjcf, hand, causes
+        self.step_s, self.tick_s, self.lead_s, self._dynamics = step_s, tick_s, 0.5 * step_s, dynamics
+        # MuJoCo adds half a step for its leapfrog, as in the graph, and half a step because it uses setpoints of a
+        # step's end. In the graph a goal acts as its mean over a tick, so a profile starts up to a tick early.
+        self.export_lead_s = step_s - 0.25 * tick_s
         self.profile_rad_s = servos.sheet.profile_rad_s
         self.watched_terms = (PAYLOAD,) if hand else ()
 
-    @cached_property
-    def task(self) -> GoalTask:
-        """The composed task of this robot's world."""
-        task, mounted = self.make_task(), list(self.servos.gears)
-        if (built := [s.gear for s in task.robot.servos]) != mounted:
-            raise UsageError(
-                f"the model's servos have the gears {built}, the joints {mounted}",
-                hint="pass the joint to each part, not its name: `Servo(joint, axis, sheet)`",
-            )
-        return task
-
-    @property
-    def tick_s(self) -> float:
-        """The world's period [s]."""
-        return float(self.task.control_timestep)
-
-    @property
-    def lead_s(self) -> float:
-        """Half a step of the physics, which the world adds to the actuator's delay [s]."""
-        return 0.5 * float(self.task.physics_timestep)
-
-    @property
-    def export_lead_s(self) -> float:
-        """Time that C MuJoCo adds to the actuator's delay [s].
-
-        It is half a step for the leapfrog, as in the graph, plus half a step because MuJoCo uses setpoints of a step's
-        end, minus a quarter of a tick: in the graph a goal acts as its mean over a tick, so a profile starts up to a
-        tick early. docs/guides/export.md has the remaining error.
-        """
-        return 2 * self.lead_s - 0.25 * self.tick_s
-
     def dynamics(self) -> list[Parameter]:
-        """Return the parameters that may be identified, at their data sheet's values."""
         if self._dynamics is not None:
             return self._dynamics()
-        of_servos = parameters.parameters(self.servos.sheet, self.servos.joints)
+        of_servos = servo_parameters(self.servos.sheet, self.servos.joints)
         return [*of_servos, self.hand.parameter()] if self.hand else of_servos
 
-    def make_world(self, resumed: bool = False) -> PyTree:
-        """Return the world's node; ``resumed``: episodes begin in the middle of a recording."""
-        from sim2real.robots.servo.plain_world import servo_world  # record imports no physics
+    def make_world(self, resumed: bool = False) -> ServoWorld:
+        from sim2real.robots.servo.world import ServoWorld  # record imports no physics
 
-        fields, worn = self.fields(self.task), self.servos.sheet.worn
-        return servo_world(WORLD, self.task, fields, resumed, ACTUATOR, worn)
-
-    def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> WorldParams:
-        """Return the world's parameters for an episode."""
-        position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
-        return self._world_params.replace(values=self.place(values, start.aim), qpos=position, qvel=velocity)
-
-    def true_state(self, state: PyTree) -> PyTree:
-        """Return positions and velocities of all bodies' joints, and the servos' setpoints."""
-        return state.data.qpos, state.data.qvel, state.variables[REFERENCE]
-
-    def fields(self, task: GoalTask) -> Mapping[str, tuple[PyTree, str]]:
-        """Return the parts of the model that differ between copies: name -> (elements, attribute)."""
-        in_hand = self.hand.fields(task) if self.hand else {}
-        return {**parameters.fields(task.robot), **in_hand, **self.aim.elements(task)}
-
-    def place(self, values: Mapping[str, Scalar], aim: Array) -> dict[str, PyTree]:
-        """Return the arrays of ``fields`` for parameters by name and an aim ``(k,)``."""
         s = self.servos
-        of_servos = parameters.place(values, s.sheet, s.joints, self.task.physics_timestep)
-        in_hand = self.hand.place(values, self._world_params.values) if self.hand else {}
-        return {**of_servos, **in_hand, **self.aim.place(aim)}
+        profiles = [s.sheet.profile_rad_s / gear for gear in s.gears]
+        return ServoWorld(self.model, s.names, self.tick_s, profiles, resumed, s.sheet.stribeck_rad_s is not None)
+
+    def params(self, values: Mapping[str, Scalar], start: EpisodeStart) -> ServoParams:
+        from sim2real.robots.servo.world import ServoParams
+
+        model, (qpos_at, qvel_at) = self.model, self._places
+        position, velocity = (jnp.asarray(x, jnp.float32) for x in (start.position, start.velocity))
+        qpos = jnp.asarray(model.qpos0, jnp.float32).at[qpos_at].set(position)
+        qvel = jnp.zeros(model.nv, jnp.float32).at[qvel_at].set(velocity)
+        return ServoParams(self.fields(values), qpos, qvel, self._stribeck(values))
+
+    def true_state(self, state: ServoState) -> PyTree:
+        """Return positions and velocities of all joints, and the servos' setpoints."""
+        return state.data.qpos, state.data.qvel, state.reference
+
+    def fields(self, values: Mapping[str, Scalar]) -> dict[str, PyTree]:
+        """Return the fields of the compiled model that parameters set: field -> array."""
+        s, model, dofs = self.servos, self.model, self._places[1]
+        gear, full = np.array(s.gears, np.float32), s.sheet.full_rad
+        gain, damping, inertia, friction, limit_rad, offset = (
+            _each(values, name, s.joints, otherwise)
+            for name, otherwise in (*((name, None) for name in _NAMES), ("saturation", full), (OFFSET, 0.0))
+        )
+        # Motors and joints.
+        motors = self._motors
+        stiffness, most = gain * gear**2, gain * limit_rad * gear  # the torque limit is that at full duty
+        numbers: dict[str, PyTree] = {n: jnp.asarray(getattr(model, n), jnp.float32) for n in _SET}
+        numbers["actuator_gainprm"] = numbers["actuator_gainprm"].at[motors, 0].set(stiffness)
+        bias = numbers["actuator_biasprm"].at[motors, 0].set(gain * offset * gear)
+        numbers["actuator_biasprm"] = bias.at[motors, 1].set(-stiffness)
+        limits = most[:, None] * jnp.array([-1.0, 1.0])
+        numbers["actuator_forcerange"] = numbers["actuator_forcerange"].at[motors].set(limits)
+        numbers["dof_damping"] = numbers["dof_damping"].at[dofs].set(damping * gear**2)
+        armature = beside_damping(inertia, damping, self.step_s) * gear**2
+        numbers["dof_armature"] = numbers["dof_armature"].at[dofs].set(armature)
+        numbers["dof_frictionloss"] = numbers["dof_frictionloss"].at[dofs].set(friction * gear)
+        if self.hand is None:
+            return numbers
+        # The payload: mass and centre of the link that holds it.
+        link = int(model.jnt_bodyid[model.joint(self.hand.joint).id])
+        mass, centre = float(model.body_mass[link]), np.asarray(model.body_ipos[link])
+        payload = jnp.asarray(values.get(PAYLOAD, 0.0), jnp.float32)
+        total = mass + payload
+        middle = (mass * centre + payload * np.asarray(self.hand.at_m)) / total
+        masses, centres = (jnp.asarray(x, jnp.float32) for x in (model.body_mass, model.body_ipos))
+        return numbers | {"body_mass": masses.at[link].set(total), "body_ipos": centres.at[link].set(middle)}
 
     def identified_mjcf(self, values: Mapping[str, Scalar]) -> str:
-        """Return the robot's model with identified values, as MJCF."""
-        s, task = self.servos, self.task
-        mjcf = parameters.identified_mjcf(self._mjcf, task.robot, values, s.sheet, s.joints)
-        return self.hand.loaded(mjcf, task, values) if self.hand else mjcf
+        return converged(self._identified(values))
 
     def plain_simulation(self, values: Mapping[str, float]) -> PlainSimulation:
-        """Return the composed model with identified values, and the numbers of its servos."""
-        s, task = self.servos, self.task
-        spec = mj.MjSpec.from_string(self.identified_mjcf(values))
-        model = spec.compile()
-        joints = tuple(j.full_identifier for j in task.joints)
-        at = [(int(model.joint(j).qposadr[0]), int(model.joint(j).dofadr[0])) for j in joints]
-        numbers = {"profile_rad_s": np.array([min(x.profile_rad_s, _AT_ONCE) for x in task.robot.servos])}
-        if s.sheet.worn:
-            widths = np.full(model.nv, _AT_ONCE)
-            worn = parameters.of_joints(values, "stribeck", s.joints, _AT_ONCE)
-            for (_, dof), joint, width in zip(at, s.joints, worn, strict=True):
-                widths[dof] = float(width) / gear_of(joint)
+        s, model, (qpos_at, qvel_at) = self.servos, self.model, self._places
+        profiles = [min(s.sheet.profile_rad_s / gear, _NEVER) for gear in s.gears]
+        numbers = {"profile_rad_s": np.array(profiles)}
+        if (stribeck := self._stribeck(values)) is not None:
+            widths = np.full(model.nv, _NEVER)
+            widths[qvel_at] = np.minimum(np.asarray(stribeck), _NEVER)
             numbers["stribeck_rad_s"] = widths
 
         def begin(start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             qpos, qvel = model.qpos0.copy(), np.zeros(model.nv)
-            for (place, dof), position, speed in zip(at, *np.split(start, 2), strict=True):
-                qpos[place], qvel[dof] = position, speed
+            qpos[qpos_at], qvel[qvel_at] = np.split(start, 2)
             return qpos, qvel
 
-        return PlainSimulation(
-            converged(spec),
-            joints,
-            self.tick_s,
-            begin,
-            "setpoint",
-            numbers,
-            lead_s=self.lead_s,
-            velocity_lead_s=self.lead_s,
-        )
+        lead: dict[str, Any] = {"lead_s": self.lead_s, "velocity_lead_s": self.lead_s}
+        mjcf = self.identified_mjcf(values)
+        return PlainSimulation(mjcf, s.names, self.tick_s, begin, "setpoint", numbers, **lead)
 
     def following(self, values: Mapping[str, float]) -> Following:
         """Return how the joints follow their goals, with every payload that the hand can bear."""
-        hand, joints = self.hand, tuple(joint.full_identifier for joint in self.task.joints)
+        hand = self.hand
         loads = [{}] if hand is None else [{PAYLOAD: hand.least_kg}, {PAYLOAD: hand.most_kg}]
-        return identified_following([self.identified_mjcf({**values, **load}) for load in loads], joints)
+        return identified_following([self.identified_mjcf({**values, **load}) for load in loads], self.servos.names)
 
     def twin(self, emulator: BusEmulation, **factors: float) -> Embedded:
         """Return an emulated robot with this model's physics.
@@ -178,8 +197,8 @@ class ComposedModel(RobotModel):
         """
         s = self.servos
         arguments = {
-            "mjcf": self._mjcf,
-            "joints": {name: j.full_identifier for name, j in zip(s.names, self.task.joints, strict=True)},
+            "mjcf": self._spec().to_xml(),
+            "joints": {name: name for name in s.names},
             "gears": list(s.gears),
             "servo_ids": s.ids,
             "p_gain": s.sheet.p_gain,
@@ -188,11 +207,130 @@ class ComposedModel(RobotModel):
         emulator = replace(emulator, model_number=s.sheet.model_number)
         return Embedded("sim2real.emulation.servo_plant:TwinPlant", emulator, arguments)
 
-    @property
-    def _mjcf(self) -> str:
-        return self.task.root_entity.mjcf_model.root_model.to_xml_string()
+    @cached_property
+    def model(self) -> MjModel:
+        """The compiled model at the data sheet's values."""
+        return self._spec().compile()
 
     @cached_property
-    def _world_params(self) -> WorldParams:
-        with at_once():  # a cached array must not belong to the function that JAX traces now
-            return self.make_world().init_params()
+    def _places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the joints' positions and velocities in the model."""
+        numbers = [self.model.joint(name).id for name in self.servos.names]
+        return self.model.jnt_qposadr[numbers], self.model.jnt_dofadr[numbers]
+
+    @cached_property
+    def _motors(self) -> np.ndarray:
+        driven = self.model.actuator_trnid[:, 0].tolist()
+        return np.array([driven.index(self.model.joint(name).id) for name in self.servos.names])
+
+    def _stribeck(self, values: Mapping[str, Scalar]) -> PyTree:
+        """Return the speeds of joints at which 1/e of their friction is left [rad/s]; None: it is the same at all."""
+        if self.servos.sheet.stribeck_rad_s is None:
+            return None
+        gears = np.array(self.servos.gears, np.float32)
+        return _each(values, "stribeck", self.servos.joints, _NEVER) / gears
+
+    def _spec(self, stops: bool = False) -> MjSpec:
+        """Return the MJCF with a servo on each joint, and options that make its steps fast.
+
+        Args:
+            stops: Whether joints keep the file's ranges; the goals' limits keep a robot off its stops.
+        """
+        if not self.mjcf.is_file():
+            raise UsageError(f"there is no model {self.mjcf}", hint="an MJCF file beside robot.py")
+        spec: MjSpec = mj.MjSpec.from_file(str(self.mjcf))
+        there, sheet = {joint.name for joint in spec.joints}, self.servos.sheet
+        if lacking := [name for name in self.servos.names if name not in there]:
+            raise UsageError(f"{self.mjcf} has no joint {lacking[0]!r}. Available: {', '.join(sorted(there))}")
+        for name, gear in zip(self.servos.names, self.servos.gears, strict=True):
+            joint: Any = spec.joint(name)
+            joint.damping, joint.armature = [sheet.damping * gear**2, 0.0, 0.0], sheet.armature * gear**2
+            joint.frictionloss, joint.solref_friction, joint.solimp_friction = sheet.friction * gear, _SOON, _STOPS
+            joint.limited = joint.limited if stops else mj.mjtLimited.mjLIMITED_FALSE
+            motor: Any = spec.add_actuator(name=f"{name}_servo", target=name, trntype=mj.mjtTrn.mjTRN_JOINT)
+            stiffness = sheet.gain * gear**2
+            motor.gaintype, motor.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
+            motor.gainprm[0], motor.biasprm[1] = stiffness, -stiffness
+            motor.forcelimited, motor.forcerange = True, [-sheet.stall * gear, sheet.stall * gear]
+        option = spec.option
+        option.timestep, option.integrator = self.step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
+        # After two seconds one step of Newton's method is 0.8 mrad off a hundred of them, at a seventh of the time of
+        # training. Only joints that friction should hold shiver, by 0.05 rad/s, and creep: a deployment takes more.
+        option.iterations, option.ls_iterations = 1, 4
+        option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
+        return spec
+
+    def _identified(self, values: Mapping[str, Scalar]) -> MjSpec:
+        """Return the MJCF with identified values."""
+        spec, numbers = self._spec(stops=True), {n: np.asarray(x, np.float64) for n, x in self.fields(values).items()}
+        model = spec.compile()
+        for name, array in numbers.items():
+            if not name.startswith("body_"):
+                getattr(model, name)[...] = array
+        spec.copy_back(model)
+        if self.hand is not None:
+            # Of a body, the centre of mass counts, and the inertia about it stays.
+            link = int(model.jnt_bodyid[model.joint(self.hand.joint).id])
+            body: Any = spec.body(model.body(link).name)
+            body.explicitinertial, body.mass = True, float(numbers["body_mass"][link])
+            body.ipos, body.iquat = numbers["body_ipos"][link], model.body_iquat[link]
+            body.inertia, body.fullinertia = model.body_inertia[link], np.full(6, np.nan)
+        return spec
+
+
+_SET = (
+    *("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
+    *("dof_damping", "dof_armature", "dof_frictionloss"),
+)
+"""Fields of the model that the servos' parameters set."""
+
+
+def servo_parameters(
+    sheet: DataSheet, joints: Sequence[Joint | str], own: Sequence[str] = ("friction",)
+) -> list[Parameter]:
+    """Return gain, damping, rotor inertia and friction, bounded to factors of 3 to 10 of the data sheet.
+
+    If friction decreases with speed, the width of this decrease, ``stribeck``, is a parameter.
+
+    Args:
+        own: Quantities with a value for each joint, named as ``friction_JOINT``; joints share the others.
+    """
+    table = {
+        "gain": ("N m/rad", sheet.gain, 3, "torque per error, at the P gain in use"),
+        "damping": ("N m s/rad", sheet.damping, 4, "back-EMF, viscous friction"),
+        "armature": ("kg m^2", sheet.armature, 4, "rotor behind the gears"),
+        "friction": ("N m", sheet.friction, 8, "dry friction"),
+        "stribeck": ("rad/s", sheet.stribeck_rad_s, 10, "speed at which 1/e of the dry friction is left"),
+    }
+    return [
+        Parameter(label, unit, value, value / factor, value * factor, about=about, vanishes=name in _NAMES[1:])
+        for name, (unit, value, factor, about) in table.items()
+        if value is not None
+        for label in ([f"{name}_{name_of(joint)}" for joint in joints] if name in own else [name])
+    ]
+
+
+def goal_offsets(joints: Sequence[Joint | str]) -> list[Parameter]:
+    """Return the offset of each servo from its goals, for ``dynamics``."""
+    about, most = "rest position without load, from its goal", _MOST_OFFSET_RAD
+    names = [f"{OFFSET}_{name_of(joint)}" for joint in joints]
+    return [Parameter(name, "rad", 0.0, -most, most, "linear", about=about) for name in names]
+
+
+def friction_causes(joints: Sequence[Joint | str]) -> dict[str, dict[str, float]]:
+    """Return the causes that change parameters of all joints: the temperature of grease and gears changes friction."""
+    return {"friction": {f"friction_{name_of(joint)}": 1.0 for joint in joints}}
+
+
+def _each(values: Mapping[str, Scalar], name: str, joints: Sequence[Joint | str], otherwise: float | None) -> PyTree:
+    """Return the value of every joint's servo ``(joints,)``: its own, otherwise the shared one.
+
+    Args:
+        name: Such as ``gain``; a joint's own is ``gain_JOINT``.
+        otherwise: The value without both; None: a missing value is an error.
+    """
+    shared = values.get(name, otherwise)
+    entries = {f"{name}_{name_of(joint)}": values.get(f"{name}_{name_of(joint)}", shared) for joint in joints}
+    if lacking := [label for label, value in entries.items() if value is None]:
+        raise KeyError(lacking[0])
+    return jnp.stack([jnp.asarray(value, jnp.float32) for value in entries.values()])

@@ -9,10 +9,10 @@ import numpy as np
 from sim2real.arrays import namespace
 from sim2real.graph.node import NodeOptions
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.loop import AGENT, SENSOR
+from sim2real.robots.agent import AgentParams, GoalAgent
+from sim2real.robots.loop import AGENT
 from sim2real.robots.messages import EpisodeStart, JointReading
 from sim2real.robots.robot import RobotAgent
-from sim2real.robots.servo.agent import AgentParams, GoalAgent
 from sim2real.robots.servo.servos import Servos
 from sim2real.robots.servo.task import NO_AIM, Aim
 from sim2real.types import Array, PyTree
@@ -59,7 +59,7 @@ class ServoAgent(RobotAgent):
     def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> GoalAgent:
         """Return the policy's node."""
         s, aims = self._servos, len(self._aim.entries)
-        return GoalAgent(AGENT, rate_hz, s.low, s.high, self.observe, self.history, aims, SENSOR, **options)
+        return GoalAgent(AGENT, rate_hz, s.low, s.high, self.observe, self.history, aims, **options)
 
     def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
         """Return the node's parameters: goals start at the joints' positions."""

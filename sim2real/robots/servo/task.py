@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from sim2real.graph.base import GraphState
 from sim2real.later import jax, jnp
-from sim2real.robots.loop import Draw
+from sim2real.robots.loop import AGENT, WORLD, Draw
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotTask
 from sim2real.robots.servo.servos import Servos
@@ -24,14 +26,10 @@ class Aim:
         entries: Name and unit of each of the k entries.
         draw: Returns the aim of an episode ``(k,)``: of training for a key of JAX, of a trial for its number; see
             ``uniform``.
-        elements: Returns the parts of the composed task that an aim sets: name -> (elements, attribute).
-        place: Returns the arrays of ``elements`` for an aim ``(k,)``.
     """
 
     entries: tuple[tuple[str, str], ...]
     draw: Callable[[Key | int], Array]
-    elements: Callable[[PyTree], Mapping[str, tuple[PyTree, str]]] = lambda task: {}
-    place: Callable[[Array], dict[str, Array]] = lambda aim: {}
 
 
 def uniform(key: Key | int, low: PyTree, high: PyTree) -> Array:
@@ -49,25 +47,39 @@ NO_AIM = Aim((), lambda key: np.zeros(0, np.float32))
 """The aim of a task that is the same in every episode."""
 
 
+class ServoMoment(NamedTuple):
+    """What a reward sees after a policy step.
+
+    Attributes:
+        position: Of the joints ``(joints,)`` [rad].
+        velocity: Of the joints ``(joints,)`` [rad/s].
+        aim: The episode's aim ``(k,)``.
+    """
+
+    position: Array
+    velocity: Array
+    aim: Array
+
+
 class AimTask(RobotTask):
-    """A composed task's reward, from random aims and starts: half of the episodes start at rest.
+    """A task with random aims and starts: half of the episodes start at rest.
 
     Args:
-        success: Returns whether a state of the world fulfils the task, bool.
+        reward: Returns the reward of a moment; a penalty on the goals' speed is added.
+        success: Returns whether the task is fulfilled, bool.
         score: Returns figures of a deployment; see ``RobotTask.score``.
-        reward: Returns the reward of a state and an action; default: the composed task's, minus a penalty on speed.
     """
 
     def __init__(
         self,
         servos: Servos,
         aim: Aim,
-        success: Callable[[PyTree], jax.Array],
+        reward: Callable[[ServoMoment], jax.Array],
+        success: Callable[[ServoMoment], jax.Array],
         score: Callable[[np.ndarray, Mapping[str, np.ndarray]], dict[str, float]],
-        reward: Callable[[PyTree, jax.Array], Rewards] | None = None,
     ) -> None:
         self._servos, self.aim = servos, aim
-        self._success, self._score, self._reward = success, score, reward
+        self._reward, self._success, self._score = reward, success, score
 
     def random(self, key: Key, draw: Draw) -> tuple[dict[str, PyTree], EpisodeStart]:
         """Return values and a start: half of the starts are at rest, half at any position."""
@@ -79,7 +91,6 @@ class AimTask(RobotTask):
         return values, EpisodeStart(position, jnp.zeros_like(position), self.aim.draw(k_aim))
 
     def at_rest(self, trial: int) -> EpisodeStart:
-        """Return the start at rest with the aim of a trial."""
         rest = self._servos.at_rest
         return EpisodeStart(rest, np.zeros_like(rest), self.aim.draw(trial))
 
@@ -89,16 +100,15 @@ class AimTask(RobotTask):
         position = jnp.clip(start.position + position, low, high)
         return start.replace(position=position, velocity=start.velocity + velocity)
 
-    def reward(self, state: PyTree, action: jax.Array) -> Rewards:
-        """Return the reward of a policy step."""
-        if self._reward is not None:
-            return self._reward(state, action)
-        return {"task": state.reward, "speed": -0.01 * jnp.mean((action / self._servos.speed) ** 2)}
+    def judged(self, graph_state: GraphState) -> ServoMoment:
+        state = graph_state.state[WORLD]
+        return ServoMoment(state.position, state.velocity, jnp.asarray(graph_state.params[AGENT].aim))
 
-    def success(self, state: PyTree) -> jax.Array:
-        """Return whether the task is fulfilled, bool."""
+    def reward(self, state: ServoMoment, action: jax.Array) -> Rewards:
+        return {"task": self._reward(state), "speed": -0.01 * jnp.mean((action / self._servos.speed) ** 2)}
+
+    def success(self, state: ServoMoment) -> jax.Array:
         return self._success(state)
 
     def score(self, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return figures of how well a deployment went."""
         return self._score(t_s, states)

@@ -1,4 +1,4 @@
-"""The policy's node of a walking robot: IMU, encoders, last actions and the command; its actions are joint targets."""
+"""The policy of a walking robot: IMU, encoders, last actions and the command; its actions are joint targets."""
 
 from __future__ import annotations
 
@@ -6,49 +6,25 @@ from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Unpack
 
-import jax.numpy as jnp
 import numpy as np
 
-from sim2real import pytree
 from sim2real.arrays import namespace
-from sim2real.graph.base import Base, GraphState, StepState
-from sim2real.graph.node import BaseNode, NodeOptions
+from sim2real.graph.base import GraphState, StepState
+from sim2real.graph.node import NodeOptions
 from sim2real.policy.contract import ActionTerm, ObservationTerm
-from sim2real.robots.loop import AGENT, SENSOR
+from sim2real.robots.agent import AgentParams, PolicyAgent
+from sim2real.robots.loop import AGENT
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.robot import RobotAgent
-from sim2real.robots.servo.agent import AgentParams, decide, first_carry
 from sim2real.robots.walking.commands import Commands
 from sim2real.robots.walking.messages import BodyReading, WalkDecision, gravity_of
 from sim2real.types import Array, Key, PyTree
 
 
-@pytree.dataclass
-class WalkingState(Base):
-    """The agent's state.
+class WalkingNode(PolicyAgent):
+    """Sends joint targets around the stance.
 
-    Attributes:
-        last: Shape ``(joints,)``: the last action.
-        before: Shape ``(joints,)``: the action before that one.
-        past: Shape ``(history, features)``: the last observations without the command, newest first.
-        carry: State of a policy with memory.
-    """
-
-    last: Array
-    before: Array
-    past: Array
-    carry: PyTree = ()
-
-
-def features(reading: BodyReading, stance: np.ndarray, last: Array) -> Array:
-    """Return what the policy gets of a reading: gyro, gravity, joints beside the stance, then its last action."""
-    xp = namespace(reading.position, last)
-    parts = [reading.gyro, gravity_of(reading.quaternion), reading.position - stance, reading.velocity, last]
-    return xp.concatenate(parts).astype(np.float32)
-
-
-class WalkingNode(BaseNode):
-    """Sends joint targets around the stance; ``step`` draws them from a policy in JAX.
+    Its features are gyro, gravity, joints beside the stance, and the last action. The history has features alone.
 
     Args:
         stance: Shape ``(joints,)``: targets of the action 0 [rad].
@@ -58,67 +34,43 @@ class WalkingNode(BaseNode):
 
     def __init__(
         self,
-        name: str,
         rate: float,
         stance: np.ndarray,
         scale: float,
         history: int,
         commands: Commands,
-        sensor: str = SENSOR,
         **options: Unpack[NodeOptions],
     ) -> None:
-        super().__init__(name, rate, **options)
-        self._stance, self._scale, self._history = np.asarray(stance, np.float32), scale, history
-        self._commands, self._sensor = commands, sensor
+        super().__init__(AGENT, rate, len(stance), history, (6 + 3 * len(stance),), **options)
+        self._stance, self._scale, self._commands = np.asarray(stance, np.float32), np.float32(scale), commands
 
     def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> AgentParams:
         """Return parameters without a policy: the robot stands."""
-        del rng, graph_state
-        return AgentParams(aim=jnp.zeros(self._commands.size), start=jnp.asarray(self._stance))
+        return AgentParams(aim=np.zeros(self._commands.size, np.float32), start=self._stance)
 
-    def init_state(self, rng: Key | None = None, graph_state: GraphState | None = None) -> WalkingState:
-        """Return a state without any past."""
-        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        zeros = jnp.zeros(len(self._stance))
-        past = jnp.zeros((self._history, 6 + 3 * len(self._stance)))
-        return WalkingState(zeros, zeros, past, first_carry(params.policy))
-
-    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> WalkDecision:
-        """Return the targets at the start, and no velocity."""
-        params = (graph_state or GraphState()).params.get(self.name) or self.init_params(rng)
-        return WalkDecision(jnp.asarray(params.start, jnp.float32), jnp.zeros(3))
-
-    def command(self, step_state: StepState) -> Array:
+    def commanded(self, step_state: StepState) -> Array:
         """Return the commanded velocity ``(3,)`` of a step: forwards, to the left [m/s], yaw rate [rad/s]."""
         return self._commands.at(step_state.params.aim, step_state.seq / self.rate)
 
-    def observe(self, step_state: StepState) -> Array:
-        """Return the policy's observation: the newest features, the command, then earlier features."""
-        now, state = self._now(step_state), step_state.state
-        xp = namespace(now, state.past)
-        return xp.concatenate([now, self.command(step_state), state.past.ravel()]).astype(np.float32)
+    def features(self, reading: BodyReading, step_state: StepState) -> Array:
+        last = step_state.state.last
+        parts = [reading.gyro, gravity_of(reading.quaternion), reading.position - self._stance, reading.velocity, last]
+        return namespace(reading.position, last).concatenate(parts).astype(np.float32)
 
-    def act(self, step_state: StepState, action: Array) -> tuple[StepState, WalkDecision]:
-        """Return the new step state and the message for an action ``(joints,)``."""
-        now, state = self._now(step_state), step_state.state
-        xp = namespace(action, now, state.past)
-        past = xp.concatenate([now[None], state.past])[: self._history]
-        action = xp.asarray(action, np.float32)
-        new = state.replace(last=action, before=state.last, past=past)
-        targets = self._stance + np.float32(self._scale) * action
-        return step_state.replace(state=new), WalkDecision(targets, xp.asarray(self.command(step_state), np.float32))
+    def shown(self, features: Array, step_state: StepState) -> Array:
+        return namespace(features).concatenate([features, self.commanded(step_state)])
 
-    def step(self, step_state: StepState) -> tuple[StepState, WalkDecision]:
-        """Make a step with the policy's action."""
-        policy, state = step_state.params.policy, step_state.state
-        if policy is None:
-            return self.act(step_state, jnp.zeros_like(self._stance))
-        carry, action = decide(policy, state.carry, self.observe(step_state))
-        return self.act(step_state.replace(state=state.replace(carry=carry)), action)
+    def command(self, before: Array, action: Array) -> Array:
+        return self._stance + self._scale * action
 
-    def _now(self, step_state: StepState) -> Array:
-        reading: BodyReading = step_state.inputs[self._sensor][-1].data
-        return features(reading, self._stance, step_state.state.last)
+    def message(self, command: Array, step_state: StepState) -> WalkDecision:
+        commanded = self.commanded(step_state)
+        return WalkDecision(command, namespace(commanded).asarray(commanded, np.float32))
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> WalkDecision:
+        """Return the targets at the start, and no velocity."""
+        start = self._params(graph_state).start
+        return WalkDecision(namespace(start).asarray(start, np.float32), np.zeros(3, np.float32))
 
 
 class WalkingAgent(RobotAgent):
@@ -145,8 +97,7 @@ class WalkingAgent(RobotAgent):
         self.action = tuple(ActionTerm(name, "1", -1.0, 1.0) for name in joints)
 
     def make(self, rate_hz: float, **options: Unpack[NodeOptions]) -> WalkingNode:
-        """Return the policy's node."""
-        return WalkingNode(AGENT, rate_hz, self._stance, self._scale, self._history, self._commands, **options)
+        return WalkingNode(rate_hz, self._stance, self._scale, self._history, self._commands, **options)
 
     def params(self, start: EpisodeStart, policy: PyTree) -> AgentParams:
         """Return the node's parameters for an episode: its commands are the aim."""

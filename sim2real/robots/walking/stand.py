@@ -16,9 +16,9 @@ from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter, ParameterTable
-from sim2real.robots.from_model.encoders import EncoderParams, Encoders
-from sim2real.robots.from_model.mjcf import driven_spec, read_spec
 from sim2real.robots.loop import ACTUATOR, SENSOR, WORLD, DelayParams, delay_of, delay_parameters, recorded_loop
+from sim2real.robots.model.drives import EncoderParams, Encoders, driven_spec
+from sim2real.robots.model.file import read_spec
 from sim2real.robots.walking.joints import STRENGTH, JointParameters
 from sim2real.robots.walking.messages import gravity_of
 from sim2real.types import Array, Key, MjModel, PyTree, Scalar

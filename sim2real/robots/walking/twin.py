@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
-from sim2real.robots.walking.agent import features
+from sim2real.graph.base import GraphState, StepState
+from sim2real.policy.runner import Runner
+from sim2real.robots.loop import AGENT, DELAYS, SENSOR
+from sim2real.robots.nodes import in_numpy
+from sim2real.robots.robot import Robot
+from sim2real.robots.walking.body import HiddenTwin as HiddenTwin
+from sim2real.robots.walking.body import LeggedBody
+from sim2real.robots.walking.joints import STRENGTH as MOTOR_STRENGTH
 from sim2real.robots.walking.messages import BodyReading, gravity_of, into_base
-from sim2real.robots.walking.plain.hidden import HiddenTwin as HiddenTwin
-from sim2real.robots.walking.plain.hidden import hidden_spec, hide
+from sim2real.robots.walking.model import FRICTION, PAYLOAD, STRENGTH
 from sim2real.robots.walking.robot import ComposedRobot
-from sim2real.robots.walking.terrain import FLOOR
 
 _mj: Any = mujoco
 STEP_S = 0.002
@@ -59,26 +65,13 @@ class Twin:
     ) -> None:
         self.robot, self.hidden = robot, hidden or HiddenTwin()
         self._rng = np.random.default_rng(seed)
-        spec = hidden_spec(robot.mjcf, STEP_S)
         self._rough = robot.terrain.even(roughness_m, seed, _REACH_M) if roughness_m else None
-        if self._rough is not None:
-            (rows, columns), share = self._rough.heights.shape, self._rough.heights / roughness_m
-            spec.add_hfield(name="ground", nrow=rows, ncol=columns, size=self._rough.size, userdata=share.ravel())
-            floor = spec.geom(FLOOR)
-            floor.type, floor.hfieldname = _mj.mjtGeom.mjGEOM_HFIELD, "ground"
-        self.model = spec.compile()
-        hide(self.model, int(self.model.jnt_bodyid[0]), self.hidden)
-        self.data = _mj.MjData(self.model)
-        self.reset()
-
-    def reset(self) -> None:
-        """Place the robot in its stance."""
-        stance = np.asarray(self.robot.stance)
-        _mj.mj_resetData(self.model, self.data)
         bumps_m = 0.0 if self._rough is None else float(self._rough.heights.max())
-        self.data.qpos[:7] = (0, 0, self.robot.height_m + bumps_m, 1, 0, 0, 0)
-        self.data.qpos[7:], self.data.ctrl[:], self.sent = stance, stance, stance
-        _mj.mj_forward(self.model, self.data)
+        how: dict[str, Any] = {"step_s": STEP_S, "settle_s": 0.0, "ground": self._rough}
+        height_m = robot.height_m + bumps_m
+        self.body = LeggedBody(robot.mjcf, robot.feet, robot.stance, height_m, self.hidden, **how)
+        self.model, self.data = self.body.model, self.body.data
+        self._drive(np.asarray(robot.stance))
         late = round(self.hidden.sensing_s / STEP_S)
         self._past = deque([self._measured()] * (late + 1), maxlen=late + 1)
         self._coming: deque[tuple[float, np.ndarray]] = deque()
@@ -87,8 +80,7 @@ class Twin:
         """Return the measurement that has arrived, with noise."""
         reading, noise = self._past[0], {n: size for n, (size, _) in self.robot.noise.items()}
         exact = {n: np.asarray(getattr(reading, n)) for n in noise}
-        reading = reading.replace(**{n: x + noise[n] * self._rng.normal(size=len(x)) for n, x in exact.items()})
-        return reading.replace(position=reading.position + self.hidden.bias_rad)
+        return reading.replace(**{n: x + noise[n] * self._rng.normal(size=len(x)) for n, x in exact.items()})
 
     def send(self, goal: np.ndarray) -> None:
         """Send joint targets ``(joints,)`` [rad], which arrive later."""
@@ -99,8 +91,8 @@ class Twin:
         """Step the physics."""
         for _ in range(round(seconds / STEP_S)):
             while self._coming and self._coming[0][0] <= self.data.time + 1e-9:
-                self.data.ctrl[:] = self._coming.popleft()[1]
-            _mj.mj_step(self.model, self.data)
+                self._drive(self._coming.popleft()[1])
+            self.body.step()
             self._past.append(self._measured())
 
     def push(self, size_m_s: float) -> None:
@@ -125,9 +117,14 @@ class Twin:
         sites = [self.model.site(name).id for name in self.robot.feet]
         return links + [(data.xpos[self.model.site_bodyid[s]].copy(), data.site_xpos[s].copy()) for s in sites]
 
+    def _drive(self, goal: np.ndarray) -> None:
+        self.sent, (kp, kd) = goal, self.robot.gains
+        none = np.zeros_like(goal)
+        self.body.drive(np.stack([goal, none, none + kp, none + kd, none], axis=1))
+
     def _measured(self) -> BodyReading:
         q, v = self.data.qpos, self.data.qvel
-        return BodyReading(q[7:].copy(), v[6:].copy(), q[3:7].copy(), v[3:6].copy())
+        return BodyReading(q[7:] + self.hidden.bias_rad, v[6:].copy(), q[3:7].copy(), v[3:6].copy())
 
 
 def walk(
@@ -139,7 +136,7 @@ def walk(
     every_s: float = 5.0,
     shown: Callable[[Twin, float], None] | None = None,
 ) -> Walked:
-    """Let a bundle's runner walk on a twin, in numpy.
+    """Let a bundle's runner walk on a twin, in numpy, as the agent's node does.
 
     Args:
         command: Time -> commanded velocity ``(3,)``.
@@ -147,20 +144,21 @@ def walk(
         shown: Called after each policy step.
     """
     robot, period_s = twin.robot, 1.0 / twin.robot.rate_hz
-    stance, steps = np.asarray(robot.stance, np.float32), round(seconds * robot.rate_hz)
-    last, past = np.zeros(len(stance), np.float32), np.zeros((robot.history, 6 + 3 * len(stance)), np.float32)
+    steps = round(seconds * robot.rate_hz)
+    node: Any = robot.agent.make(robot.rate_hz)
+    node.commanded = lambda step_state: np.asarray(command(step_state.seq * period_s), np.float32)
+    params = in_numpy(node.init_params())
+    state = in_numpy(node.init_state(None, GraphState(params={AGENT: params})))
     velocity, wanted, qpos = np.zeros((steps, 3)), np.zeros((steps, 3)), np.zeros((steps, twin.model.nq))
     changed_s, fell_s = 0.0, None
     settled = np.zeros(steps, bool)
     for i in range(steps):
         t_s = i * period_s
-        # Observe and act as the agent's node does.
-        now = features(twin.read(), stance, last)
-        wanted[i] = command(t_s)
-        observation = np.concatenate([now, wanted[i], past.ravel()]).astype(np.float32)
-        past = np.concatenate([now[None], past])[: robot.history]
-        last = np.asarray(runner(observation), np.float32)
-        twin.send(stance + robot.scale * last)
+        heard: Any = {SENSOR: [SimpleNamespace(data=twin.read())]}
+        step_state: Any = StepState(state=state, params=params, inputs=heard, seq=i)
+        after, decision = node.act(step_state, np.asarray(runner(node.observe(step_state)), np.float32))
+        state, wanted[i] = after.state, decision.aim
+        twin.send(decision.q)
         twin.advance(period_s)
         # Judge by the true motion; what follows a new command or a push does not count as an error.
         velocity[i, :2] = into_base(twin.data.qpos[3:7], twin.data.qvel[:3])[:2]
@@ -181,3 +179,59 @@ def walk(
     error = np.stack([np.convolve(velocity[:, k] - wanted[:, k], window, "same") for k in range(3)], axis=-1)
     error = error[settled] if settled.any() else np.full((1, 3), np.nan)  # too short to settle
     return Walked(fell_s, float(np.hypot(error[:, 0], error[:, 1]).mean()), float(np.abs(error[:, 2]).mean()), qpos)
+
+
+# -- beside a deployment
+
+
+def plain_episodes(
+    robot: Robot, policy: Runner, values: Mapping[str, float] | None, trials: Sequence[int], duration_s: float
+) -> list[tuple[np.ndarray, dict[str, np.ndarray]]] | None:
+    """Return episodes of a policy: times ``(N,)`` [s] and columns ``(N,)``; None for a robot that does not walk.
+
+    The graph of a walking robot takes more than ten minutes to compile on a processor, so C MuJoCo simulates it.
+
+    Args:
+        values: Parameters and delays by name; None: nominal ones.
+        trials: The trial of each episode.
+    """
+    if not isinstance(robot, ComposedRobot):
+        return None
+    return [_episode(robot, policy, {**robot.nominal(), **(values or {})}, n, duration_s) for n in trials]
+
+
+def twin_of(robot: ComposedRobot, values: Mapping[str, float], seed: int = 0) -> Twin:
+    """Return the twin with parameters and delays by name; the policy's computation adds to the actuator's delay."""
+    joints = robot.model.joints
+    hidden = HiddenTwin(
+        friction=values[FRICTION],
+        load_kg=values[PAYLOAD],
+        strength=np.asarray(values[STRENGTH] * joints.of_motor(values, MOTOR_STRENGTH)),
+        damping=np.asarray(joints.of_group(values, "damping")),
+        dry=np.asarray(joints.of_group(values, "friction")),
+        armature=np.asarray(joints.of_group(values, "armature")),
+        sensing_s=values[DELAYS[0]],
+        acting_s=values[DELAYS[1]] + robot.drive.expected_delay_s[1],
+        bias_rad=np.zeros(len(robot.joints)),
+    )
+    return Twin(robot, hidden, seed)
+
+
+def _episode(
+    robot: ComposedRobot, policy: Runner, values: Mapping[str, float], trial: int, duration_s: float
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return times ``(N,)`` [s] and columns ``(N,)`` of a trial, up to a fall."""
+    twin, drawn, times, rows = twin_of(robot, values, trial), robot.commands.of_trial(trial), [], []
+
+    def commanded(t_s: float) -> np.ndarray:
+        return np.asarray(robot.commands.at(drawn, t_s))
+
+    def shown(twin: Twin, t_s: float) -> None:
+        told = {"aim": commanded(t_s), "command": twin.sent}
+        columns = {f"{name}[{i}]": float(x) for name, values in told.items() for i, x in enumerate(values)}
+        times.append(t_s + 1.0 / robot.rate_hz)
+        rows.append({**twin.body.state(), **columns})
+
+    policy.reset()
+    walk(twin, policy, commanded, duration_s, shown=shown)
+    return np.array(times), {name: np.array([row[name] for row in rows]) for name in rows[0]}

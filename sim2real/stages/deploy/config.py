@@ -36,7 +36,8 @@ class DeployConfig:
     delay_tolerance_s: float = 0.008
     """Largest distance of the measured delay from the delays of training [s]."""
     force: bool = False
-    """Deploy with a warning if the measured delay is none of the delays of training."""
+    """Deploy with a warning if the measured delay is none of the delays of training, or the policy is of a robot on
+    another kind of port."""
     hold: bool = False
     """Hold the robot at the end of an episode, or after Ctrl-C, until Enter is pressed: it may fall without torque."""
     dry_run: bool = False

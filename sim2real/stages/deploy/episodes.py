@@ -1,19 +1,26 @@
 """The episodes of a deployment on the robot: open it, measure its delay, run the policy."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from sim2real.artifacts.bundle import Bundle
+from sim2real.artifacts.deployment import PROBE
+from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.recording import TRUTH
-from sim2real.errors import UsageError
+from sim2real.errors import DelayChanged, UsageError
+from sim2real.graph.episode import StepRecord
 from sim2real.hardware.safety.following import Following
+from sim2real.log.writer import McapRecorder
+from sim2real.policy.contract import PolicyContract
 from sim2real.policy.runner import BlendedRunner, UprightRunner
-from sim2real.robots.probe import Witness
+from sim2real.robots.loop import ACTUATOR, SENSOR
+from sim2real.robots.probe import StepAnswers, Witness, measure_delay
 from sim2real.robots.robot import Robot, Session
 from sim2real.stages.deploy.config import DeployConfig
-from sim2real.stages.deploy.preflight import check_delay
-from sim2real.stages.deploy.probe_log import write_probe
 from sim2real.stages.live.scene import scene_of
 from sim2real.stages.live.viewer import live_view
 from sim2real.stages.on_robot.episode import check_deadlines, run_episode
@@ -63,12 +70,6 @@ def check_timing(summaries: Sequence[Mapping[str, Json]], config: DeployConfig) 
             check_deadlines(summary)
 
 
-def require_tilt(robot: Robot, config: DeployConfig) -> None:
-    """Refuse a limit of the tilt for a robot that does not measure its tilt."""
-    if config.max_tilt_rad is not None and robot.agent.tilt_rad is None:
-        raise UsageError("this robot does not measure its tilt", hint="run without --max-tilt-rad, or set tilt_rad")
-
-
 def _policy_runner(bundle: Bundle, robot: Robot, config: DeployConfig) -> PolicyRunner:
     """Return the policy's runner. Its actions grow during ``blend_s``, and a limit of the tilt stops the robot."""
     blended = BlendedRunner(bundle.runner(config.backend), config.blend_s)
@@ -88,7 +89,7 @@ def _measure_delay(
     try:
         return check_delay(robot, witness, bundle.contract, config)
     finally:
-        write_probe(folder, pipeline, robot, witness)
+        _write_probe(folder, pipeline, robot, witness)
 
 
 def _run_one(
@@ -109,3 +110,103 @@ def _run_one(
         robot.drive.prepare(session, config.settle_s)
     nodes, params = robot.deployment_nodes(session, policy, trial)
     return run_episode(pipeline, robot, session, nodes, params, log, config.duration_s, config, "deploy", config.hold)
+
+
+# -- the test of the delay, and its log: the model is tested on it as on an episode
+
+
+def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config: DeployConfig) -> dict[str, str]:
+    """Measure the robot's delay with small steps, and refuse a policy that was not trained with it.
+
+    Args:
+        witness: Holds the open robot, at rest and without torque; records the commands and the measurements.
+
+    Returns:
+        Lines of the summary.
+
+    Raises:
+        DelayChanged: The delay, or its variation, lies outside of the range in training.
+        Sim2RealError: The robot does not answer.
+    """
+    if not config.measure_delay or config.dry_run or robot.drive.probe is None:
+        return {}
+    if (trained := contract.trained_s.get(ROUND_TRIP)) is None:
+        note("warning: the bundle does not list the delays of its training, so the robot's delay is not measured")
+        return {}
+    # A busy machine may delay single steps, so a misfit is measured a second time.
+    answers = measure_delay(witness, robot.drive.probe)
+    if misfit(answers, trained, config.delay_tolerance_s):
+        witness.rig.wait_until_still(config.settle_s)
+        more = measure_delay(witness, robot.drive.probe).delays_s
+        answers = replace(answers, delays_s=np.append(answers.delays_s, more))
+    measured = f"{1e3 * answers.delay_s:.0f} ms, the middle half within {1e3 * answers.jitter_s:.0f} ms"
+    if reason := misfit(answers, trained, config.delay_tolerance_s):
+        message = f"the delay is {measured}: {reason}"
+        if not config.force:
+            raise DelayChanged(
+                message,
+                hint="record, identify and train again, or see where the delay is in the report of a recording; to "
+                "deploy all the same: --force",
+            )
+        note(f"warning: {message}")
+    return {"measured delay": measured}
+
+
+def misfit(answers: StepAnswers, trained: tuple[float, float], tolerance_s: float) -> str | None:
+    """Return why a measured delay is none of the delays in training; None if it is one of them.
+
+    Args:
+        trained: Shortest and longest delay of the training [s].
+        tolerance_s: Allowed distance from these, and allowed additional variation [s].
+    """
+    low, high = trained
+    shortest, longest = answers.between_s
+    if not (longest >= low - tolerance_s and shortest <= high + tolerance_s):
+        return f"the policy was trained with {1e3 * low:.0f} to {1e3 * high:.0f} ms"
+    if answers.jitter_s > high - low + tolerance_s:
+        return f"the policy was trained with delays that vary by {1e3 * (high - low):.0f} ms"
+    return None
+
+
+def _write_probe(folder: Path, pipeline: Pipeline, robot: Robot, witness: Witness) -> Path | None:
+    """Write the commands and measurements of the steps at the robot's rate; return the log.
+
+    The steps ran faster than that. The log omits the measurements in between, so that a second of it weighs as much as
+    a second of any other log, and it omits repeated commands.
+
+    Returns:
+        None if no step was made.
+    """
+    if not witness.measured or not witness.sent:
+        return None
+    # Select the measurements and commands at the robot's rate; a command that changes is always selected.
+    sensor, actuator = SENSOR, ACTUATOR
+    period_ns, start_ns = round(1e9 / robot.rate_hz), min(witness.measured[0][0], witness.sent[0][0])
+    measured = _apart([begin_ns for begin_ns, *_ in witness.measured], period_ns)
+    changed = [i == 0 or not np.array_equal(goal, witness.sent[i - 1][2]) for i, (*_, goal) in enumerate(witness.sent)]
+    sent = _apart([begin_ns for begin_ns, *_ in witness.sent], period_ns, changed)
+    # Write them as steps of the sensor and the actuator.
+    outputs = {sensor: robot.sensor.at_rest, actuator: robot.drive.message(np.zeros(len(robot.agent.action)))}
+    graph = {n: {"rate_hz": robot.rate_hz, "delay_s": 0.0, "inputs": {}} for n in outputs}
+    metadata = {"pipeline": pipeline.name, "dry_run": False, "graph": graph, "probe": True}
+    joints, units = {sensor: robot.sensor.joints}, dict.fromkeys(outputs, robot.units)
+    recorder = McapRecorder(folder / PROBE, metadata, {}, outputs, [], joints, units)
+    recorder.start(0, start_ns)
+    rows = [
+        (sensor, k, *witness.measured[i][:2], robot.sensor.read(witness.measured[i][2])) for k, i in enumerate(measured)
+    ]
+    rows += [(actuator, k, *witness.sent[i][:2], robot.drive.message(witness.sent[i][2])) for k, i in enumerate(sent)]
+    for node, seq, *times_ns, output in rows:
+        begin, end = ((t_ns - start_ns) // 1000 for t_ns in times_ns)
+        recorder.step(StepRecord(node, seq, begin, begin, begin, -1, end, 0), output)
+    recorder.close("finished", 0, {})
+    return folder / PROBE
+
+
+def _apart(times_ns: list[int], period_ns: int, always: list[bool] | None = None) -> list[int]:
+    """Return the indices of times that are at least a period apart, and of those that ``always`` marks."""
+    selected: list[int] = []
+    for i, t_ns in enumerate(times_ns):
+        if not selected or t_ns - times_ns[selected[-1]] >= period_ns or (always is not None and always[i]):
+            selected.append(i)
+    return selected

@@ -1,4 +1,4 @@
-"""Checks before a deployment: the bundle fits the robot; the robot's delay is one of those in training."""
+"""Checks before a deployment: the bundle is of this robot, and fits it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,19 +6,17 @@ from pathlib import Path
 import numpy as np
 
 from sim2real.artifacts.bundle import Bundle
-from sim2real.artifacts.identification import ROUND_TRIP
 from sim2real.artifacts.run.manifest import sha256
 from sim2real.artifacts.run.run_folder import StageFolder, newest
-from sim2real.errors import DelayChanged, Sim2RealError
-from sim2real.policy.contract import ActionTerm, ObservationTerm, PolicyContract
-from sim2real.robots.probe import StepAnswers, Witness, measure_delay
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.policy.contract import ActionTerm, ObservationTerm
 from sim2real.robots.robot import Robot
 from sim2real.stages.deploy.config import DeployConfig
 from sim2real.stages.pipeline.find_run import warn_of_stale
 from sim2real.stages.pipeline.pipeline import Pipeline
 from sim2real.stages.terminal.console import note
 
-_TRAIN = "train a policy for this pipeline"
+_TRAIN, EMBEDDED = "train a policy for this pipeline", "embedded"
 
 
 def find_bundle(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | None) -> tuple[Path, Path | None]:
@@ -54,12 +52,15 @@ def require_untouched(training: StageFolder) -> None:
         )
 
 
-def require_fit(robot: Robot, bundle: Bundle) -> None:
+def require_fit(pipeline: Pipeline, robot: Robot, bundle: Bundle, config: DeployConfig) -> None:
     """Refuse a bundle for another robot, or one that exceeds the limits of this robot.
 
     Raises:
         Sim2RealError: Names the difference.
     """
+    _require_robot(pipeline, bundle, config)
+    if config.max_tilt_rad is not None and robot.agent.tilt_rad is None:
+        raise UsageError("this robot does not measure its tilt", hint="run without --max-tilt-rad, or set tilt_rad")
     contract, where = bundle.contract, f"in {bundle.path}" if bundle.path else "that was trained"
     for verb, in_bundle, of_robot in (
         ("sees", _observations(contract.observation), _observations(robot.agent.observation)),
@@ -96,55 +97,24 @@ def require_fit(robot: Robot, bundle: Bundle) -> None:
             )
 
 
-def check_delay(robot: Robot, witness: Witness, contract: PolicyContract, config: DeployConfig) -> dict[str, str]:
-    """Measure the robot's delay with small steps, and refuse a policy that was not trained with it.
-
-    Args:
-        witness: Holds the open robot, at rest and without torque; records the commands and the measurements.
-
-    Returns:
-        Lines of the summary.
-
-    Raises:
-        DelayChanged: The delay, or its variation, lies outside of the range in training.
-        Sim2RealError: The robot does not answer.
-    """
-    if not config.measure_delay or config.dry_run or robot.drive.probe is None:
-        return {}
-    if (trained := contract.trained_s.get(ROUND_TRIP)) is None:
-        note("warning: the bundle does not list the delays of its training, so the robot's delay is not measured")
-        return {}
-    # A busy machine may delay single steps, so a misfit is measured a second time.
-    answers = measure_delay(witness, robot.drive.probe)
-    if misfit(answers, trained, config.delay_tolerance_s):
-        witness.rig.wait_until_still(config.settle_s)
-        answers = StepAnswers(np.append(answers.delays_s, measure_delay(witness, robot.drive.probe).delays_s))
-    measured = f"{1e3 * answers.delay_s:.0f} ms, the middle half within {1e3 * answers.jitter_s:.0f} ms"
-    if reason := misfit(answers, trained, config.delay_tolerance_s):
-        message = f"the delay is {measured}: {reason}"
-        if not config.force:
-            raise DelayChanged(
-                message,
-                hint="record, identify and train again, or see where the delay is in the report of a recording; to "
-                "deploy all the same: --force",
-            )
-        note(f"warning: {message}")
-    return {"measured delay": measured}
-
-
-def misfit(answers: StepAnswers, trained: tuple[float, float], tolerance_s: float) -> str | None:
-    """Return why a measured delay is none of the delays in training; None if it is one of them.
-
-    Args:
-        trained: Shortest and longest delay of the training [s].
-        tolerance_s: Allowed distance from these, and allowed additional variation [s].
-    """
-    low, high = trained
-    if not low - tolerance_s <= answers.delay_s <= high + tolerance_s:
-        return f"the policy was trained with {1e3 * low:.0f} to {1e3 * high:.0f} ms"
-    if answers.jitter_s > high - low + tolerance_s:
-        return f"the policy was trained with delays that vary by {1e3 * (high - low):.0f} ms"
-    return None
+def _require_robot(pipeline: Pipeline, bundle: Bundle, config: DeployConfig) -> None:
+    """Refuse a policy of another robot: of another pipeline, or of the emulated one on a port, and the reverse."""
+    trained, port = bundle.contract.robot, bundle.contract.port
+    where = f" in {bundle.path}" if bundle.path else ""
+    if trained and pipeline.has_commands and trained != pipeline.name:
+        raise Sim2RealError(f"the policy{where} was trained for {trained!r}, this is {pipeline.name!r}", hint=_TRAIN)
+    if not port or (port == EMBEDDED) == (config.port == EMBEDDED):
+        return
+    names = {True: "the emulated robot", False: "a robot"}
+    message = (
+        f"the policy{where} was trained with parameters of {names[port == EMBEDDED]} (port {port}), and port "
+        f"{config.port} has {names[config.port == EMBEDDED]}"
+    )
+    if not config.force:
+        raise Sim2RealError(
+            message, hint="record, identify and train with the robot on this port; to deploy all the same: --force"
+        )
+    note(f"warning: {message}")
 
 
 def _observations(terms: Sequence[ObservationTerm]) -> list[tuple[str, tuple[str, ...], int]]:

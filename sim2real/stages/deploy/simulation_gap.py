@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +26,9 @@ from sim2real.stages.terminal.interruption import patiently
 
 if TYPE_CHECKING:
     from sim2real.stages.deploy.simulations import States
+
+Score = Callable[[np.ndarray, Mapping[str, np.ndarray]], dict[str, float]]
+"""See ``RobotTask.score``."""
 
 
 def compare(
@@ -55,7 +58,7 @@ def compare(
     trials = list(range(len(recordings)))
     played = None
     if has_jax():
-        from sim2real.robots.walking.plain.episodes import plain_episodes  # JAX is in its robot
+        from sim2real.robots.walking.twin import plain_episodes  # JAX is in its robot
 
         played = plain_episodes(robot, bundle.runner(None), values, trials, duration_s)
     if played is not None:
@@ -76,11 +79,11 @@ def compare(
     measured = [] if simulated is None else [states for _, states in simulated]
 
     # Compare scores, ages and trajectories. The page shows the first simulation of each episode.
-    scores, gap = _scored(robot, real, scored)
-    gap += _age_rows(robot, [r.episode for r in recordings], timeline)
+    scores, gap = _scored(robot.task.score, real, scored)
+    gap += _age_rows([r.episode for r in recordings], timeline)
     columns = [{"t": t, **states} for t, states in measured[: len(recordings)]]
     columns += [{}] * (len(recordings) - len(columns))
-    sensed = [(r.episode.steps[SENSOR].begun_s, _sensed(robot, r.episode)) for r in recordings]
+    sensed = [(r.episode.steps[SENSOR].begun_s, _sensed(r.episode)) for r in recordings]
     nodes = (SENSOR, AGENT, ACTUATOR)
     trajectories = courses(sensed, measured, robot.units, [lost_s(r.episode, nodes) for r in recordings])
     units = dict(robot.units)
@@ -94,10 +97,10 @@ def _states(recording: Recording, robot: Robot, use_truth: bool) -> States:
     if use_truth and (true_states := recording.true_states()) is not None:
         t_s, states = true_states
         return t_s, {**sent, **states}
-    return episode.steps[SENSOR].begun_s, {**sent, **_sensed(robot, episode)}
+    return episode.steps[SENSOR].begun_s, {**sent, **_sensed(episode)}
 
 
-def _sensed(robot: Robot, episode: Episode) -> dict[str, np.ndarray]:
+def _sensed(episode: Episode) -> dict[str, np.ndarray]:
     return as_columns(episode.outputs[SENSOR])
 
 
@@ -107,7 +110,7 @@ def _rest(robot: Robot, episode: Episode) -> np.ndarray:
     return np.array([float(c.of(np.asarray(fields[c.position])).ravel()[0]) for c in robot.sensor.channels])
 
 
-def _age_rows(robot: Robot, episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:
+def _age_rows(episodes: Sequence[Episode], timeline: Timeline | None) -> list[Gap]:
     """Return rows of the gap report: the ages of the data that policy and actuator use, on the robot and simulated."""
     rows = []
     for reader in (AGENT, ACTUATOR):
@@ -134,24 +137,24 @@ def _drawn_ages(timeline: Timeline, reader: str, name: str) -> np.ndarray:
 
 
 def _scored(
-    robot: Robot, real: Sequence[States], simulated: Sequence[States] | None
+    score: Score, real: Sequence[States], simulated: Sequence[States] | None
 ) -> tuple[tuple[Scores, ...], list[Gap]]:
     """Return the scores of every episode, and the gap report: means over episodes and over simulations.
 
     A score is None if it does not exist, such as the time to a goal that was not reached.
     """
-    on_robot = [_scores(robot, t, s) for t, s in real]
-    in_simulation = [_scores(robot, t, s) for t, s in simulated or []]
+    on_robot = [_finite(score(t, s)) for t, s in real]
+    in_simulation = [_finite(score(t, s)) for t, s in simulated or []]
     gap = []
     for quantity in on_robot[0]:
-        means = [_mean([score[quantity] for score in scores]) for scores in (on_robot, in_simulation)]
+        means = [_mean([each[quantity] for each in scores]) for scores in (on_robot, in_simulation)]
         gap.append(_gap(quantity, *means))
     beside = [*in_simulation[: len(real)], *[None] * (len(real) - len(in_simulation))]
     return tuple(Scores(r, s) for r, s in zip(on_robot, beside, strict=True)), gap
 
 
-def _scores(robot: Robot, t_s: np.ndarray, states: Mapping[str, np.ndarray]) -> dict[str, float | None]:
-    return {name: value if math.isfinite(value) else None for name, value in robot.task.score(t_s, states).items()}
+def _finite(score: Mapping[str, float]) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in score.items()}
 
 
 def _gap(quantity: str, real: float | None, simulated: float | None) -> Gap:

@@ -16,12 +16,12 @@ from sim2real.graph.timeline import Timeline
 from sim2real.graph.windows import make_room
 from sim2real.robots.loop import ACTUATOR, AGENT, SENSOR, WORLD
 from sim2real.robots.robot import Robot, as_columns, as_sent
+from sim2real.robots.servo.world import ServoWorld
 from sim2real.runtime.compiled.graph import CompiledGraph
 from sim2real.stages.terminal.console import note
 from sim2real.training.environment.draws import draw_robots
 from sim2real.training.environment.variation import VariationConfig
 from sim2real.types import PyTree
-from sim2real.worlds.composed import ComposedWorld
 
 _MIN_SIMULATIONS, _MIN_PER_EPISODE = 32, 8
 States = tuple[np.ndarray, dict[str, np.ndarray]]
@@ -73,10 +73,8 @@ def simulate(
         counts = ", ".join(f"{count} of {name}" for name, count in hiccups.items())
         note(f"the simulation omits steps that took longer than a period of the policy: {counts}")
     nodes, _ = robot.training(parameters[0], {}, computation, True)
-    for node in nodes.values():
-        if isinstance(node, ComposedWorld):
-            # A robot rests where friction holds it, and with as few iterations as in training its joints creep.
-            node.environment.mjx_model = resting(node.environment.mjx_model)
+    if isinstance(world := nodes[WORLD], ServoWorld):
+        world.solve_to_rest()
     count = len(parameters)
     timeline = draw(nodes, duration_s, count, 0)
     make_room(nodes, timeline)
@@ -97,11 +95,6 @@ def simulate(
         (_states(graph, records, robot, e, scored_node), _states(graph, records, robot, e, SENSOR))
         for e in range(count)
     ], timeline
-
-
-def resting(model: PyTree) -> PyTree:
-    """Return an ``mjx.Model`` whose solver finds the friction that holds a joint, in single precision."""
-    return model.replace(opt=model.opt.replace(iterations=6, ls_iterations=20))
 
 
 def _states(graph: CompiledGraph, records: Mapping[str, Any], robot: Robot, e: int, node: str) -> States:

@@ -14,9 +14,9 @@ from sim2real.artifacts.run.run_folder import StageFolder, finished, open_stage
 from sim2real.errors import UsageError
 from sim2real.hardware.safety.following import Following
 from sim2real.installation import has_jax
-from sim2real.robots.robot import Robot
+from sim2real.robots.robot import Robot, in_world
 from sim2real.stages.deploy.config import DeployConfig
-from sim2real.stages.deploy.episodes import check_timing, require_tilt, run_episodes
+from sim2real.stages.deploy.episodes import check_timing, run_episodes
 from sim2real.stages.deploy.preflight import find_bundle, require_fit
 from sim2real.stages.deploy.show import show, show_sessions, summary_lines
 from sim2real.stages.pipeline import python_arguments
@@ -54,13 +54,21 @@ def deploy(
     config = python_arguments.config_of(config, pipeline.deploy)
     if identification is not None:
         identification = python_arguments.identification_of(identification)
-    robot = _robot(pipeline, config)
-    require_fit(robot, bundle)
-    require_tilt(robot, config)
-    robot.task.at_rest(0)  # a task that needs JAX is refused before the robot moves
+    robot = _ready(pipeline, bundle, config)
     if identification is not None:
         check_parameters(identification, pipeline)
+    return _deployed(pipeline, robot, bundle, folder, config, identification)
 
+
+def _deployed(
+    pipeline: Pipeline,
+    robot: Robot,
+    bundle: Bundle,
+    folder: Path,
+    config: DeployConfig,
+    identification: Identification | None,
+) -> Deployment:
+    """Run the policy on the robot, and compare with the simulation; all arguments are checked."""
     # Run the episodes on the robot.
     logs = [log_of(folder, i) for i in range(config.episodes)]
     following = None if identification is None else _following(robot, identification)
@@ -77,7 +85,7 @@ def deploy(
     from sim2real.stages.deploy.verdict import judge
 
     world = None if identification is None else identification.world
-    deployment = compare(_robot(pipeline, config, world), recordings, bundle, identification, config.duration_s)
+    deployment = compare(in_world(robot, world), recordings, bundle, identification, config.duration_s)
     probe = folder / PROBE
     deployment = replace(deployment, probe=Recording.load(probe, folder / TRUTH) if probe.is_file() else None)
 
@@ -92,18 +100,17 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         run_dir: Run folder to add to; None takes that of the bundle.
     """
     # Check the bundle before a folder is made.
-    robot = _robot(pipeline, config)
     path, run_dir = find_bundle(pipeline, config, root, run_dir)
     bundle = Bundle.load(path)
-    require_fit(robot, bundle)
-    require_tilt(robot, config)
+    robot = _ready(pipeline, bundle, config)
     with open_stage(root, pipeline.name, "deploy", config, {"bundle": path}, run_dir, config.dry_run) as stage:
         # Name the logs first, so that the manifest of an interrupted deployment lists them.
         for i in range(config.episodes):
             stage.output(f"log_{i}", log_of(stage.folder, i).name)
         if config.port == "embedded":
             stage.output("truth", TRUTH)
-        deployment = deploy(pipeline, bundle, stage.folder, config, _identification(pipeline, stage.run_dir))
+        identification = _identification(pipeline, stage.run_dir)
+        deployment = _deployed(pipeline, robot, bundle, stage.folder, config, identification)
         summaries = deployment.summary
         show_sessions(summaries, config.dry_run)
 
@@ -121,19 +128,17 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     return stage.result
 
 
-def _robot(pipeline: Pipeline, config: DeployConfig, world: str | None = None) -> Robot:
-    """Return the robot, with the configured command.
-
-    Args:
-        world: World that it is simulated in; None: its own.
-    """
-    robot = moving_robot(pipeline, world)
-    if config.command is None:
-        return robot
-    commanded = getattr(robot, "commanded", None)
-    if commanded is None:
-        raise UsageError(f"pipeline {pipeline.name!r} follows no velocity", hint="run it without --command")
-    return commanded(config.command)
+def _ready(pipeline: Pipeline, bundle: Bundle, config: DeployConfig) -> Robot:
+    """Return the robot, with the configured command; refuse a policy or settings that do not fit it."""
+    robot = moving_robot(pipeline)
+    if config.command is not None:
+        commanded = getattr(robot, "commanded", None)
+        if commanded is None:
+            raise UsageError(f"pipeline {pipeline.name!r} follows no velocity", hint="run it without --command")
+        robot = commanded(config.command)
+    require_fit(pipeline, robot, bundle, config)
+    robot.task.at_rest(0)  # a task that needs JAX is refused before the robot moves
+    return robot
 
 
 def _following(robot: Robot, identification: Identification) -> Following | None:

@@ -135,7 +135,7 @@ def prepare(
     table = table_of(model, config, episodes).with_begin(begin or {})
     config = with_length(config, model)
     if standing:
-        from sim2real.robots.walking.plain import weighing
+        from sim2real.robots.walking import weighing
 
         weighing.check(robot, standing.episode, {p.name: p.nominal for p in model.parameters})
     windows = spans([log.episode for log in logs], len(fitted), config, config.settle_s + config.horizon_s)
@@ -150,7 +150,7 @@ def with_load(
 
     A load outside of its bounds is a warning: the rest is identified.
     """
-    from sim2real.robots.walking.plain import weighing  # the modules of walking robots alone
+    from sim2real.robots.walking import weighing  # the modules of walking robots alone
 
     try:
         return weighing.weighed(robot, document, log.episode, truth)

@@ -17,8 +17,9 @@ from sim2real.log.importing.mapping import ImportMapping, load_mapping
 from sim2real.log.importing.propose import check_mapping, hint_for, propose
 from sim2real.log.importing.readers import Table, joined, open_tables
 from sim2real.log.importing.signals import ImportHints, Proposal
-from sim2real.robots.from_model.mjcf import joints_of, read_model, slides_of
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot
+from sim2real.robots.model.drives import joints_of, slides_of
+from sim2real.robots.model.file import read_model
+from sim2real.robots.model.robot import MjcfRobot
 from sim2real.stages.import_logs.config import ImportConfig
 from sim2real.stages.pipeline import pipeline
 from sim2real.stages.terminal.console import note, pairs, shown, wrote

@@ -15,10 +15,11 @@ from sim2real.log.importing.importer import import_table
 from sim2real.log.importing.mapping import ImportMapping, load_mapping
 from sim2real.log.importing.readers import Table, open_tables
 from sim2real.log.reader import read_log
-from sim2real.robots.from_model import model_file
-from sim2real.robots.from_model.mjcf import joints_of, read_model, read_spec
-from sim2real.robots.from_model.mjcf_robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig
-from sim2real.robots.from_model.usual_parameters import named_terms, usual_terms
+from sim2real.robots.model import file as model_file
+from sim2real.robots.model.drives import joints_of
+from sim2real.robots.model.file import read_model, read_spec
+from sim2real.robots.model.parameters import ParameterPattern, usual_patterns
+from sim2real.robots.model.robot import COMMANDS, ROBOT_FILE, MjcfRobot, RobotConfig
 from sim2real.stages.config import MODEL_IDENTIFY
 from sim2real.stages.import_logs import stage as import_logs_stage
 from sim2real.stages.pipeline.pipeline import RobotPipeline
@@ -99,7 +100,7 @@ def _table(path: Path) -> Table:
 def note_held(description: RobotConfig) -> None:
     """Print the omitted files, and the held and free joints that were not recorded."""
     holding, model = description.held(), read_model(description.model)
-    if omitted := model_file.read(description.model, description.contacts)[1]:
+    if omitted := model_file.read_file(description.model, description.contacts)[1]:
         console.note(f"omitted, because only contacts and pictures need them: {', '.join(omitted)}")
     for held in holding.held:
         console.note(f"not recorded, held: {held}")
@@ -181,6 +182,6 @@ def describe(
         contacts=flags.contacts,
         hold=flags.hold,
         payload_body=flags.payload_body,
-        terms=named_terms(flags.parameter)
-        or usual_terms(commands, physical, read_model(Path(str(flags.mjcf))), joints),
+        terms=tuple(map(ParameterPattern.parse, flags.parameter))
+        or usual_patterns(commands, physical, read_model(Path(str(flags.mjcf))), joints),
     )

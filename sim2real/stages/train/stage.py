@@ -82,6 +82,8 @@ def train(
     with progress(None, "train: draw episodes", leads()):
         setup = prepare(pipeline, config, identification, timing)
     contract = contract_of(setup.robot, setup.env.task, setup.values, setup.episodes)
+    port = "" if recording is None else str(recording.episode.metadata.get("port", ""))
+    contract = replace(contract, robot=pipeline.name if pipeline.has_commands else "", port=port)
 
     # Train.
     write, read = (None if path is None else Path(path) for path in (checkpoint, resume))

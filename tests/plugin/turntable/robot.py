@@ -13,10 +13,10 @@ from sim2real.graph.base import Base, GraphState
 from sim2real.identify.model import Channel
 from sim2real.identify.parameters import Parameter
 from sim2real.policy.contract import ActionTerm, ObservationTerm
+from sim2real.robots.agent import AgentParams, GoalAgent
 from sim2real.robots.loop import delay_of
 from sim2real.robots.messages import EpisodeStart, Goals, JointReading
 from sim2real.robots.robot import Robot, RobotAgent, RobotDrive, RobotModel, RobotSensor, RobotTask
-from sim2real.robots.servo.agent import AgentParams, GoalAgent
 from sim2real.robots.session import Embedded, Session
 from sim2real.worlds.joint import Forces, JointState, JointWorld
 

@@ -1,19 +1,84 @@
-"""Files that a model names: the places of ROS packages, and meshes that only contacts need."""
+"""A model file as MuJoCo reads it: ROS packages, and meshes that only contacts need."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from sim2real.types import MjSpec
+import mujoco
+
+from sim2real.errors import UsageError
+from sim2real.types import MjModel, MjSpec
+
+mj: Any = mujoco
+
+_PACKAGES: Final = (
+    "put the folder of the package above the model, or name the folder that it is in with ROS_PACKAGE_PATH; without "
+    "contacts, a link with an inertia needs no meshes"
+)
+
+
+def read_file(path: Path, contacts: bool) -> tuple[Any, list[str]]:
+    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file, and the omitted files that it names.
+
+    A file that cannot be read is omitted where only contacts or pictures need it.
+
+    Args:
+        contacts: Whether bodies touch, so that all meshes are needed.
+
+    Raises:
+        UsageError: When the file is missing, or MuJoCo cannot read or compile it.
+    """
+    if not path.is_file():
+        raise UsageError(f"there is no model {path}", hint="name an MJCF or URDF file with --mjcf")
+    omitted: list[str] = []
+    notes: list[str] = []
+    packaged = False
+    try:
+        # Read it; if it does not compile, omit files that only contacts and pictures need.
+        spec = mj.MjSpec.from_file(str(path))
+        notes = _find_packages(spec, path)
+        packaged = bool(notes)
+        try:
+            spec.copy().compile()
+        except (ValueError, RuntimeError, OSError):
+            needed = _needed_by(spec)
+            notes += [f"meshes give the inertia of {', '.join(needed)}"] if needed else []
+            if contacts or not (omitted := _leave_out(spec)):
+                raise
+            spec.copy().compile()
+    except (ValueError, RuntimeError, OSError) as error:
+        raise UsageError(
+            f"MuJoCo cannot read {path}: {'; '.join([one_line(error), *notes])}",
+            hint=_PACKAGES
+            if packaged
+            else "correct the file; put the files that it names where it names them, or remove them from it",
+        ) from None
+    return spec, omitted
+
+
+def one_line(error: Exception) -> str:
+    """Return all lines of an error as one: MuJoCo names the element and its line in the later ones."""
+    return ", ".join(line.strip().rstrip(",") for line in str(error).splitlines() if line.strip())
+
+
+def read_spec(path: Path, contacts: bool = False) -> MjSpec:
+    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file; see ``read_file``."""
+    return read_file(path, contacts)[0]
+
+
+def read_model(path: Path) -> MjModel:
+    """Return the compiled model of an MJCF or URDF file."""
+    return read_spec(path).compile()
+
 
 _PACKAGE = "package://"
 _FROM_GEOMS = 1
 """Value of the compiler's option inertiafromgeom with which geoms give every inertia."""
 
 
-def find_packages(spec: MjSpec, path: Path) -> list[str]:
+def _find_packages(spec: MjSpec, path: Path) -> list[str]:
     """Replace the names of files in ROS packages by their paths; return the searched places if a file is missing.
 
     Args:
@@ -33,7 +98,7 @@ def find_packages(spec: MjSpec, path: Path) -> list[str]:
     return looked
 
 
-def leave_out(spec: MjSpec) -> list[str]:
+def _leave_out(spec: MjSpec) -> list[str]:
     """Take out files that only contacts and pictures need; return their names.
 
     These are meshes and height fields of bodies whose inertia the file has, or which cannot move, and textures.
@@ -59,7 +124,7 @@ def leave_out(spec: MjSpec) -> list[str]:
     return removed
 
 
-def needed_by(spec: MjSpec) -> list[str]:
+def _needed_by(spec: MjSpec) -> list[str]:
     """Return the bodies whose inertia their meshes give."""
     return sorted(
         {g.parent.name or "one without a name" for g in spec.geoms if g.meshname and not _spare(spec, g.parent)}

@@ -1,20 +1,27 @@
-"""A robot's MJCF or URDF, made ready for identification: its joints, and a drive on each that was recorded."""
+"""A drive on each joint of an MJCF or URDF that was recorded: its actuators, its encoders, a payload, plain MuJoCo."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from sim2real import pytree
 from sim2real.errors import UsageError
-from sim2real.robots.from_model import model_file, payload
-from sim2real.robots.from_model.holding import Holding, apply, plan
-from sim2real.types import MjModel, MjSpec, PyTree
-from sim2real.worlds.drive_terms import NO_LIMIT
+from sim2real.graph.base import Base, GraphState, StepState
+from sim2real.graph.node import BaseNode
+from sim2real.identify.export.plain import PlainSimulation, converged
+from sim2real.robots.model.file import one_line, read_spec
+from sim2real.robots.model.held import Holding, apply, plan
+from sim2real.types import Array, Json, Key, MjModel, MjSpec, PyTree
+from sim2real.worlds.drive_terms import NO_LIMIT, DriveTerms
+from sim2real.worlds.driven import PAYLOAD, DrivenWorld, DriveParams, payload_place
 
 mj: Any = mujoco
 
@@ -24,16 +31,6 @@ _SOFT, _HOLDS = (0.02, 1.0, 0.9, 0.95, 0.001, 0.5, 2.0), 0.9999
 _OF_SLIDES = {"rad": "m", "rad/s": "m/s", "N m": "N", "N m/rad": "N/m", "N m s/rad": "N s/m", "kg m^2": "kg",
               "N m s^2/rad^2": "N s^2/m^2"}  # fmt: skip
 """Units of hinges -> units of slides."""
-
-
-def read_spec(path: Path, contacts: bool = False) -> MjSpec:
-    """Return the ``mujoco.MjSpec`` of an MJCF or URDF file; see ``model_file.read``."""
-    return model_file.read(path, contacts)[0]
-
-
-def read_model(path: Path) -> MjModel:
-    """Return the compiled model of an MJCF or URDF file; see ``read_spec``."""
-    return read_spec(path).compile()
 
 
 def joints_of(model: MjModel) -> tuple[str, ...]:
@@ -85,7 +82,7 @@ def driven_spec(
     limits = {j: limit_of(model, j) for j in joints}
     apply(spec, model, holding)
     if holder is not None:
-        payload.hold(spec, model, joints, holder)
+        add_payload(spec, model, joints, holder)
 
     # Add the actuators, and give each joint its torque limit.
     for what, gain in (("force", (1.0, 0.0, 0.0)), ("kp", (0.0, -1.0, 0.0)), ("kd", (0.0, 0.0, -1.0))):
@@ -145,7 +142,7 @@ def driven(path: Path, *how: PyTree) -> MjModel:
         return spec.compile()
     except ValueError as error:
         raise UsageError(
-            f"{path} does not compile with joints held: {model_file.one_line(error)}",
+            f"{path} does not compile with joints held: {one_line(error)}",
             hint="remove the elements that need them from the model",
         ) from None
 
@@ -249,3 +246,139 @@ def force_of(model: MjModel, joint: str) -> float | None:
 def _actuators(model: MjModel, joint: int) -> list[int]:
     of_joint = model.actuator_trntype == int(mj.mjtTrn.mjTRN_JOINT)
     return [int(i) for i in np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == joint))]
+
+
+_NO_MASS = 1e-9
+
+
+def add_payload(spec: MjSpec, model: MjModel, joints: Sequence[str], holder: str) -> None:
+    """Add the payload to a model, without mass; its mass and its place are set for each log.
+
+    Args:
+        holder: Body that holds it, at its centre of mass; "": that of the last joint.
+    """
+    names = [model.body(i).name for i in range(1, model.nbody)]
+    if holder and holder not in names:
+        raise UsageError(f"no body {holder!r} for the payload. Available: {', '.join(filter(None, names))}")
+    body: Any = spec.body(holder) if holder else spec.joint(joints[-1]).parent
+    middle = model.body_ipos[model.body(holder).id if holder else model.jnt_bodyid[model.joint(joints[-1]).id]]
+    if not np.any(middle):
+        raise UsageError(
+            f"the centre of mass of body {body.name!r} is at its origin, so a payload has no direction from there",
+            hint="give the body an inertial, or name another one with --payload-body",
+        )
+    payload = body.add_body(name=PAYLOAD, pos=middle)
+    payload.explicitinertial, payload.mass, payload.inertia = True, _NO_MASS, [_NO_MASS] * 3
+    payload.ipos, payload.iquat = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]  # not the holder's, as a new body has
+
+
+def with_payload_of(model: MjModel, sent: Mapping[str, np.ndarray]) -> MjModel:
+    """Return a model with the payload of a log, if it has one.
+
+    Args:
+        sent: The log's commands by field.
+    """
+    if all(model.body(i).name != PAYLOAD for i in range(model.nbody)):
+        return model
+    model = copy.copy(model)
+    model.body(PAYLOAD).mass[:] += sent["payload"][0, 0]
+    if "payload_reach" in sent:
+        model.body(PAYLOAD).pos[:] = payload_place(model, sent["payload_reach"][0, 0])
+    return model
+
+
+@pytree.dataclass
+class Measured(Base):
+    """Readings of the encoders, each of shape ``(joints,)`` [rad, rad/s]; None without a velocity."""
+
+    position: Array
+    velocity: Array | None = None
+
+
+class Encoders(BaseNode):
+    """Reads the joints of a ``DrivenWorld``.
+
+    Args:
+        rate: Samples per second [Hz].
+    """
+
+    def __init__(self, name: str, rate: float, world: DrivenWorld, velocity: bool) -> None:
+        super().__init__(name, rate)
+        self._world, self._velocity = world, velocity
+
+    def init_params(self, rng: Key | None = None, graph_state: GraphState | None = None) -> EncoderParams:
+        """Return encoders that read 0 at the model's zero."""
+        world = self._world.init_params(rng, graph_state)
+        return EncoderParams(jnp.zeros(len(self._world.qpos_at)), world.terms)
+
+    def init_output(self, rng: Key | None = None, graph_state: GraphState | None = None) -> Measured:
+        """Return zeros."""
+        del rng, graph_state
+        still = jnp.zeros(len(self._world.qpos_at))
+        return Measured(still, still if self._velocity else None)
+
+    def step(self, step_state: StepState) -> tuple[StepState, Measured]:
+        """Read."""
+        message, params = step_state.inputs[self._world.name][-1].data, step_state.params
+        angle, speed = message.qpos[self._world.qpos_at], message.qvel[self._world.qvel_at]
+        if params.terms is not None:
+            angle, speed = params.terms.read(angle), params.terms.rate(angle, speed)
+        return step_state, Measured(angle + params.zero, speed if self._velocity else None)
+
+
+@pytree.dataclass
+class EncoderParams(Base):
+    """Parameters of the encoders.
+
+    Attributes:
+        zero: Readings at the model's zero, ``(joints,)`` [rad].
+        terms: The drives' own, which say how far each is off its axis; None: not at all.
+    """
+
+    zero: Array
+    terms: DriveTerms | None = None
+
+
+def driven_simulation(
+    params_of: Callable[[np.ndarray], DriveParams], world: DrivenWorld, how: tuple[Json, ...]
+) -> PlainSimulation:
+    """Return the driven model with identified values, and the numbers of its drives.
+
+    Args:
+        params_of: Measured positions and velocities ``(2 * joints,)`` -> the world's parameters.
+        how: Arguments of ``driven_spec``, which begin with path, joints and time step.
+    """
+    n = len(world.joints)
+    params = params_of(np.zeros(2 * n))
+    # Set the fields of the model that the values change.
+    spec = driven_spec(*how)
+    model = spec.compile()
+    for name, value in world.fields(params, None).items():
+        holder, _, field = name.rpartition(".")
+        getattr(model.opt if holder else model, field)[...] = np.asarray(value)
+    copy_back(spec, model)
+    for joint, number in zip(how[1], world.joints, strict=True):  # MuJoCo's copy_back omits the limits, too
+        spec.joint(joint).actfrcrange = model.jnt_actfrcrange[number]
+    mjcf = converged(spec)
+    made = mj.MjModel.from_xml_string(mjcf)
+    for name in world.fields(params, None):
+        holder, _, field = name.rpartition(".")
+        pair = (getattr(m.opt if holder else m, field) for m in (model, made))
+        if not np.allclose(*pair, rtol=1e-4, atol=1e-9):
+            raise UsageError(f"MJCF does not keep the identified {name} of this model", hint="export to json")
+    # Collect the numbers of the drives.
+    numbers = {
+        f: np.asarray(getattr(params, f)) + np.zeros(n) for f in ("kp", "kd", "gain", "released", "zero", "voltage")
+    }
+    numbers |= {
+        name: np.array(unit) for name, unit in zip(("kp_unit", "kd_unit", "volts_unit"), world.units, strict=True)
+    }
+    numbers |= {"joints_at": world.joints, "qpos_at": world.qpos_at, "qvel_at": world.qvel_at}
+    if params.terms is not None:
+        numbers |= {f.name: np.asarray(getattr(params.terms, f.name)) + np.zeros(n) for f in fields(DriveTerms)}
+
+    def begin(start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        started = params_of(start)
+        return np.asarray(started.qpos), np.asarray(started.qvel)
+
+    return PlainSimulation(mjcf, how[1], how[2], begin, "drive", numbers, lead_s=world.lead_s)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,49 +13,46 @@ import msgspec
 import mujoco
 import numpy as np
 
+from sim2real.arrays import beside_damping
 from sim2real.artifacts.files import check
-from sim2real.errors import UsageError
+from sim2real.errors import Sim2RealError, UsageError
+from sim2real.graph.episode import Episode
 from sim2real.graph.node import BaseNode
 from sim2real.identify.model import Channel, PlainSimulation
 from sim2real.identify.parameters import Parameter, ParameterTable
 from sim2real.log.importing.mapping import toml_value
-from sim2real.robots.from_model.doubts import beyond_ranges, check_payload, open_loops
-from sim2real.robots.from_model.encoders import EncoderParams, Encoders
-from sim2real.robots.from_model.holding import Holding
-from sim2real.robots.from_model.mjcf import (
-    NO_LIMIT,
+from sim2real.robots.identified import IdentifiableRecording, LoggedRobot
+from sim2real.robots.loop import ACTUATOR, SENSOR
+from sim2real.robots.model.drives import (
+    EncoderParams,
+    Encoders,
     JointDrive,
     copy_back,
     driven,
+    driven_simulation,
     held_in,
     limit_of,
-    read_model,
-    read_spec,
     set_drives,
     slides_of,
     stick,
     unit_for,
+    with_payload_of,
 )
-from sim2real.robots.from_model.mjcf_parameters import (
-    FALLBACK,
-    LAWS,
+from sim2real.robots.model.file import read_model, read_spec
+from sim2real.robots.model.held import Holding
+from sim2real.robots.model.parameters import (
     LIMITS,
-    ON_DOF,
-    WHOLE,
+    QUANTITIES,
+    ParameterAt,
     ParameterPattern,
-    Placed,
-    beside_damping,
     expand,
     of_each,
-    optional,
     place,
     tilted,
+    with_optional,
 )
-from sim2real.robots.from_model.plain import driven_simulation
-from sim2real.robots.from_model.reached import Recordings, reached
-from sim2real.robots.identified import IdentifiableRecording, LoggedRobot
-from sim2real.robots.loop import ACTUATOR, SENSOR
-from sim2real.types import PyTree, Scalar
+from sim2real.types import MjModel, PyTree, Scalar
+from sim2real.worlds.drive_terms import NO_LIMIT
 from sim2real.worlds.driven import OF_PAYLOAD, DriveCommand, DrivenWorld, DriveParams
 from sim2real.worlds.recorded import RecordedActuator
 
@@ -108,11 +105,11 @@ class RobotConfig:
     terms: tuple[ParameterPattern, ...] = ()
 
     def driven(self, rubbing: bool = True, carried: bool = False) -> PyTree:
-        """Return the model with a drive on each recorded joint, see ``mjcf.driven``."""
+        """Return the model with a drive on each recorded joint, see ``driven``."""
         return driven(*self.how(rubbing, carried))
 
     def how(self, rubbing: bool, carried: bool) -> tuple[PyTree, ...]:
-        """Return the arguments of ``mjcf.driven_spec``."""
+        """Return the arguments of ``driven_spec``."""
         holder = self.payload_body if "payload" in self.commands else None
         return self.model, self.joints, self.step_s, self.fix_base, self.contacts, rubbing, self.hold, carried, holder
 
@@ -124,7 +121,7 @@ class RobotConfig:
         """Return the text of a ``robot.toml`` that names the model's file."""
         keys = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "terms"}
         plain = {f.name: f.default for f in fields(self)}
-        lines = ["# A robot that was recorded: sim2real.robots.from_model.mjcf_robot.RobotConfig describes each key."]
+        lines = ["# A robot that was recorded: sim2real.robots.model.robot.RobotConfig describes each key."]
         keys["model"] = model
         lines += [f"{k} = {toml_value(v)}" for k, v in keys.items() if v != plain[k]]
         for term in self.terms:
@@ -171,7 +168,7 @@ class MjcfRobot(LoggedRobot):
             )
         self.config, self.tick_s = config, config.step_s
         file_model = read_model(config.model)
-        self.lawful = any(term.what in LAWS for term in config.terms)
+        self.lawful = any(term.quantity.place == "law" for term in config.terms)
         quantities = {term.what for term in config.terms}
         self._how = self.lawful or "frictionloss" in quantities, "gravcomp" in quantities
         self.model = config.driven(*self._how)
@@ -220,9 +217,9 @@ class MjcfRobot(LoggedRobot):
             UsageError: When a joint moves further than its range is wide.
         """
         position, file = np.asarray(outputs[SENSOR]["position"], np.float64), self.config.model.name
-        check_payload(outputs.get(ACTUATOR, {}), self.config.commands)
-        beyond = beyond_ranges(self.model, self.config.joints, position, file)
-        return [*beyond, *open_loops(self.make_nodes()[2].gaps, position, self.config.joints, file)]
+        _check_payload(outputs.get(ACTUATOR, {}), self.config.commands)
+        beyond = _beyond_ranges(self.model, self.config.joints, position, file)
+        return [*beyond, *_open_loops(self.make_nodes()[2].gaps, position, self.config.joints, file)]
 
     def with_optional_terms(self, wanted: str = "all") -> MjcfRobot:
         """Return the robot with optional terms to choose from; a step of its simulation then takes longer.
@@ -231,8 +228,11 @@ class MjcfRobot(LoggedRobot):
             wanted: ``auto``, ``all``, or names with commas between.
         """
         heavy = bool(np.any(self.model.opt.gravity))
-        offered = optional(self.config.terms, wanted, self.config.joints)
-        without = {*(() if heavy else WHOLE), *(() if "volts" in self.config.commands else ("voltage",))}
+        offered = with_optional(self.config.terms, wanted, self.config.joints)
+        without = {
+            *(() if heavy else (n for n, q in QUANTITIES.items() if q.place == "robot")),
+            *(() if "volts" in self.config.commands else ("voltage",)),
+        }
         terms = (t for t in offered if t.free or t.what not in without)
         return MjcfRobot(replace(self.config, terms=tuple(terms)))
 
@@ -245,7 +245,7 @@ class MjcfRobot(LoggedRobot):
         n, driving = len(self.config.joints), set(self.config.commands)
         zero, one = jnp.zeros(n), jnp.ones(n)
         return params.replace(
-            kp=FALLBACK["kp"] * one if "goal" in driving else zero,
+            kp=QUANTITIES["kp"].nominal * one if "goal" in driving else zero,
             kd=zero,
             gain=one,
             released=zero,
@@ -278,7 +278,7 @@ class MjcfRobot(LoggedRobot):
         # A speed without load makes a damping of the torque limit, after a damping that was identified.
         for p in sorted(self.placed, key=lambda p: p.what == "speed"):
             each = np.asarray(of_each(p, self.placed, values)).tolist()
-            for i, value in list(zip(p.at, each, strict=True))[: 1 if p.what in WHOLE else None]:
+            for i, value in list(zip(p.at, each, strict=True))[: 1 if p.of_robot else None]:
                 if p.what == "gravcomp":
                     compensated = model.body_gravcomp > 0.0
                     model.body_gravcomp[1:] = np.where(compensated.any() & ~compensated, 0.0, value)[1:]
@@ -288,8 +288,8 @@ class MjcfRobot(LoggedRobot):
                     model.body_mass[model.body(name).id if name else i] += value
                 elif p.what == "speed":
                     model.dof_damping[dofs[i]] = (drives[i].most or NO_LIMIT) / value
-                elif p.what in ON_DOF:
-                    getattr(model, ON_DOF[p.what])[dofs[i]] = value
+                elif (field := QUANTITIES[p.what].place).startswith("dof_"):
+                    getattr(model, field)[dofs[i]] = value
         if any(p.what in ("armature", "damping", "speed") for p in self.placed):
             armature, damping = model.dof_armature[dofs], model.dof_damping[dofs]
             model.dof_armature[dofs] = beside_damping(armature, damping, config.step_s)
@@ -310,7 +310,11 @@ class MjcfRobot(LoggedRobot):
         """Return the joints' drives with identified values."""
         commands = self.config.commands
         control = "position" if "goal" in commands else "velocity" if "goal_velocity" in commands else "torque"
-        usual: dict[str, float] = {"stiffness": FALLBACK["kp"], "damping": 0.0, "gain": FALLBACK["gain"]}
+        usual: dict[str, float] = {
+            "stiffness": QUANTITIES["kp"].nominal,
+            "damping": 0.0,
+            "gain": QUANTITIES["gain"].nominal,
+        }
         drives = [{**usual, "most": most} for most in self._limits]
         names = {"kp": "stiffness", "kd": "damping", "gain": "gain", "torque": "most"}
         for p in self.placed:
@@ -337,18 +341,18 @@ class IdentifiableMjcf(IdentifiableRecording):
         self.parameters = ParameterTable(p for p in self.parameters if p.name != "sensor_delay")
         self.ahead_s = robot.tick_s
         self._world = world = robot.make_nodes()[2]
-        self._placed: Sequence[Placed] = robot.placed
+        self._placed: Sequence[ParameterAt] = robot.placed
         self._joints, self._dofs = world.joints, world.qvel_at
         self._params = {**self._params, world.name: robot.base(self._params[world.name])}
         self._model = robot.model
 
-    def reached(self, recordings: Recordings) -> Mapping[str, float]:
+    def reached(self, recordings: Sequence[Episode]) -> Mapping[str, float]:
         """Return limit -> the largest torque or speed that recordings reach, of limits that no pattern names."""
         limits = [p for p in self._placed if p.among_limits]
         if not limits:
             return {}
-        pairs = [reached(self._model, self._joints, episode) for episode in recordings]
-        most = dict(zip(LIMITS, np.max(pairs, axis=0), strict=True))
+        pairs = [_reached(self._model, self._joints, episode) for episode in recordings]
+        most: dict[str, np.ndarray] = dict(zip(LIMITS, np.max(pairs, axis=0), strict=True))
         return {p.parameter.name: float(most[p.what][list(p.at)].max()) for p in limits}
 
     def loaded(self, params: dict[str, PyTree], first: Mapping[str, PyTree]) -> dict[str, PyTree]:
@@ -375,3 +379,129 @@ class IdentifiableMjcf(IdentifiableRecording):
             "world": self._world.started(world, angle, speed),
             "sensor": EncoderParams(world.zero, world.terms),
         }
+
+
+# -- recordings that a model cannot have
+
+_CHECKED, _OPEN = 100, 5e-3
+"""Number of recorded positions at which loops must close, and the largest error of a closed one [m or rad]."""
+_WIDER = 1.1
+"""Ratio of a joint's motion to its range from which the range is wrong, whichever zero the log has."""
+_BEYOND, _OFTEN = 0.1, 0.05
+"""How far beyond a range positions count, as a share of its width; share of samples there from which they do."""
+
+
+def _beyond_ranges(model: MjModel, joints: Sequence[str], position: np.ndarray, file: str) -> list[str]:
+    """Return a sentence on joints whose recorded positions ``(N, joints)`` often lie beyond the model's range.
+
+    Raises:
+        UsageError: When a joint moves further than its range is wide.
+    """
+    sentences = []
+    for i, joint in enumerate(joints):
+        number = model.joint(joint).id
+        low, high = model.jnt_range[number]
+        if not model.jnt_limited[number]:
+            continue
+        first, last = np.nanquantile(position[:, i], (0.02, 0.98))
+        moves = f"{joint} goes from {first:.3g} to {last:.3g} in the log, and its range in {file} is {low:.3g} to"
+        if last - first > _WIDER * (high - low):
+            raise UsageError(
+                f"{moves} {high:.3g}: the model cannot move that far",
+                hint='MJCF takes ranges in degrees, unless it has <compiler angle="radian"/>; or check the log\'s unit',
+            )
+        room = _BEYOND * (high - low)
+        often = float(np.mean((position[:, i] < low - room) | (position[:, i] > high + room)))
+        if often > _OFTEN:
+            sentences.append(f"{moves} {high:.3g}: it lies beyond in {often:.0%} of the samples; check zero and sign")
+    return sentences
+
+
+def _open_loops(
+    gaps_of: Callable[[np.ndarray], np.ndarray], position: np.ndarray, joints: Sequence[str], file: str
+) -> list[str]:
+    """Return a sentence on recorded positions ``(N, joints)`` at which a loop of the model cannot close."""
+    some = position[:: max(len(position) // _CHECKED, 1)]
+    gaps = gaps_of(some)
+    if not (stays := gaps > _OPEN).any():
+        return []
+    worst = ", ".join(f"{n} {x:.3g}" for n, x in zip(joints, some[gaps.argmax()], strict=True))
+    return [
+        f"the loops of {file} cannot close at {stays.mean():.0%} of the recorded positions; the largest gap is "
+        f"{gaps.max():.3g} (m or rad), at {worst}: check order, signs, units and zeros of the joints"
+    ]
+
+
+def _check_payload(sent: Mapping[str, np.ndarray], commands: Collection[str]) -> None:
+    """Raise an error if the payload changes within a log, or is no mass.
+
+    Args:
+        sent: The log's commands by field.
+        commands: Fields that the robot reads.
+    """
+    if "payload_reach" in commands and "payload" not in commands:
+        raise Sim2RealError("the log has a payload_reach and no payload", hint="map the mass, too, as payload [kg]")
+    for field in (f for f in OF_PAYLOAD if f in sent and f in commands):
+        values = np.unique(sent[field])
+        if len(values) > 1 or not np.all(values >= 0.0):
+            listed = ", ".join(f"{v:g}" for v in values[:4])
+            raise Sim2RealError(
+                f"{field} is {listed} {OF_PAYLOAD[field]}: a log has one payload, of 0 or more",
+                hint="cut the log where the payload changes, or remove the field from the mapping",
+            )
+
+
+# -- what recordings reach, which bounds the search for limits
+
+_WINDOW_S = 0.06
+"""Length of the parabolas that give speeds and accelerations [s]."""
+_MOST = 0.99
+"""Quantile that counts as reached: single samples may be wrong."""
+_STATES = 2000
+"""Most states of a log whose torques are computed."""
+
+
+def _reached(model: MjModel, joints: np.ndarray, episode: Episode) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest torques and speeds of the recorded joints, ``(joints,)`` each [N m, rad/s].
+
+    The torques are those that the model's masses need for the measured motion. Friction adds to them.
+
+    Args:
+        joints: Shape ``(joints,)``: their numbers in the model.
+    """
+    model = with_payload_of(model, episode.outputs["actuator"])
+    t_s, position = episode.steps["sensor"].begun_s, np.asarray(episode.outputs["sensor"]["position"], np.float64)
+    t_s, rows = np.unique(np.asarray(t_s, np.float64), return_index=True)
+    velocity, acceleration = _derivatives(t_s, position[rows])
+    some = np.unique(np.linspace(0, len(t_s) - 1, _STATES).astype(int))
+    needed = _torques(model, joints, position[rows][some], velocity[some], acceleration[some])
+    return np.quantile(np.abs(needed), _MOST, axis=0), np.quantile(np.abs(velocity), _MOST, axis=0)
+
+
+def _derivatives(t_s: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return speeds and accelerations ``(N, joints)`` of positions, by parabolas through the samples around each."""
+    from scipy.signal import savgol_filter  # 0.3 s
+
+    period_s = float(np.median(np.diff(t_s)))
+    even_s = np.arange(t_s[0], t_s[-1], period_s)
+    even = np.stack([np.interp(even_s, t_s, column) for column in position.T], axis=1)
+    window = min(max(5, 2 * round(_WINDOW_S / period_s / 2) + 1), len(even) - 1 + len(even) % 2)
+
+    def derivative(order: int) -> np.ndarray:
+        columns = np.asarray(savgol_filter(even, window, 2, deriv=order, delta=period_s, axis=0)).T
+        return np.stack([np.interp(t_s, even_s, column) for column in columns], axis=1)
+
+    return derivative(1), derivative(2)
+
+
+def _torques(
+    model: MjModel, joints: Sequence[int] | np.ndarray, position: np.ndarray, speed: np.ndarray, pace: np.ndarray
+) -> np.ndarray:
+    """Return the joints' torques for states and accelerations, ``(N, joints)`` [N m]."""
+    at, dof = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
+    data, needed = mj.MjData(model), np.zeros_like(position)
+    for row, (q, w, a) in enumerate(zip(position, speed, pace, strict=True)):
+        data.qpos[at], data.qvel[dof], data.qacc[dof] = q, w, a
+        mj.mj_inverse(model, data)
+        needed[row] = data.qfrc_inverse[dof]
+    return needed

@@ -1,9 +1,9 @@
-"""Joints of a model that were not recorded: some are held at a position, others move with recorded ones."""
+"""Joints of a model that were not recorded: some are held at a position, others move together with recorded ones."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 
 from sim2real.errors import UsageError
-from sim2real.robots.from_model.couplings import Coupling, below, couplings_of, groups, upwards
 from sim2real.types import MjModel, MjSpec
 
 mj: Any = mujoco
@@ -122,8 +121,7 @@ def apply(spec: MjSpec, model: MjModel, holding: Holding) -> None:
     for element in (*spec.sensors, *spec.actuators, *spec.keys, *spec.tuples, *gone):
         spec.delete(element)
     # Move each body to the pose of its held joints.
-    for body in sorted({int(model.jnt_bodyid[i]) for i in held}):
-        _pose(model, body, held, joints)
+    _pose(model, held, joints)
     # Keep the start of the joints that still move.
     if holding.moved and holding.key >= 0:
         left = [i for i in range(model.njnt) if i not in held]
@@ -262,55 +260,145 @@ def _address(model: MjModel, number: int) -> slice:
     return slice(begin, begin + {_FREE: 7, _BALL: 4}.get(int(model.jnt_type[number]), 1))
 
 
-def _pose(model: MjModel, body: int, held: Mapping[int, Held], joints: Mapping[int, Any]) -> None:
-    """Set the pose of a body with held joints, and move its free joints that come before held ones."""
-    # Apply the held joints of the body in their order.
-    pos, quat = np.array(model.body_pos[body]), np.array(model.body_quat[body])
-    first = int(model.body_jntadr[body])
-    left: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    for i in range(first, first + int(model.body_jntnum[body])):
-        anchor, axis = np.array(model.jnt_pos[i]), np.array(model.jnt_axis[i])
-        if i not in held:
-            left[i] = anchor, axis
-            continue
-        step, turn = _step(model, i, held[i].value, anchor, axis)
-        pos, quat = pos + _turned(quat, step), _product(quat, turn)
-        back = turn * np.array([1, -1, -1, -1])
-        left = {k: (_turned(back, a - step), _turned(back, x)) for k, (a, x) in left.items()}
-    # Put a frame with the new pose around the body.
-    element = joints[first].parent
-    element.set_frame(element.parent.add_frame(pos=pos, quat=quat))
-    element.pos, element.quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-    element.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
-    for i, (anchor, axis) in left.items():
-        joints[i].pos, joints[i].axis = anchor, axis
+def _pose(model: MjModel, held: Mapping[int, Held], joints: Mapping[int, Any]) -> None:
+    """Give bodies the poses that they have with held joints at their values, and their free joints the axes.
+
+    Other joints are at their references, where they move nothing. Anchors and axes of free joints are those of that
+    moment, in the frame of the body: a held joint that follows turns them.
+    """
+    data = mj.MjData(model)
+    for number, h in held.items():
+        if h.value:
+            data.qpos[_address(model, number)] = h.value
+    mj.mj_kinematics(model, data)
+    for body in sorted({int(model.jnt_bodyid[number]) for number in held}):
+        parent, turn = int(model.body_parentid[body]), data.xmat[body].reshape(3, 3)
+        around = data.xmat[parent].reshape(3, 3)
+        quat = np.zeros(4)
+        mj.mju_mat2Quat(quat, (around.T @ turn).ravel())
+        first = int(model.body_jntadr[body])
+        # Put a frame with the pose around the body.
+        element = joints[first].parent
+        pos = around.T @ (data.xpos[body] - data.xpos[parent])
+        element.set_frame(element.parent.add_frame(pos=pos, quat=quat))
+        element.pos, element.quat = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+        element.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
+        for number in set(range(first, first + int(model.body_jntnum[body]))) - held.keys():
+            joints[number].pos = turn.T @ (data.xanchor[number] - data.xpos[body])
+            joints[number].axis = turn.T @ data.xaxis[number]
 
 
-def _step(
-    model: MjModel, number: int, value: Sequence[float], anchor: np.ndarray, axis: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the motion of a body by a joint at a value, in the body's frame: a translation [m], and a quaternion."""
-    turn = np.array([1.0, 0.0, 0.0, 0.0])
-    kind = int(model.jnt_type[number])
-    if kind == _FREE:
-        return np.zeros(3), turn
-    beyond = np.array(value) - model.qpos0[_address(model, number)]
-    if kind == _SLIDE:
-        return axis * beyond[0], turn
-    if kind == _BALL:
-        turn = np.array(value) / np.linalg.norm(value)
-    else:
-        mj.mju_axisAngle2Quat(turn, axis, beyond[0])
-    return anchor - _turned(turn, anchor), turn
+# -- joints that move together: in loops, by equalities, which URDF's mimic becomes, and by tendons
 
 
-def _turned(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    turned = np.zeros(3)
-    mj.mju_rotVecQuat(turned, vector, quat)
-    return turned
+@dataclass(frozen=True)
+class Coupling:
+    """Joints that an element of the model moves together.
+
+    Attributes:
+        name: The element, such as ``equality 'crank'``.
+        joints: Numbers of the joints.
+        equality: Number of the equality; -1: it is a tendon.
+        tendon: Number of the tendon; -1: it is an equality.
+        acts: Whether the coupling exerts a force of its own; a tendon that only an actuator pulls does not.
+    """
+
+    name: str
+    joints: frozenset[int]
+    equality: int = -1
+    tendon: int = -1
+    acts: bool = True
 
 
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    product = np.zeros(4)
-    mj.mju_mulQuat(product, a, b)
-    return product
+def couplings_of(model: MjModel) -> list[Coupling]:
+    """Return the couplings of a compiled model: its active equalities, and its tendons."""
+    couplings: list[Coupling] = []
+    if not int(model.opt.disableflags) & int(mj.mjtDisableBit.mjDSBL_EQUALITY):
+        active = map(int, np.flatnonzero(model.eq_active0))
+        couplings = [Coupling(_element("equality", model.equality(i)), _of_equality(model, i), i) for i in active]
+    pulling = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss, model.tendon_armature)
+    pulled = {c.tendon for c in couplings} | _tendons_in_equalities(model)
+    for t in range(model.ntendon):
+        acts = bool(model.tendon_limited[t]) or t in pulled or any(np.any(values[t]) for values in pulling)
+        couplings.append(Coupling(_element("tendon", model.tendon(t)), joints_of_tendon(model, t), tendon=t, acts=acts))
+    return couplings
+
+
+def groups(couplings: Iterable[Coupling]) -> list[frozenset[int]]:
+    """Return the sets of joints that couplings which act join, directly or through other joints."""
+    merged: list[frozenset[int]] = []
+    for coupling in couplings:
+        if coupling.acts and coupling.joints:
+            joined = [g for g in merged if g & coupling.joints]
+            merged = [g for g in merged if g not in joined] + [coupling.joints.union(*joined)]
+    return merged
+
+
+def joints_of_tendon(model: MjModel, tendon: int) -> frozenset[int]:
+    """Return the numbers of the joints that change a tendon's length."""
+    joints: set[int] = set()
+    bodies: list[int] = []
+    begin = int(model.tendon_adr[tendon])
+    # Walk along the tendon; a pulley begins a new branch.
+    for i in range(begin, begin + int(model.tendon_num[tendon])):
+        kind, number = int(model.wrap_type[i]), int(model.wrap_objid[i])
+        if kind == int(mj.mjtWrap.mjWRAP_JOINT):
+            joints.add(number)
+        elif kind == int(mj.mjtWrap.mjWRAP_SITE):
+            bodies.append(int(model.site_bodyid[number]))
+        elif kind == int(mj.mjtWrap.mjWRAP_PULLEY):
+            joints |= _between(model, bodies)
+            bodies = []
+        else:
+            bodies.append(int(model.geom_bodyid[number]))
+    return frozenset(joints | _between(model, bodies))
+
+
+def below(model: MjModel, joint: int) -> set[int]:
+    """Return the numbers of the joints of a joint's body and of the bodies that hang on it."""
+    top = int(model.jnt_bodyid[joint])
+    return {i for i in range(model.njnt) if top in upwards(model, int(model.jnt_bodyid[i]))}
+
+
+def _of_equality(model: MjModel, equality: int) -> frozenset[int]:
+    kind = int(model.eq_type[equality])
+    ends = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
+    eq = mj.mjtEq
+    if kind == int(eq.mjEQ_JOINT):
+        return frozenset(i for i in ends if i >= 0)
+    if kind == int(eq.mjEQ_TENDON):
+        return frozenset().union(*(joints_of_tendon(model, i) for i in ends if i >= 0))
+    if kind in (int(eq.mjEQ_CONNECT), int(eq.mjEQ_WELD)):
+        if int(model.eq_objtype[equality]) == int(mj.mjtObj.mjOBJ_SITE):
+            ends = [int(model.site_bodyid[i]) for i in ends]
+        return frozenset(_between(model, ends))
+    return frozenset()
+
+
+def _tendons_in_equalities(model: MjModel) -> set[int]:
+    rows = np.flatnonzero((model.eq_type == int(mj.mjtEq.mjEQ_TENDON)) & (model.eq_active0 != 0))
+    return {int(ends[i]) for i in rows for ends in (model.eq_obj1id, model.eq_obj2id) if ends[i] >= 0}
+
+
+def _between(model: MjModel, bodies: Sequence[int]) -> set[int]:
+    """Return the joints that move some of the bodies, but not all of them."""
+    if not bodies:
+        return set()
+    chains = [upwards(model, body) for body in bodies]
+    moved = set().union(*chains) - set(chains[0]).intersection(*chains)
+    return {i for i in range(model.njnt) if int(model.jnt_bodyid[i]) in moved}
+
+
+def upwards(model: MjModel, body: int) -> set[int]:
+    """Return a body and its ancestors without the world."""
+    bodies: set[int] = set()
+    while body > 0:
+        bodies.add(body)
+        body = int(model.body_parentid[body])
+    return bodies
+
+
+def _element(kind: str, element: Any) -> str:
+    return (
+        f"{kind} {element.name!r}" if element.name else f"{'an' if kind[0] in 'aeiou' else 'a'} {kind} without a name"
+    )

@@ -1,1 +1,0 @@
-"""Robots from a model file and a recording, without Python of their own."""

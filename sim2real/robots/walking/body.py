@@ -1,0 +1,183 @@
+"""A robot on legs in C MuJoCo whose motors follow laws: for the emulator, and to judge policies. Imports no JAX."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+import numpy as np
+
+from sim2real.emulation.body import measured_dtype
+from sim2real.robots.walking.terrain import FLOOR, HeightField
+
+_mj: Any = mujoco
+_TOUCH_M = 0.03
+"""Radius of the volume in which a foot's contacts count [m]; a foot has 0.022 m."""
+
+
+@dataclass(frozen=True)
+class HiddenTwin:
+    """The hidden parameters of a body; no policy and no training reads them.
+
+    Attributes:
+        friction: Of feet and floor.
+        load_kg: In the base.
+        strength: Factor on the torque of each motor.
+        damping, dry, armature: Of each joint, or of all [N m s/rad], [N m], [kg m^2].
+        sensing_s: Time from the motion to the observation [s].
+        acting_s: Time from the observation to the motors' new target: computation and transport [s].
+        bias_rad: Of each encoder.
+    """
+
+    friction: float = 0.8
+    load_kg: float = 0.0
+    strength: np.ndarray = field(default_factory=lambda: np.ones(12))
+    damping: float | np.ndarray = 0.1
+    dry: float | np.ndarray = 0.2
+    sensing_s: float = 0.008
+    acting_s: float = 0.011
+    bias_rad: np.ndarray = field(default_factory=lambda: np.zeros(12))
+    armature: float | np.ndarray = 0.01
+
+    @staticmethod
+    def draw(rng: np.random.Generator, joints: int) -> HiddenTwin:
+        """Draw a twin from ranges wider than those of training."""
+        return HiddenTwin(
+            friction=float(rng.uniform(0.4, 1.3)),
+            load_kg=float(rng.uniform(-1.0, 3.0)),
+            strength=rng.uniform(0.8, 1.2, joints),
+            damping=float(rng.uniform(0.02, 0.5)),
+            dry=float(rng.uniform(0.05, 0.4)),
+            sensing_s=float(rng.uniform(0.004, 0.012)),
+            acting_s=float(rng.uniform(0.004, 0.022)),
+            bias_rad=rng.uniform(-0.02, 0.02, joints),
+            armature=float(rng.uniform(0.006, 0.016)),
+        )
+
+
+class LeggedBody:
+    """A robot of an MJCF file with hidden parameters; see ``sim2real.emulation.body.Body``.
+
+    Every geom collides, with elliptic cones. The torque of a motor is its law's, limited to the actuator's range, times
+    the motor's strength. The motor reports the torque of its law, as it does not know its strength. Its encoder has a
+    bias, for the law too.
+
+    Args:
+        mjcf: The model: one actuator for each joint with a motor, a site ``imu``, and a free joint of the base.
+        feet: Sites in the middle of the feet.
+        pose: Positions of the joints at the start [rad].
+        height_m: Height of the base at the start [m].
+        place: ``floor``, or ``stand``: the base is fixed, and the feet are in the air.
+        settle_s: Time in which the body comes to rest on the floor, with motors without torque [s].
+        ground: Heights in place of the model's floor; None: it is flat.
+    """
+
+    def __init__(
+        self,
+        mjcf: Path,
+        feet: Sequence[str],
+        pose: Sequence[float],
+        height_m: float,
+        hidden: HiddenTwin,
+        place: Literal["floor", "stand"] = "floor",
+        *,
+        step_s: float = 0.001,
+        settle_s: float = 3.0,
+        ground: HeightField | None = None,
+    ) -> None:
+        self.hidden, self.place, self.step_s = hidden, place, step_s
+        # The model, with what an IMU and the feet measure.
+        spec = _mj.MjSpec.from_file(str(mjcf))
+        option = spec.option
+        option.timestep, option.cone = step_s, _mj.mjtCone.mjCONE_ELLIPTIC
+        option.iterations, option.ls_iterations = 50, 20
+        option.integrator = _mj.mjtIntegrator.mjINT_IMPLICITFAST  # stable with large kd
+        free = next(j for j in spec.joints if j.type == _mj.mjtJoint.mjJNT_FREE)
+        base = free.parent.name
+        if place == "stand":
+            free.parent.pos = (0.0, 0.0, 1.0)
+            spec.delete(free)
+        if ground is not None:
+            (rows, columns), share = ground.heights.shape, ground.heights / ground.heights.max()
+            spec.add_hfield(name="ground", nrow=rows, ncol=columns, size=ground.size, userdata=share.ravel())
+            floor = spec.geom(FLOOR)
+            floor.type, floor.hfieldname = _mj.mjtGeom.mjGEOM_HFIELD, "ground"
+        for kind in (_mj.mjtSensor.mjSENS_GYRO, _mj.mjtSensor.mjSENS_ACCELEROMETER):
+            spec.add_sensor(type=kind, objtype=_mj.mjtObj.mjOBJ_SITE, objname="imu")
+        for name in feet:
+            spec.site(name).size[0] = _TOUCH_M
+            spec.add_sensor(type=_mj.mjtSensor.mjSENS_TOUCH, objtype=_mj.mjtObj.mjOBJ_SITE, objname=name)
+        model = self.model = spec.compile()
+        self.base, self.motors = model.body(base).id, int(model.nu)
+        self._hide(model, hidden)
+        # The start: motors without torque until the first command.
+        data = self.data = _mj.MjData(model)
+        self._measured = np.zeros((), measured_dtype(self.motors))
+        data.qpos[-self.motors :] = pose
+        self.drive(np.zeros((self.motors, 5)))
+        if place == "floor":
+            data.qpos[:7] = (0, 0, height_m, 1, 0, 0, 0)
+            for _ in range(round(settle_s / step_s)):
+                _mj.mj_step(model, data)
+        _mj.mj_forward(model, data)
+
+    def drive(self, law: np.ndarray) -> None:
+        """Set the laws of all motors ``(motors, 5)``: q, dq, kp, kd, tau."""
+        q, dq, kp, kd, tau = np.asarray(law, np.float64).T
+        model, strength = self.model, np.asarray(self.hidden.strength)
+        model.actuator_gainprm[:, 0] = strength * kp
+        model.actuator_biasprm[:, 0] = strength * (tau + kd * dq)
+        model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = -strength * kp, -strength * kd
+        self.data.ctrl[:] = q - self.hidden.bias_rad
+
+    def step(self) -> None:
+        """Integrate one time step."""
+        _mj.mj_step(self.model, self.data)
+
+    def measure(self) -> np.ndarray:
+        """Return a measurement without noise."""
+        data, measured, n = self.data, self._measured.copy(), self.motors
+        measured["q"], measured["dq"] = data.qpos[-n:] + self.hidden.bias_rad, data.qvel[-n:]
+        measured["tau_est"] = data.actuator_force / self.hidden.strength
+        measured["quaternion"] = data.xquat[self.base]
+        measured["gyroscope"] = data.sensordata[:3]
+        # MuJoCo computes no acceleration of a body without joints to the world.
+        measured["accelerometer"] = data.sensordata[3:6] if self.place == "floor" else -self.model.opt.gravity
+        measured["foot_force"] = data.sensordata[6:10]
+        return measured
+
+    def state(self) -> dict[str, float]:
+        """Return the true state: joints, orientation, rates and velocity of the base in its axes, and its height."""
+        data, n = self.data, self.motors
+        turn = data.xmat[self.base].reshape(3, 3)
+        moving = data.qvel[:6] if self.place == "floor" else np.zeros(6)
+        fields: Mapping[str, np.ndarray] = {
+            "position": data.qpos[-n:],
+            "velocity": data.qvel[-n:],
+            "quaternion": data.xquat[self.base],
+            "gyro": moving[3:],
+            "linear": turn.T @ moving[:3],
+            "base": data.xpos[self.base],
+        }
+        return {f"{name}[{i}]": float(x) for name, values in fields.items() for i, x in enumerate(values)}
+
+    def truth(self) -> dict[str, object]:
+        """Return the hidden parameters."""
+        return {name: np.asarray(value).tolist() for name, value in asdict(self.hidden).items()}
+
+    def _hide(self, model: Any, hidden: HiddenTwin) -> None:
+        """Set the hidden parameters, and let MuJoCo compute the constants of the load."""
+        before, motors, base = float(model.body_mass[self.base]), slice(model.nv - model.nu, None), self.base
+        model.body_mass[base] = before + hidden.load_kg
+        model.body_ipos[base] *= before / (before + hidden.load_kg)
+        model.geom_friction[:, 0] = hidden.friction
+        model.dof_damping[motors], model.dof_frictionloss[motors] = hidden.damping, hidden.dry
+        model.dof_armature[motors] = hidden.armature
+        model.actuator_forcerange *= np.asarray(hidden.strength)[:, None]
+        # Friction of joints as stiff as the solver allows: with the defaults they creep.
+        model.dof_solref[motors] = (4 * self.step_s, 1.0)
+        model.dof_solimp[motors, :3] = (0.999, 0.999, 0.001)
+        _mj.mj_setConst(model, _mj.MjData(model))
