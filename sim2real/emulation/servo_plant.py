@@ -1,181 +1,230 @@
-"""A plant made from a robot's own MJCF model: an emulated robot for when there is no hardware yet.
-
-Its parameters differ from the model's by factors, so that an identification has a task. It cannot check the model's
-structure: an error of the MJCF is also in its twin.
-"""
+"""Position servos on the joints of an MJCF, with hidden numbers: the physics of emulated arms, and of twins."""
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import mujoco
-from mujoco import MjData, MjModel, mj_step  # pyright: ignore[reportAttributeAccessIssue]
+import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
 
 mj: Any = mujoco
 _RAD_PER_COUNT = 2.0 * math.pi / 4096  # of the encoders of DYNAMIXEL X and Feetech STS servos
-_CENTRE_RAD = 2048 * _RAD_PER_COUNT
-_FACTORS = ("gain", "damping", "armature", "friction")
+_HAND_NM_RAD, _HAND_DAMPING, _HAND_MOST_NM = 12.0, 0.5, 4.0  # assumed: a person's hand [N m/rad, N m s/rad, N m]
+Each = float | Sequence[float]
+"""A number for all joints, or one for each."""
 
 
-def plain_model(mjcf: Path, step_s: float, armature: float, damping: float, carried_kg: float, carrier: str) -> Any:
-    """Return an MJCF's model for a plant: hinges with rotors and friction, and a mass at a site.
+@dataclass(frozen=True)
+class ServoTruth:
+    """The hidden numbers of servos, at their joints.
 
-    Friction constraints are as stiff as the solver allows: with the defaults, a joint held by friction creeps.
-
-    Args:
-        damping: Of each joint [N m s/rad].
-        carried_kg: Mass at the site ``carrier``; 0: none.
+    Attributes:
+        gain: Torque per error of position [N m/rad], at the P gain of the plant's ``p_gain``.
+        limit: Torque at full duty [N m].
+        damping: Back-EMF and viscous friction, while the winding is driven [N m s/rad].
+        damping_off: The same with torque off: an open winding has no back-EMF.
+        armature: Inertia of the rotor behind the gears [kg m^2].
+        friction: Dry friction at speed [N m].
+        static: What friction at standstill exceeds that by [N m].
+        stribeck_rad_s: Speed at which 1/e of that is left [rad/s].
+        offset_rad: What a servo adds to its error of position [rad].
     """
-    spec = mj.MjSpec.from_file(str(mjcf))
-    spec.option.timestep, spec.option.integrator = step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
-    if carried_kg:
-        site = spec.site(carrier)
-        body = site.parent.add_body(name="carried", pos=site.pos)
-        body.explicitinertial, body.mass, body.inertia = True, carried_kg, [1e-8] * 3
-    # Before it compiles: MuJoCo derives the stiffness of stops and friction from the rotors.
-    for joint in spec.joints:
-        joint.armature, joint.damping = armature, [damping, 0.0, 0.0]
-        joint.solref_friction, joint.solimp_friction[:3] = [4 * step_s, 1.0], [0.999, 0.999, 0.001]
-    return spec.compile()
+
+    gain: Each
+    limit: Each
+    damping: Each
+    damping_off: Each
+    armature: Each
+    friction: Each
+    static: Each = 0.0
+    stribeck_rad_s: Each = 0.1
+    offset_rad: Each = 0.0
 
 
-class TwinPlant:
-    """Position-controlled servos on a model's position actuators; see ``sim2real.emulation.plant.Plant``.
+class ServoPlant:
+    """Servos in position mode, or PWM mode; any other mode is torque off. See ``sim2real.emulation.plant.Plant``.
 
-    A joint is at 0 where its encoder reads the centre of its range; ``MountedPlant`` puts other mountings in between.
-    With torque off the motor applies no torque, but the model's damping still acts. Position errors are computed in
-    whole counts, as in the firmware.
+    The firmware moves its setpoint to the goal with limited speed, and computes the error in whole counts. D and I
+    gains are not emulated.
 
     Args:
-        mjcf: The model, with one position actuator per joint.
-        joints: Name of each joint, in the order of the servos -> its name in the model.
-        p_gain: Position P Gain that corresponds to the actuators' ``kp`` [counts].
-        factors: Factors on the model's parameters: ``gain``, ``damping``, ``armature``, ``friction``; default: 1.
+        mjcf: The model: its path, or its text.
+        joints: Names of the joints, in the order of the servos.
+        truth: Fields of ``ServoTruth``.
+        p_gain: Position P Gain that ``gain`` is given for [counts].
+        names: Parameters that ``truth`` returns, such as ``gain`` or ``friction_JOINT``.
+        zero_counts: Counts of the encoders while the joints are at 0; default: the centre of their range.
+        gears: Turns of each servo for one of its joint; default: 1. ``MountedPlant`` converts the angles.
+        start: Joint angles at the beginning [rad]; default: 0.
+        carried_kg: Mass at the site ``tip`` [kg].
+        contact: Whether bodies touch.
+        hand: File (npz) of a person's motion, ``t_s`` ``(N,)`` [s] and ``position`` ``(N, joints)`` [rad]: a hand pulls
+            each joint without torque towards it, as a spring with a damper; None: there is no hand.
         step_s: MuJoCo's time step [s].
-        gears: Turns of each servo for one of its joint; default: 1. The model's numbers are the joints', the counts of
-            the firmware and ``truth`` the servos'.
 
     Raises:
-        UsageError: When a factor or a joint is unknown.
+        UsageError: The model has no joint of a name.
     """
 
     def __init__(
         self,
-        mjcf: str,
-        joints: Mapping[str, str],
+        mjcf: str | Path,
+        joints: Sequence[str],
         servo_ids: Sequence[int],
+        truth: Mapping[str, Any],
         p_gain: int,
-        factors: Mapping[str, float] | None = None,
-        step_s: float = 0.0005,
+        names: Sequence[str] = (),
+        *,
+        zero_counts: Sequence[float] = (),
         gears: Sequence[float] = (),
+        start: Sequence[float] = (),
+        carried_kg: float = 0.0,
+        contact: bool = False,
+        hand: str | None = None,
+        step_s: float = 0.0005,
     ) -> None:
-        self.servo_ids = tuple(servo_ids)
-        self.joints = tuple(joints)
-        self._gears = tuple(gears) or (1.0,) * len(self.joints)
-        elements = [joints[name] for name in self.joints]
-        # Check names before the model is changed.
-        f = dict.fromkeys(_FACTORS, 1.0) | dict(factors or {})
-        if unknown := set(f) - set(_FACTORS):
-            raise UsageError(f"a twin has no factor {sorted(unknown)[0]!r}. Available: {', '.join(_FACTORS)}")
-        model = self.model = MjModel.from_xml_string(mjcf)
-        names = [model.joint(i).name for i in range(model.njnt)]
-        if missing := [j for j in elements if j not in names]:
-            raise UsageError(f"the twin's model has no joint {missing[0]!r}. Available: {', '.join(names)}")
-        # Scale the model's parameters.
-        model.opt.timestep = step_s
-        model.actuator_gainprm[:, 0] *= f["gain"]
-        model.actuator_biasprm[:, 1] *= f["gain"]
-        model.actuator_forcerange[:] *= f["gain"]
-        model.dof_damping[:] *= f["damping"]
-        model.dof_armature[:] *= f["armature"]
-        model.dof_frictionloss[:] *= f["friction"]
-        # Friction constraints as stiff as the solver allows: with the defaults, a joint held by friction creeps.
-        model.dof_solref[:] = (4 * step_s, 1.0)
-        model.dof_solimp[:, :3] = (0.999, 0.999, 0.001)
-        self.data = MjData(model)
-        # Find each servo's joint and actuator in the model.
-        self._p_gain, self._kp = p_gain, model.actuator_gainprm[:, 0].copy()
-        self._force_range = model.actuator_forcerange.copy()
-        self._qpos = [int(model.joint(j).qposadr[0]) for j in elements]
-        self._dofs = [int(model.joint(j).dofadr[0]) for j in elements]
-        driven = model.actuator_trnid[:, 0].tolist()
-        self._motors = [driven.index(int(model.joint(j).id)) for j in elements]
-        self._profiles = [float("inf")] * len(self.joints)
-        self._goals: list[float | None] = [None] * len(self.joints)
-        self._references = [0.0] * len(self.joints)
+        self.joints, self.servo_ids, self._names, self._carried_kg = tuple(joints), tuple(servo_ids), names, carried_kg
+        self._nominal, n, t = p_gain, len(self.joints), ServoTruth(**truth)
+        own = {f: (np.zeros(n) + getattr(t, f)).tolist() for f in ServoTruth.__dataclass_fields__}
+        self._gain, self._limit, self._on, self._off = (own[f] for f in ("gain", "limit", "damping", "damping_off"))
+        self._at_speed, self._static, self._widths = own["friction"], own["static"], own["stribeck_rad_s"]
+        self._offset, self._armature = own["offset_rad"], own["armature"]
+        self._gears = tuple(gears) or (1.0,) * n
+        self._count_rad = [_RAD_PER_COUNT / gear for gear in self._gears]
+        self._zero_rad = [count * _RAD_PER_COUNT for count in zero_counts or (2048,) * n]
+        self._hand = None if hand is None else dict(np.load(hand))
+        self.model = self._compiled(mjcf, step_s, contact)
+        self.data = mj.MjData(self.model)
+        places = [self.model.joint(name) for name in self.joints]
+        self._at, self._dofs = [int(p.qposadr[0]) for p in places], [int(p.dofadr[0]) for p in places]
+        self.data.qpos[self._at] = start or 0.0
+        mj.mj_forward(self.model, self.data)
+        self._p_gain, self._profile = [float(p_gain)] * n, [math.inf] * n
+        self._mode, self._goal, self._reference = [int(OperatingMode.OFF)] * n, [0.0] * n, [0.0] * n
+        self._torques = [0.0] * n
+        # Kept, as looking an array up in MuJoCo's structures costs as much as reading it.
+        self._qpos, self._qvel, self._applied = self.data.qpos, self.data.qvel, self.data.qfrc_applied
+        self._friction, self._damping = self.model.dof_frictionloss, self.model.dof_damping
 
     def advance(self, t_s: float) -> None:
         """Integrate up to ``t_s`` [s]."""
         model, data, step_s = self.model, self.data, self.model.opt.timestep
         for _ in range(round((t_s - data.time) / step_s)):
-            for i, goal in enumerate(self._goals):
-                angle, motor = float(data.qpos[self._qpos[i]]), self._motors[i]
-                # Torque off: a goal at the present angle makes the actuator's force 0.
-                if goal is None:
-                    data.ctrl[motor] = angle
-                    continue
-                # Move the setpoint along its profile, and round the error to counts as the firmware does.
-                reach = self._profiles[i] * step_s
-                self._references[i] += min(max(goal - self._references[i], -reach), reach)
-                count_rad = _RAD_PER_COUNT / self._gears[i]
-                counts = round(self._references[i] / count_rad) - round(angle / count_rad)
-                data.ctrl[motor] = angle + counts * count_rad
-            mj_step(model, data)
+            angles, speeds = self._qpos[self._at].tolist(), self._qvel[self._dofs].tolist()
+            self._torques = [self._torque(i, angle, step_s) for i, angle in enumerate(angles)]
+            self._applied[self._dofs] = self._torques if self._hand is None else self._with_hand(angles, speeds)
+            self._friction[self._dofs] = [
+                level + more * math.exp(-abs(speed) / width)
+                for level, more, speed, width in zip(self._at_speed, self._static, speeds, self._widths, strict=True)
+            ]
+            mj.mj_step(model, data)
 
     def command(self, servo_id: int, mode: int, goal: float) -> None:
-        """Set a servo's goal.
-
-        Args:
-            mode: Position; any other mode counts as torque off.
-            goal: Goal position [rad from the encoder's count 0].
-        """
-        i = self.servo_ids.index(servo_id)
-        if mode == OperatingMode.POSITION and self._goals[i] is None:
-            self._references[i] = float(self.data.qpos[self._qpos[i]])
-        self._goals[i] = goal - _CENTRE_RAD if mode == OperatingMode.POSITION else None
+        """Set a servo's goal: rad from the encoder's count 0 (position), or the share of the supply voltage (PWM)."""
+        i, position = self.servo_ids.index(servo_id), int(OperatingMode.POSITION)
+        # The setpoint starts from the present angle when this mode begins.
+        if mode == position and self._mode[i] != mode:
+            self._reference[i] = float(self._qpos[self._at[i]])
+        known = (position, int(OperatingMode.PWM))
+        self._mode[i] = int(mode) if mode in known else int(OperatingMode.OFF)
+        self._goal[i] = goal - self._zero_rad[i] if mode == position else goal
+        # The back-EMF brakes as damping does; there MuJoCo integrates it implicitly.
+        self._damping[self._dofs[i]] = (self._on if self._is_on(i) else self._off)[i]
 
     def configure(self, servo_id: int, p_gain: int, d_gain: int, profile_velocity_rad_s: float) -> None:
-        """Set a servo's position controller.
-
-        Args:
-            p_gain: Position P Gain [counts].
-            d_gain: Not emulated; drives set it to 0.
-            profile_velocity_rad_s: Largest speed of the setpoint [rad/s]; inf: no limit.
-        """
-        del d_gain
+        """Set a servo's P gain [counts], and the largest speed of its setpoint [rad/s]; inf is no limit."""
         i = self.servo_ids.index(servo_id)
-        motor = self._motors[i]
-        self._profiles[i] = profile_velocity_rad_s
-        kp = self._kp[motor] * p_gain / self._p_gain
-        self.model.actuator_gainprm[motor, 0], self.model.actuator_biasprm[motor, 1] = kp, -kp
+        self._p_gain[i], self._profile[i] = float(p_gain), profile_velocity_rad_s
 
     def measure(self, servo_id: int) -> tuple[float, float, float]:
-        """Return angle from the encoder's count 0 [rad], velocity [rad/s], and load, a fraction of the stall torque."""
+        """Return angle from the encoder's count 0 [rad], velocity [rad/s] and load [share of the stall torque]."""
         i = self.servo_ids.index(servo_id)
-        load = float(self.data.actuator_force[self._motors[i]]) / float(self._force_range[self._motors[i], 1])
-        angle, speed = self.data.qpos[self._qpos[i]], self.data.qvel[self._dofs[i]]
-        return float(angle) + _CENTRE_RAD, float(speed), load
+        velocity = float(self._qvel[self._dofs[i]])
+        braking = (self._on[i] - self._off[i]) * velocity if self._is_on(i) else 0.0
+        load = (self._torques[i] - braking) / max(self._limit)
+        return float(self._qpos[self._at[i]]) + self._zero_rad[i], velocity, load
 
     def state(self) -> dict[str, float]:
-        """Return the true joint angles [rad] and velocities [rad/s]."""
-        position = {f"position[{i}]": float(self.data.qpos[a]) for i, a in enumerate(self._qpos)}
-        return position | {f"velocity[{i}]": float(self.data.qvel[a]) for i, a in enumerate(self._dofs)}
+        """Return the true joint angles [rad] and velocities [rad/s], and where a site ``tip`` is [m]."""
+        rows = {"position": self._qpos[self._at], "velocity": self._qvel[self._dofs]}
+        if mj.mj_name2id(self.model, mj.mjtObj.mjOBJ_SITE, "tip") >= 0:
+            mj.mj_kinematics(self.model, self.data)  # a step leaves the site where the step began
+            rows["tip"] = self.data.site("tip").xpos
+        return {f"{name}[{i}]": value for name, row in rows.items() for i, value in enumerate(row.tolist())}
 
     def truth(self) -> dict[str, Any]:
-        """Return the parameters that can be identified from a log, named as in ``sim2real.robots.servo.model``.
+        """Return what a log can determine, at the servos' shafts, by the names of ``sim2real.robots.servo.model``.
 
-        Parameters that the joints share are those of the first servo; ``gain`` belongs to ``p_gain``.
+        The gain is that at the P gains of now. Where friction decreases with speed in the robot's model, it is that at
+        standstill, otherwise that at speed.
         """
-        dof, motor, gear = self._dofs[0], self._motors[0], self._gears[0]
-        dofs = zip(self.joints, self._dofs, self._gears, strict=True)
-        friction = {f"friction_{name}": float(self.model.dof_frictionloss[d]) / g for name, d, g in dofs}
-        return {
-            "gain": float(self._kp[motor]) / gear**2,
-            "damping": float(self.model.dof_damping[dof]) / gear**2,
-            "armature": float(self.model.dof_armature[dof]) / gear**2,
-            **friction,
+        worn = any(name.startswith("stribeck") for name in self._names)
+        friction = [f + s if worn else f for f, s in zip(self._at_speed, self._static, strict=True)]
+        gears = list(zip(self._gears, range(len(self.joints)), strict=True))
+        of_each = {
+            "gain": [self._gain[i] * self._p_gain[i] / self._nominal / g**2 for g, i in gears],
+            "damping": [self._on[i] / g**2 for g, i in gears],
+            "armature": [self._armature[i] / g**2 for g, i in gears],
+            "friction": [friction[i] / g for g, i in gears],
+            "stribeck": [self._widths[i] * g for g, i in gears],
+            "goal_offset": [self._offset[i] * g for g, i in gears],
+            "saturation": [self._limit[i] / self._gain[i] * g for g, i in gears],
+            "payload": [self._carried_kg],
         }
+        labels = {name: values[0] for name, values in of_each.items()}
+        for quantity, values in of_each.items():
+            labels |= {f"{quantity}_{joint}": value for joint, value in zip(self.joints, values, strict=False)}
+        return {name: labels[name] for name in self._names}
+
+    def _is_on(self, i: int) -> bool:
+        return self._mode[i] != OperatingMode.OFF
+
+    def _torque(self, i: int, angle: float, step_s: float) -> float:
+        """Return what the motor's duty makes of goal and angle, without back-EMF [N m]."""
+        if self._mode[i] == OperatingMode.PWM:
+            return self._limit[i] * self._goal[i]
+        if not self._is_on(i):
+            return 0.0
+        reach, count_rad = self._profile[i] * step_s, self._count_rad[i]
+        self._reference[i] += min(max(self._goal[i] - self._reference[i], -reach), reach)
+        error = (round(self._reference[i] / count_rad) - round(angle / count_rad)) * count_rad + self._offset[i]
+        torque = self._gain[i] * self._p_gain[i] / self._nominal * error
+        return min(max(torque, -self._limit[i]), self._limit[i])
+
+    def _with_hand(self, angles: list[float], speeds: list[float]) -> list[float]:
+        """Return the torques on the joints: of the motors, and of the hand on joints without a motor's torque [N m]."""
+        hand, torques = self._hand or {}, list(self._torques)
+        for i in (i for i in range(len(torques)) if not self._is_on(i)):
+            there = float(np.interp(self.data.time, hand["t_s"], hand["position"][:, i]))
+            pull = _HAND_NM_RAD * (there - angles[i]) - _HAND_DAMPING * speeds[i]
+            torques[i] += min(max(pull, -_HAND_MOST_NM), _HAND_MOST_NM)
+        return torques
+
+    def _compiled(self, mjcf: str | Path, step_s: float, contact: bool) -> Any:
+        """Return the model: friction constraints as stiff as the solver allows; with the defaults, joints creep."""
+        text = str(mjcf)
+        spec = mj.MjSpec.from_string(text) if text.lstrip().startswith("<") else mj.MjSpec.from_file(text)
+        there = [joint.name for joint in spec.joints]
+        if missing := [name for name in self.joints if name not in there]:
+            raise UsageError(f"the plant's model has no joint {missing[0]!r}. Available: {', '.join(there)}")
+        spec.option.timestep, spec.option.integrator = step_s, mj.mjtIntegrator.mjINT_IMPLICITFAST
+        if not contact:
+            spec.option.disableflags |= int(mj.mjtDisableBit.mjDSBL_CONTACT)
+        for actuator in spec.actuators:
+            spec.delete(actuator)
+        if self._carried_kg:
+            tip = spec.site("tip")
+            body = tip.parent.add_body(name="carried", pos=tip.pos)
+            body.explicitinertial, body.mass, body.inertia = True, self._carried_kg, [1e-8] * 3
+        # Before it compiles: MuJoCo derives the stiffness of stops and friction from the rotors.
+        for i, name in enumerate(self.joints):
+            joint = spec.joint(name)
+            joint.armature, joint.damping = self._armature[i], [self._off[i], 0.0, 0.0]
+            joint.frictionloss = self._at_speed[i] + self._static[i]
+            joint.solref_friction, joint.solimp_friction[:3] = [4 * step_s, 1.0], [0.999, 0.999, 0.001]
+        return spec.compile()

@@ -7,7 +7,7 @@ import pytest
 from small_robot import SERVOS, PairRobot
 
 from sim2real.emulation.dynamixel import EmulatorConfig
-from sim2real.emulation.servo_plant import TwinPlant
+from sim2real.emulation.servo_plant import ServoPlant
 from sim2real.emulation.truth import Kind, read_truth
 from sim2real.hardware.device import OperatingMode
 from sim2real.hardware.joint import Joint
@@ -38,7 +38,7 @@ def test_a_robots_joints_are_called_as_before(pair):
 
 def test_a_twins_servos_are_those_of_the_data_sheet_whatever_their_gears(pair):
     factors = {"gain": 0.9, "damping": 1.1, "armature": 1.2, "friction": 1.5}
-    one, other = (TwinPlant(**r.model.twin(EmulatorConfig(), **factors).plant_args) for r in (pair, PairRobot(GEARED)))
+    one, other = (ServoPlant(**r.model.twin(EmulatorConfig(), **factors).plant_args) for r in (pair, PairRobot(GEARED)))
     assert other.truth() == pytest.approx(one.truth(), rel=1e-5)
     assert one.truth() == pytest.approx({n: v * factors[n.split("_")[0]] for n, v in pair.nominal().items()}, rel=1e-5)
 

@@ -193,19 +193,37 @@ class ServoModel(RobotModel):
 
         Args:
             emulator: Latencies and losses; the servos' model is the data sheet's.
-            **factors: Factors on the model's ``gain``, ``damping``, ``armature`` and ``friction``.
+            **factors: Factors on the data sheet's ``gain``, ``damping``, ``armature`` and ``friction``.
+
+        Raises:
+            UsageError: A factor is unknown.
         """
-        s = self.servos
-        arguments = {
-            "mjcf": self._spec().to_xml(),
-            "joints": {name: name for name in s.names},
-            "gears": list(s.gears),
-            "servo_ids": s.ids,
-            "p_gain": s.sheet.p_gain,
-            "factors": factors,
+        s, sheet = self.servos, self.servos.sheet
+        if unknown := set(factors) - set(_NAMES):
+            raise UsageError(f"a twin has no factor {min(unknown)!r}. Available: {', '.join(_NAMES)}")
+        gain, damping, armature, friction = (getattr(sheet, n) * factors.get(n, 1.0) for n in _NAMES)
+        worn = sheet.stribeck_rad_s is not None
+        truth = {
+            "gain": [gain * g**2 for g in s.gears],
+            "limit": [gain * sheet.full_rad * g for g in s.gears],
+            "damping": [damping * g**2 for g in s.gears],
+            "damping_off": [damping * g**2 for g in s.gears],
+            "armature": [armature * g**2 for g in s.gears],
+            "friction": [0.0 if worn else friction * g for g in s.gears],
+            "static": [friction * g if worn else 0.0 for g in s.gears],
+            "stribeck_rad_s": [(sheet.stribeck_rad_s or 1.0) / g for g in s.gears],
         }
-        emulator = replace(emulator, model_number=s.sheet.model_number)
-        return Embedded("sim2real.emulation.servo_plant:TwinPlant", emulator, arguments)
+        arguments = {
+            "mjcf": self.mjcf.read_text(encoding="utf-8"),
+            "joints": s.names,
+            "servo_ids": s.ids,
+            "truth": truth,
+            "p_gain": sheet.p_gain,
+            "names": [p.name for p in self.dynamics() if p.name != PAYLOAD],
+            "gears": s.gears,
+        }
+        emulator = replace(emulator, model_number=sheet.model_number)
+        return Embedded("sim2real.emulation.servo_plant:ServoPlant", emulator, arguments)
 
     @cached_property
     def model(self) -> MjModel:
