@@ -160,14 +160,14 @@ class ServoPlant:
     def truth(self) -> dict[str, Any]:
         """Return what a log can determine, at the servos' shafts, by the names of ``sim2real.robots.servo.model``.
 
-        The gain is that at the P gains of now. Where friction decreases with speed in the robot's model, it is that at
+        The gain is that at ``p_gain``. Where friction decreases with speed in the robot's model, it is that at
         standstill, otherwise that at speed.
         """
         worn = any(name.startswith("stribeck") for name in self._names)
         friction = [f + s if worn else f for f, s in zip(self._at_speed, self._static, strict=True)]
         gears = list(zip(self._gears, range(len(self.joints)), strict=True))
         of_each = {
-            "gain": [self._gain[i] * self._p_gain[i] / self._nominal / g**2 for g, i in gears],
+            "gain": [self._gain[i] / g**2 for g, i in gears],
             "damping": [self._on[i] / g**2 for g, i in gears],
             "armature": [self._armature[i] / g**2 for g, i in gears],
             "friction": [friction[i] / g for g, i in gears],
@@ -220,7 +220,7 @@ class ServoPlant:
         if self._carried_kg:
             tip = spec.site("tip")
             body = tip.parent.add_body(name="carried", pos=tip.pos)
-            body.explicitinertial, body.mass, body.inertia = True, self._carried_kg, [1e-8] * 3
+            body.explicitinertial, body.ipos, body.mass, body.inertia = True, [0.0] * 3, self._carried_kg, [1e-8] * 3
         # Before it compiles: MuJoCo derives the stiffness of stops and friction from the rotors.
         for i, name in enumerate(self.joints):
             joint = spec.joint(name)

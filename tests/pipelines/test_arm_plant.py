@@ -166,10 +166,8 @@ def test_configure_changes_the_gain():
     droops = []
     for p_gain in (800, 1600):
         plant = ArmPlant(SMOOTH)
-        before = plant.truth()["gain"]
         for servo_id in plant.servo_ids:
             plant.configure(servo_id, p_gain, 0, np.inf)
-        assert plant.truth()["gain"] == pytest.approx(before * p_gain / 800)
         command(plant, POSITION, (0, 1.2, 0)).advance(3.0)
         droops.append(1.2 - plant.data.qpos[1])
     assert droops[0] == pytest.approx(2 * droops[1], rel=0.05)

@@ -129,7 +129,7 @@ class ServoWorld(BaseWorld):
         data = mjx.make_data(self.model, impl="jax").replace(
             qpos=jnp.asarray(params.qpos), qvel=jnp.asarray(params.qvel)
         )
-        return ServoState(stepping.forward(model, data, actuation=False), reference, derived, places)
+        return ServoState(stepping.JaxEngine().forward(model, data, actuation=False), reference, derived, places)
 
     def init_output(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> JointReading:
         if self._apart:
@@ -150,7 +150,9 @@ class ServoWorld(BaseWorld):
 
         def once(data: PyTree, control: jax.Array) -> tuple[PyTree, None]:
             now = self._worn(model, params, data.qvel)
-            return stepping.advance(now, data.replace(ctrl=control.astype(data.ctrl.dtype)), legacy=False), None
+            return stepping.JaxEngine().advance(
+                now, data.replace(ctrl=control.astype(data.ctrl.dtype)), legacy=False
+            ), None
 
         data = jax.lax.scan(once, state.data, controls)[0]
         new = step_state.state.replace(data=data)

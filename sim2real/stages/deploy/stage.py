@@ -54,7 +54,8 @@ def deploy(
     config = python_arguments.config_of(config, pipeline.deploy)
     if identification is not None:
         identification = python_arguments.identification_of(identification)
-    robot = _ready(pipeline, bundle, config)
+    robot = _commanded(moving_robot(pipeline), pipeline, config)
+    require_fit(pipeline, robot, bundle, config)
     if identification is not None:
         check_parameters(identification, pipeline)
     return _deployed(pipeline, robot, bundle, folder, config, identification)
@@ -100,9 +101,10 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
         run_dir: Run folder to add to; None takes that of the bundle.
     """
     # Check the bundle before a folder is made.
+    robot = _commanded(moving_robot(pipeline), pipeline, config)
     path, run_dir = find_bundle(pipeline, config, root, run_dir)
     bundle = Bundle.load(path)
-    robot = _ready(pipeline, bundle, config)
+    require_fit(pipeline, robot, bundle, config)
     with open_stage(root, pipeline.name, "deploy", config, {"bundle": path}, run_dir, config.dry_run) as stage:
         # Name the logs first, so that the manifest of an interrupted deployment lists them.
         for i in range(config.episodes):
@@ -128,15 +130,13 @@ def run(pipeline: Pipeline, config: DeployConfig, root: Path, run_dir: Path | No
     return stage.result
 
 
-def _ready(pipeline: Pipeline, bundle: Bundle, config: DeployConfig) -> Robot:
-    """Return the robot, with the configured command; refuse a policy or settings that do not fit it."""
-    robot = moving_robot(pipeline)
+def _commanded(robot: Robot, pipeline: Pipeline, config: DeployConfig) -> Robot:
+    """Return the robot with the configured command."""
     if config.command is not None:
         commanded = getattr(robot, "commanded", None)
         if commanded is None:
             raise UsageError(f"pipeline {pipeline.name!r} follows no velocity", hint="run it without --command")
         robot = commanded(config.command)
-    require_fit(pipeline, robot, bundle, config)
     robot.task.at_rest(0)  # a task that needs JAX is refused before the robot moves
     return robot
 
