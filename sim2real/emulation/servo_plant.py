@@ -11,9 +11,9 @@ import numpy as np
 
 from sim2real.errors import UsageError
 from sim2real.hardware.device import OperatingMode
+from sim2real.hardware.dynamixel.registers import RAD_PER_COUNT
 
 mj: Any = mujoco
-_RAD_PER_COUNT = 2.0 * math.pi / 4096  # of the encoders of DYNAMIXEL X and Feetech STS servos
 _HAND_NM_RAD, _HAND_DAMPING, _HAND_MOST_NM = 12.0, 0.5, 4.0  # assumed: a person's hand [N m/rad, N m s/rad, N m]
 Each = float | Sequence[float]
 """A number for all joints, or one for each."""
@@ -95,8 +95,8 @@ class ServoPlant:
         self._at_speed, self._static, self._widths = own["friction"], own["static"], own["stribeck_rad_s"]
         self._offset, self._armature = own["offset_rad"], own["armature"]
         self._gears = tuple(gears) or (1.0,) * n
-        self._count_rad = [_RAD_PER_COUNT / gear for gear in self._gears]
-        self._zero_rad = [count * _RAD_PER_COUNT for count in zero_counts or (2048,) * n]
+        self._count_rad = [RAD_PER_COUNT / gear for gear in self._gears]
+        self._zero_rad = [count * RAD_PER_COUNT for count in zero_counts or (2048,) * n]
         self._hand = None if hand is None else dict(np.load(hand))
         self.model = self._compiled(mjcf, step_s, contact)
         self.data = mj.MjData(self.model)

@@ -15,8 +15,7 @@ from sim2real.stages.train import stage
 from sim2real.stages.train.training_setup import prepare
 pipeline = load_pipeline(sys.argv[1])
 prepare(pipeline, TrainConfig(model="nominal", episode_s=0.5, timelines=1), None)
-limits = "sim2real.hardware.safety.limits"  # figures alone
-print(json.dumps([n for n in sys.modules if n.startswith("sim2real.hardware.") and not limits.startswith(n)]))
+print(json.dumps([n for n in sys.modules if n.startswith("sim2real.hardware.") and n.endswith((".device", ".drive"))]))
 """
 
 SAFETY = ("", ".safety", ".safety.limits", ".safety.following")
