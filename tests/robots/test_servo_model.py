@@ -11,7 +11,7 @@ from small_robot import SERVOS, SHEET, VALUES, PairRobot, play_in_a_graph, play_
 
 from sim2real.errors import UsageError
 from sim2real.hardware.joint import Joint
-from sim2real.identify.problem.engine import choose
+from sim2real.identify.rollouts import choose_engine
 from sim2real.robots.messages import EpisodeStart
 from sim2real.robots.servo.model import ServoModel, servo_parameters
 from sim2real.stages.pipeline.pipeline import load_pipeline
@@ -146,19 +146,12 @@ def test_a_robot_that_is_first_asked_while_jax_traces_keeps_no_tracer():
     assert float(heavier) == pytest.approx(0.1, rel=1e-4)
 
 
-def test_c_is_taken_where_it_can_be_and_where_forward_mode_does_not_forbid_it(pair):
+def test_c_is_taken_where_it_can_be(pair):
     model = pair.identifiable(0.03)
-    nodes = model.nodes(0.03)
-    for wanted, jacobian, name in (
-        ("auto", "auto", "c"),
-        ("compiled", "auto", "compiled"),
-        ("auto", "forward", "compiled"),
-    ):
-        assert choose(wanted, nodes, model.given, jacobian).name == name
-    with pytest.raises(UsageError, match="forward mode"):
-        choose("c", nodes, model.given, "forward")
+    for wanted, name in (("auto", "c"), ("compiled", "compiled")):
+        assert choose_engine(wanted, model.nodes(0.03), model.given).name == name
     disk = load_pipeline("disk").load().identifiable(0.06)
     motor = disk.nodes(0.06), disk.given
-    assert choose("auto", *motor).name == "compiled"
+    assert choose_engine("auto", *motor).name == "compiled"
     with pytest.raises(UsageError, match="engine c: the world is not one of MuJoCo's"):
-        choose("c", *motor)
+        choose_engine("c", *motor)

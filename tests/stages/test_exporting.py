@@ -59,9 +59,9 @@ def test_mjcf_has_what_was_identified(arm, here, capsys):
     np.testing.assert_allclose(model.dof_damping, 0.3)
     np.testing.assert_allclose(model.dof_armature, 0.006 - 0.5 * model.opt.timestep * 0.3, rtol=1e-5)
     assert model.actuator_delay[0] == pytest.approx(0.014, abs=0.0026)
-    gain = model.numeric("sim2real/joint/arm/pan/joint/stiffness").data
+    gain = model.numeric("sim2real/joint/pan/stiffness").data
     assert gain[0] * 0.7 < gain[1] < gain[0] * 0.9 < gain[0] * 1.1 < gain[2] < gain[0] * 1.35
-    limit = model.numeric("sim2real/joint/arm/pan/joint/effort_limit").data
+    limit = model.numeric("sim2real/joint/pan/effort_limit").data
     np.testing.assert_allclose(limit / limit[0], gain / gain[0], rtol=1e-3)  # it goes with the gain
 
 
@@ -79,7 +79,7 @@ def test_a_run_folder_is_found_by_its_pipeline(arm, here, capsys):
     assert document["format"] == 1
     assert document["about"]["pipeline"] == "arm"
     assert document["delays_s"]["round_trip"] == {"estimate": 0.02, "low": 0.019, "high": 0.021}
-    assert document["mujoco"]["joints"]["arm/pan/joint"]["damping"]["estimate"] == 0.3
+    assert document["mujoco"]["joints"]["pan"]["damping"]["estimate"] == 0.3
     assert {p["name"] for p in document["parameters"]} >= {"gain", "actuator_delay"}
     assert document["posterior"]["names"] == ["gain"]
 
