@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 from recorded_on_c import play
-from sim2real.robots.from_model.mjcf_parameters import ParameterPattern
-from sim2real.robots.from_model.mjcf_robot import MjcfRobot, RobotConfig
 
 from sim2real.identify.segments import Span
+from sim2real.robots.model.parameters import ParameterPattern
+from sim2real.robots.model.robot import MjcfRobot, RobotConfig
 from sim2real.stages.config import IdentifyConfig
 from sim2real.stages.identify.judgement import inclined
 
