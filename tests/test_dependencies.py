@@ -21,7 +21,7 @@ IMPORTED_AS = {
 MAY_IMPORT = {
     "view": {
         *("sim2real.view.rerun_recording", "sim2real.view.rerun_viewer", "sim2real.view.model_scene"),
-        *("pipelines.arm.scene", "pipelines.pendulum.scene"),
+        "pipelines.pendulum.scene",
     },
     "hardware": {"sim2real.policy.runner"},
     "interop": {"sim2real.interop.brax", "sim2real.interop.vector"},

@@ -46,9 +46,9 @@ class Emulation:
     def __post_init__(self) -> None:
         self.require({name: (0.0, 1.0) for name in ("reply_loss", "corrupt", "late", "late_s")})
         self.require({"actuation_jitter_s": (0.0, self.actuation_latency_s)})
-        negative = [name for name, value in asdict(self).items() if value is not None and value < 0]
-        for name in set(negative) & {f for f in Emulation.__dataclass_fields__ if f.endswith("_s")}:
-            raise UsageError(f"emulator: {name} = {getattr(self, name)} is below 0")
+        for name, value in asdict(self).items():
+            if isinstance(value, int | float) and value < 0:
+                raise UsageError(f"emulator: {name} = {value} is below 0")
 
     def require(self, ranges: dict[str, tuple[float, float]]) -> None:
         """Raise UsageError for a setting outside of its range."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from sim2real import pytree
-from sim2real.composer.physics.mjx import constants, open_loop, stepping
+from sim2real.composer.physics.mjx import constants, stepping
 from sim2real.composer.physics.mjx.environment import MjxEnvironment, State
 from sim2real.composer.physics.mjx.physics import MjxPhysics
 from sim2real.composer.task import Task
@@ -20,13 +19,12 @@ from sim2real.errors import UsageError
 from sim2real.graph.base import Base, GraphState, StepState, Value
 from sim2real.graph.node import BaseWorld
 from sim2real.worlds.recorded import command_delay
-from sim2real.worlds.rollouts import Start, StepLaw, WorldParams, check_steps
+from sim2real.worlds.rollouts import StepLaw, WorldParams
 
 if TYPE_CHECKING:
     from mujoco import mjx
 
     from sim2real.composer.mjcf.element import Elements
-    from sim2real.composer.types import MjModel
     from sim2real.types import PyTree
 
 
@@ -84,13 +82,11 @@ class ComposedWorld(BaseWorld):
         """Sets fields of the model before every physics step from the state; set by a subclass."""
         self._parameters = dict(parameters or {})
         self._derives = any(attribute in CONSTANTS for _, attribute in self._parameters.values())
-        self._apart, self._derived = False, frozenset[str]()
         # Set the parameters once, to refuse those that cannot vary.
         physics = self._view()
         self._set(physics, self.init_params())  # refuses what cannot vary
         if self._derives:
-            self._derived = constants.derived(self.environment.model, physics.mjx_model)
-            self.environment.carry(self._derived)
+            self.environment.carry(constants.derived(self.environment.model, physics.mjx_model))
 
     def _view(self) -> MjxPhysics:
         return MjxPhysics(self.environment.model, self.environment.mjx_model, None, {})
@@ -119,8 +115,6 @@ class ComposedWorld(BaseWorld):
         model = self.environment.model
         qpos = model.qpos0 if params.qpos is None else params.qpos
         qvel = jnp.zeros(model.nv) if params.qvel is None else params.qvel
-        if self._apart:
-            return self.environment.reset_apart(key, self._model(params), (qpos, qvel))
         return self.environment.reset(key, self._model(params, starts=True), (qpos, qvel), self._lawful(params))
 
     def init_delays(self, rng: jax.Array | None = None, graph_state: GraphState | None = None) -> dict[str, Value]:
@@ -137,15 +131,10 @@ class ComposedWorld(BaseWorld):
         state = (graph_state or GraphState()).state.get(self.name)
         return self.output(self.init_state(rng, graph_state) if state is None else state)
 
-    def entered(self, state: State, action: jax.Array) -> State:
-        """Return the state with which a control step under an action begins; default: as it is."""
-        del action
-        return state
-
     def step(self, step_state: StepState) -> tuple[StepState, PyTree]:
         """Take a control step under the newest action."""
         action = self._action(step_state)
-        before = self.entered(step_state.state, action)
+        before = step_state.state
         params = step_state.params
         state: PyTree = self.environment.step(before, action, self._model(params), self._lawful(params))
         # An episode that has ended stays ended: readers look only now and then.
@@ -170,55 +159,6 @@ class ComposedWorld(BaseWorld):
             return stepping.with_fields(model, {n: jnp.asarray(v, model.qpos0.dtype) for n, v in changed.items()})
 
         return lawful
-
-    # -- physics that runs elsewhere, see ``worlds.rollouts.OpenLoop``
-
-    @property
-    def substeps(self) -> int:
-        """Physics steps in a tick."""
-        return self.environment.substeps
-
-    @property
-    def derives(self) -> bool:
-        """Whether constants of the model follow from fields that differ."""
-        return self._derives
-
-    def open_loop(self) -> MjModel:
-        """Take the physics out and return the ``MjModel``; UsageError where that would change what happens."""
-        check_steps(self, ComposedWorld)
-        open_loop.check(self.environment, self.entered, self.output, self.name)
-        self._apart = True
-        return self.environment.model
-
-    def fields(self, params: WorldParams, state: State) -> dict[str, jax.Array]:
-        """Return the fields of the model that are not as compiled: parameters, and fields that hooks set at a start."""
-        physics = self._view()
-        self._set(physics, params)
-        by_hooks = {name: value for name, value in state.leaves.items() if name not in self._derived}
-        return {name: physics.field(name) for name in physics.changed} | by_hooks
-
-    def start(self, params: WorldParams, state: State) -> Start:
-        """Return where the physics starts."""
-        del params
-        return Start(state.data.qpos, state.data.qvel, state.data.qacc_warmstart)
-
-    def controls(self, step_state: StepState) -> tuple[StepState, jax.Array]:
-        """Run the hooks of a tick without its physics; return the controls of its physics steps ``(substeps, nu)``."""
-        action = self._action(step_state)
-        state = self.entered(step_state.state, action)
-        state, controls = self.environment.step_apart(state, action, self._model(step_state.params))
-        return step_state.replace(state=state), controls
-
-    def message(self, state: State, qpos: jax.Array, qvel: jax.Array, qacc: jax.Array) -> PyTree:
-        """Return what the world sends.
-
-        Args:
-            qpos: Positions ``(nq,)`` [m or rad].
-            qvel: Velocities ``(nv,)`` [m/s or rad/s].
-            qacc: Accelerations ``(nv,)`` of the last physics step [m/s^2 or rad/s^2].
-        """
-        data = state.data.replace(qpos=qpos, qvel=qvel, qacc=qacc)
-        return self.output(dataclasses.replace(state, data=data))
 
     @property
     def has_reward(self) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 import weakref
@@ -241,7 +240,6 @@ class MjxEnvironment:
         law: stepping.Law | None = None,
         initial: mjx.Data | None = None,
         dry: bool = False,
-        samples: bool = True,
     ) -> State:
         physics, random_state = self._physics(None, model, law, initial, dry)
         random_state.key = key
@@ -257,51 +255,15 @@ class MjxEnvironment:
         failed = physics.retry(attempt, random_state, self._attempts)
         physics.forward(actuation=False)
         # Take the first samples.
-        observed = self._rings if samples else []
-        rings = {r.name: r.reset(physics, random_state) for r in observed}
+        rings = {r.name: r.reset(physics, random_state) for r in self._rings}
         steps = jnp.zeros((), jnp.int32)
-        observation = {r.name: r.read(rings[r.name], steps) for r in observed}
+        observation = {r.name: r.read(rings[r.name], steps) for r in self._rings}
         dirty = jnp.asarray(physics.is_dirty, bool)
         data, leaves, variables, key, memory = physics.tree(random_state)
         reward, discount, terms = jax.tree.map(lambda x: jnp.zeros(x.shape, data.qpos.dtype), self._earned)
         no = jnp.zeros((), bool)
         outcome = (observation, reward, discount + 1, no, no, failed, terms)
         return State(data, leaves, variables, key, memory, rings, steps, dirty, *outcome)
-
-    def reset_apart(
-        self,
-        key: jax.Array,
-        model: mjx.Model | None = None,
-        start: tuple[ArrayLike, ArrayLike] | None = None,
-        data: PyTree = None,
-    ) -> State:
-        """Return the result of ``reset`` without physics and observations.
-
-        Args:
-            data: The ``mjx.Data`` at the start; default: ``initial``.
-        """
-        return self._reset(key, model, start, initial=data, dry=True, samples=False)
-
-    def step_apart(self, state: State, action: jax.Array, model: mjx.Model | None = None) -> tuple[State, jax.Array]:
-        """Run the hooks of a control step without its physics.
-
-        Args:
-            state: The copy; only ``data.ctrl``, what hooks keep and ``steps`` are up to date afterwards.
-
-        Returns:
-            The copy, and the controls of each physics step ``(substeps, nu)``.
-        """
-        physics, random_state = self._physics(state, model, dry=True)
-        controls = []
-        self._hooks.run("before_step", physics, action, random_state)
-        for _ in range(self.substeps):
-            self._hooks.run("before_substep", physics, action, random_state)
-            controls.append(physics.control())
-            self._hooks.run("after_substep", physics, random_state)
-        self._hooks.run("after_step", physics, random_state)
-        data, leaves, variables, key, memory = physics.tree(random_state)
-        carried = {"data": data, "leaves": leaves, "variables": variables, "key": key, "memory": memory}
-        return dataclasses.replace(state, steps=state.steps + 1, **carried), jnp.stack(controls)
 
     def step(
         self, state: State, action: jax.Array, model: mjx.Model | None = None, law: stepping.Law | None = None
