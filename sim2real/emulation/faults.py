@@ -47,7 +47,8 @@ class Emulation:
         self.require({name: (0.0, 1.0) for name in ("reply_loss", "corrupt", "late", "late_s")})
         self.require({"actuation_jitter_s": (0.0, self.actuation_latency_s)})
         for name, value in asdict(self).items():
-            if isinstance(value, int | float) and value < 0:
+            is_size = name.endswith(("_s", "_kd")) or "noise" in name
+            if is_size and value is not None and value < 0:
                 raise UsageError(f"emulator: {name} = {value} is below 0")
 
     def require(self, ranges: dict[str, tuple[float, float]]) -> None:
