@@ -97,52 +97,6 @@ class Timeline:
         }
         return Timeline(vertices, edges)
 
-    def cut(
-        self, begins: Sequence[int], length: int, lead: Mapping[str, int] | None = None
-    ) -> tuple[Timeline, dict[str, np.ndarray]]:
-        """Cut one episode into segments; in each, time starts at 0.
-
-        Args:
-            begins: Starts of the segments [ticks].
-            length: Length of every segment [ticks].
-            lead: Node -> time before the segment's start from which its steps are kept, at negative times [ticks].
-
-        Returns:
-            The segments as E episodes; and for each node, shape ``(E,)``, the number of the original step that is step
-            0 of each segment.
-
-        Raises:
-            UsageError: The timeline has more than one episode.
-        """
-        if self.episodes != 1:
-            raise UsageError(f"only a timeline of one episode can be cut, this one has {self.episodes}")
-        ahead = lead or {}
-        firsts = {
-            n: np.searchsorted(v.start[0, : v.count[0]], np.asarray(begins) - ahead.get(n, 0))
-            for n, v in self.vertices.items()
-        }
-        parts = [self._part({n: int(f[i]) for n, f in firsts.items()}, b, length) for i, b in enumerate(begins)]
-        return Timeline.stack(parts), firsts
-
-    def _part(self, firsts: Mapping[str, int], begin: int, length: int) -> Timeline:
-        """Return one segment; ``firsts`` has the first step of each node that belongs to it."""
-        vertices, edges = {}, {}
-        last: dict[str, int] = {}
-        for n, v in self.vertices.items():
-            stop = int(np.searchsorted(v.start[0, : v.count[0]], begin + length))
-            last[n] = stop
-            take = slice(firsts[n], stop)
-            count = np.array([stop - firsts[n]])
-            vertices[n] = Vertex(v.start[:, take] - begin, v.end[:, take] - begin, count)
-        for (n, i), e in self.edges.items():
-            take = slice(firsts[e.sender], last[e.sender])
-            seq_in = e.seq_in[:, take]
-            # A message that was consumed before the segment's first step is in the window of that step.
-            inside = (seq_in >= 0) & (seq_in < last[n])
-            seq_in = np.where(inside, np.maximum(seq_in - firsts[n], 0), -1)
-            edges[n, i] = Edge(e.received[:, take] - begin, seq_in, e.sender)
-        return Timeline(vertices, edges)
-
 
 def _edge(messages: Messages, sent: int, steps: int, sender: str) -> Edge:
     """Return an edge (E = 1) with one entry for each of the ``sent`` messages; a damaged record may lack some."""

@@ -127,7 +127,7 @@ def cut(
         check_log(episode, model)
         recorded = Timeline.from_episode(episode, {n: nodes[n] for n in (model.sensor, *model.given)})
         lead = {n: to_ticks(lead_s) for n in model.given}
-        parts, first = _cut_timeline(recorded, [to_ticks(s.begin_s) for s in parts_of], to_ticks(length_s), lead)
+        parts, first = cut_timeline(recorded, [to_ticks(s.begin_s) for s in parts_of], to_ticks(length_s), lead)
         timelines.append(parts)
         firsts += [(r, {n: int(f[i]) for n, f in first.items()}) for i in range(len(parts_of))]
         ordered += parts_of
@@ -153,7 +153,7 @@ def cut(
     )
 
 
-def _cut_timeline(
+def cut_timeline(
     timeline: Timeline, begins: Sequence[int], length: int, lead: Mapping[str, int]
 ) -> tuple[Timeline, dict[str, np.ndarray]]:
     """Cut a recorded episode into segments; in each, time starts at 0.

@@ -11,6 +11,7 @@ from sim2real.graph import BaseNode, Timeline
 from sim2real.graph.episode import MemoryRecorder, MessageRecord, StepRecord
 from sim2real.graph.schedule import draw
 from sim2real.graph.times import NEVER, search_rows
+from sim2real.identify.segments import cut_timeline
 
 
 def same(a: Timeline, b: Timeline):
@@ -96,7 +97,7 @@ def test_a_record_of_other_nodes_is_refused():
 
 def test_segments_start_at_0_with_steps_numbered_from_0():
     timeline = draw(chain(), 1.0)
-    parts, firsts = timeline.cut([100_000, 305_000], 100_000)
+    parts, firsts = cut_timeline(timeline, [100_000, 305_000], 100_000, {})
     assert parts.episodes == 2
     assert (firsts["s"].tolist(), firsts["r"].tolist()) == ([5, 16], [5, 15])
     assert parts.vertices["s"].start[0, :5].tolist() == [0, 20_000, 40_000, 60_000, 80_000]
@@ -107,7 +108,7 @@ def test_segments_start_at_0_with_steps_numbered_from_0():
 
 
 def test_with_lead_the_first_step_of_a_segment_sees_what_came_before():
-    parts, firsts = draw(chain(), 1.0).cut([305_000], 100_000, {"s": 60_000})
+    parts, firsts = cut_timeline(draw(chain(), 1.0), [305_000], 100_000, {"s": 60_000})
     assert (firsts["s"].tolist(), firsts["r"].tolist()) == ([13], [15])
     assert parts.vertices["s"].start[0, 0] == -45_000
     assert parts.edges["r", "s"].seq_in[0, :5].tolist() == [0, 0, 0, 1, 2]
