@@ -33,6 +33,12 @@ LINK = """<inertial><origin xyz="0.03 0 0"/><mass value="0.1"/>
 MANY = "more than 10000 elements"
 
 
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """An import writes its questions into the current folder."""
+    monkeypatch.chdir(tmp_path)
+
+
 def urdf(mimic: str) -> str:
     return f"""<robot name="jaw"><link name="palm"/><link name="l">{LINK}</link><link name="r">{LINK}</link>
   <joint name="drive" type="revolute"><parent link="palm"/><child link="l"/><origin xyz="0 0.02 0"/><axis xyz="0 1 0"/>
