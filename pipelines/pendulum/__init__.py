@@ -1,10 +1,7 @@
 """The disk pendulum: an eccentric mass on a DC motor, swung up by a policy."""
 
-from sim2real.stages.config import DeployConfig, GateLimits, RecordConfig
+from sim2real.stages.config import RecordConfig
 from sim2real.stages.pipeline.pipeline import Pipeline
-
-GATE = GateLimits(freeze_rad_s=0.5)
-"""It swings freely: nothing but a frozen encoder stops it dead; friction alone brakes it by 0.2 rad/s a sample."""
 
 PIPELINE = Pipeline(
     name="pendulum",
@@ -12,6 +9,5 @@ PIPELINE = Pipeline(
     package=__name__,
     scene="scene",
     # Around the pendulum's own 1.7 Hz, where 2 V swing it far enough to separate damping from friction.
-    record=RecordConfig(amplitude=2.0, low_hz=0.7, high_hz=2.0, gate=GATE),
-    deploy=DeployConfig(gate=GATE),
+    record=RecordConfig(amplitude=2.0, low_hz=0.7, high_hz=2.0),
 )
