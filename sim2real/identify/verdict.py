@@ -24,6 +24,7 @@ _WIDER = 4.0
 """Factor between the old and the new bound on a logarithmic scale."""
 _LONGEST_S = 1.0
 """Longest delay that the flags allow [s]."""
+_BASELINES = {"no delay": "the model without delays", "hold": "standing still", "nominal": "the nominal model"}
 NO_DELAY = "no delay"
 """The same model fitted without delays. If it is as good, the data needs no delays; that is no failure."""
 
@@ -173,7 +174,7 @@ def _on_held_out(held_out: Sequence[HeldOut]) -> tuple[bool, list[str]]:
 
 
 def _off(row: HeldOut) -> str:
-    """Return how far a position is off, and the ratio to the error of the best baseline."""
+    """Return how far a position is off, and how far the best baseline is."""
     errors = errors_of(row)
     sentence = f"{row.name} is off by {errors.pop('identified'):.2g} {row.unit}".rstrip()
     best = min(errors, key=lambda model: errors[model], default=None)
@@ -181,7 +182,7 @@ def _off(row: HeldOut) -> str:
         return sentence
     if not errors[best]:
         return f"{sentence}, where {best} is exact"
-    return f"{sentence}, {errors_of(row)['identified'] / errors[best]:.2g} times {best}"
+    return f"{sentence}; {_BASELINES.get(best, best)} by {errors[best]:.2g} {row.unit}".rstrip()
 
 
 def _needs_delay(row: HeldOut) -> bool:

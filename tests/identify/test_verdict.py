@@ -53,7 +53,7 @@ def judge(prediction, spread=spread(), check=check(), positions=ONE, x=None, **m
 def test_accepted():
     found = judge(rows(0.1, 1.0, hold=0.4))
     assert found.status == "accepted"
-    assert found.reasons == ("1 s ahead on held-out data th is off by 0.1 rad, 0.25 times hold",)
+    assert found.reasons == ("1 s ahead on held-out data th is off by 0.1 rad; standing still by 0.4 rad",)
 
 
 @pytest.mark.parametrize("own", [0.96, 1.0, 3.0, np.nan, np.inf])
@@ -91,7 +91,7 @@ def test_every_position_has_to_improve_on_every_baseline(worse):
 def test_the_worst_position_comes_first_and_all_are_told():
     found = judge(both(GOOD, GOOD | {"identified": 0.04}), positions=TWO)
     assert [r.split("data ")[1].split(" ")[0] for r in found.reasons] == ["tilt", "pan"]
-    assert "0.8 times no delay" in found.reasons[0]
+    assert "the model without delays by 0.05 rad" in found.reasons[0]
     lost = judge(both(GOOD | {"identified": 50.0}, GOOD), positions=TWO)
     assert "pan is no better than: nominal (0.2 rad), hold (0.4 rad), told (0.1 rad)" in str(lost)
 
